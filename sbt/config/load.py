@@ -1,0 +1,217 @@
+"""Configuration files to checked models: every error at once, each with file, line and column.
+
+>>> loaded = parse("campaign: coverage\\nscenario: cut_in\\nbudget: 40\\n")
+>>> loaded.config.initial, loaded.config.acquisition.kind
+(10, 'even')
+>>> parse("campaign: coverage\\nscenario: cut_in\\nbugdet: 40\\n", name="my.yaml")
+Traceback (most recent call last):
+    ...
+sbt.config.source.ConfigError: my.yaml:3:1: bugdet: unknown key (did you mean 'budget'?)
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+from sbt.config.model import Configuration
+from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
+
+__all__ = ["ConfigError", "Loaded", "dump", "fingerprint", "load", "parse", "resolve", "resumed", "schema"]
+
+_NOT_IDENTITY = ("executor", "store", "budget")
+_RULES = {
+    "missing": "is required",
+    "int_type": "must be a whole number",
+    "float_type": "must be a number",
+    "string_type": "must be text",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "dict_type": "must be a mapping (key: value)",
+    "model_type": "must be a mapping (key: value)",
+    "invalid_key": "keys must be text",
+    "invalid-json-value": "must be plain data (quote it, if it is text)",
+}
+"""How pydantic's kinds of errors read here; of the others its own words are taken."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A configuration, where its keys stand, and the folder that its relative `file.py:NAME` start from."""
+
+    config: Configuration
+    source: SourceMap
+    folder: Path
+
+
+def load(path: str | Path, overrides: Sequence[str] = ()) -> Loaded:
+    """Read and check a configuration file.
+
+    Args:
+        path: a YAML file.
+        overrides: `key.path=value` texts that replace or add single values, each value in YAML.
+
+    Raises:
+        ConfigError: the file cannot be read, or anything in it breaks a rule; all at once.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except IsADirectoryError:
+        raise ConfigError([f"{path}: a configuration must be a YAML file, but this is a folder"]) from None
+    except OSError as error:
+        raise ConfigError([f"{path}: a configuration must be a readable file, but: {error.strerror}"]) from None
+    except UnicodeDecodeError as error:
+        raise ConfigError([f"{path}: a configuration must be UTF-8 text, but byte {error.start} is not"]) from None
+    return parse(text, overrides, name=str(path), folder=path.resolve().parent)
+
+
+def parse(text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None) -> Loaded:
+    """Check a configuration given as text; like `load`."""
+    data, source = read_yaml(text, name)
+    if data is None:
+        raise ConfigError([f"{name}:1:1: a configuration needs at least campaign and scenario, but it is empty"])
+    if not isinstance(data, dict):
+        raise ConfigError([f"{name}:1:1: a configuration must be a mapping (key: value), but got {_shown(data)}"])
+    data, source, wrong = _overridden(data, source, overrides)
+    try:
+        config = Configuration.model_validate(data)
+    except ValidationError as error:
+        wrong += source.sorted([_problem(e) for e in error.errors() if e["type"] != "default_factory_not_called"])
+    if wrong:
+        raise ConfigError(wrong)
+    return Loaded(config, source, folder or Path.cwd())
+
+
+def resolve(config: Configuration) -> dict[str, Any]:
+    """Return the configuration as plain data, every default filled in."""
+    return config.model_dump(mode="json")
+
+
+def dump(config: Configuration) -> str:
+    """Return the resolved configuration as YAML; `parse` reads back an equal one."""
+    stream = io.StringIO()
+    yaml_reader().dump(resolve(config), stream)
+    return stream.getvalue()
+
+
+def fingerprint(config: Configuration) -> dict[str, Any]:
+    """Return what must stay the same when a campaign is resumed: all but executor, store and budget.
+
+    Plain JSON data: infinite numbers are the texts "inf" and "-inf".
+    """
+    return {key: _jsonable(value) for key, value in resolve(config).items() if key not in _NOT_IDENTITY}
+
+
+def resumed(config: Configuration, stored: Mapping[str, Any]) -> Configuration:
+    """Return the configuration with `initial` and `batch` as stored, where the user does not state them.
+
+    Their defaults follow the budget, which may grow when a campaign is resumed; they must not.
+    """
+    kept = {key: stored[key] for key in ("initial", "batch") if key not in config.model_fields_set and key in stored}
+    return config.model_copy(update=kept)
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON schema of configurations."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "sumo-sbt campaign",
+        **{k: v for k, v in Configuration.model_json_schema().items() if k != "title"},
+    }
+
+
+def _overridden(data: dict[str, Any], source: SourceMap, overrides: Sequence[str]) -> tuple[dict[str, Any], SourceMap, list[str]]:
+    """Return the data with the overrides in it, the source that knows them, and what is wrong with them."""
+    wrong: list[str] = []
+    given: set[Key] = set(source.overrides)
+    for text in overrides:
+        dotted, equals, written = text.partition("=")
+        path = tuple(dotted.strip().split("."))
+        if not equals or not all(path):
+            wrong.append(f"--set {text}: must be key.path=value, but got '{text}'")
+            continue
+        try:
+            value, _ = read_yaml(written, f"--set {dotted}")
+        except ConfigError as error:
+            wrong.append(f"--set {dotted}: the value must be YAML, but got '{written}' ({error.errors[0].partition(', but ')[2]})")
+            continue
+        try:
+            data = _with(data, path, value)
+        except TypeError as error:
+            wrong.append(f"--set {dotted}: {error}")
+            continue
+        given.add(path)
+    return data, replace(source, overrides=frozenset(given)), wrong
+
+
+def _with(data: Any, path: tuple[str, ...], value: Any) -> dict[str, Any]:
+    """Return a copy of nested mappings with one value replaced or added; null counts as an empty mapping."""
+    if data is not None and not isinstance(data, dict):
+        raise TypeError(f"--set reaches into mappings only, but '{path[0]}' would be inside {_shown(data)}")
+    head, rest = path[0], path[1:]
+    inner = (data or {}).get(head)
+    return {**(data or {}), head: _with(inner, rest, value) if rest else value}
+
+
+def _problem(error: Any) -> tuple[Key, str, bool]:
+    """Return path, message and whether the key is at fault, of one of pydantic's errors."""
+    path: Key = tuple(part for part in error["loc"] if part != "[key]")
+    kind = error["type"]
+    if kind == "extra_forbidden":
+        return path, _unknown_key(path), True
+    if kind == "missing":
+        return path, _RULES[kind], True
+    if kind == "value_error":  # a rule of ours: the message has the value already, or names it
+        return path, str(error["ctx"]["error"]), False
+    rule = _RULES.get(kind, error["msg"].replace("Input should be", "must be"))
+    return path, f"{rule}, but got {_shown(error['input'])}", kind == "invalid_key"
+
+
+def _unknown_key(path: Key) -> str:
+    known = _keys_at(path[:-1])
+    near = get_close_matches(str(path[-1]), known, 1)
+    return f"unknown key (did you mean '{near[0]}'?)" if near else f"unknown key; the keys here are {', '.join(known)}"
+
+
+def _keys_at(path: Key) -> list[str]:
+    """Return the keys of the model at a path."""
+    kind: Any = Configuration
+    for part in path:
+        kind = _inner(kind.model_fields[part].annotation) if _is_model(kind) else _inner(get_args(kind)[-1])
+        if get_origin(kind) is tuple:
+            kind = list[get_args(kind)[0]]  # type: ignore[misc]
+    return list(kind.model_fields) if _is_model(kind) else []
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _inner(kind: Any) -> Any:
+    """Return a type without `| None` and without annotations."""
+    while get_origin(kind) in (Annotated, Union, UnionType):
+        kind = next(k for k in get_args(kind) if k is not type(None))
+    return kind
+
+
+def _shown(value: Any) -> str:
+    """Return a value as the user wrote it, about, and short."""
+    text = {None: "null", True: "true", False: "false"}[value] if value is None or isinstance(value, bool) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _jsonable(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _jsonable(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_jsonable(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

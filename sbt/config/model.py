@@ -1,0 +1,300 @@
+"""The configuration of a campaign: every key with its type, rule, default and meaning.
+
+The descriptions are the JSON schema's (`sumo-sbt schema`). Rules that need the scenario (an input's
+name, low < high) are checked in `sbt.config.assemble`, everything else here.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ValidationInfo,
+    field_validator,
+)
+
+from sbt.problem.expression import Expression
+from sbt.problem.requirement import CriticalInterval
+
+__all__ = [
+    "CAMPAIGNS", "EXECUTORS", "AcquisitionChoice", "CampaignKind", "Choice", "Configuration", "CorrelationEntry", "ExecutorChoice",
+    "InputChange", "MetamodelChoice", "RequirementChange", "SimulationChoice", "StopRules", "ValidationChoice",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CampaignKind:
+    """What a campaign takes: its default acquisition, its stop rules, and whether it learns where to go."""
+
+    acquisition: str
+    stop: tuple[str, ...] = ()
+    adaptive: bool = True
+
+
+CAMPAIGNS: Mapping[str, CampaignKind] = {
+    "boundary": CampaignKind("boundary", stop=("stable",)),
+    "coverage": CampaignKind("even", adaptive=False),
+}
+"""The campaigns of this release."""
+EXECUTORS = ("serial", "local")
+"""The executors of this release."""
+_LATER = ("falsification", "estimation", "dask")
+
+
+def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
+    """Return a check for these values that names as such what is planned for a later release."""
+
+    def check(value: str) -> str:
+        if value in choices:
+            return value
+        if value in _LATER:
+            raise ValueError(f"'{value}' is not in this release; choose {' or '.join(choices)}")
+        near = get_close_matches(value, choices, 1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{hint}")
+
+    return check
+
+
+def _two(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise ValueError("must be a list of two values")
+    return value
+
+
+def _formula(*, condition: bool) -> Callable[[str], str]:
+    """Return a check that the text is a formula, and one that gives a truth value or a number as wanted."""
+
+    def check(text: str) -> str:
+        rule = Expression(text)
+        with np.errstate(all="ignore"):
+            value = np.asarray(rule(dict.fromkeys(rule.names(), np.ones(1))))
+        if not rule.names():
+            raise ValueError(f"must use at least one input, but got '{text}'")
+        if (value.dtype == np.bool_) is not condition:
+            wanted = "a condition such as 'a < b'" if condition else "a number such as 'a / b', not a condition"
+            raise ValueError(f"must be {wanted}, but got '{text}'")
+        return text
+
+    return check
+
+
+def _not_blank(text: str) -> str:
+    if not text.strip():
+        raise ValueError("must not be empty")
+    return text
+
+
+CampaignName = Annotated[str, AfterValidator(_one_of(tuple(CAMPAIGNS))), Field(json_schema_extra={"enum": [*CAMPAIGNS]})]
+ExecutorName = Annotated[str, AfterValidator(_one_of(EXECUTORS)), Field(json_schema_extra={"enum": [*EXECUTORS]})]
+Name = Annotated[str, AfterValidator(_not_blank)]
+Condition = Annotated[str, AfterValidator(_formula(condition=True))]
+Formula = Annotated[str, AfterValidator(_formula(condition=False))]
+Interval = Annotated[tuple[float, float], BeforeValidator(_two), Field(strict=False)]
+
+
+class _Strict(BaseModel):
+    """Frozen; unknown keys are errors; a string is no number and a boolean no integer."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class RequirementChange(_Strict):
+    """Changes the scenario's own requirement."""
+
+    metric: Name | None = Field(default=None, description="Safety metric; null: the scenario's own.")
+    critical: Interval | None = Field(
+        default=None, description="Closed interval [low, high] of critical values, ends may be -.inf or .inf; null: the scenario's own."
+    )
+
+    @field_validator("critical")
+    @classmethod
+    def _proper(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None:
+            CriticalInterval(*value)
+        return value
+
+
+class Choice(_Strict):
+    """A kind by name (`file.py:NAME` for one's own); the other keys are its settings."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, JsonValue]
+
+    kind: Name = Field(description="An installed name, or file.py:NAME (relative to the configuration file).")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The keys beside the declared ones."""
+        return dict(self.__pydantic_extra__)
+
+
+class MetamodelChoice(Choice):
+    """The metamodel; further keys are its settings."""
+
+    preset: Name | None = Field(default=None, description="Named settings of the metamodel, such as paper; further keys override it.")
+
+
+class AcquisitionChoice(_Strict):
+    """The acquisition: how much a candidate is worth."""
+
+    kind: Name = Field(description="even, boundary, importance, another installed name, or file.py:NAME.")
+
+
+class InputChange(_Strict):
+    """Changes one input of the scenario; what is not given stays as it is."""
+
+    min: float | None = Field(default=None, description="Lower end of the range, in the input's unit.")
+    max: float | None = Field(default=None, description="Upper end of the range, in the input's unit.")
+    distribution: Choice | None = Field(
+        default=None, description="Law of the input, truncated to the range: {kind: normal, mean: 40, std: 15}, "
+        "or uniform, lognormal, exponential, gumbel, weibull, beta, triangular, scipy.",
+    )  # fmt: skip
+
+
+class CorrelationEntry(_Strict):
+    """Correlation of two inputs' normal scores (Gaussian copula)."""
+
+    inputs: Annotated[tuple[Name, Name], BeforeValidator(_two), Field(strict=False)] = Field(description="Two inputs.")
+    value: float = Field(gt=-1, lt=1, description="Correlation of their normal scores, between -1 and 1.")
+
+
+class SimulationChoice(_Strict):
+    """How SUMO simulates."""
+
+    step_length: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Step (s); null: the scenario's own.")
+
+
+class ValidationChoice(_Strict):
+    """Runs that score the metamodel and never train it."""
+
+    share: float = Field(default=0.1, ge=0, lt=1, description="Share of every batch that is drawn at random and held out.")
+    reference: int = Field(default=0, ge=0, description="Extra random runs beyond the budget, only for scoring.")
+
+
+class StopRules(_Strict):
+    """When to stop before the budget is used up; null switches a rule off."""
+
+    failures: int | None = Field(default=None, ge=1, description="Falsification: number of critical runs.")
+    modes: int | None = Field(default=None, ge=1, description="Falsification: number of distinct failure modes.")
+    stable: float | None = Field(default=None, gt=0, lt=1, description="Boundary: share of the space that still changes sides.")
+    cov: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Estimation: coefficient of variation.")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class ExecutorChoice(_Strict):
+    """Where runs are executed; never changes their results."""
+
+    kind: ExecutorName = Field(default="local", description="serial: in this process; local: worker processes.")
+    workers: int = Field(default_factory=_cores, ge=1, description="Worker processes of local; default: the usable cores.")
+    timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped; .inf: never.")
+    isolation: Literal["auto", "fresh", "reuse", "replicas"] = Field(
+        default="auto", description="SUMO per run: fresh (load each time), reuse, replicas; auto: the fastest the scenario allows."
+    )
+
+
+def _tenth(data: dict[str, Any]) -> int:
+    return int(min(max(10, data["budget"] // 10), data["budget"]))
+
+
+def _store(data: dict[str, Any]) -> str:
+    path = Path(data["scenario"].removesuffix(":SCENARIO"))
+    name = re.sub(r"[^\w-]+", "_", path.stem if path.suffix in (".py", ".yaml") else path.name)
+    return f"runs/{data['campaign']}_{name}"
+
+
+def _metamodel(data: dict[str, Any]) -> MetamodelChoice | None:
+    return MetamodelChoice(kind="gp") if CAMPAIGNS[data["campaign"]].adaptive else None
+
+
+def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
+    return AcquisitionChoice(kind=CAMPAIGNS[data["campaign"]].acquisition)
+
+
+class Configuration(_Strict):
+    """A campaign: what is asked, of which scenario, with how many runs."""
+
+    campaign: CampaignName = Field(
+        description="boundary: identify where critical meets uncritical; coverage: evenly distributed points."
+    )
+    scenario: Name = Field(description="An installed scenario, or file.py:NAME (relative to the configuration file).")
+    requirement: RequirementChange = Field(default=RequirementChange(), description="What is critical; default: the scenario's own.")
+    inputs: dict[str, InputChange] = Field(default={}, description="Changes to the scenario's inputs, by name.")
+    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False)] = Field(
+        default=(), description="Correlated pairs of inputs; the others stay as the scenario has them."
+    )
+    constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = Field(
+        default=(), description="Conditions on inputs that every concrete scenario meets, such as 'v_ego - v_co < 30'."
+    )
+    features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel, name: formula.")
+    ego: Choice | None = Field(default=None, description="The AV under test: a controller; null: the scenario's own.")
+    simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates.")
+    seed: int = Field(default=0, ge=0, description="Seed of everything random in the campaign.")
+    budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
+    initial: int = Field(
+        default_factory=_tenth, ge=1,
+        description="Evenly distributed runs before the first fit; default: a tenth of the budget, at least 10.",
+    )  # fmt: skip
+    batch: int = Field(
+        default_factory=lambda data: data["initial"], ge=1, description="Runs per iteration; default: as many as initial."
+    )
+    validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
+    metamodel: MetamodelChoice | None = Field(
+        default_factory=_metamodel, description="What learns the safety metric; default: gp, none for coverage."
+    )
+    acquisition: AcquisitionChoice = Field(
+        default_factory=_acquisition, description="How much a candidate is worth; default: boundary for boundary, even for coverage."
+    )
+    stop: StopRules = Field(default=StopRules(), description="When to stop before the budget is used up.")
+    executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")
+    store: Name = Field(default_factory=_store, description="Folder of the results; default: runs/<campaign>_<scenario>.")
+
+    @field_validator("initial")
+    @classmethod
+    def _within_budget(cls, value: int, info: ValidationInfo) -> int:
+        if value > info.data.get("budget", value):
+            raise ValueError(f"initial <= budget must hold, but got initial {value}, budget {info.data['budget']}")
+        return value
+
+    @field_validator("metamodel")
+    @classmethod
+    def _learns(cls, value: MetamodelChoice | None, info: ValidationInfo) -> MetamodelChoice | None:
+        name = info.data.get("campaign")
+        if value is None and name is not None and CAMPAIGNS[name].adaptive:
+            raise ValueError(f"a {name} campaign needs a metamodel, but got null")
+        return value
+
+    @field_validator("acquisition")
+    @classmethod
+    def _fits_campaign(cls, value: AcquisitionChoice, info: ValidationInfo) -> AcquisitionChoice:
+        name = info.data.get("campaign")
+        if name is not None and not CAMPAIGNS[name].adaptive and value.kind != CAMPAIGNS[name].acquisition:
+            raise ValueError(f"a {name} campaign draws by {CAMPAIGNS[name].acquisition}, but got '{value.kind}'")
+        return value
+
+    @field_validator("stop")
+    @classmethod
+    def _rules_fit_campaign(cls, value: StopRules, info: ValidationInfo) -> StopRules:
+        name = info.data.get("campaign")
+        allowed = CAMPAIGNS[name].stop if name is not None else tuple(StopRules.model_fields)
+        surplus = [rule for rule, limit in value.model_dump().items() if limit is not None and rule not in allowed]
+        if surplus:
+            known = ", ".join(allowed) or "none"
+            raise ValueError(f"a {name} campaign has the stop rules: {known}; but got {', '.join(surplus)}")
+        return value

@@ -1,0 +1,153 @@
+"""Where each key of a configuration stands: file, line and column, or the `--set` that gave it.
+
+YAML 1.2 is read twice by ruamel.yaml: as nodes, for positions and doubled keys, and as values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
+
+from sbt.errors import InputError
+
+__all__ = ["ConfigError", "Place", "SourceMap", "read_yaml", "yaml_reader"]
+
+Key = tuple[str | int, ...]
+_DEPTH = 30
+"""Deeper nesting is an alias that contains itself."""
+
+
+class ConfigError(InputError):
+    """Everything that is wrong with a configuration; `errors` has one line for each."""
+
+    def __init__(self, errors: Sequence[str]):
+        super().__init__("\n".join(errors))
+        self.errors = tuple(errors)
+
+    def __reduce__(self) -> tuple[type[ConfigError], tuple[tuple[str, ...]]]:
+        """Pickle by the errors."""
+        return type(self), (self.errors,)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Line and column, from 1, of a key and of its value."""
+
+    key: tuple[int, int] = (1, 1)
+    value: tuple[int, int] = (1, 1)
+
+
+@dataclass(frozen=True)
+class SourceMap:
+    """Places of the keys in one file, and the keys that `--set` gave.
+
+    Args:
+        name: the file, as the user wrote it.
+        places: by path of keys.
+        overrides: paths that `--set` gave.
+    """
+
+    name: str
+    places: Mapping[Key, Place] = field(default_factory=dict)
+    overrides: frozenset[Key] = frozenset()
+
+    def located(self, key: str | Key, message: str, *, at_key: bool = False) -> str:
+        """Return `file:line:column: key.path: message`, or `--set key.path: message`.
+
+        Args:
+            key: dotted path or its parts; the nearest key that is written somewhere gives the place.
+            message: the rule, then the value.
+            at_key: the key itself is wrong, not its value.
+        """
+        return self._sortable(_path(key), message, at_key)[1]
+
+    def sorted(self, problems: Sequence[tuple[Key, str, bool]]) -> list[str]:
+        """Return the located messages of (path, message, at_key), in the order of the file."""
+        lines = [self._sortable(*problem) for problem in problems]
+        return [text for _, text in sorted(lines, key=lambda line: line[0])]
+
+    def _sortable(self, path: Key, message: str, at_key: bool) -> tuple[tuple[int, int, int], str]:  # noqa: FBT001
+        dotted = ".".join(str(part) for part in path)
+        for prefix in (path[:n] for n in range(len(path), -1, -1)):
+            if prefix in self.overrides:
+                given = ".".join(str(part) for part in prefix)
+                inner = "" if prefix == path else f" {dotted}:"
+                return (1, 0, 0), f"--set {given}:{inner} {message}"
+            if prefix in self.places:
+                place = self.places[prefix]
+                line, column = place.key if at_key and prefix == path else place.value
+                subject = f" {dotted}:" if dotted else ""
+                return (0, line, column), f"{self.name}:{line}:{column}:{subject} {message}"
+        return (0, 0, 0), f"{self.name}: {dotted}: {message}"
+
+
+def _path(key: str | Key) -> Key:
+    parts = key.split(".") if isinstance(key, str) else key
+    return tuple(int(p) if isinstance(p, str) and p.isdecimal() else p for p in parts)
+
+
+def yaml_reader() -> YAML:
+    """Return a reader and writer of YAML 1.2: plain data only, order kept."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.allow_duplicate_keys = True  # reported by `read_yaml`, all of them
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False
+    return yaml
+
+
+def read_yaml(text: str, name: str) -> tuple[Any, SourceMap]:
+    """Return the value of a YAML document and where its keys stand.
+
+    Raises:
+        ConfigError: the text is not YAML, or a key stands twice in one mapping.
+    """
+    try:
+        node = yaml_reader().compose(text)
+        value = yaml_reader().load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark is not None else (1, 1)
+        what = " ".join(filter(None, (error.context, error.problem))).replace("\n", " ")
+        hint = " (indent with blanks, not with tabs)" if "'\\t'" in what else ""
+        raise ConfigError([f"{name}:{line}:{column}: the file must be YAML, but {what}{hint}"]) from None
+    except (YAMLError, ValueError, RecursionError) as error:
+        where = str(text[: getattr(error, "position", 0)]).count("\n") + 1
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError([f"{name}:{where}:1: the file must be YAML, but {reason}"]) from None
+    places: dict[Key, Place] = {}
+    doubled: list[tuple[Key, str, bool]] = []
+    for path, place in _walk(node, ()):
+        if path in places:
+            line = places[path].key[0]
+            message = f"a key must stand once in its mapping, but '{path[-1]}' stands already in line {line}"
+            doubled.append((path, message, True))
+        places[path] = place
+    source = SourceMap(name, places)
+    if doubled:
+        raise ConfigError(source.sorted(doubled))
+    return value, source
+
+
+def _walk(node: Node | None, path: Key) -> Iterator[tuple[Key, Place]]:
+    """Yield the place of every key and list entry below a node, and of the node itself if it is the root."""
+    if node is None or len(path) > _DEPTH:
+        return
+    if not path:
+        yield (), Place(_mark(node), _mark(node))
+    entries: list[tuple[str | int, Node, Node]] = []
+    if isinstance(node, MappingNode):
+        entries = [(key.value, key, value) for key, value in node.value if isinstance(key.value, str)]
+    elif isinstance(node, SequenceNode):
+        entries = [(k, item, item) for k, item in enumerate(node.value)]
+    for name, key, value in entries:
+        yield (*path, name), Place(_mark(key), _mark(value))
+        yield from _walk(value, (*path, name))
+
+
+def _mark(node: Node) -> tuple[int, int]:
+    return node.start_mark.line + 1, node.start_mark.column + 1

@@ -1,0 +1,38 @@
+"""The errors a user can meet: one base class, one name a cause.
+
+`InputError` is the user's to mend (exit code 2 of the command line); `StoreError` is about the
+folder of a campaign; `RunError` ends one run and becomes a row of the store, never an abort.
+"""
+
+from __future__ import annotations
+
+__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError"]
+
+
+class SbtError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class InputError(SbtError, ValueError):
+    """A value from outside breaks a rule; the message states the rule, then the value."""
+
+
+class PluginError(InputError):
+    """A named scenario, metamodel, acquisition or metric cannot be loaded."""
+
+
+class StoreError(SbtError):
+    """The store cannot be read or written, or belongs to another configuration."""
+
+
+class RunError(SbtError):
+    """One run cannot give a metric; `status` is the `Status` value it ends with."""
+
+    def __init__(self, status: str, reason: str):
+        super().__init__(reason)
+        self.status = status
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[type[RunError], tuple[str, str]]:
+        """Pickle by status and reason (`Exception` would call `__init__` with the reason alone)."""
+        return type(self), (self.status, self.reason)

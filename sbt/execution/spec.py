@@ -1,0 +1,57 @@
+"""What crosses a process border in place of a scenario: its name and the user's choices, as plain data.
+
+A worker resolves the specification itself, once; nothing that holds SUMO or a function is pickled.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from sbt.errors import PluginError
+from sbt.plugins import load
+from sbt.problem.scenario import LogicalScenario
+
+__all__ = ["ScenarioSpec"]
+
+
+@dataclass(frozen=True)
+class ScenarioSpec:
+    """A scenario by name, with the choices that change how it runs (not what is asked about it).
+
+    Args:
+        name: an installed scenario, or `file.py:NAME`.
+        folder: where a relative file is looked up; make it absolute before it goes to another process.
+        ego: the AV under test; None: the scenario's own.
+        isolation: auto, fresh, reuse or replicas; scenarios without SUMO ignore it.
+        step_length: simulation step (s); None: the scenario's own.
+    """
+
+    name: str
+    folder: str = "."
+    ego: Mapping[str, Any] | None = None
+    isolation: str = "auto"
+    step_length: float | None = None
+
+    def resolve(self) -> LogicalScenario:
+        """Return the scenario; loaded once per process and specification.
+
+        Raises:
+            PluginError: there is no such scenario, or its code raises when it is imported.
+            InputError: the scenario does not offer one of the choices.
+        """
+        ego = None if self.ego is None else json.dumps(dict(self.ego), sort_keys=True)
+        return _resolve(self.name, str(Path(self.folder).resolve()), ego, self.isolation, self.step_length)
+
+
+@cache
+def _resolve(name: str, folder: str, ego: str | None, isolation: str, step_length: float | None) -> LogicalScenario:
+    scenario = load("scenarios", name, Path(folder))
+    if not isinstance(scenario, LogicalScenario):
+        raise PluginError(f"a scenario must be a LogicalScenario, but '{name}' is a {type(scenario).__name__}")
+    chosen = scenario.configured(None if ego is None else json.loads(ego), None, step_length)
+    return chosen.configured(isolation=isolation)  # afterwards: what is allowed may depend on the ego

@@ -1,0 +1,1 @@
+"""Safety metrics: functions of a trace, computed after the run."""

@@ -1,0 +1,87 @@
+"""Oriented rectangles: overlap while moving, and distance; vectorised over time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sbt.arrays import Vector
+from sbt.problem.trace import ActorTrace
+
+__all__ = ["contact_index", "corners", "rectangle_distance", "swept_contact"]
+
+
+def corners(actor: ActorTrace) -> np.ndarray:
+    """Return the (t, 4, 2) corners of the rectangle, counter-clockwise from the front left."""
+    cos, sin = np.cos(actor.heading), np.sin(actor.heading)
+    along = 0.5 * actor.length * np.array([1.0, -1.0, -1.0, 1.0])
+    across = 0.5 * actor.width * np.array([1.0, 1.0, -1.0, -1.0])
+    x = actor.x[:, None] + cos[:, None] * along - sin[:, None] * across  # (t, 4)
+    y = actor.y[:, None] + sin[:, None] * along + cos[:, None] * across
+    return np.stack([x, y], axis=-1)
+
+
+def _axes(a: ActorTrace, b: ActorTrace) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (t, 4) directions of the separating axes: along and across each rectangle."""
+    angle = np.stack([a.heading, a.heading + np.pi / 2, b.heading, b.heading + np.pi / 2], axis=1)
+    return np.cos(angle), np.sin(angle)
+
+
+def _reach(actor: ActorTrace, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+    """Return the (t, 4) half extent of a rectangle along each axis."""
+    c, s = np.cos(actor.heading)[:, None], np.sin(actor.heading)[:, None]
+    return 0.5 * (actor.length * np.abs(c * cos + s * sin) + actor.width * np.abs(-s * cos + c * sin))
+
+
+def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
+    """Return (t,) the share of the step before each instant after which the rectangles touch.
+
+    Between instants the centres move on straight lines and the headings are those at the end of the
+    step; the relative motion is tested against the separating axes, so that no crossing is missed
+    however coarse the step. inf where there is no contact; the first instant has no step before it
+    and gives 0 on overlap.
+
+    Source:
+        separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
+    """
+    cos, sin = _axes(a, b)
+    reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)
+    dx, dy = b.x - a.x, b.y - a.y
+    end = dx[:, None] * cos + dy[:, None] * sin  # (t, 4) centre distance along each axis
+    start = np.concatenate([dx[:1], dx[:-1]])[:, None] * cos + np.concatenate([dy[:1], dy[:-1]])[:, None] * sin
+    rate = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (-np.sign(rate) * reach - start) / rate
+        last = (np.sign(rate) * reach - start) / rate
+    still = rate == 0
+    outside = np.abs(start) > reach
+    first = np.where(still, np.where(outside, np.inf, -np.inf), first)
+    last = np.where(still, np.where(outside, -np.inf, np.inf), last)
+    enter, leave = first.max(axis=1), last.min(axis=1)
+    hit = (enter <= leave) & (leave >= 0) & (enter <= 1)
+    return np.where(hit, np.maximum(enter, 0.0), np.inf)
+
+
+def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
+    """Return the first instant at which, or in the step before which, the rectangles touch; None: never."""
+    hits = np.flatnonzero(np.isfinite(swept_contact(a, b)))
+    return int(hits[0]) if hits.size else None
+
+
+def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:
+    """Return the (t,) smallest distance between the rectangles (m), 0 where they overlap."""
+    cos, sin = _axes(a, b)
+    reach = _reach(a, cos, sin) + _reach(b, cos, sin)
+    along = np.abs((b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin)
+    overlap = (along <= reach).all(axis=1)
+    corner_a, corner_b = corners(a), corners(b)
+    distance = np.minimum(_point_distance(corner_a, b), _point_distance(corner_b, a))
+    return np.where(overlap, 0.0, distance)
+
+
+def _point_distance(points: np.ndarray, box: ActorTrace) -> Vector:
+    """Return the (t,) smallest distance of (t, 4, 2) points to a rectangle."""
+    dx, dy = points[..., 0] - box.x[:, None], points[..., 1] - box.y[:, None]
+    c, s = np.cos(box.heading)[:, None], np.sin(box.heading)[:, None]
+    u = np.maximum(np.abs(c * dx + s * dy) - box.length / 2, 0.0)
+    v = np.maximum(np.abs(-s * dx + c * dy) - box.width / 2, 0.0)
+    return np.hypot(u, v).min(axis=1)

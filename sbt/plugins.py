@@ -1,0 +1,100 @@
+"""How scenarios, metamodels, acquisitions, metrics and controllers are found: built-ins and strangers alike.
+
+A name is an entry point (groups `sbt.scenarios`, `sbt.metamodels`, ...), `file.py:NAME` runs the
+user's own file, and only because the user names it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+import sys
+import threading
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from sbt.errors import InputError, PluginError
+
+__all__ = ["KINDS", "load", "names"]
+
+KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
+_LOCK = threading.Lock()
+
+
+@cache
+def _entries(kind: str) -> dict[str, EntryPoint]:
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, but got '{kind}'")
+    return {entry.name: entry for entry in entry_points(group=f"sbt.{kind}")}
+
+
+def names(kind: str) -> list[str]:
+    """Return what is installed of one kind, sorted."""
+    return sorted(_entries(kind))
+
+
+def load(kind: str, name: str, folder: Path | None = None) -> Any:
+    """Return the object with this name.
+
+    Args:
+        kind: one of `KINDS`.
+        name: an installed name, or `file.py:NAME`.
+        folder: where a relative file is looked up; default the working directory.
+
+    Raises:
+        PluginError: nothing has this name, or its code raises when it is imported.
+    """
+    if ".py:" in name:
+        path, _, attribute = name.rpartition(":")
+        return _from_file(str((folder or Path.cwd()) / Path(path).expanduser()), attribute)
+    entries = _entries(kind)
+    if name not in entries:
+        near = difflib.get_close_matches(name, entries, 1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        known = ", ".join(sorted(entries)) or "nothing is installed"
+        raise PluginError(f"{kind} must be one of {known}, or file.py:NAME, but got '{name}'{hint}")
+    try:
+        return entries[name].load()
+    except InputError:
+        raise
+    except Exception as error:
+        raise PluginError(f"{kind[:-1]} '{name}' cannot be imported: {type(error).__name__}: {error}") from error
+
+
+@cache
+def _module(path: str) -> Any:
+    """Import one file under a name of its own, once a process."""
+    name = f"sbt_user_{abs(hash(path)):x}_{Path(path).stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None or not Path(path).is_file():
+        raise PluginError(f"a plug-in file must exist, but got '{path}'")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        line = _line_of(error, path)
+        raise PluginError(f"plug-in file {path}{line} raised on import: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _line_of(error: BaseException, path: str) -> str:
+    """Return ':line' of the last frame in the user's own file."""
+    found, trace = "", error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == path:
+            found = f":{trace.tb_lineno}"
+        trace = trace.tb_next
+    return f":{error.lineno}" if isinstance(error, SyntaxError) else found
+
+
+def _from_file(path: str, attribute: str) -> Any:
+    with _LOCK:
+        module = _module(str(Path(path).resolve()))
+    if not hasattr(module, attribute):
+        offered = ", ".join(n for n in vars(module) if n.isupper() or not n.startswith("_")) or "nothing"
+        raise PluginError(f"plug-in file {path} must define {attribute}, but it defines {offered}")
+    return getattr(module, attribute)

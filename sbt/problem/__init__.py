@@ -1,0 +1,1 @@
+"""What is asked: inputs and their law, scenarios, traces, metrics, requirements, outcomes."""

@@ -1,0 +1,97 @@
+"""Arithmetic over named inputs from a configuration file, without running anybody's code.
+
+>>> rule = Expression("v_ego - v_co < 30 and d_t > 0.5")
+>>> rule({"v_ego": np.array([40.0, 90.0]), "v_co": np.array([30.0, 30.0]), "d_t": np.ones(2)}).tolist()
+[True, False]
+"""
+
+from __future__ import annotations
+
+import ast
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from sbt.errors import InputError
+
+__all__ = ["Expression"]
+
+_BINARY: dict[type, Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}
+_COMPARE: dict[type, Callable[[Any, Any], Any]] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "log": np.log,
+    "min": np.minimum, "max": np.maximum, "sin": np.sin, "cos": np.cos,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A formula over inputs: + - * / **, comparisons, and, or, not, and a few functions.
+
+    Raises:
+        InputError: the text is not such a formula.
+    """
+
+    text: str
+
+    def __post_init__(self) -> None:
+        names = self.names()
+        _evaluate(self._tree(), dict.fromkeys(names, np.ones(1)), self.text)
+
+    def _tree(self) -> ast.expr:
+        try:
+            return ast.parse(self.text, mode="eval").body
+        except SyntaxError as error:
+            raise InputError(f"an expression must be a formula, but got '{self.text}' ({error.msg})") from None
+
+    def names(self) -> tuple[str, ...]:
+        """Return the inputs that the formula uses, in order of appearance."""
+        found = [n.id for n in ast.walk(self._tree()) if isinstance(n, ast.Name) and n.id not in _FUNCTIONS]
+        return tuple(dict.fromkeys(found))
+
+    def __call__(self, values: Mapping[str, Any]) -> Any:
+        """Return the formula's value: (n,) for arrays of n values."""
+        return _evaluate(self._tree(), values, self.text)
+
+
+def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
+    """Return the value of one node of the syntax tree."""
+    match node:
+        case ast.Constant(value=int() | float() as value):
+            return float(value)
+        case ast.Name(id=name):
+            if name not in values:
+                raise InputError(f"'{name}' in '{text}' must be an input, one of: {', '.join(values)}")
+            return values[name]
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -_evaluate(operand, values, text)
+        case ast.UnaryOp(op=ast.Not(), operand=operand):
+            return np.logical_not(_evaluate(operand, values, text))
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+            return _BINARY[type(op)](_evaluate(left, values, text), _evaluate(right, values, text))
+        case ast.BoolOp(op=op, values=parts):
+            join = np.logical_and if isinstance(op, ast.And) else np.logical_or
+            return reduce(join, (_evaluate(part, values, text) for part in parts))
+        case ast.Compare(left=left, ops=ops, comparators=rest) if all(type(o) in _COMPARE for o in ops):
+            terms = [_evaluate(part, values, text) for part in (left, *rest)]
+            pairs = zip(ops, terms[:-1], terms[1:], strict=True)
+            return reduce(np.logical_and, (_COMPARE[type(o)](a, b) for o, a, b in pairs))
+        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS:
+            return _FUNCTIONS[name](*(_evaluate(arg, values, text) for arg in args))
+    allowed = "numbers, inputs, + - * / **, comparisons, and, or, not, " + ", ".join(_FUNCTIONS)
+    raise InputError(f"an expression may use {allowed}, but got '{text}'")

@@ -1,0 +1,155 @@
+"""A logical scenario: inputs, how a concrete one runs, what is measured, and what is required."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
+
+from sbt.errors import InputError, RunError
+from sbt.problem.outcome import Status
+from sbt.problem.requirement import Requirement
+from sbt.problem.space import ParameterSpace
+from sbt.problem.trace import Trace
+
+__all__ = ["Configurable", "LogicalScenario", "Metric", "Simulate"]
+
+
+class Simulate(Protocol):
+    """Runs one concrete scenario; same values and seed, same trace, in any process."""
+
+    def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
+        """Return the trace; raise `RunError` where the run cannot give one."""
+        ...
+
+
+@runtime_checkable
+class Configurable(Protocol):
+    """A `Simulate` that offers choices: the AV under test, the isolation level, the step."""
+
+    isolations: tuple[str, ...]
+    step_length: float
+
+    def configured(
+        self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
+    ) -> Simulate:
+        """Return a copy with these choices; None leaves one as it is."""
+        ...
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A named function of a trace.
+
+    Args:
+        name: as written in requirements and in the store (`y.<name>`).
+        function: trace to a finite number.
+        unit: "" for a pure number or a flag.
+        direction: "low" where small values are critical, "high" where large ones are.
+        without: the value where there was no interaction to measure.
+        description: one sentence.
+        source: reference of the definition.
+    """
+
+    name: str
+    function: Callable[[Trace], float]
+    unit: str = ""
+    direction: str = "low"
+    without: float = math.inf
+    description: str = ""
+    source: str = ""
+
+    def __call__(self, trace: Trace) -> float:
+        """Return the metric of a trace.
+
+        Raises:
+            RunError: the value is not finite.
+        """
+        value = float(self.function(trace))
+        if not math.isfinite(value):
+            raise RunError(Status.FAILED, f"metric {self.name} must be finite, but got {value}")
+        return value
+
+
+@dataclass(frozen=True)
+class LogicalScenario:
+    """A parametrized traffic situation and its requirement.
+
+    Args:
+        name: as written in configurations.
+        space: the inputs.
+        simulate: values and seed to a trace; None where `evaluate` is given.
+        metrics: computed from the trace; the requirement's is one of them.
+        requirement: default requirement.
+        description: for people; the first line is a title.
+        evaluate: values and seed to metrics directly (analytic functions, recorded tables), instead
+            of `simulate`: there is no trace to look at.
+        metric_names: the metrics that `evaluate` gives.
+
+    Raises:
+        InputError: neither or both of simulate and evaluate, or a requirement on an absent metric.
+    """
+
+    name: str
+    space: ParameterSpace
+    requirement: Requirement
+    simulate: Simulate | None = None
+    metrics: tuple[Metric, ...] = ()
+    description: str = ""
+    evaluate: Callable[[Mapping[str, float], int], Mapping[str, float]] | None = None
+    metric_names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.simulate is None) == (self.evaluate is None):
+            raise InputError(f"scenario {self.name}: give either simulate or evaluate")
+        if self.requirement.metric not in self.measured:
+            raise InputError(
+                f"requirement.metric must be one of {', '.join(self.measured)}, but got '{self.requirement.metric}'"
+            )
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the metrics that every run gives."""
+        return self.metric_names if self.evaluate is not None else tuple(m.name for m in self.metrics)
+
+    @property
+    def isolations(self) -> tuple[str, ...]:
+        """Isolation levels that are allowed, the fastest last; empty where there is no SUMO."""
+        return self.simulate.isolations if isinstance(self.simulate, Configurable) else ()
+
+    def configured(
+        self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
+    ) -> LogicalScenario:
+        """Return a copy with another AV under test, isolation level or step length.
+
+        Raises:
+            InputError: the scenario does not offer the choice.
+        """
+        if isolation == "auto":
+            isolation = self.isolations[-1] if self.isolations else None
+        if ego is None and step_length is None and (isolation is None or not self.isolations):
+            return self
+        if not isinstance(self.simulate, Configurable):
+            raise InputError(f"scenario {self.name} offers no choice of ego or step length")
+        return replace(self, simulate=self.simulate.configured(ego, isolation, step_length))
+
+    def measure(self, trace: Trace) -> dict[str, float]:
+        """Return every metric of a trace by name."""
+        return {metric.name: metric(trace) for metric in self.metrics}
+
+    def run(self, values: Mapping[str, float], seed: int) -> dict[str, float]:
+        """Run one concrete scenario and return its metrics.
+
+        Raises:
+            RunError: it gives none; the error says which `Status` the run has.
+        """
+        if self.simulate is not None:
+            return self.measure(self.simulate(values, seed))
+        if self.evaluate is None:
+            raise InputError(f"scenario {self.name}: give either simulate or evaluate")
+        metrics = {name: float(value) for name, value in self.evaluate(values, seed).items()}
+        for name, value in metrics.items():
+            if not math.isfinite(value):
+                raise RunError(Status.FAILED, f"metric {name} must be finite, but got {value}")
+        return metrics

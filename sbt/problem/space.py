@@ -1,0 +1,209 @@
+"""The parameter space of a logical scenario and its maps: physical x, unit cube u, standard normal z."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.stats import qmc
+
+from sbt.arrays import Mask, Points, Vector, as_points
+from sbt.errors import InputError
+from sbt.problem.parameter import Parameter
+
+__all__ = ["ParameterSpace"]
+
+Formula = Callable[[Mapping[str, Vector]], Vector]
+_MASS_POINTS = 2**15
+_MIN_FEASIBLE = 1e-3
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """d inputs, joined by a Gaussian copula, restricted by constraints.
+
+    Args:
+        parameters: the inputs, in the order of the columns of every (n, d) array.
+        correlation: (d, d) correlation of the inputs' normal scores as nested tuples; None:
+            independent. This is the copula's matrix, not the correlation of the values.
+        constraints: (text, predicate) pairs; a concrete scenario must satisfy all of them.
+        features: (name, formula) pairs, quantities derived from the inputs that metamodels see as
+            further columns; they change no range and no density.
+
+    Raises:
+        InputError: no or doubled names, a matrix that is no correlation matrix, or constraints that
+            less than 1 in 1,000 points of the box satisfy.
+    """
+
+    parameters: tuple[Parameter, ...]
+    correlation: tuple[tuple[float, ...], ...] | None = None
+    constraints: tuple[tuple[str, Formula], ...] = ()
+    features: tuple[tuple[str, Formula], ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if not self.parameters:
+            raise InputError("a parameter space needs at least one input, but got none")
+        if len(set(self.names)) != len(self.names):
+            raise InputError(f"inputs must have different names, but got {', '.join(self.names)}")
+        if self.correlation is not None:
+            self._check_correlation()
+        if self.constraints and self._feasible_share < _MIN_FEASIBLE:
+            rules = "; ".join(text for text, _ in self.constraints)
+            raise InputError(f"constraints must leave at least {_MIN_FEASIBLE:g} of the box, but '{rules}' leave less")
+
+    def _check_correlation(self) -> None:
+        matrix = np.asarray(self.correlation, dtype=np.float64)
+        d = self.dimension
+        if matrix.shape != (d, d) or not np.allclose(matrix, matrix.T) or not np.allclose(np.diag(matrix), 1.0):
+            raise InputError(f"correlation must be a symmetric ({d}, {d}) matrix with ones on its diagonal")
+        if not np.linalg.eigvalsh(matrix)[0] > 1e-10:
+            raise InputError("correlation must be positive definite, but it is not")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the inputs, in the order of the columns."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def dimension(self) -> int:
+        """Number of inputs d."""
+        return len(self.parameters)
+
+    @cached_property
+    def _factor(self) -> Points | None:
+        return None if self.correlation is None else np.linalg.cholesky(np.asarray(self.correlation))
+
+    @cached_property
+    def _feasible_share(self) -> float:
+        """Share of the box (uniform measure) that satisfies the constraints."""
+        u = qmc.Sobol(self.dimension, scramble=True, rng=0).random(_MASS_POINTS)
+        return float(self.feasible(self.from_unit(u)).mean())
+
+    @cached_property
+    def feasible_mass(self) -> float:
+        """Probability of the constraints under the law, by 32,768 Sobol points (1 without constraints)."""
+        if not self.constraints:
+            return 1.0
+        u = qmc.Sobol(self.dimension, scramble=True, rng=0).random(_MASS_POINTS)
+        from scipy.special import ndtri  # noqa: PLC0415
+
+        mass = float(self.feasible(self.from_normal(ndtri(np.clip(u, 1e-12, 1 - 1e-12)))).mean())
+        if mass == 0.0:
+            raise InputError("constraints must have mass under the inputs' distribution, but they have none")
+        return mass
+
+    def columns(self, x: Points) -> dict[str, Vector]:
+        """Return the (n,) column of each input by name."""
+        return {name: x[:, k] for k, name in enumerate(self.names)}
+
+    def feasible(self, x: Points) -> Mask:
+        """Return (n,) booleans: in the ranges and all constraints hold."""
+        mask = np.all([p.contains(x[:, k]) for k, p in enumerate(self.parameters)], axis=0)
+        for _, predicate in self.constraints:
+            mask &= np.asarray(predicate(self.columns(x)), dtype=bool)
+        return mask
+
+    def from_unit(self, u: Points) -> Points:
+        """Map (n, d) unit-cube coordinates to physical values, along the ranges (not the law)."""
+        u = as_points(u, self.dimension)
+        return np.column_stack([p.from_unit(u[:, k]) for k, p in enumerate(self.parameters)])
+
+    def to_unit(self, x: Points) -> Points:
+        """Map (n, d) physical values to the unit cube, the inverse of `from_unit`."""
+        x = as_points(x, self.dimension)
+        return np.column_stack([p.to_unit(x[:, k]) for k, p in enumerate(self.parameters)])
+
+    def from_normal(self, z: Points) -> Points:
+        """Map (n, d) independent standard-normal scores to physical values under the law."""
+        z = as_points(z, self.dimension)
+        if self._factor is not None:
+            z = z @ self._factor.T
+        return np.column_stack([p.from_normal(z[:, k]) for k, p in enumerate(self.parameters)])
+
+    def to_normal(self, x: Points) -> Points:
+        """Map (n, d) physical values to independent standard-normal scores."""
+        scores = self._scores(as_points(x, self.dimension))
+        if self._factor is None:
+            return scores
+        return np.ascontiguousarray(solve_triangular(self._factor, scores.T, lower=True).T)
+
+    def _scores(self, x: Points) -> Points:
+        """Return the (n, d) normal scores of each input alone."""
+        return np.column_stack([p.to_normal(x[:, k]) for k, p in enumerate(self.parameters)])
+
+    def log_density(self, x: Points) -> Vector:
+        """Return (n,) log p(x): the marginals, the copula, the constraints.
+
+        -inf outside the ranges and constraints. With integer inputs it is a density in the
+        continuous and a mass in the integer ones; their copula term is that of the cell's middle.
+        """
+        x = as_points(x, self.dimension)
+        log_p = np.sum([p.log_density(x[:, k]) for k, p in enumerate(self.parameters)], axis=0)
+        if self._factor is not None:
+            scores = np.clip(self._scores(x), -38.0, 38.0)
+            whitened = solve_triangular(self._factor, scores.T, lower=True)
+            log_p += 0.5 * (scores**2).sum(axis=1) - 0.5 * (whitened**2).sum(axis=0)
+            log_p -= np.log(np.diag(self._factor)).sum()
+        if self.constraints:
+            log_p = np.where(self.feasible(x), log_p - np.log(self.feasible_mass), -np.inf)
+        return log_p
+
+    def sample(self, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, d) values drawn from the law, constraints included (by rejection)."""
+        kept: list[Points] = []
+        missing = n
+        while missing > 0:
+            x = self.from_normal(rng.standard_normal((max(missing, 16), self.dimension)))
+            x = x[self.feasible(x)][:missing] if self.constraints else x[:missing]
+            kept.append(x)
+            missing -= len(x)
+        return np.vstack(kept) if kept else np.empty((0, self.dimension))
+
+    def metamodel_inputs(self, u: Points) -> Points:
+        """Return (n, d + f) columns for a metamodel: u and the derived features, each scaled to [0, 1].
+
+        A feature is scaled by its range over 4,096 Sobol points of the box.
+        """
+        if not self.features:
+            return u
+        ranges = self._feature_ranges
+        columns = self.columns(self.from_unit(u))
+        derived = [(np.asarray(f(columns)) - lo) / (hi - lo) for (_, f), (lo, hi) in zip(self.features, ranges, strict=True)]
+        return np.column_stack([u, *derived])
+
+    @cached_property
+    def _feature_ranges(self) -> tuple[tuple[float, float], ...]:
+        u = qmc.Sobol(self.dimension, scramble=True, rng=0).random(4096)
+        columns = self.columns(self.from_unit(u))
+        ranges = []
+        for name, formula in self.features:
+            values = np.asarray(formula(columns), dtype=np.float64)
+            if not np.isfinite(values).all() or np.ptp(values) == 0:
+                raise InputError(f"a derived feature must be finite and vary over the box, but '{name}' does not")
+            ranges.append((float(values.min()), float(values.max())))
+        return tuple(ranges)
+
+    def values(self, given: Mapping[str, float]) -> dict[str, float]:
+        """Return all inputs by name: the given ones checked, the others at their centre.
+
+        Raises:
+            InputError: an unknown name, or a value outside its range or the constraints.
+        """
+        for name in given:
+            if name not in self.names:
+                near = difflib.get_close_matches(name, self.names, 1)
+                hint = f" (did you mean '{near[0]}'?)" if near else ""
+                raise InputError(f"an input must be one of {', '.join(self.names)}, but got '{name}'{hint}")
+        full = {p.name: float(given.get(p.name, p.centre)) for p in self.parameters}
+        for p in self.parameters:
+            if not bool(p.contains(np.array(full[p.name]))):
+                kind = "a whole number " if p.kind == "integer" else ""
+                raise InputError(f"input {p.name} must be {kind}in [{p.low:g}, {p.high:g}] {p.unit}, but got {full[p.name]:g}")
+        if self.constraints and not bool(self.feasible(np.array([list(full.values())]))[0]):
+            rules = "; ".join(text for text, _ in self.constraints)
+            raise InputError(f"inputs must satisfy '{rules}', but got {full}")
+        return full

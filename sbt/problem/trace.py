@@ -1,0 +1,105 @@
+"""A trace: the states of every actor over time in one run, as arrays.
+
+Positions are rectangle centres in the network's plane, headings are mathematical (radians,
+counter-clockwise from +x): SUMO's front-bumper positions and compass angles are converted once,
+where the trace is recorded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbt.arrays import Vector
+from sbt.errors import RunError
+from sbt.problem.outcome import Status
+
+__all__ = ["ActorTrace", "Trace"]
+
+States = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ActorTrace:
+    """One actor of a trace: (t,) arrays and the size of its rectangle."""
+
+    x: Vector
+    y: Vector
+    heading: Vector
+    speed: Vector
+    acceleration: Vector
+    length: float
+    width: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """States of m actors at t instants.
+
+    Attributes:
+        time: (t,) seconds from the start of the concrete scenario, increasing.
+        actors: m names, in the order of the columns.
+        x, y: (t, m) centre of the rectangle (m).
+        heading: (t, m) radians, counter-clockwise from +x.
+        speed: (t, m) along the heading (m/s).
+        acceleration: (t, m) rate of the speed over the step that led to the state (m/s^2).
+        length, width: (m,) size of the rectangle (m).
+        ended: why the run ended, such as "collision" or "duration".
+        reported: SUMO's own collision list ("collider>victim@time"), a cross-check only.
+
+    Two traces are the same where `identical` says so; as keys they count by identity.
+
+    Raises:
+        ValueError: the arrays do not have these shapes.
+    """
+
+    time: Vector
+    actors: tuple[str, ...]
+    x: States
+    y: States
+    heading: States
+    speed: States
+    acceleration: States
+    length: Vector
+    width: Vector
+    ended: str = ""
+    reported: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        shape = (len(self.time), len(self.actors))
+        for name in ("x", "y", "heading", "speed", "acceleration"):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"trace.{name} must have shape {shape}, but got {getattr(self, name).shape}")
+
+    def actor(self, name: str) -> ActorTrace:
+        """Return the columns of one actor.
+
+        Raises:
+            RunError: there is no such actor in this trace.
+        """
+        if name not in self.actors:
+            known = ", ".join(self.actors)
+            raise RunError(Status.FAILED, f"no actor '{name}' in the trace, there are: {known}")
+        k = self.actors.index(name)
+        return ActorTrace(
+            self.x[:, k], self.y[:, k], self.heading[:, k], self.speed[:, k], self.acceleration[:, k],
+            float(self.length[k]), float(self.width[k]),
+        )  # fmt: skip
+
+    def identical(self, other: Trace) -> bool:
+        """Return whether two traces agree to the last bit, SUMO's collision list included."""
+        arrays = ("time", "x", "y", "heading", "speed", "acceleration", "length", "width")
+        same = all(np.array_equal(getattr(self, name), getattr(other, name)) for name in arrays)
+        return same and (self.actors, self.ended, self.reported) == (other.actors, other.ended, other.reported)
+
+    def rows(self) -> list[dict[str, float | str]]:
+        """Return one dictionary a time and actor, for a CSV file."""
+        columns = ("x", "y", "heading", "speed", "acceleration")
+        return [
+            {"time": float(t), "actor": name} | {c: float(getattr(self, c)[i, k]) for c in columns}
+            | {"length": float(self.length[k]), "width": float(self.width[k])}
+            for i, t in enumerate(self.time)
+            for k, name in enumerate(self.actors)
+        ]  # fmt: skip

@@ -1,0 +1,1 @@
+"""What a reader sees: figures, one self-contained page a campaign, replay, export."""

@@ -1,0 +1,154 @@
+"""The tables of a report: cells with what is read, what is sorted by, and no markup."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sbt.arrays import Vector
+from sbt.history import History, Record
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.report.words import SCORES, law_words, number, share
+
+__all__ = ["Cell", "Table", "critical_table", "failed_table", "input_table", "iteration_table", "simulate_command"]
+
+_MOST = 200
+_LIST_SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """`text` is read; `key` is sorted by and shown in full on hover; `code` opens on a click."""
+
+    text: str
+    key: str | float | None = None
+    code: str = ""
+
+    @classmethod
+    def of(cls, value: Any) -> Cell:
+        """Return the cell of a number or a text."""
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        return cls(number(value), value if is_number else None)
+
+    @property
+    def numeric(self) -> bool:
+        """The cell is right-aligned and sorted as a number."""
+        return isinstance(self.key, (int, float))
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns, rows and a note below."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+
+def input_table(scenario: LogicalScenario, influence: Vector | None) -> Table:
+    """Return the inputs; with a metamodel also their relative influence on P(critical)."""
+    columns = ["input", "range", "unit", "distribution", "description"]
+    rows = [_input(parameter) for parameter in scenario.space.parameters]
+    if influence is not None:
+        columns.insert(4, "influence")
+        rows = [(*row[:4], Cell(f"{value:.2f}", float(value)), *row[4:]) for row, value in zip(rows, influence, strict=True)]
+    notes = []
+    if influence is not None:
+        notes.append("Influence: total Sobol index of the metamodel's P(critical) over the ranges, relative to the largest.")
+    if scenario.space.constraints:
+        notes.append("Constraints: " + "; ".join(text for text, _ in scenario.space.constraints) + ".")
+    if scenario.space.correlation is not None:
+        notes.append("The inputs are joined by a Gaussian copula.")
+    if scenario.space.features:
+        notes.append("Derived for the metamodel: " + ", ".join(name for name, _ in scenario.space.features) + ".")
+    return Table(tuple(columns), tuple(rows), " ".join(notes))
+
+
+def _input(parameter: Parameter) -> tuple[Cell, ...]:
+    whole = ", whole numbers" if parameter.kind == "integer" else ""
+    return (
+        Cell(parameter.name),
+        Cell(f"[{parameter.low:g}, {parameter.high:g}]{whole}"),
+        Cell(parameter.unit or "–"),
+        Cell(law_words(parameter.distribution)),
+        Cell(parameter.description),
+    )
+
+
+def iteration_table(
+    iterations: Sequence[Mapping[str, Any]], fits: Sequence[Mapping[str, Any]], history: History, requirement: Requirement
+) -> Table:
+    """Return how each batch was chosen, what it gave, and the scores of the metamodel fitted then."""
+    critical, by_iteration = requirement.critical.contains(history.y(requirement.metric)), {fit["iteration"]: fit for fit in fits}
+    scored = [key for key in _LIST_SCORES if any(fit.get(key) is not None for fit in fits)]
+    rows = []
+    for batch in iterations:
+        mine, fit = history.iteration == batch["iteration"], by_iteration.get(batch["iteration"], {})
+        how = {key: value for key, value in batch.items() if key not in ("iteration", "stage")}
+        rows.append((
+            Cell.of(batch["iteration"]), Cell(str(batch["stage"])), Cell.of(int(mine.sum())),
+            Cell.of(int((mine & critical).sum())), Cell.of(int((mine & ~history.ok).sum())),
+            Cell(_listed(how)), *(Cell.of(fit.get(key)) for key in scored),
+        ))  # fmt: skip
+    columns = ("iteration", "stage", "runs", "critical", "failed", "how it was chosen", *(SCORES[key] for key in scored))
+    return Table(columns, tuple(rows))
+
+
+def _listed(how: Mapping[str, Any]) -> str:
+    """Return a proposal's keys and values on one line."""
+    def shown(value: Any) -> str:
+        return number(value) if isinstance(value, (int, float, str)) or value is None else json.dumps(value, ensure_ascii=False)
+
+    return ", ".join(f"{key.replace('_', ' ')} {shown(value)}" for key, value in how.items())
+
+
+def simulate_command(scenario: str, record: Record) -> str:
+    """Return the command that runs a concrete scenario again, its inputs to the last digit."""
+    inputs = (f"{name}={value!r}" for name, value in record.inputs.items())
+    return shlex.join(["sumo-sbt", "simulate", scenario, *inputs, "--seed", str(record.seed)])
+
+
+def critical_table(history: History, requirement: Requirement, reference: str) -> Table:
+    """Return the critical runs, the deepest in the critical interval first, at most 200."""
+    margin = requirement.critical.margin(history.y(requirement.metric))
+    found = [int(k) for k in np.argsort(margin, kind="stable") if margin[k] <= 0]
+    metrics = sorted(history.metrics, key=lambda name: name != requirement.metric)
+    rows = []
+    for k in found[:_MOST]:
+        record = history.records[k]
+        rows.append((
+            Cell.of(record.index), Cell.of(float(margin[k])), *(Cell.of(record.inputs[name]) for name in history.names),
+            *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), float(record.seed)),
+            Cell("command", code=simulate_command(reference, record)),
+        ))  # fmt: skip
+    rest = len(found) - len(rows)
+    note = f"{rest:,} more critical runs are in the store: `sumo-sbt export` lists all." if rest else ""
+    return Table(("run", "margin", *history.names, *metrics, "seed", "again"), tuple(rows), note)
+
+
+def failed_table(history: History, reference: str) -> Table:
+    """Return the failed runs in order, at most 200, each with its reason."""
+    failed = [record for record in history.where(~history.ok).records]
+    rows = tuple(
+        (Cell.of(record.index), Cell(record.stage), Cell(record.status), Cell(record.reason),
+         Cell.of(record.seconds), Cell("command", code=simulate_command(reference, record)))
+        for record in failed[:_MOST]
+    )  # fmt: skip
+    rest = len(failed) - len(rows)
+    note = f"{rest:,} more failed runs are in the store." if rest else ""
+    kinds = "" if not failed else " " + ", ".join(
+        f"{status}: {count:,} ({share(count / len(failed))})" for status, count in _counted(failed)
+    ) + "."  # fmt: skip
+    return Table(("run", "stage", "status", "reason", "seconds", "again"), rows, (note + kinds).strip())
+
+
+def _counted(records: Sequence[Record]) -> list[tuple[str, int]]:
+    names, counts = np.unique([record.status for record in records], return_counts=True)
+    return [(str(name), int(count)) for name, count in zip(names, counts, strict=True)]

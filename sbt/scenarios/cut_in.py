@@ -1,0 +1,87 @@
+"""Cut-in on a three-lane motorway: a slower car in the right lane shears in ahead of the ego.
+
+Inputs, ranges, metric and critical interval are those of the scenario `Cut-In` of the Driving
+Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882). What its text
+leaves open is chosen here and named as a constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.actors import Actor, Scene, State, Until, VehicleType
+from sbt.sumo.drivers import LaneChange
+from sbt.sumo.ego import Ego
+from sbt.sumo.simulation import SumoSimulation
+
+__all__ = ["SCENARIO"]
+
+CO_SPEED = 80 / 3.6
+"""Speed of the car that cuts in (m/s), from the data set's text."""
+LANE_CHANGE = 4.0
+"""Duration of the lane change (s); naturalistic cut-ins last 3 to 6 s."""
+LANE_WIDTH = 3.5
+DURATION = 12.0
+"""Longest time that is looked at (s)."""
+START = 20.0
+CAR = VehicleType(length=5.0, width=1.8)
+MARGIN = (LANE_WIDTH - CAR.width) / 2
+"""Lateral clearance at which a car has crossed the marking (m): from then on it is in ego's path."""
+
+
+def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
+    """Return ego in the middle lane, d_v faster, and co in the right lane, a time gap d_t ahead."""
+    speed = CO_SPEED + values["d_v"] / 3.6
+    gap = values["d_t"] * speed
+    return Scene(
+        (
+            Actor("ego", ("road",), 1, START, speed, ego.driver(rng, speed), ego.vehicle_type(CAR, speed)),
+            Actor("co", ("road",), 0, START + gap + CAR.length, CO_SPEED, LaneChange(lane=1), CAR),
+        ),
+        until_over(),
+    )
+
+
+def until_over() -> Until:
+    """Return the rule that ends the run: ego has passed co, or can no longer come closer to it."""
+
+    def over(t: float, states: Mapping[str, State]) -> str | None:
+        ego, co = states["ego"], states["co"]
+        if ego.x - co.x > 0.5 * (ego.length + co.length) + 1.0:
+            return "passed"
+        if t >= LANE_CHANGE and ego.speed <= co.speed:
+            return "resolved"
+        return None
+
+    return over
+
+
+SCENARIO = LogicalScenario(
+    name="cut_in",
+    description=(
+        "Cut-in: a car shears in from the right lane ahead of the AV.\n"
+        "Straight motorway with three lanes. Co drives in the right lane at a constant 80 km/h; ego, with ACC and AEB, "
+        "is in the middle lane, d_v faster and a time gap d_t behind it. At t = 0 co changes into ego's lane."
+    ),
+    space=ParameterSpace(
+        (
+            Parameter("d_v", 0.0, 120.0, "km/h", description="speed of ego above that of co"),
+            Parameter("d_t", 0.1, 10.0, "s", description="time gap from ego's front to co's rear at ego's speed"),
+        )
+    ),
+    simulate=SumoSimulation(
+        net="straight", scene=scene, duration=DURATION, step_length=0.05, lane_change_duration=LANE_CHANGE
+    ),
+    metrics=(
+        ttc_min(margin=MARGIN), d_min(margin=MARGIN), collision(), impact_speed(), thw_min(margin=MARGIN),
+        drac_max(margin=MARGIN),
+    ),  # fmt: skip
+    requirement=Requirement("ttc_min", CriticalInterval(-5.0, 0.5)),
+)

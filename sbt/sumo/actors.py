@@ -1,0 +1,113 @@
+"""Actors of a concrete scenario and the door for their controllers.
+
+A controller is called once a step with the time, its own state and the other actors' states, and
+returns an `Action`. States are rectangle centres in the network's plane (m, rad, m/s), the same as
+in a `Trace`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+from sbt.errors import InputError
+
+__all__ = ["KEEP", "Action", "Actor", "Controller", "Scene", "State", "Until", "VehicleType"]
+
+
+class Action(NamedTuple):
+    """What an actor does until the next step; None leaves a thing as it is.
+
+    `acceleration` (m/s^2) or `speed` (m/s, reached at the end of the step), not both; `lane` starts a
+    continuous change to that lane of the edge; `pose` (x, y, heading of the centre) puts the actor
+    there, off the lanes too, and needs `speed` with it.
+    """
+
+    acceleration: float | None = None
+    speed: float | None = None
+    lane: int | None = None
+    pose: tuple[float, float, float] | None = None
+
+
+KEEP = Action(acceleration=0.0)
+"""Drive on at the same speed."""
+
+
+class State:
+    """State of one actor now; the object is updated in place, so copy what must be kept."""
+
+    __slots__ = ("acceleration", "heading", "length", "name", "speed", "width", "x", "y")
+
+    def __init__(self, name: str, length: float, width: float):
+        self.name = name
+        self.length = length
+        self.width = width
+        self.x = self.y = self.heading = self.speed = self.acceleration = 0.0
+
+
+class Controller(Protocol):
+    """Drives one actor through one run; may keep what it remembers."""
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the action from `t` (s) to the next step."""
+        ...
+
+
+@dataclass(frozen=True)
+class VehicleType:
+    """A SUMO vehicle type: its rectangle, and any other vType attribute by SUMO's name.
+
+    Raises:
+        InputError: a length or width that is not positive.
+    """
+
+    length: float = 5.0
+    width: float = 1.8
+    attributes: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (self.length > 0 and self.width > 0):
+            raise InputError(f"a vehicle needs length > 0 and width > 0, but got {self.length} m x {self.width} m")
+
+
+@dataclass(frozen=True)
+class Actor:
+    """One vehicle and where it starts.
+
+    Args:
+        name: unique in the scene, also SUMO's vehicle id.
+        route: edges, the first is where it starts.
+        lane: index on that edge, 0 is the right one.
+        position: of the front bumper on that lane (m).
+        speed: at the start (m/s).
+        driver: its controller; None lets SUMO's models drive it.
+        type: its SUMO type.
+    """
+
+    name: str
+    route: tuple[str, ...]
+    lane: int
+    position: float
+    speed: float
+    driver: Controller | None = None
+    type: VehicleType = field(default_factory=VehicleType)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.position) and math.isfinite(self.speed) and self.speed >= 0):
+            raise InputError(
+                f"actor {self.name}: position must be finite and speed >= 0, but got {self.position} m, {self.speed} m/s"
+            )
+
+
+Until = Callable[[float, Mapping[str, State]], str | None]
+"""Called every step; the word it returns ends the run and says why, None goes on."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The actors of one concrete scenario and when it is over (apart from collision and duration)."""
+
+    actors: tuple[Actor, ...]
+    until: Until | None = None

@@ -1,0 +1,130 @@
+"""Controllers that the built-in scenarios use: an ego of ACC and AEB, and scripted others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sbt.errors import InputError
+from sbt.sumo.actors import KEEP, Action, State
+from sbt.sumo.dynamics import DeadTime, FirstOrderLag
+from sbt.sumo.sensors import RangeSensor, Target
+
+__all__ = ["AccAeb", "Braking", "LaneChange"]
+
+
+class AccAeb:
+    """Adaptive cruise control with automatic emergency braking on a noisy radar.
+
+    ACC holds the set speed, or follows with a constant time gap (gap and closing-speed feedback, the
+    form of Milanes and Shladover (2014), doi 10.1016/j.trc.2014.09.001), within comfort limits. AEB
+    brakes fully once the target is closer than a driver could still stop from: when the time to
+    collision falls below closing / (2 aeb_braking) + aeb_reserve; it holds until nothing closes in. The demand
+    passes a dead time and a first-order lag before it becomes acceleration.
+
+    Args:
+        rng: source of the sensor noise.
+        set_speed: cruising speed (m/s).
+        reaction_time: dead time from measurement to actuation (s).
+        lag: time constant of the actuation (s).
+        time_gap: wanted headway (s).
+        distance_min: wanted gap at standstill (m).
+        acc_accel, acc_braking: comfort limits of ACC (m/s^2), both positive.
+        aeb_braking: deceleration that AEB demands and the vehicle can reach (m/s^2), positive.
+        aeb_reserve: time that AEB keeps in hand beyond the last moment to brake (s).
+        aeb_distance: gap below which AEB brakes whenever the target closes in (m).
+        gap_noise, speed_noise: standard deviations of the sensor (m, m/s).
+        sensor_range: of the radar (m).
+        path_margin: lateral clearance up to which a road user counts as in the path (m).
+
+    Raises:
+        InputError: a negative time, distance or limit.
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, set_speed: float, *, reaction_time: float = 0.2, lag: float = 0.1,
+        time_gap: float = 1.5, distance_min: float = 3.0, acc_accel: float = 2.0, acc_braking: float = 3.5,
+        aeb_braking: float = 9.0, aeb_reserve: float = 0.5, aeb_distance: float = 1.0, gap_noise: float = 0.25,
+        speed_noise: float = 0.15, sensor_range: float = 200.0, path_margin: float = 0.85,
+    ):  # fmt: skip
+        given = {k: v for k, v in locals().items() if k not in ("self", "rng")}
+        for name, value in given.items():
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= 0:
+                raise InputError(f"ego.{name} must be a number >= 0, but got {value!r}")
+        self._set_speed = set_speed
+        self._time_gap, self._distance_min = time_gap, distance_min
+        self._acc_accel, self._acc_braking = acc_accel, acc_braking
+        self._aeb_braking, self._aeb_reserve, self._aeb_distance = aeb_braking, aeb_reserve, aeb_distance
+        self._sensor = RangeSensor(
+            rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise
+        )
+        self._delay = DeadTime(reaction_time)
+        self._lag = FirstOrderLag(lag)
+        self._last = 0.0
+        self._braking = False
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the acceleration that the vehicle reaches by now."""
+        demand = self._demand(own, self._sensor(t, own, others))
+        reached = self._lag(self._delay(t, demand), t - self._last)
+        self._last = t
+        return Action(acceleration=reached)
+
+    def _demand(self, own: State, target: Target | None) -> float:
+        """Return the acceleration that ACC and AEB ask for."""
+        cruise = 0.4 * (self._set_speed - own.speed)
+        if target is None:
+            self._braking = False
+            return _limited(cruise, self._acc_braking, self._acc_accel)
+        if self._must_brake(target):
+            return -self._aeb_braking
+        wanted = self._distance_min + self._time_gap * own.speed
+        follow = 0.1 * (target.gap - wanted) - 0.6 * target.closing
+        return _limited(min(cruise, follow), self._acc_braking, self._acc_accel)
+
+    def _must_brake(self, target: Target) -> bool:
+        """Return whether AEB brakes; once it does, it goes on until nothing closes in."""
+        closing = target.closing
+        last_moment = closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
+        if closing > 0 and target.gap < max(last_moment, self._aeb_distance):
+            self._braking = True
+        elif closing <= 0:
+            self._braking = False
+        return self._braking
+
+
+def _limited(demand: float, braking: float, accel: float) -> float:
+    return min(max(demand, -braking), accel)
+
+
+class LaneChange:
+    """Holds its speed and changes to another lane at once, continuously in SUMO."""
+
+    def __init__(self, lane: int):
+        self._first = Action(acceleration=0.0, lane=lane)
+        self._started = False
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the lane change at first, then nothing new."""
+        if self._started:
+            return KEEP
+        self._started = True
+        return self._first
+
+
+class Braking:
+    """Brakes at once with a constant deceleration down to a final speed and holds it.
+
+    Args:
+        deceleration: m/s^2, positive.
+        final_speed: m/s.
+    """
+
+    def __init__(self, deceleration: float, final_speed: float):
+        self._deceleration, self._final_speed = deceleration, final_speed
+        self._start: float | None = None
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the acceleration over the next step, exact where the final speed is reached in it."""
+        if own.speed <= self._final_speed:
+            return KEEP
+        return Action(acceleration=-self._deceleration)

@@ -1,0 +1,81 @@
+"""What the AV under test perceives: noisy, sampled, limited in range and to its own path."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sbt.sumo.actors import State
+
+__all__ = ["RangeSensor", "Target"]
+
+
+class Target(NamedTuple):
+    """The nearest road user ahead in the path, as measured."""
+
+    gap: float
+    """bumper to bumper (m)"""
+    closing: float
+    """rate at which the gap shrinks (m/s)"""
+    speed: float
+    """of the target (m/s)"""
+
+
+class RangeSensor:
+    """A forward-looking radar that measures the nearest road user in the own path.
+
+    Measurements come every `period` with Gaussian noise and hold until the next one. A road user is
+    in the path when the lateral clearance between the two rectangles is below `margin`.
+
+    Args:
+        rng: source of the noise.
+        period: of the measurements (s).
+        reach: greatest gap that is measured (m).
+        margin: lateral clearance up to which a road user counts as in the path (m).
+        gap_noise: standard deviation of the gap (m).
+        speed_noise: standard deviation of the closing speed (m/s).
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, *, period: float = 0.05, reach: float = 200.0, margin: float = 0.85,
+        gap_noise: float = 0.25, speed_noise: float = 0.15,
+    ):  # fmt: skip
+        self._rng = rng
+        self._period, self._reach, self._margin = period, reach, margin
+        self._noise = (gap_noise, speed_noise)
+        self._buffer: list[tuple[float, float]] = []
+        self._next = 0
+        self._held: Target | None = None
+
+    def __call__(self, t: float, own: State, others: tuple[State, ...]) -> Target | None:
+        """Return the latest measurement at time t; None where nothing is in the path."""
+        tick = int(t / self._period + 1e-6)
+        if tick >= self._next:
+            self._held = self._measure(tick, own, others)
+            self._next = tick + 1
+        return self._held
+
+    def _measure(self, tick: int, own: State, others: tuple[State, ...]) -> Target | None:
+        cos, sin = math.cos(own.heading), math.sin(own.heading)
+        nearest: State | None = None
+        smallest = self._reach
+        for other in others:
+            dx, dy = other.x - own.x, other.y - own.y
+            gap = dx * cos + dy * sin - 0.5 * (own.length + other.length)
+            clearance = abs(dy * cos - dx * sin) - 0.5 * (own.width + other.width)
+            if 0.0 <= gap < smallest and clearance < self._margin:
+                nearest, smallest = other, gap
+        if nearest is None:
+            return None
+        noise = self._draw(tick)
+        speed = nearest.speed * math.cos(nearest.heading - own.heading)
+        closing = own.speed - speed + self._noise[1] * noise[1]
+        return Target(max(smallest + self._noise[0] * noise[0], 0.0), closing, own.speed - closing)
+
+    def _draw(self, tick: int) -> tuple[float, float]:
+        """Return the noise of one tick: the same whatever was in the path before."""
+        while tick >= len(self._buffer):
+            self._buffer += [(a, b) for a, b in self._rng.standard_normal((256, 2)).tolist()]
+        return self._buffer[tick]

@@ -1,0 +1,191 @@
+"""The one SUMO simulation of this process, guarded: every error leaves as a plain `RunError`.
+
+libsumo holds one simulation a process, its exceptions cannot be pickled, and the reason of an error
+is often only on file descriptor 2. All of that stays in here. Two isolation levels:
+
+- `fresh`: SUMO is loaded anew for every run; always right.
+- `reuse`: one simulation lives on, actors are removed and inserted again; bit-identical to `fresh`
+  where SUMO draws no random numbers and nothing else needs a reset.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from sbt.errors import RunError
+from sbt.problem.outcome import Status
+from sbt.sumo.actors import VehicleType
+
+__all__ = ["ABSENT", "Setup", "Session", "libsumo", "session"]
+
+ABSENT = -1073741824.0
+"""What SUMO answers for an actor that is not on the road (it does not raise)."""
+
+_DEFAULTS = {"minGap": "0", "maxSpeed": "100", "speedFactor": "1", "speedDev": "0", "sigma": "0",
+             "accel": "10", "decel": "10", "emergencyDecel": "10"}  # fmt: skip
+_OPTIONS = (
+    "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never",
+    "--insertion-checks", "none", "--time-to-teleport", "-1", "--step-method.ballistic", "true",
+    "--collision.action", "warn", "--collision.mingap-factor", "0", "--collision.check-junctions", "true",
+)  # fmt: skip
+
+
+@cache
+def libsumo() -> Any:
+    """Import libsumo once, keeping what it prints off standard output (0.8 s)."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        import libsumo as module  # noqa: PLC0415
+    return module
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a simulation is loaded with; equal setups can share one simulation.
+
+    Args:
+        net: network file.
+        types: vehicle types by id.
+        step_length: of SUMO (s).
+        lane_change_duration: time of a continuous lane change (s), 0: at once.
+        options: further SUMO options, as on its command line.
+    """
+
+    net: str
+    types: tuple[tuple[str, VehicleType], ...]
+    step_length: float
+    lane_change_duration: float = 0.0
+    options: tuple[str, ...] = ()
+
+    def command(self, seed: int) -> list[str]:
+        """Return SUMO's arguments without the program's name."""
+        return [
+            "--net-file", self.net, "--additional-files", _types_file(self.types),
+            "--step-length", repr(self.step_length), "--lanechange.duration", repr(self.lane_change_duration),
+            "--seed", str(seed), *_OPTIONS, *self.options,
+        ]  # fmt: skip
+
+
+@cache
+def _scratch() -> tempfile.TemporaryDirectory[str]:
+    """Return a folder of this process that goes away with it."""
+    return tempfile.TemporaryDirectory(prefix="sbt-")
+
+
+@cache
+def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
+    """Write the vehicle types once a process and return the file's name."""
+    lines = []
+    for name, kind in types:
+        attributes = {**_DEFAULTS, "length": repr(kind.length), "width": repr(kind.width), **dict(kind.attributes)}
+        lines.append(f"<vType id={quoteattr(name)} " + " ".join(f"{k}={quoteattr(v)}" for k, v in attributes.items()) + "/>")
+    text = "<additional>\n" + "\n".join(lines) + "\n</additional>\n"
+    path = Path(_scratch().name) / f"types-{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.add.xml"
+    path.write_text(text)
+    return str(path)
+
+
+class Session:
+    """The process's simulation; use the one that `session()` returns."""
+
+    def __init__(self) -> None:
+        self._sumo = libsumo()
+        self._setup: Setup | None = None
+        self._routes: set[tuple[str, ...]] = set()
+        self._inside: list[str] = []
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
+
+    @contextlib.contextmanager
+    def run(self, setup: Setup, seed: int, isolation: str) -> Iterator[Any]:
+        """Give libsumo with an empty simulation of this setup at hand, for one run.
+
+        Raises:
+            RunError: SUMO raised; the reason carries what it wrote to file descriptor 2.
+        """
+        with self._captured():
+            try:
+                self._load(setup, seed, isolation)
+                yield self._sumo
+                self._clear()
+            except BaseException as error:
+                self._setup = None
+                if isinstance(error, (self._sumo.TraCIException, self._sumo.FatalTraCIError)):
+                    raise RunError(Status.FAILED, self._reason(error)) from None
+                raise
+
+    def route(self, edges: tuple[str, ...]) -> str:
+        """Return the id of the route over these edges, known to SUMO from now on."""
+        name = "route:" + ">".join(edges)
+        if edges not in self._routes:
+            self._sumo.route.add(name, list(edges))
+            self._routes.add(edges)
+        return name
+
+    def inserted(self, name: str) -> None:
+        """Remember an actor that the end of the run has to remove."""
+        self._inside.append(name)
+
+    def _load(self, setup: Setup, seed: int, isolation: str) -> None:
+        if isolation == "reuse" and setup == self._setup:
+            return
+        command = setup.command(0 if isolation == "reuse" else seed)
+        self._routes.clear()
+        self._inside.clear()
+        if self._sumo.isLoaded():
+            self._sumo.load(command)
+        else:
+            self._sumo.start(["sumo", *command])
+        self._setup = setup if isolation == "reuse" else None
+
+    def _clear(self) -> None:
+        if self._setup is not None:
+            for name in self._inside:
+                self._sumo.vehicle.remove(name)
+        self._inside.clear()
+
+    @contextlib.contextmanager
+    def _captured(self) -> Iterator[None]:
+        """Send file descriptor 2 to a temporary file while SUMO runs."""
+        sys.stderr.flush()
+        self._stderr.seek(0)
+        self._stderr.truncate()
+        saved = os.dup(2)
+        os.dup2(self._stderr.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+
+    def _reason(self, error: Exception) -> str:
+        self._stderr.seek(0)
+        written = [line.strip() for line in self._stderr.read().decode(errors="replace").splitlines() if line.strip()]
+        return "SUMO: " + "; ".join(dict.fromkeys([str(error).strip(), *written[-5:]]))
+
+
+@cache
+def session() -> Session:
+    """Return the simulation of this process."""
+    return Session()
+
+
+def check_options(options: Sequence[str]) -> None:
+    """Refuse options that this package sets itself (SUMO takes each only once).
+
+    Raises:
+        ValueError: one of them is given.
+    """
+    own = {o for o in _OPTIONS if o.startswith("--")} | {"--net-file", "--seed", "--step-length", "--lanechange.duration"}
+    for option in options:
+        if option in own:
+            raise ValueError(f"SUMO takes each option once, but {option} is set by sbt already")

@@ -1,0 +1,237 @@
+"""Runs a scene in SUMO step by step: insert, verify, control, record, stop."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from sbt.errors import InputError, RunError
+from sbt.metrics.geometry import contact_index
+from sbt.problem.outcome import Status
+from sbt.problem.trace import ActorTrace, Trace
+from sbt.seeds import stream
+from sbt.sumo.actors import Action, Actor, Scene, State
+from sbt.sumo.ego import Ego
+from sbt.sumo.nets import net_file
+from sbt.sumo.session import ABSENT, Setup, check_options, session
+
+__all__ = ["DEADLINE_STEPS", "SumoSimulation"]
+
+SceneBuilder = Callable[[Mapping[str, float], Ego, np.random.Generator], Scene]
+
+DEADLINE_STEPS = 256
+"""The wall clock is looked at once in so many steps."""
+_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class SumoSimulation:
+    """How one concrete scenario runs in SUMO: callable from values and seed to a `Trace`.
+
+    Args:
+        net: name of a built-in network or path of a `.net.xml`.
+        scene: values, ego and the run's generator to the actors.
+        duration: longest simulated time (s).
+        step_length: SUMO's step (s); positions follow by the trapezoidal rule.
+        ego: the AV under test.
+        lane_change_duration: of SUMO's continuous lane change (s).
+        isolations: allowed levels, the fastest last. `reuse` only where SUMO draws no random numbers.
+        isolation: the level of this simulation; None: the fastest.
+        options: further SUMO options.
+        timeout: wall-clock seconds after which a run ends as `timeout`; None: never.
+    """
+
+    net: str
+    scene: SceneBuilder
+    duration: float
+    step_length: float = 0.05
+    ego: Ego = field(default_factory=Ego)
+    lane_change_duration: float = 0.0
+    isolations: tuple[str, ...] = ("fresh", "reuse")
+    isolation: str | None = None
+    options: tuple[str, ...] = ()
+    timeout: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.duration > 0 and 0 < self.step_length <= self.duration):
+            raise InputError(
+                f"0 < step_length <= duration must hold, but got step {self.step_length} s, duration {self.duration} s"
+            )
+        if round(self.step_length * 1000) / 1000 != self.step_length:
+            raise InputError(f"SUMO counts time in whole milliseconds, but got step_length {self.step_length} s")
+        if self.isolation is not None and self.isolation not in self.isolations:
+            raise InputError(f"executor.isolation must be auto or {', '.join(self.isolations)} here, but got '{self.isolation}'")
+        check_options(self.options)
+
+    def configured(
+        self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
+    ) -> SumoSimulation:
+        """Return a copy with another ego, isolation level or step length."""
+        chosen = self.ego if ego is None else Ego.of(**ego)
+        levels = self.isolations if chosen.deterministic else ("fresh",)
+        return replace(
+            self, ego=chosen, isolations=levels, isolation=isolation,
+            step_length=self.step_length if step_length is None else step_length,
+        )  # fmt: skip
+
+    def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
+        """Run one concrete scenario.
+
+        Raises:
+            RunError: SUMO fails, an actor vanishes, a controller asks for the impossible, the start is
+                not the one asked for, or it takes too long.
+        """
+        scene = self.scene(values, self.ego, stream(seed, "scene"))
+        types = tuple(sorted({_type_name(a): a.type for a in scene.actors}.items()))
+        setup = Setup(str(net_file(self.net)), types, self.step_length, self.lane_change_duration, self.options)
+        level = self.isolation or self.isolations[-1]
+        with session().run(setup, seed, level) as sumo:
+            _insert(sumo, scene)
+            sumo.simulationStep()
+            _verify(sumo, scene)
+            return _drive(sumo, scene, self)
+
+
+def _type_name(actor: Actor) -> str:
+    """Return an id for the actor's type that is the same in every run."""
+    extra = "".join(f",{k}={v}" for k, v in actor.type.attributes)
+    return f"type:{actor.type.length!r}x{actor.type.width!r}{extra}"
+
+
+def _insert(sumo: Any, scene: Scene) -> None:
+    """Ask SUMO to put every actor on the road in the next step, with its own checks off."""
+    here = session()
+    for actor in scene.actors:
+        sumo.vehicle.add(
+            actor.name, here.route(actor.route), typeID=_type_name(actor), depart="now",
+            departLane=str(actor.lane), departPos=repr(actor.position), departSpeed=repr(actor.speed),
+        )  # fmt: skip
+        here.inserted(actor.name)
+        if actor.driver is not None:
+            sumo.vehicle.setSpeedMode(actor.name, 32)
+            sumo.vehicle.setLaneChangeMode(actor.name, 0)
+
+
+def _verify(sumo: Any, scene: Scene) -> None:
+    """Compare what SUMO realised with what was asked for."""
+    for actor in scene.actors:
+        position = sumo.vehicle.getLanePosition(actor.name)
+        if position == ABSENT:
+            raise RunError(Status.INVALID, f"{actor.name} must be on the road at the start, but SUMO did not insert it")
+        realised = {
+            "position": (actor.position, position, "m"),
+            "speed": (actor.speed, sumo.vehicle.getSpeed(actor.name), "m/s"),
+            "lane": (actor.lane, sumo.vehicle.getLaneIndex(actor.name), ""),
+        }
+        for what, (asked, got, unit) in realised.items():
+            if abs(asked - got) > _TOLERANCE:
+                raise RunError(
+                    Status.INVALID, f"{actor.name} must start with {what} {asked:.6g} {unit}, but SUMO gave {got:.6g} {unit}"
+                )
+
+
+def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
+    """Step until something ends the run, recording every state."""
+    actors, dt = scene.actors, simulation.step_length
+    vehicle = sumo.vehicle
+    states = [State(a.name, a.type.length, a.type.width) for a in actors]
+    others = [tuple(s for s in states if s is not own) for own in states]
+    by_name = {s.name: s for s in states}
+    reach = max(math.hypot(s.length, s.width) for s in states)
+    steps = round(simulation.duration / dt)
+    deadline = math.inf if simulation.timeout is None else time.monotonic() + simulation.timeout
+    rows: list[tuple[float, ...]] = []
+    reported: list[str] = []
+    ended = "duration"
+    for k in range(steps + 1):
+        t = k * dt
+        _observe(vehicle, states, k, dt, actors)
+        rows.append(tuple(v for s in states for v in (s.x, s.y, s.heading, s.speed, s.acceleration)))
+        if sumo.simulation.getCollidingVehiclesNumber():
+            reported += [f"{c.collider}>{c.victim}@{t:.3f}" for c in sumo.simulation.getCollisions()]
+        if _touching(states, rows, reach, dt):
+            ended = "collision"
+            break
+        reason = scene.until(t, by_name) if scene.until is not None else None
+        if reason is not None:
+            ended = reason
+            break
+        if k == steps:
+            break
+        if k % DEADLINE_STEPS == 0 and time.monotonic() > deadline:
+            raise RunError(Status.TIMEOUT, f"a run must take at most {simulation.timeout:g} s, but it was at t = {t:g} s")
+        for actor, own, rest in zip(actors, states, others, strict=True):
+            if actor.driver is not None:
+                _apply(vehicle, actor, own, actor.driver.act(t, own, rest), dt)
+        sumo.simulationStep()
+    return _trace(actors, rows, dt, ended, tuple(reported))
+
+
+def _observe(vehicle: Any, states: list[State], k: int, dt: float, actors: tuple[Actor, ...]) -> None:
+    """Read every actor from SUMO: its front bumper and compass angle become centre and heading."""
+    for state, actor in zip(states, actors, strict=True):
+        name = state.name
+        x, y = vehicle.getPosition(name)
+        if x == ABSENT:
+            raise RunError(Status.FAILED, f"{name} must stay on the road, but it was gone at t = {k * dt:g} s")
+        heading = math.radians(90.0 - vehicle.getAngle(name))
+        half = 0.5 * state.length
+        speed = vehicle.getSpeed(name)
+        state.x = x - half * math.cos(heading)
+        state.y = y - half * math.sin(heading)
+        state.heading = heading
+        state.acceleration = (speed - state.speed) / dt if k else 0.0
+        state.speed = speed
+
+
+def _apply(vehicle: Any, actor: Actor, own: State, action: Action, dt: float) -> None:
+    """Hand one action to SUMO; numbers that are not finite end the run."""
+    acceleration, speed, lane, pose = action
+    if acceleration is not None:
+        speed = max(own.speed + acceleration * dt, 0.0)
+    if speed is not None:
+        if not math.isfinite(speed):
+            raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but got {action}")
+        vehicle.setSpeed(actor.name, speed)
+    if lane is not None:
+        vehicle.changeLane(actor.name, lane, 3600.0)
+    if pose is not None:
+        x, y, heading = pose
+        if not math.isfinite(x + y + heading):
+            raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but got {action}")
+        half = 0.5 * actor.type.length
+        angle = 90.0 - math.degrees(heading)
+        vehicle.moveToXY(actor.name, "", -1, x + half * math.cos(heading), y + half * math.sin(heading), angle, keepRoute=2)
+
+
+def _touching(states: list[State], rows: list[tuple[float, ...]], reach: float, dt: float) -> bool:
+    """Return whether the first actor touched another since the last row (exact test only when near)."""
+    ego = states[0]
+    for j, other in enumerate(states[1:], start=1):
+        near = reach + (ego.speed + other.speed) * dt
+        dx, dy = other.x - ego.x, other.y - ego.y
+        if dx * dx + dy * dy < near * near:
+            last = np.array(rows[-2:]).reshape(-1, len(states), 5)
+            if contact_index(_columns(last, 0, ego), _columns(last, j, other)) is not None:
+                return True
+    return False
+
+
+def _columns(rows: np.ndarray, k: int, state: State) -> ActorTrace:
+    """Return one actor's (t,) columns of (t, m, 5) rows."""
+    x, y, heading, speed, acceleration = rows[:, k].T
+    return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width)
+
+
+def _trace(actors: tuple[Actor, ...], rows: list[tuple[float, ...]], dt: float, ended: str, reported: tuple[str, ...]) -> Trace:
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(actors), 5)
+    x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
+    return Trace(
+        np.arange(len(rows)) * dt, tuple(a.name for a in actors), x, y, heading, speed, acceleration,
+        np.array([a.type.length for a in actors]), np.array([a.type.width for a in actors]), ended, reported,
+    )  # fmt: skip

@@ -1,0 +1,179 @@
+"""Laws of the sequence (position decides the point) and of rejection (the density is the score's)."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sbt.acquisition import even
+from sbt.errors import InputError
+from sbt.metamodels.prediction import Prediction
+from sbt.problem.requirement import CriticalInterval
+from sbt.samplers.roi import rejection
+from sbt.samplers.sobol import SobolSequence
+from sbt.testing import check_sampler
+
+SOBOL = SobolSequence(2, seed=3)
+
+
+def hill(u: np.ndarray) -> np.ndarray:
+    """A known acceptance a(u) = u_0 (1 - u_1)^2, as a log score."""
+    return np.log(u[:, 0]) + 2 * np.log1p(-u[:, 1])
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 7, 24])
+def test_position_decides_the_point(dimension):
+    sequence = SobolSequence(dimension, seed=11)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = sequence.points(0, 300)
+        parts = np.concatenate([sequence.points(a, b) for a, b in ((0, 1), (1, 2), (2, 100), (100, 300))])
+    np.testing.assert_array_equal(whole, parts)
+    assert whole.shape == (300, dimension)
+    assert ((whole > 0) & (whole < 1)).all()
+    assert len(np.unique(whole[:, 0])) == 300
+    assert sequence.points(5, 5).shape == (0, dimension)
+
+
+def test_sequence_depends_on_the_seed_only():
+    np.testing.assert_array_equal(SOBOL.points(0, 64), SobolSequence(2, seed=3).points(0, 64))
+    assert not np.array_equal(SOBOL.points(0, 64), SobolSequence(2, seed=4).points(0, 64))
+
+
+def test_sequence_is_balanced():
+    u = SobolSequence(7, seed=0).points(0, 1024)
+    np.testing.assert_array_equal(np.sort(np.floor(u * 1024), axis=0), np.arange(1024.0)[:, None] + np.zeros(7))
+
+
+def test_far_positions_cost_little_and_stay_inside():
+    far = SobolSequence(20, seed=0).points(5_000_000, 5_000_010)
+    assert ((far > 0) & (far < 1)).all()
+
+
+@pytest.mark.parametrize(("start", "stop"), [(-1, 2), (3, 2), (0, 2**32 + 1)])
+def test_positions_outside_are_refused(start, stop):
+    with pytest.raises(InputError, match="positions must be"):
+        SOBOL.points(start, stop)
+
+
+def test_dimension_zero_is_refused():
+    with pytest.raises(InputError, match="dimension"):
+        SobolSequence(0, seed=0)
+
+
+def test_even_is_the_sequence_itself():
+    belief = CriticalInterval(high=0.0)
+    draw = rejection(
+        lambda u: even(Prediction.gaussian(np.zeros(len(u)), np.ones(len(u))), belief, np.zeros(len(u))),
+        SOBOL, 700, start=40, seed=0, label=1,
+    )  # fmt: skip
+    np.testing.assert_array_equal(draw.u, SOBOL.points(40, 740))
+    np.testing.assert_array_equal(draw.positions, np.arange(40, 740))
+    assert (draw.next_position, draw.candidates, draw.method, draw.acceptance) == (740, 700, "rejection", 1.0)
+
+
+def test_accepted_density_is_proportional_to_the_score():
+    draw = rejection(hill, SOBOL, 4000, start=100, seed=5, label="law")
+    counts, x, y = np.histogram2d(draw.u[:, 0], draw.u[:, 1], bins=5, range=[[0, 1], [0, 1]])
+    mass = np.outer(np.diff(x**2), -np.diff((1 - y) ** 3))
+    assert mass.sum() == pytest.approx(1.0)
+    assert stats.chisquare(counts.ravel(), 4000 * mass.ravel()).pvalue > 0.01
+    assert draw.method == "rejection"
+    assert draw.acceptance == pytest.approx(1 / 6, rel=0.05)
+
+
+@pytest.mark.parametrize("chunk", [1, 37, 512, 100_000])
+def test_chunks_do_not_change_the_draw(chunk):
+    n = 20 if chunk == 1 else 200
+    draws = [rejection(hill, SOBOL, n, start=7, seed=5, label=2, chunk=c) for c in (4096, chunk)]
+    for name in ("u", "positions", "next_position", "candidates", "method", "acceptance"):
+        np.testing.assert_array_equal(getattr(draws[0], name), getattr(draws[1], name))
+
+
+def test_a_draw_goes_on_where_the_last_one_stopped():
+    whole = rejection(hill, SOBOL, 100, start=0, seed=5, label=0)
+    first = rejection(hill, SOBOL, 60, start=0, seed=5, label=0)
+    second = rejection(hill, SOBOL, 40, start=first.next_position, seed=5, label=0)
+    np.testing.assert_array_equal(np.concatenate([first.positions, second.positions]), whole.positions)
+    assert second.next_position == whole.next_position == whole.positions[-1] + 1
+
+
+def test_another_label_draws_other_points():
+    one, two = (rejection(hill, SOBOL, 50, start=0, seed=5, label=label) for label in (1, 2))
+    assert not np.array_equal(one.positions, two.positions)
+
+
+def test_constraints_hold_and_are_never_scored():
+    def below_diagonal(u: np.ndarray) -> np.ndarray:
+        return u[:, 0] > u[:, 1]
+
+    def score(u: np.ndarray) -> np.ndarray:
+        assert below_diagonal(u).all()
+        return hill(u)
+
+    draw = rejection(score, SOBOL, 200, start=0, seed=1, label=0, accept_filter=below_diagonal)
+    assert below_diagonal(draw.u).all()
+    np.testing.assert_array_equal(draw.u, np.concatenate([SOBOL.points(p, p + 1) for p in draw.positions]))
+
+
+def test_a_hopeless_score_falls_back_to_the_pool_in_proportion():
+    def peak(u: np.ndarray) -> np.ndarray:
+        return -60.0 - 5.0 * u[:, 0]
+
+    draws = [
+        rejection(peak, SOBOL, 300, start=10, seed=2, label=0, max_candidates=8192, chunk=c) for c in (64, 4096)
+    ]
+    assert draws[0].method == "pool"
+    assert draws[0].next_position == 10 + 8192
+    assert draws[0].acceptance == 0.0
+    np.testing.assert_array_equal(draws[0].positions, draws[1].positions)
+    assert (np.diff(draws[0].positions) > 0).all()
+    expected = (1 - np.exp(-5.0 * np.array([0.1, 0.2, 0.4]))) / (1 - np.exp(-5.0))
+    shares = [(draws[0].u[:, 0] < x).mean() for x in (0.1, 0.2, 0.4)]
+    np.testing.assert_allclose(shares, expected, atol=0.07)
+
+
+def test_part_accepted_part_pool():
+    draw = rejection(
+        lambda u: np.full(len(u), -6.0), SOBOL, 100, start=0, seed=0, label=0, max_candidates=4096
+    )
+    assert draw.method == "pool"
+    assert 0 < draw.acceptance < 100 / 4096
+    assert len(np.unique(draw.positions)) == 100
+
+
+def test_no_score_at_all_continues_evenly():
+    draw = rejection(
+        lambda u: np.full(len(u), -np.inf), SOBOL, 30, start=5, seed=0, label=0, max_candidates=2048
+    )
+    np.testing.assert_array_equal(draw.u, SOBOL.points(5, 35))
+    assert (draw.method, draw.next_position, draw.acceptance) == ("even", 35, 0.0)
+
+
+def test_nothing_asked_nothing_drawn():
+    draw = rejection(hill, SOBOL, 0, start=5, seed=0, label=0)
+    assert draw.u.shape == (0, 2)
+    assert (draw.next_position, draw.method) == (5, "rejection")
+
+
+def test_bad_scores_and_constraints_are_refused():
+    for value in (np.nan, 0.5):
+        with pytest.raises(InputError, match="must be <= 0"):
+            rejection(lambda u, v=value: np.full(len(u), v), SOBOL, 3, start=0, seed=0, label=0)
+    with pytest.raises(InputError, match="shape"):
+        rejection(lambda u: u, SOBOL, 3, start=0, seed=0, label=0)
+    with pytest.raises(InputError, match="constraints must admit"):
+        rejection(
+            hill, SOBOL, 3, start=0, seed=0, label=0, max_candidates=100,
+            accept_filter=lambda u: np.zeros(len(u), bool),
+        )  # fmt: skip
+    with pytest.raises(InputError, match="max_candidates"):
+        rejection(hill, SOBOL, 3, start=0, seed=0, label=0, max_candidates=2)
+
+
+def test_samplers_obey_their_contract():
+    check_sampler(lambda n, seed: SobolSequence(3, seed).points(0, n), dimension=3)
+    check_sampler(lambda n, seed: rejection(hill, SobolSequence(2, seed), n, start=0, seed=seed, label=0).u, dimension=2)
