@@ -65,7 +65,7 @@ def boundary(prediction: Prediction, critical: CriticalInterval, log_density: Ve
     """
     del log_density
     log_p, log_not = prediction.log_probability(critical)
-    return np.minimum(np.log(2.0) + np.minimum(log_p, log_not), 0.0)
+    return np.asarray(np.minimum(np.log(2.0) + np.minimum(log_p, log_not), 0.0))
 
 
 def importance(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:

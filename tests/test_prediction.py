@@ -112,9 +112,7 @@ def test_mixture_of_far_components_stays_finite():
 
 
 def test_a_zero_weight_and_a_tiny_sigma_do_no_harm():
-    belief = Prediction(
-        np.array([[0.0], [5.0]]), np.array([[1e-12], [1.0]]), np.array([0.0, 1.0]), np.zeros(1)
-    )
+    belief = Prediction(np.array([[0.0], [5.0]]), np.array([[1e-12], [1.0]]), np.array([0.0, 1.0]), np.zeros(1))
     assert belief.mu[0] == 5.0
     log_p, log_not = belief.log_probability(CriticalInterval(high=0.0))
     assert log_p[0] == pytest.approx(stats.norm.logcdf(-5.0))
@@ -140,9 +138,7 @@ def test_mixture_of_predictions_is_the_weighted_law():
 def test_take_is_pointwise():
     index = np.array([3, 1, 3])
     critical = CriticalInterval(high=0.0)
-    np.testing.assert_array_equal(
-        MIXTURE.take(index).probability(critical), MIXTURE.probability(critical)[index]
-    )
+    np.testing.assert_array_equal(MIXTURE.take(index).probability(critical), MIXTURE.probability(critical)[index])
     assert len(MIXTURE.take(slice(0, 0))) == 0
 
 

@@ -123,9 +123,7 @@ def test_a_hopeless_score_falls_back_to_the_pool_in_proportion():
     def peak(u: np.ndarray) -> np.ndarray:
         return -60.0 - 5.0 * u[:, 0]
 
-    draws = [
-        rejection(peak, SOBOL, 300, start=10, seed=2, label=0, max_candidates=8192, chunk=c) for c in (64, 4096)
-    ]
+    draws = [rejection(peak, SOBOL, 300, start=10, seed=2, label=0, max_candidates=8192, chunk=c) for c in (64, 4096)]
     assert draws[0].method == "pool"
     assert draws[0].next_position == 10 + 8192
     assert draws[0].acceptance == 0.0
@@ -137,18 +135,14 @@ def test_a_hopeless_score_falls_back_to_the_pool_in_proportion():
 
 
 def test_part_accepted_part_pool():
-    draw = rejection(
-        lambda u: np.full(len(u), -6.0), SOBOL, 100, start=0, seed=0, label=0, max_candidates=4096
-    )
+    draw = rejection(lambda u: np.full(len(u), -6.0), SOBOL, 100, start=0, seed=0, label=0, max_candidates=4096)
     assert draw.method == "pool"
     assert 0 < draw.acceptance < 100 / 4096
     assert len(np.unique(draw.positions)) == 100
 
 
 def test_no_score_at_all_continues_evenly():
-    draw = rejection(
-        lambda u: np.full(len(u), -np.inf), SOBOL, 30, start=5, seed=0, label=0, max_candidates=2048
-    )
+    draw = rejection(lambda u: np.full(len(u), -np.inf), SOBOL, 30, start=5, seed=0, label=0, max_candidates=2048)
     np.testing.assert_array_equal(draw.u, SOBOL.points(5, 35))
     assert (draw.method, draw.next_position, draw.acceptance) == ("even", 35, 0.0)
 

@@ -1,9 +1,9 @@
-"""Configuration files to checked models: every error at once, each with file, line and column.
+r"""Configuration files to checked models: every error at once, each with file, line and column.
 
->>> loaded = parse("campaign: coverage\\nscenario: cut_in\\nbudget: 40\\n")
+>>> loaded = parse("campaign: coverage\nscenario: cut_in\nbudget: 40\n")
 >>> loaded.config.initial, loaded.config.acquisition.kind
 (10, 'even')
->>> parse("campaign: coverage\\nscenario: cut_in\\nbugdet: 40\\n", name="my.yaml")
+>>> parse("campaign: coverage\nscenario: cut_in\nbugdet: 40\n", name="my.yaml")
 Traceback (most recent call last):
     ...
 sbt.config.source.ConfigError: my.yaml:3:1: bugdet: unknown key (did you mean 'budget'?)
@@ -76,12 +76,13 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Loaded:
 
 def parse(text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None) -> Loaded:
     """Check a configuration given as text; like `load`."""
-    data, source = read_yaml(text, name)
+    data, source, doubled = read_yaml(text, name)
     if data is None:
         raise ConfigError([f"{name}:1:1: a configuration needs at least campaign and scenario, but it is empty"])
     if not isinstance(data, dict):
         raise ConfigError([f"{name}:1:1: a configuration must be a mapping (key: value), but got {_shown(data)}"])
     data, source, wrong = _overridden(data, source, overrides)
+    wrong = doubled + wrong
     try:
         config = Configuration.model_validate(data)
     except ValidationError as error:
@@ -140,9 +141,10 @@ def _overridden(data: dict[str, Any], source: SourceMap, overrides: Sequence[str
             wrong.append(f"--set {text}: must be key.path=value, but got '{text}'")
             continue
         try:
-            value, _ = read_yaml(written, f"--set {dotted}")
+            value, _, _ = read_yaml(written, f"--set {dotted}")
         except ConfigError as error:
-            wrong.append(f"--set {dotted}: the value must be YAML, but got '{written}' ({error.errors[0].partition(', but ')[2]})")
+            reason = error.errors[0].partition(", but ")[2]
+            wrong.append(f"--set {dotted}: the value must be YAML, but got '{written}' ({reason})")
             continue
         try:
             data = _with(data, path, value)

@@ -30,8 +30,9 @@ from sbt.problem.expression import Expression
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "CAMPAIGNS", "EXECUTORS", "AcquisitionChoice", "CampaignKind", "Choice", "Configuration", "CorrelationEntry", "ExecutorChoice",
-    "InputChange", "MetamodelChoice", "RequirementChange", "SimulationChoice", "StopRules", "ValidationChoice",
+    "CAMPAIGNS", "EXECUTORS", "AcquisitionChoice", "CampaignKind", "Choice", "Configuration",
+    "CorrelationEntry", "ExecutorChoice", "InputChange", "MetamodelChoice", "RequirementChange",
+    "SimulationChoice", "StopRules", "ValidationChoice",
 ]  # fmt: skip
 
 
@@ -39,14 +40,15 @@ __all__ = [
 class CampaignKind:
     """What a campaign takes: its default acquisition, its stop rules, and whether it learns where to go."""
 
+    description: str
     acquisition: str
     stop: tuple[str, ...] = ()
     adaptive: bool = True
 
 
 CAMPAIGNS: Mapping[str, CampaignKind] = {
-    "boundary": CampaignKind("boundary", stop=("stable",)),
-    "coverage": CampaignKind("even", adaptive=False),
+    "boundary": CampaignKind("identify where critical meets uncritical", "boundary", stop=("stable",)),
+    "coverage": CampaignKind("evenly distributed points: the baseline, and data sets", "even", adaptive=False),
 }
 """The campaigns of this release."""
 EXECUTORS = ("serial", "local")
@@ -71,7 +73,7 @@ def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
 
 def _two(value: Any) -> Any:
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise ValueError("must be a list of two values")
+        raise ValueError(f"must be a list of two values, but got {value!r}")
     return value
 
 
@@ -117,7 +119,8 @@ class RequirementChange(_Strict):
 
     metric: Name | None = Field(default=None, description="Safety metric; null: the scenario's own.")
     critical: Interval | None = Field(
-        default=None, description="Closed interval [low, high] of critical values, ends may be -.inf or .inf; null: the scenario's own."
+        default=None,
+        description="Critical values [low, high], closed; ends may be -.inf or .inf; null: the own.",
     )
 
     @field_validator("critical")
@@ -145,7 +148,9 @@ class Choice(_Strict):
 class MetamodelChoice(Choice):
     """The metamodel; further keys are its settings."""
 
-    preset: Name | None = Field(default=None, description="Named settings of the metamodel, such as paper; further keys override it.")
+    preset: Name | None = Field(
+        default=None, description="Named settings of the metamodel, such as paper; further keys override it."
+    )
 
 
 class AcquisitionChoice(_Strict):
@@ -160,7 +165,7 @@ class InputChange(_Strict):
     min: float | None = Field(default=None, description="Lower end of the range, in the input's unit.")
     max: float | None = Field(default=None, description="Upper end of the range, in the input's unit.")
     distribution: Choice | None = Field(
-        default=None, description="Law of the input, truncated to the range: {kind: normal, mean: 40, std: 15}, "
+        default=None, description="Law, truncated to the range: {kind: normal, mean: 40, std: 15}, "
         "or uniform, lognormal, exponential, gumbel, weibull, beta, triangular, scipy.",
     )  # fmt: skip
 
@@ -205,7 +210,8 @@ class ExecutorChoice(_Strict):
     workers: int = Field(default_factory=_cores, ge=1, description="Worker processes of local; default: the usable cores.")
     timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped; .inf: never.")
     isolation: Literal["auto", "fresh", "reuse", "replicas"] = Field(
-        default="auto", description="SUMO per run: fresh (load each time), reuse, replicas; auto: the fastest the scenario allows."
+        default="auto",
+        description="SUMO is loaded per run (fresh) or kept (reuse, replicas); auto: the fastest allowed.",
     )
 
 
@@ -220,7 +226,7 @@ def _store(data: dict[str, Any]) -> str:
 
 
 def _metamodel(data: dict[str, Any]) -> MetamodelChoice | None:
-    return MetamodelChoice(kind="gp") if CAMPAIGNS[data["campaign"]].adaptive else None
+    return MetamodelChoice.model_validate({"kind": "gp"}) if CAMPAIGNS[data["campaign"]].adaptive else None
 
 
 def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
@@ -230,17 +236,18 @@ def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
 class Configuration(_Strict):
     """A campaign: what is asked, of which scenario, with how many runs."""
 
-    campaign: CampaignName = Field(
-        description="boundary: identify where critical meets uncritical; coverage: evenly distributed points."
-    )
+    campaign: CampaignName = Field(description="; ".join(f"{name}: {kind.description}" for name, kind in CAMPAIGNS.items()))
     scenario: Name = Field(description="An installed scenario, or file.py:NAME (relative to the configuration file).")
-    requirement: RequirementChange = Field(default=RequirementChange(), description="What is critical; default: the scenario's own.")
+    requirement: RequirementChange = Field(
+        default=RequirementChange(), description="What is critical; default: the scenario's own."
+    )
     inputs: dict[str, InputChange] = Field(default={}, description="Changes to the scenario's inputs, by name.")
     correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False)] = Field(
         default=(), description="Correlated pairs of inputs; the others stay as the scenario has them."
     )
     constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = Field(
-        default=(), description="Conditions on inputs that every concrete scenario meets, such as 'v_ego - v_co < 30'."
+        default=(),
+        description="Conditions on inputs that every concrete scenario meets, such as 'v_ego - v_co < 30'.",
     )
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel, name: formula.")
     ego: Choice | None = Field(default=None, description="The AV under test: a controller; null: the scenario's own.")
@@ -249,17 +256,21 @@ class Configuration(_Strict):
     budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
     initial: int = Field(
         default_factory=_tenth, ge=1,
-        description="Evenly distributed runs before the first fit; default: a tenth of the budget, at least 10.",
+        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10.",
     )  # fmt: skip
     batch: int = Field(
-        default_factory=lambda data: data["initial"], ge=1, description="Runs per iteration; default: as many as initial."
+        default_factory=lambda data: data["initial"],
+        ge=1,
+        description="Runs per iteration; default: as many as initial.",
     )
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
-        default_factory=_metamodel, description="What learns the safety metric; default: gp, none for coverage."
+        default_factory=_metamodel,
+        description="What learns the safety metric; default: gp, none for coverage.",
     )
     acquisition: AcquisitionChoice = Field(
-        default_factory=_acquisition, description="How much a candidate is worth; default: boundary for boundary, even for coverage."
+        default_factory=_acquisition,
+        description="How much a candidate is worth; default: boundary for boundary, even for coverage.",
     )
     stop: StopRules = Field(default=StopRules(), description="When to stop before the budget is used up.")
     executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")

@@ -5,9 +5,10 @@ YAML 1.2 is read twice by ruamel.yaml: as nodes, for positions and doubled keys,
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from difflib import get_close_matches
+from typing import Any, TypeVar
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -15,9 +16,20 @@ from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 
 from sbt.errors import InputError
 
-__all__ = ["ConfigError", "Place", "SourceMap", "read_yaml", "yaml_reader"]
+__all__ = [
+    "ConfigError",
+    "Key",
+    "Place",
+    "Problems",
+    "SourceMap",
+    "must_be_one_of",
+    "read_yaml",
+    "yaml_reader",
+]
 
+T = TypeVar("T")
 Key = tuple[str | int, ...]
+"""Path of keys and list positions."""
 _DEPTH = 30
 """Deeper nesting is an alias that contains itself."""
 
@@ -26,6 +38,7 @@ class ConfigError(InputError):
     """Everything that is wrong with a configuration; `errors` has one line for each."""
 
     def __init__(self, errors: Sequence[str]):
+        """Keep the lines, one an error."""
         super().__init__("\n".join(errors))
         self.errors = tuple(errors)
 
@@ -71,7 +84,7 @@ class SourceMap:
         lines = [self._sortable(*problem) for problem in problems]
         return [text for _, text in sorted(lines, key=lambda line: line[0])]
 
-    def _sortable(self, path: Key, message: str, at_key: bool) -> tuple[tuple[int, int, int], str]:  # noqa: FBT001
+    def _sortable(self, path: Key, message: str, at_key: bool) -> tuple[tuple[int, int, int], str]:
         dotted = ".".join(str(part) for part in path)
         for prefix in (path[:n] for n in range(len(path), -1, -1)):
             if prefix in self.overrides:
@@ -86,6 +99,42 @@ class SourceMap:
         return (0, 0, 0), f"{self.name}: {dotted}: {message}"
 
 
+@dataclass
+class Problems:
+    """Collects what is wrong, each at its key, until `check` raises all of it."""
+
+    source: SourceMap
+    found: list[tuple[Key, str, bool]] = field(default_factory=list)
+
+    def add(self, path: Key, message: str, *, at_key: bool = False) -> None:
+        """Keep a problem."""
+        self.found.append((path, message, at_key))
+
+    def attempt(self, path: Key, make: Callable[[], T]) -> T | None:
+        """Return what `make` makes; None where it raises an `InputError`, which is kept."""
+        try:
+            return make()
+        except InputError as error:
+            self.add(path, str(error))
+            return None
+
+    def error(self) -> ConfigError:
+        """Return everything that was found as one error."""
+        return ConfigError(self.source.sorted(self.found))
+
+    def check(self) -> None:
+        """Raise what was found, if anything was."""
+        if self.found:
+            raise self.error()
+
+
+def must_be_one_of(what: str, name: str, known: Sequence[str]) -> str:
+    """Return the message about a name that is not among the known ones."""
+    near = get_close_matches(name, known, 1)
+    hint = f" (did you mean '{near[0]}'?)" if near else ""
+    return f"{what} must be one of {', '.join(known)}, but got '{name}'{hint}"
+
+
 def _path(key: str | Key) -> Key:
     parts = key.split(".") if isinstance(key, str) else key
     return tuple(int(p) if isinstance(p, str) and p.isdecimal() else p for p in parts)
@@ -96,15 +145,15 @@ def yaml_reader() -> YAML:
     yaml = YAML(typ="safe", pure=True)
     yaml.allow_duplicate_keys = True  # reported by `read_yaml`, all of them
     yaml.default_flow_style = False
-    yaml.sort_base_mapping_type_on_output = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     return yaml
 
 
-def read_yaml(text: str, name: str) -> tuple[Any, SourceMap]:
-    """Return the value of a YAML document and where its keys stand.
+def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
+    """Return the value of a YAML document, where its keys stand, and a message for each doubled key.
 
     Raises:
-        ConfigError: the text is not YAML, or a key stands twice in one mapping.
+        ConfigError: the text is not YAML.
     """
     try:
         node = yaml_reader().compose(text)
@@ -128,9 +177,7 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap]:
             doubled.append((path, message, True))
         places[path] = place
     source = SourceMap(name, places)
-    if doubled:
-        raise ConfigError(source.sorted(doubled))
-    return value, source
+    return value, source, source.sorted(doubled)
 
 
 def _walk(node: Node | None, path: Key) -> Iterator[tuple[Key, Place]]:

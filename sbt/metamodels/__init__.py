@@ -1,0 +1,1 @@
+"""What is believed: metamodels and their predictions; the only place with torch and scikit-learn."""

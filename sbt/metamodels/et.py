@@ -64,8 +64,7 @@ class ExtraTrees:
     def __post_init__(self) -> None:
         if not (self.trees >= 1 and self.min_samples_split >= 2):
             raise InputError(
-                "ExtraTrees needs trees >= 1 and min_samples_split >= 2, "
-                f"but got {self.trees} and {self.min_samples_split}"
+                f"ExtraTrees needs trees >= 1 and min_samples_split >= 2, but got {self.trees} and {self.min_samples_split}"
             )
         if not 0.0 < self.max_features <= 1.0:
             raise InputError(f"max_features must be in (0, 1], but got {self.max_features}")
@@ -130,7 +129,7 @@ class ForestPredictor:
 
     def mu(self, u: Points) -> Vector:
         """Return the (n,) mean of the trees, without the rest of the belief."""
-        return self.mean[self._nodes(u)].mean(axis=0)
+        return np.asarray(self.mean[self._nodes(u)].mean(axis=0))
 
     def _nodes(self, u: Points) -> NDArray[np.int64]:
         """Return (k, n) rows of the tables: the leaves that the points fall into."""

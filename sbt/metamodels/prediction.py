@@ -89,19 +89,21 @@ class Prediction:
 
     @property
     def mu(self) -> Vector:
-        """(n,) mean of the mixture: the paper's mu(x)."""
-        return self.weight @ self.mean
+        """Mean of the mixture, (n,): the paper's mu(x)."""
+        mean: Vector = self.weight @ self.mean
+        return mean
 
     @property
     def sigma(self) -> Vector:
-        """(n,) standard deviation of the mixture (moment-matched): the paper's sigma(x)."""
+        """Standard deviation of the mixture (moment-matched), (n,): the paper's sigma(x)."""
         if len(self.weight) == 1:
-            return self.std[0]
-        return np.sqrt(self.weight @ (self.std**2 + (self.mean - self.mu) ** 2))
+            return np.asarray(self.std[0])
+        variance: Vector = self.weight @ (self.std**2 + (self.mean - self.mu) ** 2)
+        return np.sqrt(variance)
 
     @property
     def epistemic(self) -> Vector:
-        """(n,) the part of `sigma` that more runs reduce, a standard deviation."""
+        """The part of `sigma` that more runs reduce, (n,), a standard deviation."""
         return np.sqrt(np.maximum(self.sigma**2 - self.noise**2, 0.0))
 
     def take(self, index: NDArray[Any] | slice) -> Prediction:
@@ -122,7 +124,8 @@ class Prediction:
 
     def cdf(self, y: Vector) -> Vector:
         """Return (n,) P(Y <= y) of the mixture at y (n,)."""
-        return np.minimum(self.weight @ ndtr((self._paired(y) - self.mean) / self.std), 1.0)
+        mass: Vector = self.weight @ ndtr((self._paired(y) - self.mean) / self.std)
+        return np.minimum(mass, 1.0)
 
     def log_probability(self, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) log P(y in M_c) and (n,) log P(y not in M_c), both accurate in the tails.
@@ -149,7 +152,7 @@ class Prediction:
             raise InputError(f"a quantile needs 0 < q < 1, but got {q}")
         at = self.mean + self.std * ndtri(q)  # (k, n)
         if len(self.weight) == 1:
-            return at[0]
+            return np.asarray(at[0])
         if q > 0.5:
             mirrored = Prediction(-self.mean, self.std, self.weight, self.noise)
             return -mirrored._lower_quantile(float(np.log1p(-q)), -at)
@@ -158,7 +161,7 @@ class Prediction:
     def _lower_quantile(self, log_q: float, at: _Matrix) -> Vector:
         """Solve log P(Y <= y) = log_q between the smallest and the largest component quantile."""
         low, high = at.min(axis=0), at.max(axis=0)
-        y = self.weight @ at
+        y: Vector = self.weight @ at
         for _ in range(100):
             log_cdf = self._mix(log_ndtr((y - self.mean) / self.std))
             below = log_cdf < log_q
@@ -176,12 +179,12 @@ class Prediction:
     def _mix(self, log_terms: _Matrix) -> Vector:
         """Return the (n,) logarithm of the weighted sum of exp((k, n) terms)."""
         if len(self.weight) == 1:
-            return log_terms[0]
+            return np.asarray(log_terms[0])
         with np.errstate(divide="ignore"):
             terms = log_terms + np.log(self.weight)[:, None]
             top = terms.max(axis=0)
             top[np.isneginf(top)] = 0.0
-            return np.log(np.exp(terms - top).sum(axis=0)) + top
+            return np.asarray(np.log(np.exp(terms - top).sum(axis=0)) + top)
 
     def _paired(self, y: Vector) -> Vector:
         """Return y as (n,) float64, one value a point."""
@@ -197,7 +200,7 @@ def _first_bad(std: _Matrix) -> float:
 
 def _log_gauss(y: Vector, mean: _Matrix, std: _Matrix) -> _Matrix:
     """Return log N(y; mean, std^2), broadcast over components."""
-    return -0.5 * ((y - mean) / std) ** 2 - np.log(std) - _LOG_SQRT_2PI
+    return np.asarray(-0.5 * ((y - mean) / std) ** 2 - np.log(std) - _LOG_SQRT_2PI)
 
 
 def _log_interval(mean: _Matrix, std: _Matrix, critical: CriticalInterval) -> tuple[_Matrix, _Matrix]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sbt.arrays import Vector
@@ -63,8 +65,21 @@ def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
 
 def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
     """Return the first instant at which, or in the step before which, the rectangles touch; None: never."""
-    hits = np.flatnonzero(np.isfinite(swept_contact(a, b)))
-    return int(hits[0]) if hits.size else None
+    dx, dy = b.x - a.x, b.y - a.y
+    reach = 0.5 * (math.hypot(a.length, a.width) + math.hypot(b.length, b.width))
+    moved = max(float(np.abs(np.diff(dx)).max(initial=0.0)), float(np.abs(np.diff(dy)).max(initial=0.0)))
+    near = np.flatnonzero(dx * dx + dy * dy <= (reach + 1.5 * moved) ** 2)  # circles: the exact test only there
+    if near.size == 0:
+        return None
+    first, last = max(int(near[0]) - 1, 0), int(near[-1]) + 1
+    hits = np.flatnonzero(np.isfinite(swept_contact(_part(a, first, last), _part(b, first, last))))
+    return first + int(hits[0]) if hits.size else None
+
+
+def _part(actor: ActorTrace, first: int, last: int) -> ActorTrace:
+    """Return the instants first to last - 1 of an actor."""
+    arrays = (actor.x, actor.y, actor.heading, actor.speed, actor.acceleration)
+    return ActorTrace(*(values[first:last] for values in arrays), actor.length, actor.width)
 
 
 def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:

@@ -64,6 +64,11 @@ class Encounter:
 
 
 @lru_cache(maxsize=8)
+def _contact(trace: Trace, ego: str, other: str) -> int | None:
+    return contact_index(trace.actor(ego), trace.actor(other))
+
+
+@lru_cache(maxsize=8)
 def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Encounter:
     """Return how `ego` and `other` stand to each other; kept for the last few traces."""
     a, b = trace.actor(ego), trace.actor(other)
@@ -75,7 +80,7 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
     in_path = offset < 0.5 * (a.width + b.width) + margin
     behind = gap <= -(a.length + b.length)
     ahead = in_path & (gap >= 0)
-    contact = contact_index(a, b)
+    contact = _contact(trace, ego, other)
     rear_end = contact is not None and (bool(ahead[contact]) or (contact > 0 and bool(ahead[contact - 1])))
     return Encounter(
         gap, a.speed - b.speed * turn, in_path, ahead, in_path & (gap < 0) & ~behind, a.speed,
@@ -169,9 +174,7 @@ def collision(ego: str = "ego") -> Metric:
     """Return 1 where ego's rectangle touches another's at any time, steps in between included, else 0."""
 
     def function(trace: Trace) -> float:
-        a = trace.actor(ego)
-        others = (trace.actor(name) for name in trace.actors if name != ego)
-        return float(any(contact_index(a, b) is not None for b in others))
+        return float(any(_contact(trace, ego, other) is not None for other in trace.actors if other != ego))
 
     return Metric("collision", function, "", "high", 0.0, "the ego's rectangle touched another one")
 
@@ -180,10 +183,10 @@ def impact_speed(ego: str = "ego", other: str = "co") -> Metric:
     """Return the speed of ego relative to the other at the first contact (m/s), 0 without one."""
 
     def function(trace: Trace) -> float:
-        a, b = trace.actor(ego), trace.actor(other)
-        k = encounter(trace, ego, other).contact
+        k = _contact(trace, ego, other)
         if k is None:
             return 0.0
+        a, b = trace.actor(ego), trace.actor(other)
         dx = a.speed[k] * np.cos(a.heading[k]) - b.speed[k] * np.cos(b.heading[k])
         dy = a.speed[k] * np.sin(a.heading[k]) - b.speed[k] * np.sin(b.heading[k])
         return float(np.hypot(dx, dy))

@@ -31,6 +31,14 @@ class Configurable(Protocol):
     isolations: tuple[str, ...]
     step_length: float
 
+    def prepare(self) -> None:
+        """Load what is slow to load, before the first run."""
+        ...
+
+    def limited(self, timeout: float | None) -> Simulate:
+        """Return a copy whose runs end as `timeout` after so many wall-clock seconds."""
+        ...
+
     def configured(
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
     ) -> Simulate:
@@ -133,6 +141,17 @@ class LogicalScenario:
         if not isinstance(self.simulate, Configurable):
             raise InputError(f"scenario {self.name} offers no choice of ego or step length")
         return replace(self, simulate=self.simulate.configured(ego, isolation, step_length))
+
+    def limited(self, timeout: float | None) -> LogicalScenario:
+        """Return a copy whose runs look at the clock, where the scenario can."""
+        if timeout is None or not isinstance(self.simulate, Configurable):
+            return self
+        return replace(self, simulate=self.simulate.limited(timeout))
+
+    def prepare(self) -> None:
+        """Load what is slow to load, before the first run."""
+        if isinstance(self.simulate, Configurable):
+            self.simulate.prepare()
 
     def measure(self, trace: Trace) -> dict[str, float]:
         """Return every metric of a trace by name."""

@@ -19,7 +19,16 @@ from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.samplers.sobol import SobolSequence
 
-__all__ = ["Plane", "Predict", "influence", "influence_from_runs", "most_telling_pairs", "probability", "probability_plane"]
+__all__ = [
+    "Plane",
+    "Predict",
+    "influence",
+    "influence_from_runs",
+    "log_probability",
+    "most_telling_pairs",
+    "probability",
+    "probability_plane",
+]
 
 Predict = Callable[[Points], Prediction]
 """(n, d) points of the unit cube to the metamodel's belief about the metric."""
@@ -45,10 +54,18 @@ class Plane:
     averaged: int
 
 
+def log_probability(predict: Predict, critical: CriticalInterval, u: Points) -> tuple[Vector, Vector]:
+    """Return (n,) log P(critical) and (n,) log P(uncritical) at n >= 1 points of the unit cube.
+
+    In chunks that fit into memory.
+    """
+    parts = [predict(u[k : k + _CHUNK]).log_probability(critical) for k in range(0, len(u), _CHUNK)]
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
 def probability(predict: Predict, critical: CriticalInterval, u: Points) -> Vector:
-    """Return (n,) P(critical) at points of the unit cube, in chunks that fit into memory."""
-    parts = [predict(u[k : k + _CHUNK]).probability(critical) for k in range(0, len(u), _CHUNK)]
-    return np.concatenate(parts) if parts else np.empty(0)
+    """Return (n,) P(critical) at n >= 1 points of the unit cube."""
+    return np.exp(log_probability(predict, critical, u)[0])
 
 
 def influence(predict: Predict, critical: CriticalInterval, dimension: int, points: int = 512) -> Vector:
@@ -98,17 +115,23 @@ def _relative(values: Vector) -> Vector:
 
 
 def most_telling_pairs(weights: Vector, limit: int = 6) -> list[tuple[int, int]]:
-    """Return at most `limit` pairs of inputs, those with the largest joint weight first.
+    """Return at most `limit` pairs of the four heaviest inputs, those with the largest joint weight first.
 
     >>> most_telling_pairs(np.array([0.1, 1.0, 0.5]), limit=2)
     [(1, 2), (0, 1)]
     """
-    pairs = combinations(range(len(weights)), 2)
+    heaviest = np.argsort(-weights, kind="stable")[:4]
+    pairs = combinations(sorted(int(k) for k in heaviest), 2)
     return sorted(pairs, key=lambda p: (-float(weights[p[0]] + weights[p[1]]), p))[:limit]
 
 
 def probability_plane(
-    predict: Predict, critical: CriticalInterval, space: ParameterSpace, pair: tuple[int, ...], *, samples: int = 256
+    predict: Predict,
+    critical: CriticalInterval,
+    space: ParameterSpace,
+    pair: tuple[int, ...],
+    *,
+    samples: int = 256,
 ) -> Plane:
     """Return P(critical) over one or two inputs: its mean over `samples` Sobol points of the others.
 

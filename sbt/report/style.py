@@ -7,12 +7,22 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CRITICAL", "FAILED", "MODEL", "REGION", "UNCRITICAL", "figure_style", "label", "new_figure", "to_svg"]
+__all__ = [
+    "CRITICAL",
+    "FAILED",
+    "MODEL",
+    "REGION",
+    "UNCRITICAL",
+    "figure_style",
+    "label",
+    "new_figure",
+    "to_svg",
+]
 
 UNCRITICAL = "#5b9bd5"
 CRITICAL = "#8c1515"
@@ -21,7 +31,7 @@ MODEL = "#1f4e79"
 REGION = "#f6d5c9"
 """light enough to print under black text: the critical side of a figure"""
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9.5,
     "axes.titlesize": 9.5,
     "axes.labelsize": 9.5,
@@ -52,7 +62,7 @@ _STYLE = {
 @contextmanager
 def figure_style() -> Iterator[None]:
     """Draw and save under the package's style, whatever the user's matplotlibrc says."""
-    import matplotlib as mpl  # noqa: PLC0415  (half a second, only where figures are drawn)
+    import matplotlib as mpl
 
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
@@ -63,7 +73,7 @@ def figure_style() -> Iterator[None]:
 
 def new_figure(width: float = 5.4, height: float = 4.0) -> Figure:
     """Return a figure of this size in inches that lays itself out and belongs to no window."""
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 

@@ -15,9 +15,17 @@ from sbt.history import History, Record
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
-from sbt.report.words import SCORES, law_words, number, share
+from sbt.report.words import NOTHING, SCORES, law_words, number, share
 
-__all__ = ["Cell", "Table", "critical_table", "failed_table", "input_table", "iteration_table", "simulate_command"]
+__all__ = [
+    "Cell",
+    "Table",
+    "critical_table",
+    "failed_table",
+    "input_table",
+    "iteration_table",
+    "simulate_command",
+]
 
 _MOST = 200
 _LIST_SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
@@ -32,10 +40,10 @@ class Cell:
     code: str = ""
 
     @classmethod
-    def of(cls, value: Any) -> Cell:
+    def of(cls, value: Any, digits: int = 4) -> Cell:
         """Return the cell of a number or a text."""
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return cls(number(value), value if is_number else None)
+        return cls(number(value, digits), value if is_number else None)
 
     @property
     def numeric(self) -> bool:
@@ -50,6 +58,11 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Which columns hold numbers, in some row at least."""
+        return tuple(any(cell.numeric for cell in column) for column in zip(*self.rows, strict=True))
 
 
 def input_table(scenario: LogicalScenario, influence: Vector | None) -> Table:
@@ -76,17 +89,23 @@ def _input(parameter: Parameter) -> tuple[Cell, ...]:
     return (
         Cell(parameter.name),
         Cell(f"[{parameter.low:g}, {parameter.high:g}]{whole}"),
-        Cell(parameter.unit or "–"),
+        Cell(parameter.unit or NOTHING),
         Cell(law_words(parameter.distribution)),
         Cell(parameter.description),
     )
 
 
 def iteration_table(
-    iterations: Sequence[Mapping[str, Any]], fits: Sequence[Mapping[str, Any]], history: History, requirement: Requirement
+    iterations: Sequence[Mapping[str, Any]],
+    fits: Sequence[Mapping[str, Any]],
+    history: History,
+    requirement: Requirement,
 ) -> Table:
     """Return how each batch was chosen, what it gave, and the scores of the metamodel fitted then."""
-    critical, by_iteration = requirement.critical.contains(history.y(requirement.metric)), {fit["iteration"]: fit for fit in fits}
+    critical, by_iteration = (
+        requirement.critical.contains(history.y(requirement.metric)),
+        {fit["iteration"]: fit for fit in fits},
+    )
     scored = [key for key in _LIST_SCORES if any(fit.get(key) is not None for fit in fits)]
     rows = []
     for batch in iterations:
@@ -95,14 +114,23 @@ def iteration_table(
         rows.append((
             Cell.of(batch["iteration"]), Cell(str(batch["stage"])), Cell.of(int(mine.sum())),
             Cell.of(int((mine & critical).sum())), Cell.of(int((mine & ~history.ok).sum())),
-            Cell(_listed(how)), *(Cell.of(fit.get(key)) for key in scored),
+            *(Cell.of(fit.get(key), 3) for key in scored), Cell(_listed(how)),
         ))  # fmt: skip
-    columns = ("iteration", "stage", "runs", "critical", "failed", "how it was chosen", *(SCORES[key] for key in scored))
+    columns = (
+        "iteration",
+        "stage",
+        "runs",
+        "critical",
+        "failed",
+        *(SCORES[key] for key in scored),
+        "how it was chosen",
+    )
     return Table(columns, tuple(rows))
 
 
 def _listed(how: Mapping[str, Any]) -> str:
     """Return a proposal's keys and values on one line."""
+
     def shown(value: Any) -> str:
         return number(value) if isinstance(value, (int, float, str)) or value is None else json.dumps(value, ensure_ascii=False)
 
@@ -125,17 +153,17 @@ def critical_table(history: History, requirement: Requirement, reference: str) -
         record = history.records[k]
         rows.append((
             Cell.of(record.index), Cell.of(float(margin[k])), *(Cell.of(record.inputs[name]) for name in history.names),
-            *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), float(record.seed)),
+            *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
             Cell("command", code=simulate_command(reference, record)),
         ))  # fmt: skip
     rest = len(found) - len(rows)
-    note = f"{rest:,} more critical runs are in the store: `sumo-sbt export` lists all." if rest else ""
+    note = f"{rest:,} more critical runs are in the store: sumo-sbt export lists all." if rest else ""
     return Table(("run", "margin", *history.names, *metrics, "seed", "again"), tuple(rows), note)
 
 
 def failed_table(history: History, reference: str) -> Table:
     """Return the failed runs in order, at most 200, each with its reason."""
-    failed = [record for record in history.where(~history.ok).records]
+    failed = history.where(~history.ok).records
     rows = tuple(
         (Cell.of(record.index), Cell(record.stage), Cell(record.status), Cell(record.reason),
          Cell.of(record.seconds), Cell("command", code=simulate_command(reference, record)))

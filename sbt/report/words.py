@@ -14,11 +14,23 @@ from sbt.history import PLANNED, VALIDATION, History
 from sbt.problem.distribution import Distribution
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
-from sbt.report.figures import binomial_interval
+from sbt.report.curves import binomial_interval
 from sbt.store import Store
 
-__all__ = ["SCORES", "Findings", "conclusion_sentences", "law_words", "number", "requirement_words", "share", "warnings_for"]
+__all__ = [
+    "NOTHING",
+    "SCORES",
+    "Findings",
+    "conclusion_sentences",
+    "law_words",
+    "number",
+    "requirement_words",
+    "share",
+    "warnings_for",
+]
 
+NOTHING = "\N{EN DASH}"
+"""Stands where there is no value."""
 SCORES: Mapping[str, str] = {
     "log_likelihood": "log likelihood",
     "log_likelihood_critical": "log likelihood, critical runs",
@@ -93,24 +105,29 @@ def number(value: Any, digits: int = 4) -> str:
     ('0.1235', '–', '1.235e+06')
     """
     if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "–"
+        return NOTHING
     if isinstance(value, (bool, str)):
         return str(value)
     return f"{value:,}" if isinstance(value, int) else f"{value:.{digits}g}"
 
 
 def share(value: float) -> str:
-    """Return a share as percentage.
+    """Return a share as percentage; the space before the sign does not break.
 
-    >>> share(0.0123), share(0.5)
-    ('1.23 %', '50 %')
+    >>> share(0.0123) == "1.23\N{NO-BREAK SPACE}%"
+    True
     """
-    return f"{100 * value:.3g} %"
+    return f"{100 * value:.3g}\N{NO-BREAK SPACE}%"
 
 
 def requirement_words(requirement: Requirement, unit: str) -> str:
     """Return when a run is critical."""
-    low, high, name, tail = requirement.critical.low, requirement.critical.high, requirement.metric, f" {unit}" if unit else ""
+    low, high, name, tail = (
+        requirement.critical.low,
+        requirement.critical.high,
+        requirement.metric,
+        f" {unit}" if unit else "",
+    )
     if math.isinf(low):
         return f"{name} ≤ {high:g}{tail}"
     if math.isinf(high):
@@ -143,7 +160,7 @@ def _not_a_share(found: Findings) -> str:
     adaptive = set(found.history.stage.tolist()) - {VALIDATION}
     if found.configuration.get("campaign") == "coverage" or not adaptive:
         return ""
-    return " They were sought where the campaign expected them, so this share says nothing about their probability."
+    return " Runs are chosen, not drawn at random, so this share is no estimate of their probability."
 
 
 def _estimation(result: Mapping[str, Any]) -> list[str]:
@@ -157,7 +174,11 @@ def _estimation(result: Mapping[str, Any]) -> list[str]:
         f"Probability of a critical run under the inputs' distribution: {number(result['probability'])}"
         f" ({confidence} interval {number(result.get('low'))} to {number(result.get('high'))})."
     ]
-    details = {"coefficient of variation": "cov", "effective sample size": "effective_sample_size", "hits": "hits"}
+    details = {
+        "coefficient of variation": "cov",
+        "effective sample size": "effective_sample_size",
+        "hits": "hits",
+    }
     given = [f"{name} {number(result[key], 3)}" for name, key in details.items() if result.get(key) is not None]
     if given:
         said.append(f"Behind it: {', '.join(given)}.")
@@ -197,7 +218,12 @@ def _fraction(found: Findings) -> list[str]:
 
 def warnings_for(found: Findings) -> list[str]:
     """Return what limits the conclusion, in plain words; empty where nothing does."""
-    return [*_about_progress(found), *_about_runs(found), *_about_scores(found), *map(str, found.result.get("warnings") or [])]
+    return [
+        *_about_progress(found),
+        *_about_runs(found),
+        *_about_scores(found),
+        *map(str, found.result.get("warnings") or []),
+    ]
 
 
 def _about_progress(found: Findings) -> list[str]:
@@ -206,21 +232,24 @@ def _about_progress(found: Findings) -> list[str]:
     done, budget = len(found.history), found.configuration.get("budget")
     of = f" of {budget:,}" if isinstance(budget, int) else ""
     waiting = f", {found.planned:,} more are planned" if found.planned else ""
-    return [f"The campaign is not finished: {done:,}{of} runs are done{waiting}. Everything below may still change."]
+    return [f"The campaign has not concluded: {done:,}{of} runs are done{waiting}. What follows may still change."]
 
 
 def _about_runs(found: Findings) -> list[str]:
-    history, said = found.history, []
-    failed = [record for record in history.records if record.metrics == {}]
+    history = found.history
+    said: list[str] = []
+    failed = history.where(~history.ok).records
     if failed:
         reason, times = Counter(record.reason or record.status for record in failed).most_common(1)[0]
         said.append(
-            f"{len(failed):,} of {len(history):,} runs failed ({share(len(failed) / len(history))}) and tell nothing about safety."
-            f" Most frequent reason ({times:,} times): {reason[:200]}"
+            f"{len(failed):,} of {len(history):,} runs failed ({share(len(failed) / len(history))}) and tell nothing"
+            f" about safety. Most frequent reason ({times:,} times): {reason[:200]}"
         )
     if history.ok.any() and not found.critical.any():
         n = int(found.held_out.sum())
-        bound = f" From the {n:,} random held-out runs alone, up to {share(1 - 0.05 ** (1 / n))} may be critical (95 %)." if n else ""
+        bound = (
+            f" From the {n:,} random held-out runs alone, up to {share(1 - 0.05 ** (1 / n))} may be critical (95 %)." if n else ""
+        )
         said.append(f"No critical run was found. That is no proof that there is none.{bound}")
     if len({record.versions for record in history.records}) > 1:
         said.append("Runs were made with different versions of the software; see the header.")
@@ -228,7 +257,8 @@ def _about_runs(found: Findings) -> list[str]:
 
 
 def _about_scores(found: Findings) -> list[str]:
-    scores, said = found.scores, []
+    scores = found.scores
+    said: list[str] = []
     if not scores:
         return said
     n, critical, error = scores.get("n"), scores.get("n_critical"), scores.get("calibration_error")
@@ -241,5 +271,7 @@ def _about_scores(found: Findings) -> list[str]:
             " runs are noisy, and whole critical regions may be missing from the test."
         )
     if error is not None and error > _POOR_CALIBRATION:
-        said.append(f"Poor calibration: the metamodel's P(critical) is off by {error:.2f} on average. Do not read it as a probability.")
+        said.append(
+            f"Poor calibration: the metamodel's P(critical) is off by {error:.2f} on average. Do not read it as a probability."
+        )
     return said

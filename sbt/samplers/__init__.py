@@ -1,0 +1,1 @@
+"""Where next: samplers of concrete scenarios."""

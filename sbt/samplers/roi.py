@@ -138,8 +138,11 @@ class _Candidates:
         return _Candidates(self.u, self.positions, key)
 
     def joined(self, other: _Candidates) -> _Candidates:
-        pairs = ((self.u, other.u), (self.positions, other.positions), (self.key, other.key))
-        return _Candidates(*(np.concatenate(pair) for pair in pairs))
+        return _Candidates(
+            np.concatenate([self.u, other.u]),
+            np.concatenate([self.positions, other.positions]),
+            np.concatenate([self.key, other.key]),
+        )
 
     def best(self, n: int) -> _Candidates:
         """Return the n largest keys; ties (those at -inf) go to the earlier position."""
@@ -151,9 +154,7 @@ def _fall_back(accepted: _Candidates, rejected: _Candidates, n: int, scored: int
     filling = rejected.best(n - len(accepted))
     both = accepted.joined(filling)
     if len(both) < n:
-        raise InputError(
-            f"the constraints must admit at least {n} of the candidates looked at, but admitted {scored}"
-        )
+        raise InputError(f"the constraints must admit at least {n} of the candidates looked at, but admitted {scored}")
     both = both.at(np.argsort(both.positions))
     if len(accepted) == 0 and np.isneginf(rejected.key).all():
         return RoiDraw(both.u, both.positions, int(both.positions[-1]) + 1, scored, "even", 0.0)

@@ -48,9 +48,7 @@ class SobolSequence:
 
     def __post_init__(self) -> None:
         if not 1 <= self.dimension <= qmc.Sobol.MAXDIM:
-            raise InputError(
-                f"a Sobol sequence needs 1 <= dimension <= {qmc.Sobol.MAXDIM}, but got {self.dimension}"
-            )
+            raise InputError(f"a Sobol sequence needs 1 <= dimension <= {qmc.Sobol.MAXDIM}, but got {self.dimension}")
 
     def points(self, start: int, stop: int) -> Points:
         """Return the points at positions start, ..., stop - 1, strictly inside the unit cube.
@@ -65,6 +63,7 @@ class SobolSequence:
         Raises:
             InputError: not 0 <= start <= stop <= 2**32.
         """
+        start, stop = int(start), int(stop)  # SciPy takes no NumPy integers
         if not 0 <= start <= stop <= 2**_BITS:
             raise InputError(f"positions must be 0 <= start <= stop <= 2**32, but got [{start}, {stop})")
         if start == stop:

@@ -18,11 +18,11 @@ __all__ = ["KEEP", "Action", "Actor", "Controller", "Scene", "State", "Until", "
 
 
 class Action(NamedTuple):
-    """What an actor does until the next step; None leaves a thing as it is.
+    """What an actor does until the next step; None leaves it as commanded before.
 
-    `acceleration` (m/s^2) or `speed` (m/s, reached at the end of the step), not both; `lane` starts a
-    continuous change to that lane of the edge; `pose` (x, y, heading of the centre) puts the actor
-    there, off the lanes too, and needs `speed` with it.
+    `acceleration` (m/s^2) over the step, or `speed` (m/s) at its end, or both: accelerate until that
+    speed; `lane` starts a continuous change to that lane of the edge; `pose` (x, y, heading of the
+    centre) puts the actor there, off the lanes too, `speed` with it says how fast it is.
     """
 
     acceleration: float | None = None
@@ -31,20 +31,40 @@ class Action(NamedTuple):
     pose: tuple[float, float, float] | None = None
 
 
-KEEP = Action(acceleration=0.0)
-"""Drive on at the same speed."""
+KEEP = Action()
+"""Change nothing: SUMO holds the speed that was commanded last."""
 
 
 class State:
-    """State of one actor now; the object is updated in place, so copy what must be kept."""
+    """State of one actor now; the object is updated in place, so copy what must be kept.
 
-    __slots__ = ("acceleration", "heading", "length", "name", "speed", "width", "x", "y")
+    Attributes:
+        x, y: centre (m).
+        heading: radians, counter-clockwise from +x; `cos` and `sin` are its direction.
+        speed, acceleration: along the heading (m/s, m/s^2).
+        length, width: of the rectangle (m).
+        steered: the speed commanded with a pose (SUMO does not keep it), None for lane-bound actors.
+    """
+
+    __slots__ = ("acceleration", "angle", "cos", "heading", "length", "name", "sin", "speed", "steered", "width", "x", "y")
 
     def __init__(self, name: str, length: float, width: float):
         self.name = name
         self.length = length
         self.width = width
         self.x = self.y = self.heading = self.speed = self.acceleration = 0.0
+        self.cos, self.sin = 1.0, 0.0
+        self.angle = 90.0
+        self.steered: float | None = None
+
+    def place(self, front_x: float, front_y: float, angle: float) -> None:
+        """Take over SUMO's front-bumper position and its angle (degrees clockwise from north)."""
+        if angle != self.angle:
+            self.angle = angle
+            self.heading = math.radians(90.0 - angle)
+            self.cos, self.sin = math.cos(self.heading), math.sin(self.heading)
+        self.x = front_x - 0.5 * self.length * self.cos
+        self.y = front_y - 0.5 * self.length * self.sin
 
 
 class Controller(Protocol):

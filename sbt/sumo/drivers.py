@@ -59,15 +59,16 @@ class AccAeb:
         )
         self._delay = DeadTime(reaction_time)
         self._lag = FirstOrderLag(lag)
-        self._last = 0.0
+        self._last = self._reached = 0.0
         self._braking = False
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the acceleration that the vehicle reaches by now."""
-        demand = self._demand(own, self._sensor(t, own, others))
-        reached = self._lag(self._delay(t, demand), t - self._last)
+        """Return the acceleration over the next step: the mean of the lag's output at its ends."""
+        demand = self._delay(t, self._demand(own, self._sensor(t, own, others)))
+        before = self._reached
+        self._reached = after = self._lag(demand, t - self._last)
         self._last = t
-        return Action(acceleration=reached)
+        return Action(0.5 * (before + after))
 
     def _demand(self, own: State, target: Target | None) -> float:
         """Return the acceleration that ACC and AEB ask for."""
@@ -77,9 +78,8 @@ class AccAeb:
             return _limited(cruise, self._acc_braking, self._acc_accel)
         if self._must_brake(target):
             return -self._aeb_braking
-        wanted = self._distance_min + self._time_gap * own.speed
-        follow = 0.1 * (target.gap - wanted) - 0.6 * target.closing
-        return _limited(min(cruise, follow), self._acc_braking, self._acc_accel)
+        follow = 0.1 * (target.gap - self._distance_min - self._time_gap * own.speed) - 0.6 * target.closing
+        return _limited(follow if follow < cruise else cruise, self._acc_braking, self._acc_accel)
 
     def _must_brake(self, target: Target) -> bool:
         """Return whether AEB brakes; once it does, it goes on until nothing closes in."""
@@ -93,14 +93,16 @@ class AccAeb:
 
 
 def _limited(demand: float, braking: float, accel: float) -> float:
-    return min(max(demand, -braking), accel)
+    if demand < -braking:
+        return -braking
+    return accel if demand > accel else demand
 
 
 class LaneChange:
     """Holds its speed and changes to another lane at once, continuously in SUMO."""
 
     def __init__(self, lane: int):
-        self._first = Action(acceleration=0.0, lane=lane)
+        self._lane = lane
         self._started = False
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
@@ -108,7 +110,7 @@ class LaneChange:
         if self._started:
             return KEEP
         self._started = True
-        return self._first
+        return Action(speed=own.speed, lane=self._lane)
 
 
 class Braking:
@@ -120,11 +122,8 @@ class Braking:
     """
 
     def __init__(self, deceleration: float, final_speed: float):
-        self._deceleration, self._final_speed = deceleration, final_speed
-        self._start: float | None = None
+        self._action = Action(acceleration=-deceleration, speed=final_speed)
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the acceleration over the next step, exact where the final speed is reached in it."""
-        if own.speed <= self._final_speed:
-            return KEEP
-        return Action(acceleration=-self._deceleration)
+        """Return the braking, which ends at the final speed."""
+        return self._action

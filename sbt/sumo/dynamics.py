@@ -18,20 +18,21 @@ class DeadTime:
 
     def __init__(self, delay: float, initial: float = 0.0):
         self._delay = delay
-        self._samples: deque[tuple[float, float]] = deque([(-math.inf, initial)])
+        self._samples: deque[tuple[float, float]] = deque()
+        self._before = (-math.inf, initial)
 
     def __call__(self, t: float, value: float) -> float:
         """Put `value` in at time t and return the value of t - delay; t must not decrease."""
         samples = self._samples
         samples.append((t, value))
-        then = t - self._delay
-        while len(samples) > 1 and samples[1][0] <= then:
-            samples.popleft()
-        before, now = samples[0]
-        if len(samples) == 1 or before == -math.inf:
+        then = t - self._delay + 1e-9
+        while samples and samples[0][0] <= then:
+            self._before = samples.popleft()
+        start, now = self._before
+        if not samples or then - start < 1e-6 or start == -math.inf:
             return now
-        after, following = samples[1]
-        return now + (following - now) * (then - before) / (after - before)
+        end, following = samples[0]
+        return now + (following - now) * (then - start) / (end - start)
 
 
 class FirstOrderLag:
@@ -40,11 +41,12 @@ class FirstOrderLag:
     def __init__(self, constant: float, initial: float = 0.0):
         self._constant = constant
         self._value = initial
+        self._step = self._share = 0.0
 
     def __call__(self, value: float, dt: float) -> float:
         """Return the output after dt seconds of the input `value`."""
-        if self._constant > 0:
-            self._value += (value - self._value) * -math.expm1(-dt / self._constant)
-        else:
-            self._value = value
+        if dt != self._step:
+            self._step = dt
+            self._share = -math.expm1(-dt / self._constant) if self._constant > 0 else 1.0
+        self._value += (value - self._value) * self._share
         return self._value

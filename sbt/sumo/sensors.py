@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -58,19 +57,18 @@ class RangeSensor:
         return self._held
 
     def _measure(self, tick: int, own: State, others: tuple[State, ...]) -> Target | None:
-        cos, sin = math.cos(own.heading), math.sin(own.heading)
+        cos, sin = own.cos, own.sin
         nearest: State | None = None
         smallest = self._reach
         for other in others:
             dx, dy = other.x - own.x, other.y - own.y
             gap = dx * cos + dy * sin - 0.5 * (own.length + other.length)
-            clearance = abs(dy * cos - dx * sin) - 0.5 * (own.width + other.width)
-            if 0.0 <= gap < smallest and clearance < self._margin:
+            if 0.0 <= gap < smallest and abs(dy * cos - dx * sin) - 0.5 * (own.width + other.width) < self._margin:
                 nearest, smallest = other, gap
         if nearest is None:
             return None
         noise = self._draw(tick)
-        speed = nearest.speed * math.cos(nearest.heading - own.heading)
+        speed = nearest.speed * (nearest.cos * cos + nearest.sin * sin)
         closing = own.speed - speed + self._noise[1] * noise[1]
         return Target(max(smallest + self._noise[0] * noise[0], 0.0), closing, own.speed - closing)
 

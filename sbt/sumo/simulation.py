@@ -15,7 +15,7 @@ from sbt.metrics.geometry import contact_index
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.seeds import stream
-from sbt.sumo.actors import Action, Actor, Scene, State
+from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
 from sbt.sumo.ego import Ego
 from sbt.sumo.nets import net_file
 from sbt.sumo.session import ABSENT, Setup, check_options, session
@@ -27,6 +27,7 @@ SceneBuilder = Callable[[Mapping[str, float], Ego, np.random.Generator], Scene]
 DEADLINE_STEPS = 256
 """The wall clock is looked at once in so many steps."""
 _TOLERANCE = 1e-6
+_FASTEST = 1e4
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,19 @@ class SumoSimulation:
             self, ego=chosen, isolations=levels, isolation=isolation,
             step_length=self.step_length if step_length is None else step_length,
         )  # fmt: skip
+
+    def prepare(self) -> None:
+        """Import libsumo and find the network.
+
+        Raises:
+            InputError: there is no such network.
+        """
+        net_file(self.net)
+        session()
+
+    def limited(self, timeout: float | None) -> SumoSimulation:
+        """Return a copy whose runs end as `timeout` after so many wall-clock seconds."""
+        return replace(self, timeout=timeout)
 
     def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
         """Run one concrete scenario.
@@ -138,85 +152,92 @@ def _verify(sumo: Any, scene: Scene) -> None:
 def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
     """Step until something ends the run, recording every state."""
     actors, dt = scene.actors, simulation.step_length
-    vehicle = sumo.vehicle
+    vehicle, step, collisions = sumo.vehicle, sumo.simulation.step, sumo.simulation.getCollidingVehiclesNumber
     states = [State(a.name, a.type.length, a.type.width) for a in actors]
-    others = [tuple(s for s in states if s is not own) for own in states]
     by_name = {s.name: s for s in states}
-    reach = max(math.hypot(s.length, s.width) for s in states)
+    driven = [
+        (a, s, a.driver.act, tuple(o for o in states if o is not s))
+        for a, s in zip(actors, states, strict=True) if a.driver is not None
+    ]  # fmt: skip
     steps = round(simulation.duration / dt)
     deadline = math.inf if simulation.timeout is None else time.monotonic() + simulation.timeout
     rows: list[tuple[float, ...]] = []
     reported: list[str] = []
-    ended = "duration"
     for k in range(steps + 1):
         t = k * dt
-        _observe(vehicle, states, k, dt, actors)
-        rows.append(tuple(v for s in states for v in (s.x, s.y, s.heading, s.speed, s.acceleration)))
-        if sumo.simulation.getCollidingVehiclesNumber():
+        _observe(vehicle, states, rows, dt)
+        if collisions():
             reported += [f"{c.collider}>{c.victim}@{t:.3f}" for c in sumo.simulation.getCollisions()]
-        if _touching(states, rows, reach, dt):
-            ended = "collision"
-            break
+        if _touching(states, rows, dt):
+            return _trace(actors, rows, dt, "collision", reported)
         reason = scene.until(t, by_name) if scene.until is not None else None
         if reason is not None:
-            ended = reason
-            break
-        if k == steps:
-            break
+            return _trace(actors, rows, dt, reason, reported)
         if k % DEADLINE_STEPS == 0 and time.monotonic() > deadline:
             raise RunError(Status.TIMEOUT, f"a run must take at most {simulation.timeout:g} s, but it was at t = {t:g} s")
-        for actor, own, rest in zip(actors, states, others, strict=True):
-            if actor.driver is not None:
-                _apply(vehicle, actor, own, actor.driver.act(t, own, rest), dt)
-        sumo.simulationStep()
-    return _trace(actors, rows, dt, ended, tuple(reported))
+        if k < steps:
+            for actor, own, act, others in driven:
+                action = act(t, own, others)
+                if action is not KEEP:
+                    _apply(vehicle, actor, own, action, dt)
+            step()
+    return _trace(actors, rows, dt, "duration", reported)
 
 
-def _observe(vehicle: Any, states: list[State], k: int, dt: float, actors: tuple[Actor, ...]) -> None:
-    """Read every actor from SUMO: its front bumper and compass angle become centre and heading."""
-    for state, actor in zip(states, actors, strict=True):
+def _observe(vehicle: Any, states: list[State], rows: list[tuple[float, ...]], dt: float) -> None:
+    """Read every actor from SUMO and record it: a row an actor."""
+    first = not rows
+    for state in states:
         name = state.name
         x, y = vehicle.getPosition(name)
         if x == ABSENT:
-            raise RunError(Status.FAILED, f"{name} must stay on the road, but it was gone at t = {k * dt:g} s")
-        heading = math.radians(90.0 - vehicle.getAngle(name))
-        half = 0.5 * state.length
-        speed = vehicle.getSpeed(name)
-        state.x = x - half * math.cos(heading)
-        state.y = y - half * math.sin(heading)
-        state.heading = heading
-        state.acceleration = (speed - state.speed) / dt if k else 0.0
+            raise RunError(Status.FAILED, f"{name} must stay on the road, but it was gone at t = {len(rows) // len(states) * dt:g} s")
+        state.place(x, y, vehicle.getAngle(name))
+        speed = vehicle.getSpeed(name) if state.steered is None else state.steered
+        state.acceleration = 0.0 if first else (speed - state.speed) / dt
         state.speed = speed
+        rows.append((state.x, state.y, state.heading, speed, state.acceleration))
 
 
 def _apply(vehicle: Any, actor: Actor, own: State, action: Action, dt: float) -> None:
     """Hand one action to SUMO; numbers that are not finite end the run."""
     acceleration, speed, lane, pose = action
     if acceleration is not None:
-        speed = max(own.speed + acceleration * dt, 0.0)
+        aim, speed = speed, own.speed + acceleration * dt
+        if aim is not None:
+            speed = max(speed, aim) if acceleration < 0 else min(speed, aim)
+        if speed < 0.0:
+            speed = 0.0
     if speed is not None:
-        if not math.isfinite(speed):
-            raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but got {action}")
+        if not -_FASTEST < speed < _FASTEST:
+            raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
         vehicle.setSpeed(actor.name, speed)
     if lane is not None:
         vehicle.changeLane(actor.name, lane, 3600.0)
     if pose is not None:
-        x, y, heading = pose
-        if not math.isfinite(x + y + heading):
-            raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but got {action}")
-        half = 0.5 * actor.type.length
-        angle = 90.0 - math.degrees(heading)
-        vehicle.moveToXY(actor.name, "", -1, x + half * math.cos(heading), y + half * math.sin(heading), angle, keepRoute=2)
+        _place(vehicle, actor, own, action, speed)
 
 
-def _touching(states: list[State], rows: list[tuple[float, ...]], reach: float, dt: float) -> bool:
-    """Return whether the first actor touched another since the last row (exact test only when near)."""
+def _place(vehicle: Any, actor: Actor, own: State, action: Action, speed: float | None) -> None:
+    """Put an actor on a pose; SUMO loses its speed then, so that it is kept here."""
+    if action.pose is None or not all(math.isfinite(v) for v in action.pose):
+        raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
+    x, y, heading = action.pose
+    own.steered = own.speed if speed is None else speed
+    half = 0.5 * actor.type.length
+    angle = (90.0 - math.degrees(heading)) % 360.0
+    vehicle.moveToXY(actor.name, "", -1, x + half * math.cos(heading), y + half * math.sin(heading), angle, keepRoute=2)
+
+
+def _touching(states: list[State], rows: list[tuple[float, ...]], dt: float) -> bool:
+    """Return whether the first actor, the ego, touched another since the last step (exact test only when near)."""
     ego = states[0]
-    for j, other in enumerate(states[1:], start=1):
-        near = reach + (ego.speed + other.speed) * dt
+    for j in range(1, len(states)):
+        other = states[j]
         dx, dy = other.x - ego.x, other.y - ego.y
+        near = ego.length + other.length + (ego.speed + other.speed) * dt
         if dx * dx + dy * dy < near * near:
-            last = np.array(rows[-2:]).reshape(-1, len(states), 5)
+            last = np.array(rows[-2 * len(states) :]).reshape(-1, len(states), 5)
             if contact_index(_columns(last, 0, ego), _columns(last, j, other)) is not None:
                 return True
     return False
@@ -228,10 +249,11 @@ def _columns(rows: np.ndarray, k: int, state: State) -> ActorTrace:
     return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width)
 
 
-def _trace(actors: tuple[Actor, ...], rows: list[tuple[float, ...]], dt: float, ended: str, reported: tuple[str, ...]) -> Trace:
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(actors), 5)
+def _trace(actors: tuple[Actor, ...], rows: list[tuple[float, ...]], dt: float, ended: str, reported: list[str]) -> Trace:
+    """Return the recorded rows as a trace."""
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(actors), 5)
     x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
     return Trace(
-        np.arange(len(rows)) * dt, tuple(a.name for a in actors), x, y, heading, speed, acceleration,
-        np.array([a.type.length for a in actors]), np.array([a.type.width for a in actors]), ended, reported,
+        np.arange(len(table)) * dt, tuple(a.name for a in actors), x, y, heading, speed, acceleration,
+        np.array([a.type.length for a in actors]), np.array([a.type.width for a in actors]), ended, tuple(reported),
     )  # fmt: skip

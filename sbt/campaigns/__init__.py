@@ -1,0 +1,1 @@
+"""The campaigns: functions that build the stages of one, and what it concludes."""

@@ -1,0 +1,28 @@
+"""Coverage: evenly distributed runs, the baseline of every other campaign and the way data sets are made."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sbt.campaign import Campaign, Fit, Log
+from sbt.campaigns.boundary import validation_of
+from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
+
+__all__ = ["recipe"]
+
+
+def recipe(settings: Settings) -> Campaign:
+    """Return the campaign: one Sobol sequence in batches, a share held out where there is a metamodel.
+
+    The conclusion holds the share of critical runs with its interval and, with a metamodel, its
+    scores on the held-out runs.
+    """
+
+    def conclude(log: Log) -> tuple[dict[str, Any], Fit | None]:
+        conclusion = critical_share(log.history, settings.scenario)
+        belief = settings.learner.fit(log.history) if settings.learner is not None else None
+        if belief is not None:
+            conclusion["validation"] = validation_of(belief.scores)
+        return conclusion, fit_of(belief)
+
+    return Campaign((BatchStage("even", settings, adaptive=False),), conclude)

@@ -1,0 +1,51 @@
+"""The command line `sumo-sbt`; nothing heavy is imported before a verb needs it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from sbt import __version__
+from sbt.cli import campaign, inform, scenario
+from sbt.cli.console import verb
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="sumo-sbt",
+    help="Scenario-based testing of automated vehicles on SUMO.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+for _verb in (
+    campaign.run,
+    scenario.simulate,
+    scenario.check,
+    campaign.status,
+    campaign.report,
+    campaign.export,
+):
+    app.command()(verb(_verb))
+app.command("list")(verb(inform.list_))
+app.command()(verb(inform.schema))
+app.command()(verb(inform.doctor))
+
+
+def _version(value: bool) -> None:
+    if value:
+        print(f"sumo-sbt {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    *,
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
+) -> None:
+    """Scenario-based testing of automated vehicles on SUMO."""
+
+
+def main() -> None:
+    """Run the command line; ends the process."""
+    app(prog_name="sumo-sbt")

@@ -1,0 +1,181 @@
+"""The verbs of a campaign: run, status, report, export."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+from sbt.errors import InputError
+
+__all__ = ["export", "report", "run", "status"]
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign (its store).")]
+
+
+def run(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.yaml", help="Configuration of the campaign.")],
+    *,
+    store: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the results.")] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one key; repeatable.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Worker processes.")] = None,
+    fail_on_critical: Annotated[
+        bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
+) -> None:
+    """Run a campaign, or resume it where it was interrupted."""
+    overrides = list(changes or [])
+    if store is not None:
+        overrides.append(f"store={json.dumps(str(store))}")
+    if workers is not None:
+        overrides.append(f"executor.workers={workers}")
+    try:
+        with clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
+            from sbt.config.load import load
+
+            loaded = load(config, overrides)
+            from sbt.run import run_campaign  # after the configuration, which is wrong more often
+
+            result = run_campaign(loaded, progress=show)
+    except KeyboardInterrupt:
+        raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+    if as_json:
+        print_json(result)
+    else:
+        print("\n".join(conclusion_lines(result)))
+    if fail_on_critical and result["critical"] > 0:
+        raise fail(f"{result['critical']} critical runs", Exit.CRITICAL)
+    if 2 * result["failed"] > result["runs"]:
+        reason = f"at most half of the runs may fail, but {result['failed']} of {result['runs']} did"
+        raise fail(f"{reason}; `sumo-sbt status` and `export` show why", Exit.FAILED_RUNS)
+
+
+def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
+    """Return the result of a campaign (`run --json`) for people."""
+    ended = f", stopped: {result['stopped']}" if result.get("stopped") else ""
+    lines = [
+        f"{result['campaign']} of {result['scenario']}: {result['runs']} runs in {result['iterations']} iterations{ended}",
+        f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}",
+    ]
+    for key, value in result.get("conclusion", {}).items():
+        if isinstance(value, Mapping):
+            lines.append(f"  {key.replace('_', ' ')}")
+            lines += [f"    {name.replace('_', ' '):<24}{_number(item)}" for name, item in value.items()]
+        else:
+            lines.append(f"  {key.replace('_', ' '):<26}{_number(value)}")
+    path = Path(result["store"]) / "report.html"
+    lines.append(f"report: {path}" if path.is_file() else f"store: {result['store']}")
+    return lines
+
+
+def _number(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def status(
+    folder: Folder,
+    *,
+    watch: Annotated[bool, typer.Option("--watch", help="Repeat until the campaign is finished.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Say how far a campaign is, also while it runs."""
+    found = _status(folder)
+    try:
+        while watch and found["conclusion"] is None:
+            if not as_json:
+                print("\n".join(_status_lines(found)), flush=True)
+            time.sleep(2.0)
+            found = _status(folder)
+    except KeyboardInterrupt:
+        pass
+    if as_json:
+        print_json(found)
+    else:
+        print("\n".join(_status_lines(found)))
+
+
+def _status(folder: Path) -> dict[str, Any]:
+    """Return counts, iteration, last validation and conclusion."""
+    from sbt.store import Store
+
+    with clean_stdout(), Store.read(_with_store(folder)) as store:
+        iterations, fits = store.iterations(), store.fits()
+        return {
+            "store": str(folder),
+            "runs": store.counts,
+            "iterations": len(iterations),
+            "stage": iterations[-1]["stage"] if iterations else None,
+            "validation": fits[-1] if fits else None,
+            "conclusion": store.conclusion,
+        }
+
+
+def _status_lines(found: Mapping[str, Any]) -> list[str]:
+    counts = ", ".join(f"{n} {name}" for name, n in sorted(found["runs"].items())) or "none planned"
+    lines = [f"{found['store']}: {counts}; {found['iterations']} iterations"]
+    if found["validation"] is not None:
+        scores = (f"{key} {_number(value)}" for key, value in found["validation"].items() if not isinstance(value, dict | list))
+        lines.append("  validation: " + ", ".join(scores))
+    if found["conclusion"] is None:
+        return [*lines, "  not finished"]
+    return [
+        *lines,
+        *(conclusion_lines(found["conclusion"]) if "campaign" in found["conclusion"] else ["  finished"]),
+    ]
+
+
+def report(folder: Folder) -> None:
+    """Write the report of a campaign again."""
+    with clean_stdout():
+        from sbt.run import rebuild_report
+
+        path = rebuild_report(_with_store(folder))
+    print(path)
+
+
+def export(
+    folder: Folder,
+    *,
+    form: Annotated[str, typer.Option("--format", metavar="csv|parquet", help="Form of the file.")] = "csv",
+) -> None:
+    """Write the runs of a campaign as a table."""
+    import importlib.util
+
+    from sbt.store import Store
+
+    if form == "dsiod":
+        raise InputError("--format dsiod is not in this release; choose csv or parquet")
+    if form not in ("csv", "parquet"):
+        raise InputError(f"--format must be csv or parquet, but got '{form}'")
+    if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise InputError("--format parquet needs pyarrow: pip install 'sumo-sbt[parquet]', or choose csv")
+    with clean_stdout():
+        with Store.read(_with_store(folder)) as store:
+            frame = store.history().to_frame()
+        path = folder / "exports" / f"runs.{form}"
+        path.parent.mkdir(exist_ok=True)
+        part = path.with_suffix(".part")
+        if form == "csv":
+            frame.to_csv(part, index=False)
+        else:
+            frame.to_parquet(part, index=False)
+        part.replace(path)
+    print(path)
+
+
+def _with_store(folder: Path) -> Path:
+    """Return the folder if a campaign is in it."""
+    if not (folder / "campaign.sqlite").is_file():
+        raise InputError(f"DIR must be the folder of a campaign (with campaign.sqlite), but got '{folder}'")
+    return folder

@@ -1,0 +1,183 @@
+"""How the command line speaks: exit codes, errors in one line, a clean stdout, progress on stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import math
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, ParamSpec
+
+import typer
+
+from sbt.errors import InputError, SbtError
+
+if TYPE_CHECKING:
+    from sbt.campaign import Progress
+
+__all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "print_json", "verb"]
+
+P = ParamSpec("P")
+_QUIET_SECONDS = 10.0
+"""Without a terminal, a line of progress appears at most this often within an iteration."""
+
+
+class Exit(IntEnum):
+    """Exit codes, a contract with scripts."""
+
+    DONE = 0
+    INTERNAL = 1
+    INPUT = 2
+    CRITICAL = 3
+    FAILED_RUNS = 4
+    INTERRUPTED = 130
+
+
+def fail(message: str, code: Exit) -> typer.Exit:
+    """Print a message on stderr and return the exception that ends the process with this code."""
+    print(message, file=sys.stderr, flush=True)
+    return typer.Exit(int(code))
+
+
+def verb(function: Callable[P, None]) -> Callable[P, None]:
+    """Return the verb with errors turned into exit codes; SIGTERM is an interruption like Ctrl-C."""
+
+    @functools.wraps(function)
+    def reported(*args: P.args, **kwargs: P.kwargs) -> None:
+        with _terminable():
+            try:
+                function(*args, **kwargs)
+            except (typer.Exit, BrokenPipeError):
+                raise
+            except KeyboardInterrupt:
+                raise fail("interrupted", Exit.INTERRUPTED) from None
+            except Exception as error:
+                if os.environ.get("SBT_DEBUG"):
+                    traceback.print_exc()
+                raise fail(*_verdict(error)) from None
+
+    return reported
+
+
+def _verdict(error: Exception) -> tuple[str, Exit]:
+    """Return what to say of an error, and its exit code."""
+    if isinstance(error, InputError):
+        return str(error), Exit.INPUT
+    if isinstance(error, SbtError):
+        return str(error), Exit.INTERNAL
+    return f"internal error: {type(error).__name__}: {error} (SBT_DEBUG=1 shows where)", Exit.INTERNAL
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not the main thread: somebody else's signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def clean_stdout() -> Iterator[None]:
+    """Send to stderr what anything below prints to stdout: Python, C++ (SUMO) and worker processes."""
+    sys.stdout.flush()
+    try:
+        same = sys.stdout.fileno() == 1
+    except (OSError, ValueError):  # a stream in memory
+        same = False
+    saved = os.dup(1) if same else None
+    try:
+        if same:
+            os.dup2(2, 1)
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        if saved is not None:
+            os.dup2(saved, 1)
+            os.close(saved)
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON object on one line of stdout; NaN and infinity become null."""
+    print(json.dumps(_plain(value), allow_nan=False), flush=True)
+
+
+def _plain(value: Any) -> Any:
+    """Return plain JSON data; scalars of NumPy become Python's."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+class ProgressDisplay:
+    """Progress on stderr: a bar on a terminal, else a line now and then, or nothing.
+
+    Use as a context manager; call it with each `Progress`.
+    """
+
+    def __init__(self, *, silent: bool = False):
+        """Decide how to show."""
+        self._silent = silent
+        self._bar: Any = None
+        self._last = (-1, -math.inf)
+
+    def __enter__(self) -> ProgressDisplay:
+        """Return the display itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the last state of the bar on the screen."""
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, progress: Progress) -> None:
+        """Show a state of the campaign."""
+        if self._silent:
+            return
+        if sys.stderr.isatty():
+            self._on_terminal(progress)
+        else:
+            self._on_line(progress)
+
+    def _on_terminal(self, progress: Progress) -> None:
+        if self._bar is None:
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=progress.budget, initial=progress.done, unit="run", file=sys.stderr)
+        self._bar.set_postfix_str(_counts(progress), refresh=False)
+        self._bar.update(progress.done - self._bar.n)
+        self._bar.refresh()
+
+    def _on_line(self, progress: Progress) -> None:
+        iteration, shown = self._last
+        now = time.monotonic()
+        if progress.iteration == iteration and now - shown < _QUIET_SECONDS and progress.done < progress.budget:
+            return
+        self._last = (progress.iteration, now)
+        line = f"{progress.done}/{progress.budget} runs, iteration {progress.iteration}, {_counts(progress)}"
+        print(line, file=sys.stderr, flush=True)
+
+
+def _counts(progress: Progress) -> str:
+    failed = f", {progress.failed} failed" if progress.failed else ""
+    return f"{progress.critical} critical{failed}, {progress.activity}"

@@ -1,0 +1,90 @@
+"""The verbs that inform: list, schema, doctor."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sbt.cli.console import Exit, clean_stdout, print_json
+from sbt.errors import InputError, PluginError
+
+__all__ = ["doctor", "list_", "schema"]
+
+_KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
+
+
+def list_(
+    kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help=" | ".join(_KINDS))] = None,
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """List what is installed, with a line on each."""
+    if kind is not None and kind not in _KINDS:
+        near = get_close_matches(kind, _KINDS, 1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise InputError(f"KIND must be one of {', '.join(_KINDS)}, but got '{kind}'{hint}")
+    with clean_stdout():
+        found = {each: _entries(each) for each in ([kind] if kind is not None else _KINDS)}
+    if as_json:
+        print_json(found)
+        return
+    for each, entries in found.items():
+        print(f"{each}:" if entries else f"{each}: none installed")
+        for entry in entries:
+            print(f"  {entry['name']:<24}{entry['summary']}".rstrip())
+
+
+def _entries(kind: str) -> list[dict[str, str]]:
+    """Return name and summary of everything of one kind; what cannot be loaded says so."""
+    from sbt.plugins import load, names
+
+    if kind == "campaigns":
+        from sbt.config.model import CAMPAIGNS
+
+        return [{"name": name, "summary": campaign.description} for name, campaign in CAMPAIGNS.items()]
+    entries = []
+    for name in names(kind):
+        try:
+            summary = _summary(load(kind, name))
+        except PluginError as error:
+            summary = f"cannot be loaded: {error}"
+        entries.append({"name": name, "summary": summary})
+    return entries
+
+
+def _summary(thing: Any) -> str:
+    """Return the first line of a description or docstring."""
+    text = getattr(thing, "description", "") or inspect.getdoc(thing) or ""
+    unit = f" ({thing.unit})" if getattr(thing, "unit", "") else ""
+    return (text.strip().splitlines() or [""])[0] + unit
+
+
+def schema() -> None:
+    """Print the JSON schema of configurations, for editors."""
+    from sbt.config.load import schema as configuration_schema
+
+    print(json.dumps(configuration_schema(), indent=2))
+
+
+def doctor(
+    folder: Annotated[Path, typer.Option("--store", metavar="DIR", help="Where results shall go.")] = Path("runs"),
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Look at the environment: versions, SUMO, disk; say what to do where something is amiss."""
+    with clean_stdout():
+        from sbt.cli.doctor import examine
+
+        checks = examine(folder)
+    if as_json:
+        print_json({"ok": all(c.state != "broken" for c in checks), "checks": [vars(c) for c in checks]})
+    else:
+        for c in checks:
+            print(f"{c.state:<8}{c.name:<14}{c.detail}" + (f"; {c.advice}" if c.advice else ""))
+    if any(c.state == "broken" for c in checks):
+        raise typer.Exit(int(Exit.INTERNAL))

@@ -1,0 +1,164 @@
+"""From a checked configuration to the objects of a campaign: scenario, metamodel, acquisition.
+
+Here the rules are checked that need the scenario or a plug-in; all problems are collected and
+raised together, each at the place of the key that is responsible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sbt.acquisition import Acquisition, even
+from sbt.config.load import Loaded
+from sbt.config.model import Choice
+from sbt.config.source import Key, Problems, must_be_one_of
+from sbt.config.space import configured_space
+from sbt.execution.spec import ScenarioSpec
+from sbt.metamodels.base import Metamodel, build
+from sbt.plugins import load
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+
+__all__ = ["Assembly", "acquisition_of", "assemble", "metamodel_of", "scenario_of", "spec_of"]
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """What a configuration asks for, ready to run.
+
+    Attributes:
+        scenario: with the configured inputs and requirement.
+        spec: the same scenario for other processes, as plain data.
+        metamodel: settings, not fitted; None where the campaign learns nothing.
+        acquisition: how much a candidate is worth.
+    """
+
+    scenario: LogicalScenario
+    spec: ScenarioSpec
+    metamodel: Metamodel | None
+    acquisition: Acquisition
+
+
+def assemble(loaded: Loaded) -> Assembly:
+    """Return everything a campaign needs.
+
+    Raises:
+        ConfigError: all problems of the scenario, metamodel and acquisition at once.
+    """
+    problems = Problems(loaded.source)
+    metamodel = _metamodel(loaded, problems)
+    acquisition = _acquisition(loaded, problems)
+    scenario = _scenario(loaded, problems)
+    problems.check()
+    return Assembly(scenario, spec_of(loaded), metamodel, acquisition)
+
+
+def scenario_of(loaded: Loaded) -> LogicalScenario:
+    """Return the scenario with the configured inputs, requirement, ego, step and isolation.
+
+    Raises:
+        ConfigError: all problems of the scenario at once.
+    """
+    return _without_problems(loaded, _scenario)
+
+
+def metamodel_of(loaded: Loaded) -> Metamodel | None:
+    """Return the metamodel's settings, None where the campaign learns nothing.
+
+    Raises:
+        ConfigError: unknown metamodel, preset or setting, or a value it refuses.
+    """
+    return _without_problems(loaded, _metamodel)
+
+
+def acquisition_of(loaded: Loaded) -> Acquisition:
+    """Return the acquisition function.
+
+    Raises:
+        ConfigError: there is no such acquisition.
+    """
+    return _without_problems(loaded, _acquisition)
+
+
+def _without_problems(loaded: Loaded, make: Callable[[Loaded, Problems], T]) -> T:
+    problems = Problems(loaded.source)
+    made = make(loaded, problems)
+    problems.check()
+    return made
+
+
+def spec_of(loaded: Loaded) -> ScenarioSpec:
+    """Return the scenario as plain data for other processes; files are absolute."""
+    config = loaded.config
+    ego = None if config.ego is None else _plain_ego(config.ego, loaded.folder)
+    folder = str(loaded.folder.resolve())
+    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, config.simulation.step_length)
+
+
+def _plain_ego(ego: Choice, folder: Path) -> dict[str, Any]:
+    kind = str(folder.resolve() / Path(ego.kind).expanduser()) if ".py:" in ego.kind else ego.kind
+    return {"kind": kind, **ego.settings}
+
+
+def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
+    """Return the configured scenario, as far as the problems allow; raise them where there is none at all."""
+    config, spec = loaded.config, spec_of(loaded)
+    base = problems.attempt(("scenario",), ScenarioSpec(spec.name, spec.folder).resolve)
+    if base is None:
+        raise problems.error()
+    scenario = base
+    steps: tuple[tuple[Key, ScenarioSpec], ...] = (
+        (("ego",), replace(spec, step_length=None, isolation="auto")),
+        (("simulation", "step_length"), replace(spec, ego=None, isolation="auto")),
+        (("executor", "isolation"), spec),
+    )
+    before = len(problems.found)
+    for path, chosen in steps:
+        if path[0] != "executor" or len(problems.found) == before:
+            scenario = problems.attempt(path, chosen.resolve) or scenario
+    space = configured_space(config, scenario.space, problems)
+    requirement = _requirement(loaded, scenario, problems)
+    return replace(scenario, space=space, requirement=requirement)
+
+
+def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) -> Requirement:
+    """Return the scenario's requirement with the configured metric and interval."""
+    change, own = loaded.config.requirement, scenario.requirement
+    metric = own.metric if change.metric is None else change.metric
+    if metric not in scenario.measured:
+        problems.add(("requirement", "metric"), must_be_one_of("a metric", metric, scenario.measured))
+        return own
+    if change.critical is None and metric != own.metric:
+        problems.add(("requirement",), f"critical: [low, high] is required with the metric {metric}")
+        return own
+    return Requirement(metric, own.critical if change.critical is None else CriticalInterval(*change.critical))
+
+
+def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
+    choice = loaded.config.metamodel
+    if choice is None:
+        return None
+    kind = problems.attempt(("metamodel", "kind"), lambda: load("metamodels", choice.kind, loaded.folder))
+    if kind is None:
+        return None
+    if not isinstance(kind, type) or not callable(getattr(kind, "fit", None)):
+        problems.add(
+            ("metamodel", "kind"),
+            f"a metamodel must be a class with fit(u, y, rng), but '{choice.kind}' is not",
+        )
+        return None
+    made: Metamodel | None = problems.attempt(("metamodel",), lambda: build(kind, choice.preset, choice.settings))
+    return made
+
+
+def _acquisition(loaded: Loaded, problems: Problems) -> Acquisition:
+    kind = loaded.config.acquisition.kind
+    found = problems.attempt(("acquisition", "kind"), lambda: load("acquisitions", kind, loaded.folder))
+    if found is not None and not callable(found):
+        problems.add(("acquisition", "kind"), f"an acquisition must be a function, but '{kind}' is not")
+    return even if found is None else found  # `even` only stands in until the problems are raised

@@ -1,0 +1,113 @@
+"""The scenario's parameter space with the configured inputs, correlation, constraints and features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from sbt.config.model import Choice, Configuration, CorrelationEntry, InputChange
+from sbt.config.source import Key, Problems, must_be_one_of
+from sbt.errors import InputError
+from sbt.problem.distribution import Distribution
+from sbt.problem.expression import Expression
+from sbt.problem.parameter import Parameter
+from sbt.problem.space import ParameterSpace
+
+__all__ = ["configured_space"]
+
+
+def configured_space(config: Configuration, space: ParameterSpace, problems: Problems) -> ParameterSpace:
+    """Return the space with the configured changes; what is wrong with them is added to `problems`."""
+    changed = {p.name: p for p in space.parameters}
+    for name, change in config.inputs.items():
+        if name not in changed:
+            problems.add(("inputs", name), must_be_one_of("an input", name, space.names), at_key=True)
+        else:
+            changed[name] = _parameter(changed[name], change, problems)
+    before = len(problems.found)
+    correlation = _correlation(config.correlation, space, problems)
+    constraints = _expressions("constraints", dict(enumerate(config.constraints)), space, problems)
+    features = dict(space.features) | dict(_expressions("features", config.features, space, problems))
+    if len(problems.found) > before:
+        return space
+    steps: tuple[tuple[str, Mapping[str, Any]], ...] = (
+        ("inputs", {"parameters": tuple(changed.values())}),
+        ("correlation", {"correlation": correlation}),
+        ("constraints", {"constraints": (*space.constraints, *((f.text, f) for _, f in constraints))}),
+        ("features", {"features": tuple(features.items())}),
+    )
+    for key, step in steps:
+        space = problems.attempt((key,), partial(_changed, space, step)) or space
+    return space
+
+
+def _changed(space: ParameterSpace, step: Mapping[str, Any]) -> ParameterSpace:
+    """Return the space with one change, after what it would otherwise check only when it is used."""
+    space = replace(space, **step)
+    if space.constraints:
+        space.feasible_mass  # noqa: B018  (raises where the law gives the constraints no mass)
+    space.metamodel_inputs(np.full((1, space.dimension), 0.5))
+    return space
+
+
+def _parameter(old: Parameter, change: InputChange, problems: Problems) -> Parameter:
+    """Return the input with another range or law."""
+    path: Key = ("inputs", old.name)
+    distribution = old.distribution
+    if change.distribution is not None:
+        law = change.distribution
+        distribution = problems.attempt((*path, "distribution"), lambda: _law(law))
+        if distribution is None:
+            return old
+    low = old.low if change.min is None else change.min
+    high = old.high if change.max is None else change.max
+    return problems.attempt(path, lambda: replace(old, low=low, high=high, distribution=distribution)) or old
+
+
+def _law(choice: Choice) -> Distribution:
+    for name, value in choice.settings.items():
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise InputError(f"a distribution's parameters must be numbers, but got {name}: {value!r}")
+    try:
+        return Distribution.of(choice.kind, **choice.settings)
+    except TypeError as error:
+        raise InputError(f"distribution '{choice.kind}' cannot have the parameters {choice.settings}: {error}") from None
+
+
+def _correlation(
+    entries: tuple[CorrelationEntry, ...], space: ParameterSpace, problems: Problems
+) -> tuple[tuple[float, ...], ...] | None:
+    """Return the scenario's matrix with the configured pairs in it."""
+    if not entries:
+        return space.correlation
+    matrix = np.eye(space.dimension) if space.correlation is None else np.array(space.correlation)
+    seen: set[frozenset[str]] = set()
+    for k, entry in enumerate(entries):
+        path: Key = ("correlation", k, "inputs")
+        unknown = [name for name in entry.inputs if name not in space.names]
+        for name in unknown:
+            problems.add(path, must_be_one_of("an input", name, space.names))
+        pair = frozenset(entry.inputs)
+        if len(pair) < 2 or pair in seen:
+            problems.add(path, f"a correlation needs two inputs, each pair once, but got {', '.join(entry.inputs)}")
+        elif not unknown:
+            a, b = (space.names.index(name) for name in entry.inputs)
+            matrix[a, b] = matrix[b, a] = entry.value
+        seen.add(pair)
+    return tuple(tuple(float(value) for value in row) for row in matrix)
+
+
+def _expressions(key: str, texts: Mapping[Any, str], space: ParameterSpace, problems: Problems) -> list[tuple[Any, Expression]]:
+    """Return the formulas by key, after a check that they use inputs only."""
+    found = [(name, Expression(text)) for name, text in texts.items()]
+    for name, rule in found:
+        for used in rule.names():
+            if used not in space.names:
+                problems.add((key, name), must_be_one_of("a formula's name", used, space.names))
+        if name in space.names:
+            problems.add((key, name), f"a feature must not have the name of an input, but got '{name}'", at_key=True)
+    return found

@@ -1,0 +1,223 @@
+"""Worker processes on this machine: spawned by loky, kept alive, one libsumo each, one thread each.
+
+A worker that dies breaks loky's whole pool, so the recovery is ours: every worker notes which run it
+is at in a file of its own. After a death the runs that were at work are tried again alone; one that
+kills its worker again is `crashed`, all others go on as if nothing had happened. A run that hangs
+inside SUMO cannot be stopped from within (the step holds the interpreter's lock): the driver kills
+exactly that process.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import run_job
+from sbt.problem.outcome import Job, Outcome, Status
+
+__all__ = ["LocalExecutor"]
+
+_MARK = struct.Struct("<qd")
+_IDLE = -1
+_TARGET = 0.05
+"""Runs are handed out in chunks of about so many seconds."""
+_TICK = 0.25
+_GRACE = 2.0
+_THREADS = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
+
+
+class LocalExecutor:
+    """Runs in `workers` processes.
+
+    Args:
+        spec: the scenario; workers resolve it themselves.
+        workers: number of processes.
+        timeout: wall-clock seconds a run may take; None: no limit.
+    """
+
+    def __init__(self, spec: ScenarioSpec, workers: int, timeout: float | None = None):
+        self._spec, self._workers, self._timeout = spec, workers, timeout
+        self._pool: Any = None
+        self._marks: tempfile.TemporaryDirectory[str] | None = None
+        self._seconds = _TARGET
+
+    def __enter__(self) -> Self:
+        """Start the workers and let them load the scenario."""
+        self._marks = tempfile.TemporaryDirectory(prefix="sbt-marks-")
+        self._start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the workers."""
+        self._stop()
+        if self._marks is not None:
+            self._marks.cleanup()
+
+    def _start(self) -> None:
+        from joblib.externals.loky.backend import get_context  # noqa: PLC0415  (only where workers are wanted)
+        from joblib.externals.loky.process_executor import ProcessPoolExecutor  # noqa: PLC0415
+
+        self._pool = ProcessPoolExecutor(max_workers=self._workers, context=get_context("loky"), timeout=None, env=_THREADS)
+        ready = [self._pool.submit(_prepare, self._spec, self._folder, self._workers) for _ in range(self._workers)]
+        wait(ready)
+        for future in ready:
+            if not isinstance(future.exception(), _broken()):
+                future.result()
+
+    def _stop(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, kill_workers=True)
+            self._pool = None
+
+    @property
+    def _folder(self) -> str:
+        if self._marks is None:
+            raise RuntimeError("an executor must be entered before it runs: with executor: ...")
+        return self._marks.name
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Yield one outcome a job as they finish."""
+        queue = deque(jobs)
+        suspects: deque[Job] = deque()
+        while queue or suspects:
+            alone = bool(suspects)
+            missing, dead = yield from self._drain(deque([suspects.popleft()]) if alone else queue)
+            queue = queue if alone else deque()
+            for job in missing:
+                if job.index in dead and (alone or dead[job.index] == Status.TIMEOUT):
+                    yield self._lost(job, dead[job.index])
+                elif job.index in dead or alone:
+                    suspects.append(job)
+                else:
+                    queue.append(job)
+
+    def _lost(self, job: Job, status: Status) -> Outcome:
+        if status == Status.TIMEOUT:
+            return Outcome(job.index, status, {}, f"a run must take at most {self._timeout:g} s: its process was stopped")
+        return Outcome(job.index, status, {}, "the worker process died, also when this run was tried again alone")
+
+    def _drain(self, queue: deque[Job]) -> Any:
+        """Run what is queued; return the jobs that are missing after a death, and who was at work then."""
+        flying: dict[Future[Any], list[Job]] = {}
+        overdue: dict[int, Status] = {}
+        broken = False
+        while (queue or flying) and not broken:
+            while queue and len(flying) < 2 * self._workers and not broken:
+                chunk = self._chunk(queue)
+                try:
+                    flying[self._pool.submit(_run_chunk, self._spec, chunk, self._folder, self._timeout)] = chunk
+                except _broken():
+                    queue.extendleft(reversed(chunk))
+                    broken = True
+            done, _ = wait(flying, timeout=_TICK, return_when=FIRST_COMPLETED)
+            for future in done:
+                if isinstance(future.exception(), _broken()):
+                    broken = True
+                    continue
+                del flying[future]
+                yield from self._measured(future.result())
+            if not done:
+                overdue |= self._kill_overdue()
+        if not broken:
+            return [], {}
+        yield from self._rescued(flying)
+        missing = [job for chunk in flying.values() for job in chunk] + list(queue)
+        dead = {index: Status.CRASHED for index, _, _ in self._at_work()} | overdue
+        self._restart()
+        return missing, dead
+
+    def _rescued(self, flying: dict[Future[Any], list[Job]]) -> Iterator[Outcome]:
+        """Yield what had come back by the time the pool broke."""
+        wait(flying, timeout=5.0)
+        for future in [f for f in flying if f.done() and not f.cancelled() and f.exception() is None]:
+            del flying[future]
+            yield from self._measured(future.result())
+
+    def _measured(self, outcomes: list[Outcome]) -> list[Outcome]:
+        """Note how long runs take, and pass them on."""
+        mean = sum(o.seconds for o in outcomes) / len(outcomes)
+        self._seconds += 0.3 * (mean - self._seconds)
+        return outcomes
+
+    def _chunk(self, queue: deque[Job]) -> list[Job]:
+        """Take so many jobs that a chunk lasts about 50 ms and every worker stays busy to the end."""
+        size = int(_TARGET / max(self._seconds, 1e-4))
+        size = max(1, min(size, 64, len(queue) // (2 * self._workers)))
+        return [queue.popleft() for _ in range(min(size, len(queue)))]
+
+    def _at_work(self) -> list[tuple[int, int, float]]:
+        """Return (index of the run, process, start on the monotonic clock) of every run at work."""
+        found = []
+        for path in Path(self._folder).iterdir():
+            data = path.read_bytes()
+            if len(data) == _MARK.size:
+                index, start = _MARK.unpack(data)
+                if index != _IDLE:
+                    found.append((index, int(path.name), start))
+        return found
+
+    def _kill_overdue(self) -> dict[int, Status]:
+        """Kill the processes whose run is past its time, and say which runs those were."""
+        if self._timeout is None:
+            return {}
+        late = [(i, pid) for i, pid, start in self._at_work() if time.monotonic() - start > self._timeout + _GRACE]
+        for _, pid in late:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        return {index: Status.TIMEOUT for index, _ in late}
+
+    def _restart(self) -> None:
+        self._stop()
+        for path in Path(self._folder).iterdir():
+            path.unlink()
+        self._start()
+
+
+def _broken() -> type[BaseException]:
+    """Return the error of a pool whose worker died."""
+    from joblib.externals.loky.process_executor import BrokenProcessPool  # noqa: PLC0415
+
+    error: type[BaseException] = BrokenProcessPool
+    return error
+
+
+@cache
+def _mark_file(folder: str) -> int:
+    """Open this worker's own note, once."""
+    return os.open(Path(folder) / str(os.getpid()), os.O_CREAT | os.O_WRONLY)
+
+
+def _mark(folder: str, index: int) -> None:
+    os.pwrite(_mark_file(folder), _MARK.pack(index, time.monotonic()), 0)
+
+
+def _prepare(spec: ScenarioSpec, folder: str, workers: int) -> None:
+    """Load the scenario in a worker, and wait until every worker does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
+    spec.resolve().prepare()
+    _mark(folder, _IDLE)
+    deadline = time.monotonic() + 20.0
+    while len(os.listdir(folder)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
+        time.sleep(0.005)
+
+
+def _run_chunk(spec: ScenarioSpec, jobs: list[Job], folder: str, timeout: float | None) -> list[Outcome]:
+    """Run jobs one after the other in a worker, noting which one is at work."""
+    scenario = spec.resolve().limited(timeout)
+    outcomes = []
+    for job in jobs:
+        _mark(folder, job.index)
+        outcomes.append(run_job(scenario, job))
+    _mark(folder, _IDLE)
+    return outcomes

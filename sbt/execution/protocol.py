@@ -1,0 +1,48 @@
+"""What an executor is: jobs in, outcomes out, in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+from typing import Protocol, Self
+
+from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import run_job
+from sbt.problem.outcome import Job, Outcome
+
+__all__ = ["Executor", "SerialExecutor"]
+
+
+class Executor(Protocol):
+    """Runs concrete scenarios; results do not depend on which executor or how many workers."""
+
+    def __enter__(self) -> Self:
+        """Start what is needed, so that the first run costs no more than the others."""
+        ...
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        """Stop it."""
+        ...
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Yield one outcome a job as they finish; a run that fails is an outcome, never an exception."""
+        ...
+
+
+class SerialExecutor:
+    """Runs one after the other in this process: the reference, and for debugging."""
+
+    def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
+        self._scenario = spec.resolve().limited(timeout)
+
+    def __enter__(self) -> Self:
+        """Return the executor."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing."""
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Yield one outcome a job, in order."""
+        for job in jobs:
+            yield run_job(self._scenario, job)

@@ -1,0 +1,206 @@
+"""Figures of the scores: how far to trust the metamodel, and what the campaign gained.
+
+Every function draws data on axes that it is given, and returns them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import betaincinv
+
+from sbt.arrays import Mask, Vector
+from sbt.history import History
+from sbt.problem.requirement import Requirement
+from sbt.report.axes import reach, shade
+from sbt.report.style import CRITICAL, MODEL, UNCRITICAL, label
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = [
+    "PANELS",
+    "binomial_interval",
+    "plot_metric_histogram",
+    "plot_precision_recall",
+    "plot_progress",
+    "plot_reliability",
+    "plot_validation",
+]
+
+PANELS: Mapping[str, tuple[tuple[str, str], ...]] = {
+    "log likelihood a held-out run": (
+        ("log_likelihood", "all"),
+        ("log_likelihood_critical", "critical ones"),
+    ),
+    "RMSE of held-out runs": (("rmse", ""),),
+    "precision on held-out runs": (
+        ("average_precision", "average precision"),
+        ("precision_at_recall_90", "precision at 90 % recall"),
+    ),
+    "calibration error": (("calibration_error", ""),),
+}
+"""The panels of `plot_validation`: label of the ordinate, and (key of a fit, name of the curve) pairs."""
+_CURVE = 400
+"""A curve over the runs is drawn at no more places than this."""
+
+
+def binomial_interval(hits: Vector, n: Vector, confidence: float = 0.95) -> tuple[Vector, Vector]:
+    """Return (m,) lower and (m,) upper ends of the Clopper-Pearson interval of hits/n, n >= 1.
+
+    >>> low, high = binomial_interval(np.array([0.0]), np.array([100.0]))
+    >>> low.tolist(), high.round(4).tolist()
+    ([0.0], [0.0362])
+    """
+    hits, n, tail = np.asarray(hits, float), np.asarray(n, float), (1 - confidence) / 2
+    low = np.where(hits > 0, betaincinv(np.maximum(hits, 0.5), n - hits + 1, tail), 0.0)
+    high = np.where(hits < n, betaincinv(hits + 1, np.maximum(n - hits, 0.5), 1 - tail), 1.0)
+    return low, high
+
+
+def plot_validation(fits: Sequence[Mapping[str, Any]], panel: str, ax: Axes, *, unit: str = "") -> Axes:
+    """Draw one of `PANELS` over the number of runs; fits without the score leave a gap."""
+    runs = np.array([fit["runs"] for fit in fits], dtype=np.float64)
+    for (key, name), look in zip(PANELS[panel], ("o-", "s--"), strict=False):
+        values = np.array([np.nan if fit.get(key) is None else fit[key] for fit in fits], dtype=np.float64)
+        if np.isfinite(values).any():
+            colour = MODEL if look == "o-" else CRITICAL
+            ax.plot(runs, values, look, color=colour, markersize=3.5, linewidth=1.4, label=name or None)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="best")
+    ax.set(xlabel="number of runs", ylabel=label(panel, unit if "RMSE" in panel else ""))
+    if "RMSE" in panel or "error" in panel:
+        ax.set_ylim(bottom=0.0)
+    elif "precision" in panel:
+        ax.set_ylim(-0.03, 1.03)
+    return ax
+
+
+def plot_precision_recall(p: Vector, critical: Mask, ax: Axes) -> Axes:
+    """Draw precision against recall on held-out runs, a star at full recall, the base rate as line.
+
+    Args:
+        p: (n,) P(critical) by the metamodel, or a score that ranks as it does, such as its log odds.
+        critical: (n,) the truth, at least one run critical.
+        ax: where.
+    """
+    from sbt.metamodels.scores import precision_recall
+
+    precision, recall, _ = precision_recall(p, critical)
+    base = float(np.mean(critical))
+    end = int(np.argmax(recall >= 1.0 - 1e-12)) + 1  # beyond full recall, more flags are only more false alarms
+    full = float(precision[end - 1])
+    ax.plot(recall[:end], precision[:end], drawstyle="steps-pre", color=MODEL)
+    ax.axhline(base, color="#777777", linestyle="--", linewidth=1.0, label=f"base rate {base:.3g}")
+    ax.plot(
+        [1.0],
+        [full],
+        "*",
+        color=CRITICAL,
+        markersize=13,
+        clip_on=False,
+        zorder=5,
+        label=f"all critical runs found: precision {full:.2f}",
+    )
+    ax.set(
+        xlabel="recall (share of the critical runs found)",
+        ylabel="precision (share critical of those flagged)",
+    )
+    ax.set(xlim=(0.0, 1.03), ylim=(0.0, 1.03))
+    ax.legend(loc="lower left")
+    return ax
+
+
+def plot_reliability(p: Vector, critical: Mask, ax: Axes, *, bins: int = 10) -> Axes:
+    """Draw how often runs are critical against the probability that the metamodel gave them.
+
+    Bars are 95 % Clopper-Pearson intervals of the frequency; the numbers on top count the runs of the bins.
+    """
+    from sbt.metamodels.scores import reliability
+
+    mean, frequency, count = (np.asarray(column, dtype=np.float64) for column in reliability(p, critical, bins))
+    some = count > 0
+    mean, frequency, count = mean[some], frequency[some], count[some]
+    low, high = binomial_interval(np.round(frequency * count), count)
+    ax.plot([0, 1], [0, 1], color="#777777", linestyle="--", linewidth=1.0, label="perfect calibration")
+    bars = np.stack([np.maximum(frequency - low, 0.0), np.maximum(high - frequency, 0.0)])
+    ax.errorbar(
+        mean,
+        frequency,
+        yerr=bars,
+        fmt="o-",
+        color=MODEL,
+        markersize=5,
+        linewidth=1.2,
+        elinewidth=1.0,
+        capsize=2.5,
+        label="held-out runs",
+    )
+    top = ax.secondary_xaxis("top")
+    top.set_xticks((np.flatnonzero(some) + 0.5) / bins, [f"{int(n):,}" for n in count])
+    top.tick_params(length=0, pad=1)
+    top.set_xlabel("number of runs", fontsize=8.5, color="#444444")
+    top.spines["top"].set_visible(False)
+    ax.set(xlabel="P(critical) by the metamodel", ylabel="share of runs that were critical")
+    ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+    ax.legend(loc="upper left")
+    return ax
+
+
+def plot_metric_histogram(history: History, requirement: Requirement, ax: Axes, *, unit: str = "") -> Axes:
+    """Draw the distribution of the safety metric, the critical interval shaded, held-out runs outlined.
+
+    The middle 99 % of the values and the ends of the critical interval set the range; the outermost
+    bins hold what lies beyond.
+    """
+    chosen, held = history.training.y(requirement.metric), history.held_out.y(requirement.metric)
+    low, high = reach(np.concatenate([chosen, held]), requirement.critical, middle=0.99)
+    edges = np.linspace(low, high, 41).tolist()
+    shade(requirement.critical, (low, high), ax, along="x")
+    if len(chosen):
+        ax.hist(np.clip(chosen, low, high), edges, color=UNCRITICAL, label=f"chosen runs: {len(chosen):,}")
+    if len(held):
+        ax.hist(
+            np.clip(held, low, high),
+            edges,
+            histtype="step",
+            color="black",
+            linewidth=1.2,
+            label=f"held-out runs: {len(held):,}",
+        )
+    ax.set(xlabel=label(requirement.metric, unit), ylabel="number of runs", xlim=(low, high))
+    ax.legend(loc="best")
+    return ax
+
+
+def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
+    """Draw the number of critical runs so far, stacked by stage, and what random runs would have found."""
+    critical = requirement.critical.contains(history.y(requirement.metric))
+    stages = list(dict.fromkeys(history.stage.tolist()))
+    at = np.unique(np.linspace(0, len(history) - 1, _CURVE).round().astype(int))
+    found = [np.cumsum(critical & (history.stage == stage))[at] for stage in stages]
+    shades = ["#1f4e79", "#8fbbe0", "#d96f50", "#f3c9a8", "#777777", "#c9c9c9"]
+    hatches = ["", "//", "", "..", "", "xx"]
+    planned = [int((history.stage == stage).sum()) for stage in stages]
+    names = [f"{stage}: {n[-1]:,} of {all_:,}" for stage, n, all_ in zip(stages, found, planned, strict=True)]
+    bands = ax.stackplot(history.index[at] + 1, *found, labels=[label(n) for n in names], edgecolor="white", linewidth=0.3)
+    for k, band in enumerate(bands):
+        band.set(facecolor=shades[k % 6], hatch=hatches[k % 6])
+    held = history.held_out
+    if len(held):
+        rate = float(requirement.critical.contains(held.y(requirement.metric)).mean())
+        ends = np.array([0, history.index[-1] + 1])
+        ax.plot(
+            ends,
+            rate * ends,
+            color="black",
+            linestyle="--",
+            linewidth=1.2,
+            label=f"all runs at random: {rate * ends[1]:,.0f}",
+        )
+    ax.set(xlabel="number of runs", ylabel="critical runs so far", xlim=(0, history.index[-1] + 1))
+    ax.set_ylim(bottom=0, top=None if critical.any() else 1)
+    ax.legend(loc="upper left")
+    return ax

@@ -1,0 +1,182 @@
+"""Which figures a campaign's rows can fill, drawn, with a caption that says how to read each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sbt.arrays import Vector
+from sbt.problem.space import ParameterSpace
+from sbt.report import curves, figures
+from sbt.report.projection import Predict, log_probability, most_telling_pairs, probability_plane
+from sbt.report.style import figure_style, new_figure, to_svg
+from sbt.report.words import Findings, requirement_words
+
+__all__ = ["Drawing", "draw"]
+
+_MARKERS = "Light circles are uncritical, dark triangles critical, crosses failed; hollow markers are held out."
+
+_MOST_RUNS_ON_MAP = 800
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure as SVG; `wide` ones take the whole width of the page."""
+
+    name: str
+    title: str
+    caption: str
+    svg: str
+    wide: bool = False
+
+
+def draw(
+    found: Findings,
+    space: ParameterSpace,
+    fits: Sequence[Mapping[str, Any]],
+    predict: Predict | None,
+    weights: Vector,
+) -> list[Drawing]:
+    """Return every figure that the campaign can fill by now.
+
+    Args:
+        found: rows and requirement.
+        space: the inputs.
+        fits: scores of the metamodels so far.
+        predict: the last metamodel, None where there is none.
+        weights: (d,) importance of the inputs, to choose which are shown.
+    """
+    with figure_style():
+        drawn = list(_runs(found, space, predict, weights))
+        if predict is not None:
+            drawn += [*_map(found, space, predict, weights), *_held_out(found, space, predict)]
+        drawn += [*_validation(found, fits), *_counts(found)]
+    return drawn
+
+
+def _runs(found: Findings, space: ParameterSpace, predict: Predict | None, weights: Vector) -> Iterator[Drawing]:
+    """Yield the runs in input space: the metric over one input, one plane, or the most telling pairs."""
+    if len(found.history) == 0:
+        return
+    if space.dimension == 1:
+        yield _runs_over_one(found, space, predict)
+        return
+    pairs = most_telling_pairs(weights)
+    columns = min(len(pairs), 3)
+    lines = -(-len(pairs) // columns)
+    figure = new_figure(5.4 if columns == 1 else 11.0, 4.4 if columns == 1 else 0.35 + 3.3 * lines)
+    grid = np.atleast_1d(figure.subplots(lines, columns)).ravel()
+    for ax, pair in zip(grid, pairs, strict=True):
+        figures.plot_runs(found.history, found.requirement, space, ax, pair=pair)
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper center", ncols=3 if columns == 1 else 5)
+    caption = f"Every run. {_MARKERS}"
+    if any(parameter.kind == "integer" for parameter in space.parameters):
+        caption += " Whole-number inputs are spread around their value."
+    if columns > 1:
+        chosen = "all pairs of inputs" if space.dimension == 3 else "the pairs of the four most influential inputs"
+        caption += f" Shown are {chosen}, most influential first; the other inputs vary unseen, so that verdicts overlap."
+    yield Drawing("runs", "Runs in input space", caption, to_svg(figure, "runs"), wide=columns > 1)
+
+
+def _runs_over_one(found: Findings, space: ParameterSpace, predict: Predict | None) -> Drawing:
+    figure = new_figure(5.4, 4.4)
+    ax = figures.plot_metric(found.history, found.requirement, space, figure.subplots(), unit=found.unit)
+    caption = f"The safety metric of every run; shaded where critical. {_MARKERS} Failed runs lie on the floor."
+    if predict is not None:
+        u = np.linspace(0.0, 1.0, 401)[:, None]
+        figures.plot_belief(space.from_unit(u)[:, 0], predict(u), ax)
+        caption += " Line and band: the metamodel's mean and its 5 % to 95 % quantiles."
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return Drawing("runs", "Runs in input space", caption, to_svg(figure, "runs"))
+
+
+def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vector) -> Iterator[Drawing]:
+    """Yield what the metamodel believes about where critical runs are."""
+    pair = (0,) if space.dimension == 1 else (most_telling_pairs(weights)[0] if space.dimension > 2 else (0, 1))
+    plane = probability_plane(predict, found.requirement.critical, space, pair)
+    figure = new_figure(5.4, 4.4)
+    ax = figures.plot_probability(plane, space, figure.subplots())
+    if len(pair) == 2 and space.dimension == 2 and len(found.history):
+        shown = np.unique(np.linspace(0, len(found.history) - 1, _MOST_RUNS_ON_MAP).round())
+        runs = found.history.where(np.isin(np.arange(len(found.history)), shown))
+        figures.plot_runs(runs, found.requirement, space, ax, pair=(0, 1), size=5.0)
+    caption = "The metamodel's probability that a run is critical."
+    if space.dimension == 2 and len(found.history) > _MOST_RUNS_ON_MAP:
+        caption += f" Markers: {_MOST_RUNS_ON_MAP:,} of the runs, evenly spaced over the campaign."
+    if space.dimension > 2:
+        caption += (
+            f" Each value is the mean over {plane.averaged} Sobol points of the other {space.dimension - 2}"
+            f" input{'s' if space.dimension > 3 else ''} in their ranges (marginal P): a middling shade may mean doubt,"
+            " or that the other inputs decide."
+        )
+    if len(pair) == 2:
+        caption += " Solid: P = 0.5" + (", the boundary as the metamodel sees it" if space.dimension == 2 else "")
+        caption += "; dashed: 0.1 and 0.9." + (" The gap between the dashed lines is its doubt." if space.dimension == 2 else "")
+    yield Drawing("probability", "Where critical runs are expected", caption, to_svg(figure, "probability"))
+
+
+def _held_out(found: Findings, space: ParameterSpace, predict: Predict) -> Iterator[Drawing]:
+    """Yield how the last metamodel does on runs it has not seen."""
+    mask = found.held_out
+    if not mask.any():
+        return
+    log_p, log_not = log_probability(predict, found.requirement.critical, space.to_unit(found.history.x[mask]))
+    truth, n = found.critical[mask], int(mask.sum())
+    if truth.any():
+        figure = new_figure(5.4, 4.0)
+        curves.plot_precision_recall(log_p - log_not, truth, figure.subplots())
+        caption = (
+            f"If every run above some P(critical) is flagged, how many critical ones are found (recall), and how many flags are"
+            f" right (precision)? On {n:,} held-out runs, {int(truth.sum()):,} of them critical. Up and to the right is better;"
+            " dashed: flagging everything."
+        )
+        yield Drawing("precision_recall", "Finding critical runs", caption, to_svg(figure, "precision_recall"))
+    figure = new_figure(5.4, 4.0)
+    curves.plot_reliability(np.exp(log_p), truth, figure.subplots())
+    caption = (
+        f"Of the held-out runs with a given P(critical), how many were critical? On the dashed line, P can be read as a"
+        f" probability; below it the metamodel warns too often, above it too seldom. Bars: 95 % intervals; numbers on top: runs"
+        f" in the bin, {n:,} in all."
+    )
+    yield Drawing("reliability", "Calibration", caption, to_svg(figure, "reliability"))
+
+
+def _validation(found: Findings, fits: Sequence[Mapping[str, Any]]) -> Iterator[Drawing]:
+    """Yield the scores over the campaign."""
+    panels = [
+        panel for panel, lines in curves.PANELS.items()
+        if any(fit.get(key) is not None for fit in fits for key, _ in lines)
+    ]  # fmt: skip
+    if not panels:
+        return
+    figure = new_figure(11.0, 2.9)
+    for panel, ax in zip(panels, np.atleast_1d(figure.subplots(1, len(panels))), strict=True):
+        curves.plot_validation(fits, panel, ax, unit=found.unit)
+    caption = (
+        "Scores on held-out runs after each fit. Likelihood, average precision and precision should rise, RMSE and calibration"
+        " error fall. Curves that are still moving at the right end ask for more runs."
+    )
+    yield Drawing("validation", "The metamodel over the campaign", caption, to_svg(figure, "validation"), wide=True)
+
+
+def _counts(found: Findings) -> Iterator[Drawing]:
+    """Yield the distribution of the metric and the critical runs found so far."""
+    if not found.history.ok.any():
+        return
+    figure = new_figure(5.4, 3.7)
+    curves.plot_metric_histogram(found.history, found.requirement, figure.subplots(), unit=found.unit)
+    caption = (
+        f"The safety metric; shaded where critical ({requirement_words(found.requirement, found.unit)}). Held-out runs are"
+        " random, the others were chosen. The outermost bins hold what lies beyond."
+    )
+    yield Drawing("metric", f"Distribution of {found.requirement.metric}", caption, to_svg(figure, "metric"))
+    figure = new_figure(5.4, 3.7)
+    curves.plot_progress(found.history, found.requirement, figure.subplots())
+    caption = (
+        "Critical runs found so far, by the stage that asked for them. Dashed: how many the same number of random runs would have"
+        " found, by the share among the held-out ones. A slope above it is what choosing runs gains."
+    )
+    yield Drawing("progress", "Critical runs over the campaign", caption, to_svg(figure, "progress"))

@@ -1,0 +1,152 @@
+"""One self-contained page a campaign: what was asked, what was found, how far to trust it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import tempfile
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from sbt.problem.scenario import LogicalScenario
+from sbt.report.gallery import Drawing, draw
+from sbt.report.projection import Predict, influence, influence_from_runs
+from sbt.report.tables import critical_table, failed_table, input_table, iteration_table
+from sbt.report.words import NOTHING, SCORES, Findings, conclusion_sentences, number, requirement_words, warnings_for
+from sbt.store import Store
+
+__all__ = ["REPORT", "write_report"]
+
+REPORT = "report.html"
+
+
+def write_report(store: Store, scenario: LogicalScenario, predict: Predict | None, *, folder: Path | None = None) -> Path:
+    """Write `report.html` and `figures/*.svg`; works at any moment of a campaign, and gives the same bytes twice.
+
+    Args:
+        store: open for reading or writing.
+        scenario: as the campaign ran it, with the campaign's inputs and requirement.
+        predict: the last metamodel as a function of (n, d) points of the unit cube; None: no metamodel.
+        folder: where to write; None: the store's folder.
+
+    Returns:
+        The path of the page.
+    """
+    target = Path(folder) if folder is not None else store.folder
+    found, fits = Findings.of(store, scenario), store.fits()
+    weights = None if predict is None else influence(predict, scenario.requirement.critical, scenario.space.dimension)
+    order = weights if weights is not None and weights.any() else influence_from_runs(found.history, scenario.requirement)
+    drawings = draw(found, scenario.space, fits, predict, order)
+    (target / "figures").mkdir(parents=True, exist_ok=True)
+    for drawing in drawings:
+        _replace(target / "figures" / f"{drawing.name}.svg", drawing.svg)
+    reference = str(found.configuration.get("scenario", scenario.name))
+    page = _render({
+        "title": _title(scenario),
+        "description": "\n".join(scenario.description.strip().splitlines()[1:]).strip(),
+        "facts": _facts(found, scenario, store),
+        "conclusion": conclusion_sentences(found),
+        "warnings": warnings_for(found),
+        "scores": _scores(found),
+        "drawings": [_inline(drawing) for drawing in drawings],
+        "inputs": input_table(scenario, weights),
+        "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement),
+        "critical": critical_table(found.history, scenario.requirement, reference),
+        "failed": failed_table(found.history, reference),
+        "ego": found.configuration.get("ego"),
+        "commands": _commands(found, store),
+        "configuration": json.dumps(found.configuration, indent=2, ensure_ascii=False),
+    })  # fmt: skip
+    _replace(target / REPORT, page)
+    return target / REPORT
+
+
+def _render(values: Mapping[str, Any]) -> str:
+    import jinja2
+
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(files("sbt.report").joinpath("template.html").read_text(encoding="utf-8"))
+    return template.render(values)
+
+
+def _inline(drawing: Drawing) -> dict[str, Any]:
+    """Return a drawing for the template; its SVG, without the XML prologue, is the only text not escaped."""
+    import markupsafe
+
+    svg = drawing.svg[drawing.svg.index("<svg ") :]
+    svg = svg.replace("<svg ", f'<svg role="img" aria-label="{markupsafe.escape(drawing.title)}" ', 1)
+    return {
+        "name": drawing.name,
+        "title": drawing.title,
+        "caption": drawing.caption,
+        "wide": drawing.wide,
+        "svg": markupsafe.Markup(svg),
+    }
+
+
+def _title(scenario: LogicalScenario) -> str:
+    lines = scenario.description.strip().splitlines()
+    return lines[0].rstrip(".") if lines else scenario.name
+
+
+def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tuple[str, str]]:
+    """Return the header: names and values."""
+    history, configuration = found.history, found.configuration
+    failed, planned = int((~history.ok).sum()), found.planned
+    runs = f"{len(history):,} done, {int(found.critical.sum()):,} critical, {failed:,} failed"
+    return [
+        ("campaign", str(configuration.get("campaign", NOTHING))),
+        ("scenario", str(configuration.get("scenario", scenario.name))),
+        ("critical if", requirement_words(found.requirement, found.unit)),
+        ("runs", runs + (f", {planned:,} planned" if planned else "")),
+        ("seed", str(configuration.get("seed", NOTHING))),
+        ("store", store.folder.name),
+        ("time", _time(found)),
+        ("versions", " | ".join(sorted({r.versions for r in history.records if r.versions})[:5]) or NOTHING),
+    ]
+
+
+def _time(found: Findings) -> str:
+    simulated = f"{_duration(sum(r.seconds for r in found.history.records))} of simulation, summed over workers"
+    spent = found.conclusion.get("seconds") or {}
+    other = [f"{name} {_duration(spent[name])}" for name in ("fit", "propose") if spent.get(name) is not None]
+    return ", ".join([simulated, *other])
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration for people."""
+    if seconds < 120:
+        return f"{seconds:.3g} s"
+    return f"{seconds / 60:.3g} min" if seconds < 7200 else f"{seconds / 3600:.3g} h"
+
+
+def _scores(found: Findings) -> list[tuple[str, str]]:
+    """Return the scores of the last metamodel on held-out runs."""
+    given = [(SCORES[key], number(found.scores[key], 3)) for key in SCORES if found.scores.get(key) is not None]
+    counts = (("held-out runs", "n"), ("critical among them", "n_critical"))
+    return given and given + [(name, number(found.scores[key])) for name, key in counts if found.scores.get(key) is not None]
+
+
+def _commands(found: Findings, store: Store) -> dict[str, str]:
+    folder = str(found.configuration.get("store") or store.folder.name)
+    return {
+        "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml"]),
+        "replay": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN",
+        "export": shlex.join(["sumo-sbt", "export", folder, "--format", "csv"]),
+    }
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file whole or not at all: a reader may have it open."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

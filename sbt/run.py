@@ -1,0 +1,175 @@
+"""Runs a configured campaign from its first run to its report, or resumes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sbt import plugins
+from sbt.campaign import Campaign, Progress, run_stages
+from sbt.campaigns.parts import Settings
+from sbt.errors import InputError
+from sbt.execution.local import LocalExecutor
+from sbt.execution.protocol import Executor, SerialExecutor
+from sbt.execution.spec import ScenarioSpec
+from sbt.learner import Learner
+from sbt.problem.outcome import Status
+from sbt.store import DATABASE, Store
+
+if TYPE_CHECKING:
+    from sbt.config.assemble import Assembly
+    from sbt.config.load import Loaded
+    from sbt.config.model import Configuration
+
+__all__ = ["rebuild_report", "run_campaign"]
+
+_RESOLVED = "config.resolved.yaml"
+_MAY_CHANGE = {"budget", "folder", "yaml"}
+
+
+def run_campaign(
+    loaded: Loaded, *, progress: Callable[[Progress], None] | None = None, report: bool = True
+) -> dict[str, Any]:
+    """Run a campaign to its end, or go on where the store stopped.
+
+    Args:
+        loaded: a checked configuration.
+        progress: called after every run.
+        report: write `report.html` in the end.
+
+    Returns:
+        What `run --json` prints: campaign, scenario, store, runs, ok, failed, critical, iterations,
+        stopped, seconds, conclusion.
+
+    Raises:
+        InputError: the configuration does not fit the scenario, or the store belongs to another one.
+        StoreError: the store cannot be written.
+    """
+    from sbt.config.load import dump, resumed  # noqa: PLC0415
+
+    folder = Path(loaded.config.store)
+    loaded = replace(loaded, config=resumed(loaded.config, _stored(folder)))
+    config = loaded.config
+    parts = assembly_of(loaded)
+    settings = settings_of(loaded, parts)
+    campaign: Campaign = plugins.load("campaigns", config.campaign)(settings)
+    kept = _kept(loaded, settings)
+    with Store.open(folder, kept) as store:
+        _check_same(store, kept)
+        store.update_configuration(kept)
+        _write_text(folder / _RESOLVED, dump(config))
+        with _executor(config, parts.spec) as executor:
+            stopped, conclusion, seconds = run_stages(
+                campaign, store, executor, seed=config.seed, budget=config.budget + config.validation.reference,
+                requirement=settings.scenario.requirement, versions=_versions(), listener=progress or (lambda _: None),
+            )  # fmt: skip
+        result = _result(store, settings, config, stopped, conclusion, seconds)
+        store.conclude(result)
+        if report:
+            _report(store, settings)
+    return result
+
+
+def assembly_of(loaded: Loaded) -> Assembly:
+    """Return the objects that a configuration names."""
+    from sbt.config.assemble import assemble  # noqa: PLC0415
+
+    return assemble(loaded)
+
+
+def _stored(folder: Path) -> dict[str, Any]:
+    """Return the configuration of the store that is there, empty without one."""
+    if not (folder / DATABASE).is_file():
+        return {}
+    with Store.read(folder) as store:
+        return store.configuration
+
+
+def _kept(loaded: Loaded, settings: Settings) -> dict[str, Any]:
+    """Return what the store remembers of a configuration: plain JSON, and the YAML to read back."""
+    from sbt.config.load import dump, fingerprint  # noqa: PLC0415
+
+    return {
+        **fingerprint(loaded.config), "budget": loaded.config.budget, "names": list(settings.scenario.space.names),
+        "folder": str(Path(loaded.folder).resolve()), "yaml": dump(loaded.config),
+    }  # fmt: skip
+
+
+def settings_of(loaded: Loaded, parts: Assembly) -> Settings:
+    """Return what the campaigns are built from."""
+    config = loaded.config
+    learner = None if parts.metamodel is None else Learner(parts.scenario, parts.metamodel, config.seed)
+    return Settings(
+        parts.scenario, config.seed, config.budget, config.initial, config.batch,
+        config.validation.share if learner is not None else 0.0, config.validation.reference, learner,
+        parts.acquisition, config.stop.stable,
+    )  # fmt: skip
+
+
+def rebuild_report(folder: Path) -> Path:
+    """Write the report of a store again, also while its campaign runs.
+
+    Raises:
+        StoreError: the folder holds no campaign.
+    """
+    from sbt.config.load import parse  # noqa: PLC0415
+
+    with Store.read(folder) as store:
+        kept = store.configuration
+        loaded = parse(kept["yaml"], name=str(Path(folder) / _RESOLVED), folder=Path(kept["folder"]))
+        return _report(store, settings_of(loaded, assembly_of(loaded)))
+
+
+def _report(store: Store, settings: Settings) -> Path:
+    from sbt.report.html import write_report  # noqa: PLC0415
+
+    belief = settings.learner.fit(store.history()) if settings.learner is not None else None
+    return write_report(store, settings.scenario, None if belief is None else belief.predict)
+
+
+def _executor(config: Configuration, spec: ScenarioSpec) -> Executor:
+    choice = config.executor
+    limit = None if choice.timeout == float("inf") else choice.timeout
+    if choice.kind == "serial":
+        return SerialExecutor(spec, limit)
+    return LocalExecutor(spec, choice.workers, limit)
+
+
+def _check_same(store: Store, kept: Mapping[str, Any]) -> None:
+    """Refuse to go on with a store that another configuration made.
+
+    Only the budget may change, and where runs are executed.
+    """
+    before = store.configuration
+    changed = sorted(key for key in {*kept, *before} - _MAY_CHANGE if kept.get(key) != before.get(key))
+    if changed:
+        told = "; ".join(f"{key}: {before.get(key)} there, {kept.get(key)} now" for key in changed)
+        raise InputError(f"a store belongs to one configuration, but {store.folder} was made with another ({told})")
+
+
+def _result(
+    store: Store, settings: Settings, config: Configuration, stopped: str, conclusion: Mapping[str, Any],
+    seconds: Mapping[str, float],
+) -> dict[str, Any]:  # fmt: skip
+    history = store.history()
+    ok = int(history.ok.sum())
+    critical = settings.scenario.requirement.critical.contains(history.y(settings.scenario.requirement.metric))
+    return {
+        "campaign": config.campaign, "scenario": config.scenario, "store": str(store.folder), "runs": len(history),
+        "ok": ok, "failed": len(history) - ok, "critical": int(critical.sum()), "iterations": len(store.iterations()),
+        "stopped": stopped, "seconds": {k: round(v, 4) for k, v in seconds.items()}, "conclusion": dict(conclusion),
+    }  # fmt: skip
+
+
+def _versions() -> str:
+    return f"sbt {version('sumo-sbt')}, libsumo {version('libsumo')}"
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Write a file as a whole or not at all."""
+    part = path.with_suffix(".part")
+    part.write_text(text)
+    part.replace(path)

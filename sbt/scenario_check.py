@@ -1,0 +1,204 @@
+"""The contract of a scenario, tried out: what `sumo-sbt check` proves before a campaign relies on it."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+
+import numpy as np
+
+from sbt.errors import InputError, RunError
+from sbt.execution.spec import ScenarioSpec
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.problem.trace import Trace
+from sbt.seeds import run_seed
+
+__all__ = ["Finding", "check_scenario"]
+
+_CORNERS_UP_TO = 4
+"""With more inputs than this, every input goes to its ends alone instead of all 2^d corners."""
+_WORKER_DEADLINE = 300.0
+"""Longest wait (s) for the worker process."""
+
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One rule of the contract, whether it holds, and what was seen."""
+
+    rule: str
+    ok: bool
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One run as plain data: its metrics, a digest of its trace, or the reason why there are none."""
+
+    metrics: tuple[tuple[str, float], ...] = ()
+    digest: str = ""
+    problem: str = ""
+
+
+def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | None = None) -> tuple[Finding, ...]:
+    """Run a scenario at its centre and corners and compare repetitions, processes and isolation levels.
+
+    Args:
+        spec: the scenario, as workers get it.
+        seed: of the runs.
+        scenario: the configured scenario, where its ranges or requirement differ from those of `spec`.
+
+    Returns:
+        One finding a rule; the last, whether both sides of the requirement were met, is only information.
+
+    Raises:
+        InputError: the scenario cannot be loaded.
+    """
+    asked = scenario if scenario is not None else spec.resolve()
+    points = list(_points(asked.space))
+    jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
+    first = _runs(spec, jobs)
+    findings = [_all_ok(first, points), _finite(first, asked)]
+    if not findings[0].ok:
+        return tuple(findings)
+    again = _runs(spec, jobs[::-1])[::-1]
+    findings.append(_equal("same seed, same trace", first, again, points))
+    findings.append(_in_worker(spec, jobs, first, points))
+    findings += _isolations(spec, jobs, points)
+    findings.append(_sides(first, asked))
+    return tuple(findings)
+
+
+def _points(space: ParameterSpace) -> Iterator[dict[str, float]]:
+    """Yield the centre and the corners that satisfy the constraints."""
+    centre = {p.name: p.centre for p in space.parameters}
+    ends = [p.bounds for p in space.parameters]
+    if space.dimension <= _CORNERS_UP_TO:
+        corners = [dict(zip(space.names, corner, strict=True)) for corner in itertools.product(*ends)]
+    else:
+        corners = [{**centre, p.name: end} for p in space.parameters for end in p.bounds]
+    for values in (centre, *corners):
+        if bool(space.feasible(np.array([[values[name] for name in space.names]]))[0]):
+            yield values
+
+
+def _runs(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run]:
+    """Return the runs of these values and seeds, in this order, in this process."""
+    scenario = spec.resolve()
+    return [_run(scenario, values, seed) for values, seed in jobs]
+
+
+def _run(scenario: LogicalScenario, values: Values, seed: int) -> _Run:
+    """Return one run; whatever the user's code raises is its problem, not ours."""
+    try:
+        if scenario.simulate is None:
+            return _Run(tuple(scenario.run(values, seed).items()))
+        trace = scenario.simulate(values, seed)
+        return _Run(tuple(scenario.measure(trace).items()), _digest(trace))
+    except RunError as error:
+        return _Run(problem=f"{error.status}: {error.reason}")
+    except Exception as error:
+        return _Run(problem=f"failed: {type(error).__name__}: {error}")
+
+
+def _digest(trace: Trace) -> str:
+    """Return a digest of every number and name in a trace."""
+    columns = (
+        trace.time,
+        trace.x,
+        trace.y,
+        trace.heading,
+        trace.speed,
+        trace.acceleration,
+        trace.length,
+        trace.width,
+    )
+    digest = hashlib.blake2b("/".join(trace.actors).encode(), digest_size=16)
+    for column in columns:
+        digest.update(np.ascontiguousarray(column, dtype=np.float64).tobytes())
+    return digest.hexdigest()
+
+
+def _all_ok(runs: list[_Run], points: list[dict[str, float]]) -> Finding:
+    bad = [f"at {_at(p)}: {r.problem}" for r, p in zip(runs, points, strict=True) if r.problem]
+    detail = f"{len(bad)} of {len(runs)} failed; {bad[0]}" if bad else f"{len(runs)} runs"
+    return Finding("centre and corners run", not bad and bool(runs), detail)
+
+
+def _finite(runs: list[_Run], scenario: LogicalScenario) -> Finding:
+    """Return whether every run gives every declared metric, finite."""
+    for run in (r for r in runs if not r.problem):
+        metrics = dict(run.metrics)
+        missing = [name for name in scenario.measured if not math.isfinite(metrics.get(name, math.nan))]
+        if missing:
+            return Finding("metrics are finite", ok=False, detail=f"no finite {', '.join(missing)}, but got {metrics}")
+    return Finding("metrics are finite", ok=True, detail=", ".join(scenario.measured))
+
+
+def _equal(rule: str, first: list[_Run], second: list[_Run], points: list[dict[str, float]]) -> Finding:
+    """Return whether two series are bit-equal, and where they are not."""
+    for a, b, values in zip(first, second, points, strict=True):
+        if a != b:
+            differ = [f"{n} {x!r} and {y!r}" for (n, x), (_, y) in zip(a.metrics, b.metrics, strict=False) if x != y]
+            what = b.problem or a.problem or "; ".join(differ) or "the traces differ, their metrics do not"
+            return Finding(rule, ok=False, detail=f"at {_at(values)}: {what}")
+    return Finding(rule, ok=True, detail=f"{len(first)} runs bit-equal")
+
+
+def _in_worker(
+    spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], first: list[_Run], points: list[dict[str, float]]
+) -> Finding:
+    """Return whether a spawned process, which gets plain data only, gives the same."""
+    rule = "same seed, same trace in a worker process"
+    pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+    try:
+        return _equal(rule, first, pool.submit(_runs, spec, jobs).result(_WORKER_DEADLINE), points)
+    except BrokenProcessPool:
+        return Finding(rule, ok=False, detail="the worker process died")
+    except TimeoutError:
+        return Finding(rule, ok=False, detail=f"the worker process gave no answer within {_WORKER_DEADLINE:g} s")
+    except (InputError, OSError) as error:
+        return Finding(rule, ok=False, detail=str(error))
+    finally:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: list[dict[str, float]]) -> list[Finding]:
+    """Return, for every allowed isolation level but `fresh`, whether it is bit-equal to `fresh`.
+
+    The kept simulation runs the jobs in another order, and twice, so that each follows different ones.
+    """
+    levels = spec.resolve().isolations
+    if not set(levels) - {"fresh"}:
+        return []
+    fresh = _runs(replace(spec, isolation="fresh"), jobs)
+    order = [*range(0, len(jobs), 2), *range(1, len(jobs), 2), *range(len(jobs))[::-1]]
+    findings = []
+    for level in levels:
+        if level != "fresh":
+            kept = _runs(replace(spec, isolation=level), [jobs[k] for k in order])
+            expected, at = [fresh[k] for k in order], [points[k] for k in order]
+            findings.append(_equal(f"isolation {level} = fresh", expected, kept, at))
+    return findings
+
+
+def _sides(runs: list[_Run], scenario: LogicalScenario) -> Finding:
+    y = np.array([dict(run.metrics)[scenario.requirement.metric] for run in runs])
+    critical = int(scenario.requirement.critical.contains(y).sum())
+    low, high = scenario.requirement.critical.low, scenario.requirement.critical.high
+    detail = f"{critical} of {len(runs)} critical by {scenario.requirement.metric} in [{low:g}, {high:g}]"
+    return Finding("for information: both sides of the requirement", ok=True, detail=detail)
+
+
+def _at(values: Values) -> str:
+    return ", ".join(f"{name}={value:g}" for name, value in values.items())

@@ -1,0 +1,217 @@
+"""Contract checks for plug-ins: call them from your own tests, or through `sumo-sbt check`.
+
+Each check runs the laws that campaigns rely on and raises `ContractError` with the rule and the value
+that broke it; it returns nothing where all hold.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbt.acquisition import Acquisition
+from sbt.arrays import Points, Vector
+from sbt.errors import SbtError
+from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.prediction import Prediction
+from sbt.problem.requirement import CriticalInterval
+from sbt.seeds import stream
+
+__all__ = ["ContractError", "check_acquisition", "check_metamodel", "check_sampler"]
+
+_INTERVALS = (
+    CriticalInterval(high=0.0),
+    CriticalInterval(low=1.0),
+    CriticalInterval(-0.5, 0.5),
+    CriticalInterval(high=-1e6),
+)
+
+
+class ContractError(SbtError, AssertionError):
+    """A plug-in breaks a law that campaigns rely on."""
+
+
+def check_metamodel(metamodel: Metamodel, *, dimensions: tuple[int, ...] = (1, 2, 7), seed: int = 0) -> None:
+    """Check a metamodel against the laws that campaigns rely on.
+
+    Shapes and finiteness; sigma > 0; the same rng gives the same bits; the order of rows, the scale and
+    the shift of y hardly matter; few rows, constant y, duplicates and an outlier are survived; a belief
+    at a point does not depend on the other points asked about; predictors can be pickled; a smooth
+    function is learned better than by its mean.
+
+    Args:
+        metamodel: settings with `fit`.
+        dimensions: numbers of inputs to try.
+        seed: seed >= 0 of the rows and of the fits.
+
+    Raises:
+        ContractError: a law is broken.
+    """
+    for d in dimensions:
+        rng = stream(seed, "check_metamodel", d)
+        u, asked = rng.random((30 + 10 * d, d)), rng.random((25, d))
+        y = _smooth(u)
+
+        def fit(u: Points, y: Vector, d: int = d) -> Predictor:
+            return metamodel.fit(u.copy(), y.copy(), stream(seed, "check_metamodel", "fit", d))
+
+        predictor = fit(u, y)
+        belief = predictor(asked)
+        _check_belief(belief, len(asked), f"d = {d}")
+        _check_predictor(predictor, fit(u, y), asked, belief)
+        _check_learning(predictor, u, y, asked)
+        _check_rows(fit, u, y, asked, belief)
+        _check_awkward_rows(fit, u, y, asked)
+
+
+def check_acquisition(acquisition: Acquisition, *, seed: int = 0) -> None:
+    """Check an acquisition function: (n,) scores without NaN, each from its own point alone.
+
+    Args:
+        acquisition: (prediction, critical, log_density) -> (n,) log scores.
+        seed: seed >= 0 of the beliefs.
+
+    Raises:
+        ContractError: a law is broken.
+    """
+    rng = stream(seed, "check_acquisition")
+    n, k = 20, 3
+    mean = rng.normal(0.0, 5.0, (k, n))
+    mean[:, :2] = 1e6, -1e6  # certain points
+    mixture = Prediction(mean, rng.uniform(0.1, 2.0, (k, n)), np.full(k, 1 / k), np.full(n, 0.05))
+    gaussian = Prediction.gaussian(mixture.mu, mixture.sigma, mixture.noise)
+    log_density = rng.normal(0.0, 3.0, n)
+    order = rng.permutation(n)
+    for critical in _INTERVALS:
+        for belief in (gaussian, mixture):
+            score = np.asarray(acquisition(belief, critical, log_density))
+            _require(score.shape == (n,), "an acquisition must return shape (n,)", f"{score.shape} for {n} points")
+            _require(not np.isnan(score).any(), "an acquisition must not return NaN", f"NaN for {critical}")
+            _require(not np.isposinf(score).any(), "an acquisition must be < inf", f"inf for {critical}")
+            permuted = acquisition(belief.take(order), critical, log_density[order])
+            _close(permuted, score[order], 1e-9, "an acquisition must not depend on the order of the points")
+            one = [acquisition(belief.take(np.array([i])), critical, log_density[[i]])[0] for i in range(n)]
+            _close(np.array(one), score, 1e-9, "a score must not depend on the other points scored")
+    nothing = acquisition(gaussian.take(slice(0)), _INTERVALS[0], log_density[:0])
+    _require(np.shape(nothing) == (0,), "an acquisition must take n = 0 points", f"shape {np.shape(nothing)}")
+
+
+def check_sampler(propose: Callable[[int, int], Points], *, dimension: int, seed: int = 0) -> None:
+    """Check a sampler: (n, d) distinct points in the unit cube that depend on the seed only.
+
+    Args:
+        propose: (n, seed) -> (n, d) points; wrap a sampler with a fixed history in a function.
+        dimension: number of inputs d.
+        seed: seed >= 0 to propose with.
+
+    Raises:
+        ContractError: a law is broken.
+    """
+    for n in (0, 1, 7, 64):
+        points = np.asarray(propose(n, seed))
+        shape = (n, dimension)
+        _require(points.shape == shape, f"a sampler must return shape {shape}", str(points.shape))
+        inside = np.isfinite(points).all() and ((points >= 0) & (points <= 1)).all()
+        _require(bool(inside), "a sampler must return points in the unit cube", f"{points.min(initial=0)} to "
+                 f"{points.max(initial=0)}")  # fmt: skip
+        distinct = len(np.unique(points, axis=0))
+        _require(distinct == n, "a sampler must return distinct points", f"{distinct} of {n}")
+        again = np.array_equal(points, np.asarray(propose(n, seed)))
+        _require(again, "the same seed must give the same points, bit by bit", f"other points for n = {n}")
+
+
+def _check_belief(belief: Prediction, n: int, case: str) -> None:
+    """Check shapes, finiteness, positive sigma and probabilities."""
+    _require(isinstance(belief, Prediction), "a predictor must return a Prediction", f"{type(belief)} ({case})")
+    _require(len(belief) == n, "a prediction must have one belief a point", f"{len(belief)} of {n} ({case})")
+    finite = np.isfinite(belief.mu).all() and np.isfinite(belief.sigma).all()
+    _require(bool(finite), "mu and sigma must be finite", f"NaN or infinity ({case})")
+    _require(bool((belief.sigma > 0).all()), "sigma must be > 0", f"{belief.sigma.min()} ({case})")
+    most = 1.0 + 1e-6
+    _require(bool((belief.noise <= most * belief.sigma).all()), "noise is a part of sigma", f"noise > sigma ({case})")
+    for critical in _INTERVALS:
+        p = belief.probability(critical)
+        _require(bool(((p >= 0) & (p <= 1)).all()), "P(y in M_c) must be in [0, 1]", f"{p} ({case})")
+
+
+def _check_predictor(predictor: Predictor, same: Predictor, asked: Points, belief: Prediction) -> None:
+    """Check that a predictor is a pure, picklable function that the rng decides."""
+    _same_bits(same(asked), belief, "the same rng must give the same predictor, bit by bit")
+    _same_bits(predictor(asked), belief, "a predictor must return the same belief when asked again")
+    copy = pickle.loads(pickle.dumps(predictor))
+    _same_bits(copy(asked), belief, "a predictor must survive pickling")
+    single = [predictor(asked[i : i + 1]) for i in range(len(asked))]
+    rule = "a belief must not depend on the other points asked about"
+    scale = float(belief.sigma.max())
+    _close(np.array([s.mu[0] for s in single]), belief.mu, 1e-6, rule, scale)
+    _close(np.array([s.sigma[0] for s in single]), belief.sigma, 1e-6, rule, scale)
+    _require(len(predictor(asked[:0])) == 0, "a predictor must take n = 0 points", "another number of beliefs")
+
+
+def _check_learning(predictor: Predictor, u: Points, y: Vector, asked: Points) -> None:
+    """Check that a smooth function is learned better than by the mean of y."""
+    near = np.clip(u + 0.01 * (asked.mean() - 0.5), 0.0, 1.0)
+    error = float(np.sqrt(np.mean((predictor(near).mu - _smooth(near)) ** 2)))
+    limit = 0.8 * float(y.std())
+    rule = "near its rows a metamodel must predict a smooth function better than the mean does"
+    _require(error < limit, rule, f"RMSE {error:.3g} for a standard deviation of {y.std():.3g}")
+
+
+def _check_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y: Vector, asked: Points, belief: Prediction) -> None:
+    """Check that scale, shift and order of the rows hardly matter."""
+    scaled = fit(u, 1e6 * y + 3e6)(asked)
+    size = float(belief.sigma.max())
+    rule = "scaling and shifting y must scale and shift the belief"
+    _close((scaled.mu - 3e6) / 1e6, belief.mu, 0.05, rule, size)
+    _close(scaled.sigma / 1e6, belief.sigma, 0.05, rule, size)
+    order = np.random.Generator(np.random.PCG64(0)).permutation(len(y))
+    other = fit(u[order], y[order])(asked)
+    rule = "the order of the rows must not change the belief beyond its own doubt"
+    _require(float(np.median(np.abs(other.mu - belief.mu) / belief.sigma)) < 2.0, rule, "a shift > 2 sigma")
+
+
+def _check_awkward_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y: Vector, asked: Points) -> None:
+    """Check that few rows, constant y, duplicates, an outlier and a plateau are survived."""
+    few = u.shape[1] + 2
+    outlier, plateau = y.copy(), np.clip(y, np.median(y), None)
+    outlier[0] = 1e6
+    cases = {
+        "n = d + 2": (u[:few], y[:few]),
+        "n = 2": (u[:2], y[:2]),
+        "constant y": (u, np.full(len(y), 10.0)),
+        "y = 0": (u, np.zeros(len(y))),
+        "duplicates": (np.repeat(u[:10], 3, axis=0), np.repeat(y[:10], 3)),
+        "one point, two values": (np.repeat(u[:1], 8, axis=0), np.tile([0.0, 1.0], 4)),
+        "one outlier": (u, outlier),
+        "a plateau": (u, plateau),
+    }
+    for case, (rows, values) in cases.items():
+        _check_belief(fit(rows, values)(asked), len(asked), case)
+    constant = fit(u, np.full(len(y), 10.0))(asked)
+    off = float(np.abs(constant.mu - 10.0).max())
+    _require(off < 1.0, "where all y are 10 the belief must be about 10", f"off by {off}")
+
+
+def _smooth(u: Points) -> Vector:
+    """Return a smooth function of mostly the first two inputs."""
+    return np.asarray(np.sin(4.0 * u[:, 0]) + u[:, -1] ** 2 + 0.1 * u.sum(axis=1))
+
+
+def _same_bits(a: Prediction, b: Prediction, rule: str) -> None:
+    for name in ("mean", "std", "weight", "noise"):
+        _require(np.array_equal(getattr(a, name), getattr(b, name)), rule, f"another {name}")
+
+
+def _close(got: NDArray[np.float64], expected: NDArray[np.float64], tolerance: float, rule: str, size: float = 1.0) -> None:
+    with np.errstate(invalid="ignore"):
+        gap = np.abs(np.asarray(got) - expected) - tolerance * np.abs(expected)
+    worst = float(np.where(got == expected, 0.0, gap).max(initial=0.0))
+    _require(worst <= tolerance * size, rule, f"a difference of {worst:.3g}")
+
+
+def _require(holds: bool, rule: str, value: str) -> None:
+    if not holds:
+        raise ContractError(f"{rule}, but got {value}")

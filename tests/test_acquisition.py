@@ -1,0 +1,59 @@
+"""Acquisitions: the paper's formulas, exact in logs; the public check accepts ours and refuses wrong ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sbt.acquisition import boundary, even, importance
+from sbt.metamodels.prediction import Prediction
+from sbt.problem.requirement import CriticalInterval
+from sbt.testing import ContractError, check_acquisition
+
+BELIEF = Prediction.gaussian(np.linspace(-3, 3, 13), np.ones(13))
+CRITICAL = CriticalInterval(-10.0, 0.0)
+
+
+@pytest.mark.parametrize("acquisition", [even, boundary, importance])
+def test_acquisitions_obey_their_contract(acquisition):
+    check_acquisition(acquisition)
+
+
+def test_boundary_is_equation_3():
+    expected = 1 - 2 * np.abs(BELIEF.probability(CRITICAL) - 0.5)
+    score = boundary(BELIEF, CRITICAL, np.zeros(13))
+    np.testing.assert_allclose(np.exp(score), expected)
+    assert score.argmax() == 6
+    assert (score <= 0).all()
+
+
+def test_boundary_is_finite_where_the_formula_rounds_to_zero():
+    score = boundary(Prediction.gaussian([-50.0, 50.0], [1.0, 1.0]), CriticalInterval(high=0.0), np.zeros(2))
+    np.testing.assert_allclose(score, score[::-1])
+    assert -1300 < score[0] < -1200
+
+
+def test_importance_is_equation_4():
+    log_density = np.linspace(-4, 0, 13)
+    expected = BELIEF.probability(CRITICAL) * np.exp(log_density)
+    np.testing.assert_allclose(np.exp(importance(BELIEF, CRITICAL, log_density)), expected)
+    assert importance(BELIEF, CRITICAL, np.full(13, -np.inf)).max() == -np.inf
+
+
+def test_even_ignores_the_belief():
+    np.testing.assert_array_equal(even(BELIEF, CRITICAL, np.zeros(13)), np.zeros(13))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "rule"),
+    [
+        (lambda p, c, d: np.zeros((len(p), 1)), "shape"),
+        (lambda p, c, d: np.full(len(p), np.nan), "NaN"),
+        (lambda p, c, d: np.full(len(p), np.inf), "< inf"),
+        (lambda p, c, d: p.mu - p.mu.mean(), "other points"),
+        (lambda p, c, d: p.mu + np.arange(len(p)), "order"),
+    ],
+)
+def test_wrong_acquisitions_are_refused(wrong, rule):
+    with pytest.raises(ContractError, match=rule):
+        check_acquisition(wrong)

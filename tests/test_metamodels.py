@@ -1,0 +1,281 @@
+"""Every built-in metamodel obeys the public contract, in its defaults and in the paper's settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gpytorch
+import numpy as np
+import pytest
+import torch
+
+from sbt.errors import InputError
+from sbt.metamodels.base import build, split_validation, standardise
+from sbt.metamodels.et import ExtraTrees
+from sbt.metamodels.gp import GaussianProcess, matern
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.scores import scores
+from sbt.problem.requirement import CriticalInterval
+from sbt.testing import ContractError, check_metamodel
+
+JAYWALKING = Path(__file__).resolve().parents[2] / "shared" / "data" / "dsiod_jaywalking"
+BUILT_IN = {
+    "et": ExtraTrees(),
+    "et paper": build(ExtraTrees, "paper"),
+    "gp": GaussianProcess(),
+    "gp homoscedastic": GaussianProcess(nu=2.5, input_noise=False),
+    "gp paper": build(GaussianProcess, "paper"),
+}
+
+
+def rows(n: int, d: int = 3, seed: int = 0, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    u = rng.random((n, d))
+    return u, np.sin(5 * u[:, 0]) + u[:, 1] ** 2 + noise * rng.normal(size=n)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_metamodels_obey_their_contract(name):
+    check_metamodel(BUILT_IN[name], dimensions=(1, 2, 7) if name != "gp paper" else (2,))
+
+
+@dataclasses.dataclass(frozen=True)
+class Wrong:
+    """Extra-trees that break one law."""
+
+    law: str
+
+    def fit(self, u, y, rng):
+        scale, salt = (y.std() or 1.0), np.random.default_rng(None if self.law == "bits" else 0).normal()
+        shift = y.mean() + {"bits": 1e-3 * salt, "scaling": 1.0}.get(self.law, 0.0)
+
+        def predict(points):
+            if self.law == "learned":
+                mu = np.zeros(len(points)) + shift
+            else:
+                mu = shift + (ExtraTrees().fit(u, y, np.random.default_rng(0))(points).mu - y.mean())
+            mu = mu + (len(points) if self.law == "other points" else 0.0)
+            return Prediction.gaussian(mu[:-1] if self.law == "one belief a point" else mu, np.full_like(
+                mu[:-1] if self.law == "one belief a point" else mu, scale))  # fmt: skip
+
+        return predict
+
+
+@pytest.mark.parametrize("law", ["one belief a point", "bits", "pickle"])
+def test_wrong_metamodels_are_refused(law):
+    with pytest.raises((ContractError, AttributeError), match=r"one belief a point|bit by bit|pickle"):
+        check_metamodel(Wrong(law), dimensions=(2,))
+    assert issubclass(ContractError, AssertionError)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_rows_that_cannot_be_learned_from_are_refused(name):
+    u, y = rows(5)
+    for bad_u, bad_y in ((u[:1], y[:1]), (u, y[:3]), (u, y * np.nan), (u * np.inf, y), (u[:, :0], y)):
+        with pytest.raises(InputError):
+            BUILT_IN[name].fit(bad_u, bad_y, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", ["et", "gp"])
+def test_global_random_states_are_neither_used_nor_changed(name):
+    u, y = rows(40)
+    torch.manual_seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    before = torch.get_rng_state(), np.random.get_state()[1].copy(), torch.get_num_threads()  # noqa: NPY002
+    first = BUILT_IN[name].fit(u, y, np.random.default_rng(0))(u)
+    assert torch.equal(before[0], torch.get_rng_state())
+    np.testing.assert_array_equal(before[1], np.random.get_state()[1])  # noqa: NPY002
+    assert torch.get_num_threads() == before[2]
+    torch.manual_seed(2)
+    second = BUILT_IN[name].fit(u, y, np.random.default_rng(0))(u)
+    np.testing.assert_array_equal(first.mean, second.mean)
+
+
+@pytest.mark.parametrize("kind", ["sbt.metamodels.gp:GaussianProcess", "sbt.metamodels.et:ExtraTrees"])
+def test_bits_do_not_depend_on_the_number_of_threads(kind):
+    module, name = kind.split(":")
+    code = f"""
+import hashlib, numpy as np
+from {module} import {name}
+from sbt.acquisition import boundary
+from sbt.problem.requirement import CriticalInterval
+u = np.random.default_rng(0).random((400, 5)); y = np.sin(9 * u[:, 0]) + u[:, 1] * u[:, 2]
+belief = {name}().fit(u[:200], y[:200], np.random.default_rng(1))(u)
+score = boundary(belief, CriticalInterval(high=0.3), np.zeros(400))
+print(hashlib.sha256(score.tobytes() + belief.mu.tobytes() + belief.sigma.tobytes()).hexdigest())
+"""
+    digests = set()
+    for threads in ("1", "2"):
+        limits = {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+        run = subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, **limits}, capture_output=True, text=True, check=True
+        )
+        digests.add(run.stdout)
+    assert len(digests) == 1
+
+
+def test_forest_agrees_with_scikit_learn():
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    u, y = rows(200, noise=0.1)
+    predictor = ExtraTrees(trees=7).fit(u, y, np.random.default_rng(3))
+    seed = int(np.random.default_rng(3).integers(2**31))
+    z, shift, scale = standardise(y)
+    forest = ExtraTreesRegressor(7, min_samples_split=4, random_state=seed).fit(u.astype(np.float32), z)
+    asked = rows(50, seed=9)[0]
+    np.testing.assert_allclose(predictor(asked).mu, shift + scale * forest.predict(asked))
+    np.testing.assert_allclose(predictor.mu(asked), predictor(asked).mu)
+
+
+def test_total_variance_is_kept_by_the_papers_single_gaussian():
+    u, y = rows(100, noise=0.2)
+    mixture = ExtraTrees().fit(u, y, np.random.default_rng(0))(u)
+    single = ExtraTrees(mixture=False).fit(u, y, np.random.default_rng(0))(u)
+    assert single.mean.shape == (1, 100)
+    np.testing.assert_allclose(single.sigma, mixture.sigma)
+    assert mixture.sigma.min() >= 0.01 * y.std()
+
+
+@pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
+def test_kernel_is_gpytorchs(nu):
+    a, b = rows(20)[0], rows(15, seed=1)[0]
+    kernel = gpytorch.kernels.MaternKernel(nu).double()
+    kernel.lengthscale = 0.4
+    distance = np.linalg.norm(a[:, None] - b, axis=-1) / 0.4
+    expected = kernel(torch.from_numpy(a), torch.from_numpy(b)).to_dense().detach().numpy()
+    np.testing.assert_allclose(matern(distance, nu), expected, rtol=1e-6)
+
+
+def test_gradient_is_that_of_the_objective():
+    from scipy.optimize import approx_fprime
+
+    from sbt.metamodels.gp import _Hyperparameters, _Model
+
+    u, y = rows(30, noise=0.1)
+    z, spread = standardise(y)[0], np.linspace(0.5, 2.0, 30)
+    for priors in (True, False):
+        model = _Model.build(1.5, 3, priors=priors)
+        model.assign(_Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
+        parameters = model.parameters()
+
+        def value(vector, model=model, parameters=parameters):
+            torch.nn.utils.vector_to_parameters(torch.from_numpy(vector), parameters)
+            return model.backward(torch.from_numpy(u), z, spread)
+
+        at = torch.nn.utils.parameters_to_vector(parameters).detach().numpy().copy()
+        numeric = approx_fprime(at, value, 1e-6)
+        value(at)
+        exact = np.concatenate([p.grad.numpy().ravel() for p in parameters])
+        np.testing.assert_allclose(exact, numeric, atol=1e-5)
+
+
+def test_likelihood_is_gpytorchs():
+    from sbt.metamodels.gp import _Hyperparameters, _Model
+
+    u, y = rows(30, noise=0.1)
+    z = standardise(y)[0]
+    model = _Model.build(1.5, 3, priors=False)
+    model.assign(_Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.3, 0.05))
+    value = model.backward(torch.from_numpy(u), z, np.ones(30))
+    covariance = model.kernel(torch.from_numpy(u)).to_dense().detach() + 0.05 * torch.eye(30)
+    inverse = torch.linalg.inv(covariance)
+    centre = (inverse.sum(0) @ torch.from_numpy(z)) / inverse.sum()
+    law = torch.distributions.MultivariateNormal(centre.expand(30), covariance)
+    assert value == pytest.approx(-law.log_prob(torch.from_numpy(z)).item() / 30)
+
+
+def test_process_interpolates_a_smooth_function():
+    u, y = rows(120)
+    asked, truth = rows(200, seed=5)
+    belief = GaussianProcess().fit(u, y, np.random.default_rng(0))(asked)
+    assert np.sqrt(np.mean((belief.mu - truth) ** 2)) < 0.05
+    assert np.mean(np.abs(truth - belief.mu) < 1.96 * belief.sigma) > 0.9
+
+
+def test_noise_is_found_where_it_is():
+    rng = np.random.default_rng(2)
+    u = rng.random((400, 2))
+    y = np.sin(4 * u[:, 1]) + np.where(u[:, 0] > 0.5, 0.5, 0.02) * rng.normal(size=400)
+    belief = GaussianProcess().fit(u, y, rng)(np.array([[0.25, 0.5], [0.75, 0.5]]))
+    assert belief.noise[0] < 0.1
+    assert 0.3 < belief.noise[1] < 0.8
+
+
+def test_process_learns_from_more_rows_than_it_is_tuned_on():
+    u, y = rows(300, noise=0.05)
+    asked, truth = rows(200, seed=5)
+    few = GaussianProcess().fit(u[:60], y[:60], np.random.default_rng(0))(asked)
+    more = GaussianProcess(fit_rows=60).fit(u, y, np.random.default_rng(0))(asked)
+    assert np.mean((more.mu - truth) ** 2) < np.mean((few.mu - truth) ** 2)
+
+
+def test_split_is_the_papers():
+    assert split_validation(10) == (slice(0, 2), slice(2, 10))
+    assert split_validation(2) == (slice(0, 1), slice(1, 2))
+    with pytest.raises(InputError, match="n >= 2"):
+        split_validation(1)
+
+
+def test_constant_y_keeps_a_scale():
+    for value in (0.0, 10.0, -1e8, 1e-9):
+        z, shift, scale = standardise(np.full(7, value))
+        assert (z == 0).all()
+        assert shift == pytest.approx(value)
+        assert scale > 0
+
+
+def test_settings_are_checked_by_name():
+    assert build(GaussianProcess, "paper").nu == 0.5
+    assert build(GaussianProcess, "paper", {"nu": 2.5}).nu == 2.5
+    assert build(ExtraTrees) == ExtraTrees()
+    with pytest.raises(InputError, match=r"preset of paper, but got 'papper'; did you mean 'paper'\?"):
+        build(ExtraTrees, "papper")
+    with pytest.raises(InputError, match=r"fit_rows.*got 'fitrows'; did you mean 'fit_rows'\?"):
+        build(GaussianProcess, settings={"fitrows": 100})
+    with pytest.raises(InputError, match="does not take"):
+        build(ExtraTrees, settings={"trees": "many"})
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        (ExtraTrees, {"trees": 0}),
+        (ExtraTrees, {"min_samples_split": 1}),
+        (ExtraTrees, {"max_features": 0.0}),
+        (ExtraTrees, {"sigma_floor": 0.0}),
+        (GaussianProcess, {"nu": 1.0}),
+        (GaussianProcess, {"fit_rows": 1}),
+        (GaussianProcess, {"learning_rate": 0.0}),
+        (GaussianProcess, {"patience": 0}),
+    ],
+)
+def test_impossible_settings_are_refused(kind, settings):
+    with pytest.raises(InputError, match=next(iter(settings))):
+        build(kind, settings=settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "least"), [(GaussianProcess, -1.36), (ExtraTrees, -1.45)])
+def test_recorded_jaywalking_runs(kind, least):
+    pytest.importorskip("pyarrow", reason="reading the recorded runs needs pyarrow")
+    import pandas as pd
+
+    path = JAYWALKING / "quasi_random.parquet"
+    if not path.exists():
+        pytest.skip(f"the recorded runs are not at {path}")
+    table = pd.read_parquet(path)
+    names = ["v_av", "v_ped", "d_0", "rain_rel", "fog_rel", "wind_rel", "time_of_day"]
+    low, high = np.array([4.5, 0.4, 0, 0, 0, 0, 0]), np.array([7.5, 2.0, 50, 1, 1, 1, 24])
+    u, y = (table[names].to_numpy() - low) / (high - low), table["min_dist*"].to_numpy()
+    results = []
+    for seed in range(4):
+        order = np.random.default_rng(seed).permutation(len(y))
+        train, test = order[:500], order[500:]
+        belief = kind().fit(u[train], y[train], np.random.default_rng(seed))(u[test])
+        results.append(scores(belief, y[test], CriticalInterval(high=0.0)))
+    assert np.mean([r["log_likelihood"] for r in results]) >= least
+    assert np.mean([r["average_precision"] for r in results]) >= 0.38

@@ -1,0 +1,372 @@
+"""The report: one page that needs nothing else, at any moment of a campaign, whatever the rows hold."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sbt.history import VALIDATION
+from sbt.metamodels.prediction import Prediction
+from sbt.problem.distribution import Distribution
+from sbt.problem.outcome import Outcome, Status
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.report import curves, figures
+from sbt.report.html import write_report
+from sbt.report.projection import influence, influence_from_runs, most_telling_pairs, probability_plane
+from sbt.report.style import figure_style, new_figure, to_svg
+from sbt.report.words import Findings, requirement_words, warnings_for
+from sbt.store import PlannedRun, Store
+
+CRITICAL = CriticalInterval(-5.0, 0.5)
+SECTIONS = ("conclusion", "figures", "inputs", "iterations", "critical", "failed", "reproduce", "references")
+SCORES = {
+    "log_likelihood": -0.4, "log_likelihood_critical": None, "rmse": 0.3, "average_precision": 0.9,
+    "precision_at_recall_90": 0.8, "calibration_error": 0.03, "n": 50, "n_critical": 17,
+}  # fmt: skip
+
+
+def metric(u):
+    """A wedge: about a sixth of the square is critical; inputs after the second matter less and less."""
+    weights = np.array([4.0, -5.0, *(1.0 / k for k in range(1, u.shape[1] - 1))])[: u.shape[1]]
+    return 2.0 + (u - 0.5) @ weights
+
+
+def predict(u):
+    return Prediction.gaussian(metric(u), np.full(len(u), 0.4))
+
+
+def scenario_of(d, description="Wedge.\nAn analytic stand-in.", **changes):
+    law = Distribution.of(kind="normal", mean=0, std=8)
+    first = (Parameter("d_t", 0.2, 4.0, "s", description="time gap"), Parameter("d_v", -10.0, 30.0, "m/s", law))
+    rest = tuple(Parameter(f"x{k}", 0, 5, "", kind="integer") for k in range(2, d))
+    return LogicalScenario(
+        "wedge", ParameterSpace((first + rest)[:d]), Requirement("ttc_min", CRITICAL), description=description,
+        evaluate=lambda values, seed: {}, metric_names=("ttc_min", "speed"), **changes,
+    )  # fmt: skip
+
+
+def fill(folder, scenario, runs=60, held_out=50, *, fail=False, fits=True, reason="no SUMO", configuration=None):
+    """Return a store as a campaign leaves it."""
+    space = scenario.space
+    extra = {"campaign": "boundary", "scenario": "wedge", "seed": 7, "budget": runs + held_out, **(configuration or {})}
+    store = Store.open(folder, {"names": list(space.names), **extra})
+    rng = np.random.default_rng(3)
+    for iteration, (stage, n) in enumerate([(VALIDATION, held_out), ("initial", runs // 2), ("boundary", runs - runs // 2)]):
+        if n == 0:
+            continue
+        x = space.from_unit(rng.random((n, space.dimension)))
+        start, y = store.planned, metric(space.to_unit(x))
+        planned = [PlannedRun(stage, dict(zip(space.names, map(float, row), strict=True))) for row in x]
+        store.plan(iteration, stage, planned, list(range(start, start + n)), {"acceptance": 0.25, "sobol": [0, n]})
+        with store._transaction() if n > 1000 else _nothing():  # thousands of durable commits are not what is tested
+            for k in range(n):
+                lost = fail or k == 7
+                metrics = {} if lost else {"ttc_min": float(y[k]), "speed": 3.0}
+                status = Status.FAILED if lost else Status.OK
+                outcome = Outcome(start + k, status, metrics, reason if lost else "", 0.01)
+                (store.append if n <= 1000 else _append(store))(outcome, "sbt 0, libsumo 1.28")
+    if fits:
+        store.add_fit(60, 1, SCORES)
+        store.add_fit(110, 2, {**SCORES, "log_likelihood": -0.2})
+    return store
+
+
+class _nothing:
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+def _append(store):
+    def write(outcome, versions):
+        row = (str(outcome.status), json.dumps(dict(outcome.metrics)), outcome.reason, 0.01, versions, outcome.index)
+        store._db.execute("UPDATE runs SET status=?, metrics=?, reason=?, seconds=?, versions=? WHERE idx=?", row)
+
+    return write
+
+
+class Page(HTMLParser):
+    """What a browser would load, and which ids there are."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.text, self.ids, self.loads, self.tags = text, [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.tags.append(tag)
+        self.ids += [given["id"]] if "id" in given else []
+        if tag in ("script", "img", "iframe", "link", "source", "image", "use", "object", "embed"):
+            self.loads += [value for key, value in attrs if key in ("src", "href", "xlink:href", "data") and value]
+
+
+def page_of(store, scenario, predictor=predict):
+    return Page(write_report(store, scenario, predictor).read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " "))
+
+
+@pytest.fixture(scope="module")
+def wedge(tmp_path_factory):
+    scenario = scenario_of(2)
+    with fill(tmp_path_factory.mktemp("wedge"), scenario) as store:
+        yield store, scenario, page_of(store, scenario)
+
+
+def test_needs_nothing_from_outside(wedge):
+    page = wedge[2]
+    assert all(value.startswith(("#", "data:")) for value in page.loads)
+    assert not re.search(r"url\((?!#)|@import|<link|src=\"http", page.text)
+    addresses = set(re.findall(r"https?://[^\"'\s<)]+", page.text))
+    assert addresses <= {
+        "https://doi.org/10.1109/TITS.2022.3206882",
+        "http://www.w3.org/2000/svg",
+        "http://www.w3.org/1999/xlink",
+    }
+
+
+def test_has_every_section_and_figure_and_no_id_twice(wedge):
+    store, _, page = wedge
+    assert set(SECTIONS) <= set(page.ids)
+    assert len(page.ids) == len(set(page.ids))
+    names = {"runs", "probability", "validation", "precision_recall", "reliability", "metric", "progress"}
+    assert names <= set(page.ids)
+    assert names == {path.stem for path in (store.folder / "figures").glob("*.svg")}
+    for text in ("ttc_min in [-5, 0.5]", "normal (mean 0, std 8)", "held-out runs", "acceptance 0.25"):
+        assert text in page.text
+
+
+def test_is_the_same_twice(wedge):
+    store, scenario, page = wedge
+    before = {path.name: path.read_bytes() for path in (store.folder / "figures").iterdir()}
+    assert page_of(store, scenario).text == page.text
+    assert before == {path.name: path.read_bytes() for path in (store.folder / "figures").iterdir()}
+    assert not any(b"<dc:date>" in content for content in before.values())
+
+
+def test_commands_give_the_inputs_to_the_last_digit(wedge):
+    store, _scenario, page = wedge
+    commands = [shlex.split(c) for c in re.findall(r"<code>(sumo-sbt simulate [^<]*)</code>", page.text)]
+    history = store.history()
+    critical = CRITICAL.contains(history.y("ttc_min"))
+    assert len(commands) == critical.sum() + (~history.ok).sum()
+    by_seed = {record.seed: record for record in history.records}
+    for words in commands:
+        record = by_seed[int(words[words.index("--seed") + 1])]
+        assert words[:3] == ["sumo-sbt", "simulate", "wedge"]
+        assert {n: float(v) for n, v in (w.split("=") for w in words[3:-2])} == dict(record.inputs)
+
+
+def test_hostile_text_stays_text(tmp_path):
+    evil = "<script>alert(1)</script>\n</style><img src=http://x.invalid/a onerror=alert(2)> ${x} {{ 7*7 }}"
+    space = ParameterSpace((Parameter("a", 0, 1, "$<b>&\\frac"), Parameter("b", 0, 1, "--><script>", description=evil)))
+    scenario = LogicalScenario(
+        "evil", space, Requirement("m", CRITICAL), description=evil, evaluate=lambda v, s: {}, metric_names=("m",)
+    )
+    configuration = {"names": ["a", "b"], "scenario": "my; rm -rf <x>.yaml", "campaign": evil}
+    with Store.open(tmp_path, configuration) as store:
+        store.plan(0, "<b>$stage", [PlannedRun("<b>$stage", {"a": 0.1, "b": 0.2})] * 2, [1, 2], {"<i>": "<i>"})
+        store.append(Outcome(0, Status.OK, {"m": 0.1}))
+        store.append(Outcome(1, Status.FAILED, {}, evil))
+        page = page_of(store, scenario)
+    assert page.tags.count("script") == 1
+    assert "img" not in page.tags
+    assert "{{ 7*7 }}" in page.text
+    assert "simulate &#39;my; rm -rf &lt;x&gt;.yaml&#39;" in page.text
+
+
+@pytest.mark.parametrize("predictor", [None, predict])
+def test_empty_store(tmp_path, predictor):
+    scenario = scenario_of(2)
+    with fill(tmp_path, scenario, 0, 0, fits=False) as store:
+        page = page_of(store, scenario, predictor)
+    assert set(SECTIONS) <= set(page.ids)
+    assert "not concluded" in page.text
+    assert "No run has given a metric yet" in page.text
+
+
+@pytest.mark.parametrize("d", [1, 2, 7])
+def test_all_failed(tmp_path, d):
+    scenario = scenario_of(d)
+    with fill(tmp_path, scenario, fail=True, fits=False) as store:
+        page = page_of(store, scenario, None)
+    assert "110 of 110 runs failed" in page.text
+    assert "no SUMO" in page.text
+
+
+@pytest.mark.parametrize(("d", "held_out"), [(1, 50), (1, 0), (3, 50), (7, 50), (20, 0)])
+@pytest.mark.parametrize("predictor", [None, predict])
+def test_any_number_of_inputs(tmp_path, d, held_out, predictor):
+    scenario = scenario_of(d)
+    with fill(tmp_path, scenario, held_out=held_out) as store:
+        page = page_of(store, scenario, predictor)
+    assert {"runs", "metric", "progress"} <= set(page.ids)
+    assert ("probability" in page.ids) == (predictor is not None)
+    assert ("reliability" in page.ids) == (predictor is not None and held_out > 0)
+
+
+def test_thousands_of_runs_stay_a_small_file(tmp_path):
+    scenario = scenario_of(5)
+    with fill(tmp_path, scenario, 4500, 500) as store:
+        start = time.perf_counter()
+        path = write_report(store, scenario, predict)
+        assert time.perf_counter() - start < 20
+    assert path.stat().st_size < 3_000_000
+    assert "more critical runs are in the store" in path.read_text(encoding="utf-8")
+
+
+def test_writes_elsewhere_and_leaves_no_temporary_file(tmp_path):
+    scenario = scenario_of(2)
+    with fill(tmp_path / "store", scenario) as store:
+        assert write_report(store, scenario, None, folder=tmp_path / "out") == tmp_path / "out" / "report.html"
+    assert not (tmp_path / "store" / "report.html").exists()
+    assert not [path for path in Path(tmp_path / "out").rglob(".*")]
+
+
+def warned(tmp_path, conclusion=None, fit=None, runs=60, **settings):
+    scenario = scenario_of(2)
+    with fill(tmp_path, scenario, runs, fits=False, **settings) as store:
+        if fit is not None:
+            store.add_fit(110, 2, {**SCORES, **fit})
+        if conclusion is not None:
+            store.conclude(conclusion)
+        return " ".join(warnings_for(Findings.of(store, scenario)))
+
+
+def test_says_what_limits_the_conclusion(tmp_path):
+    done = {"conclusion": {"warnings": ["own warning"]}, "stopped": "budget"}
+    assert "not concluded: 110 of 110" in warned(tmp_path / "a")
+    text = warned(tmp_path / "b", done, {"n_critical": 3, "calibration_error": 0.3})
+    for part in ("Only 3 critical runs", "Poor calibration", "own warning", "3 of 110 runs failed"):
+        assert part in text
+    assert "not concluded" not in text
+    fine = warned(tmp_path / "c", {"stopped": "budget"}, {})
+    assert "Only" not in fine
+    assert "calibration" not in fine
+    assert "never tested" in warned(tmp_path / "d", done, {"n": 0, "n_critical": 0})
+
+
+@pytest.mark.parametrize(
+    ("result", "expected"),
+    [
+        ({"critical_fraction": 0.163, "low": 0.12, "high": 0.21}, "16.3 % (95 % interval 12 % to 21 %)"),
+        ({"first_critical_run": 12, "failure_modes": 3}, "falsified: the first critical run is number 12; 3 distinct"),
+        ({"first_critical_run": None}, "not falsified"),
+        ({"probability": 1.2e-5, "low": 8e-6, "high": 2e-5, "confidence": 0.95, "hits": 0}, "1.2e-05 (95 % interval 8e-06"),
+        ({"probability": 0.0, "exact_bound": 0.003}, "at most 0.003"),
+        ({}, "scenarios drawn at random"),
+    ],
+)
+def test_conclusion_in_words(tmp_path, result, expected):
+    scenario = scenario_of(2)
+    with fill(tmp_path, scenario) as store:
+        store.conclude({"conclusion": result, "stopped": "budget", "seconds": {"fit": 2.0}})
+        assert expected in page_of(store, scenario, None).text
+
+
+def test_ego_of_the_campaign_is_not_forgotten(tmp_path):
+    scenario = scenario_of(2)
+    with fill(tmp_path, scenario, configuration={"ego": {"kind": "acc"}, "store": "runs/a b"}) as store:
+        text = page_of(store, scenario, None).text
+    assert "which <code>simulate</code> does not know" in text
+    assert "replay &#39;runs/a b&#39; RUN" in text
+
+
+def test_requirement_in_words():
+    assert requirement_words(Requirement("ttc_min", CRITICAL), "s") == "ttc_min in [-5, 0.5] s"
+    assert requirement_words(Requirement("m", CriticalInterval(high=0.0)), "") == "m ≤ 0"
+    assert requirement_words(Requirement("m", CriticalInterval(low=2.0)), "m") == "m ≥ 2 m"
+
+
+def test_influence_finds_what_matters(tmp_path):
+    assert influence(predict, CRITICAL, 4).argmax() == 1
+    assert np.all(influence(lambda u: predict(u * 0 + 0.5), CRITICAL, 4) == 0)
+    scenario = scenario_of(4)
+    with fill(tmp_path, scenario, 400, 0) as store:
+        order = influence_from_runs(store.history(), scenario.requirement)
+    assert order.argmax() == 1
+    assert order.max() == 1.0
+    pairs = most_telling_pairs(np.array([0.1, 1.0, 0.5, 0.2, 0.0]))
+    assert pairs[0] == (1, 2)
+    assert len(pairs) == 6
+    assert all(4 not in pair for pair in pairs)
+    assert most_telling_pairs(np.zeros(20)) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+
+
+def test_plane_is_the_mean_over_the_other_inputs():
+    space = scenario_of(3).space
+    plane = probability_plane(predict, CRITICAL, space, (0, 1), samples=8)
+    assert plane.probability.shape == (len(plane.axes[1]), len(plane.axes[0]))
+    u = np.random.default_rng(0).random((4000, 3))
+    u[:, 0], u[:, 1] = 0.5, 1.0
+    by_hand = predict(u).probability(CRITICAL).mean()
+    at = plane.probability[-1, len(plane.axes[0]) // 2]
+    assert plane.averaged == 8
+    assert at == pytest.approx(by_hand, abs=0.05)
+
+
+def test_plane_leaves_out_what_the_constraints_forbid():
+    rule = ("d_t < 2", lambda columns: columns["d_t"] < 2.0)
+    space = ParameterSpace(scenario_of(2).space.parameters, constraints=(rule,))
+    plane = probability_plane(predict, CRITICAL, space, (0, 1))
+    assert (np.isnan(plane.probability) == (plane.axes[0] >= 2.0)[None, :]).all()
+    with figure_style():
+        figures.plot_probability(plane, space, new_figure().subplots())
+
+
+def test_integer_inputs_are_drawn_value_by_value():
+    space = scenario_of(3).space
+    plane = probability_plane(predict, CRITICAL, space, (1, 2), samples=2)
+    assert plane.axes[1].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_star_and_base_rate():
+    with figure_style():
+        ax = curves.plot_precision_recall(
+            np.array([0.9, 0.8, 0.7, 0.1]), np.array([True, False, True, False]), new_figure().subplots()
+        )
+    star = next(line for line in ax.lines if line.get_marker() == "*")
+    assert star.get_ydata()[0] == pytest.approx(2 / 3)
+    assert any("base rate 0.5" in text.get_text() for text in ax.get_legend().get_texts())
+
+
+def test_binomial_interval_against_scipy():
+    from scipy.stats import binomtest
+
+    low, high = curves.binomial_interval(np.array([0, 3, 20]), np.array([20, 20, 20]))
+    for k, hits in enumerate((0, 3, 20)):
+        truth = binomtest(hits, 20).proportion_ci(0.95, method="exact")
+        assert (low[k], high[k]) == pytest.approx((truth.low, truth.high), abs=1e-9)
+
+
+def test_svgs_of_a_page_share_no_id():
+    with figure_style():
+        texts = []
+        for name in ("one", "two"):
+            figure = new_figure()
+            figure.subplots().plot([0, 1], [0, 1])
+            texts.append(to_svg(figure, name))
+    first, second = (set(re.findall(r' id="([^"]+)"', text)) for text in texts)
+    assert first
+    assert not first & second
+    assert all(f"#{ref}" in f"#{' #'.join(first)}" for ref in re.findall(r'href="#([^"]+)"', texts[0]))
+
+
+def test_user_settings_of_matplotlib_are_left_alone():
+    import matplotlib as mpl
+
+    with mpl.rc_context({"font.size": 31.0}):
+        with figure_style():
+            assert mpl.rcParams["font.size"] < 12
+        assert mpl.rcParams["font.size"] == 31.0
