@@ -24,6 +24,8 @@ __all__ = ["Finding", "check_scenario"]
 
 _CORNERS_UP_TO = 4
 """With more inputs than this, every input goes to its ends alone instead of all 2^d corners."""
+_RUN_DEADLINE = 60.0
+"""Longest run (s), where the scenario looks at the clock."""
 _WORKER_DEADLINE = 300.0
 """Longest wait (s) for the worker process."""
 
@@ -92,7 +94,7 @@ def _points(space: ParameterSpace) -> Iterator[dict[str, float]]:
 
 def _runs(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run]:
     """Return the runs of these values and seeds, in this order, in this process."""
-    scenario = spec.resolve()
+    scenario = spec.resolve().limited(_RUN_DEADLINE)
     return [_run(scenario, values, seed) for values, seed in jobs]
 
 

@@ -141,7 +141,10 @@ def _check_predictor(predictor: Predictor, same: Predictor, asked: Points, belie
     """Check that a predictor is a pure, picklable function that the rng decides."""
     _same_bits(same(asked), belief, "the same rng must give the same predictor, bit by bit")
     _same_bits(predictor(asked), belief, "a predictor must return the same belief when asked again")
-    copy = pickle.loads(pickle.dumps(predictor))
+    try:
+        copy = pickle.loads(pickle.dumps(predictor))
+    except Exception as error:
+        raise ContractError(f"a predictor must survive pickling, but got {error!r}") from error
     _same_bits(copy(asked), belief, "a predictor must survive pickling")
     single = [predictor(asked[i : i + 1]) for i in range(len(asked))]
     rule = "a belief must not depend on the other points asked about"
@@ -189,7 +192,11 @@ def _check_awkward_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y
         "a plateau": (u, plateau),
     }
     for case, (rows, values) in cases.items():
-        _check_belief(fit(rows, values)(asked), len(asked), case)
+        try:
+            belief = fit(rows, values)(asked)
+        except Exception as error:
+            raise ContractError(f"a metamodel must learn from {case}, but got {error!r}") from error
+        _check_belief(belief, len(asked), case)
     constant = fit(u, np.full(len(y), 10.0))(asked)
     off = float(np.abs(constant.mu - 10.0).max())
     _require(off < 1.0, "where all y are 10 the belief must be about 10", f"off by {off}")

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import gpytorch
@@ -44,31 +45,60 @@ def test_metamodels_obey_their_contract(name):
 
 
 @dataclasses.dataclass(frozen=True)
+class WrongPredictor:
+    """A predictor whose belief `change` (mu, sigma, noise) spoils; None: not a Prediction."""
+
+    right: Callable[[np.ndarray], Prediction]
+    flaw: str
+
+    def __call__(self, u: np.ndarray) -> Prediction | None:
+        belief = self.right(u)
+        mu, sigma, noise = belief.mu, belief.sigma, belief.noise
+        if self.flaw == "type":
+            return None
+        if self.flaw == "number":
+            return Prediction.gaussian(mu[:-1], sigma[:-1], noise[:-1])
+        if self.flaw == "noise":
+            return Prediction.gaussian(mu, sigma, 2 * sigma)
+        if self.flaw == "batch":
+            return Prediction.gaussian(mu + len(u), sigma, noise)
+        if self.flaw == "mean":
+            return Prediction.gaussian(np.full(len(u), 0.7), sigma, noise)
+        return belief
+
+
+@dataclasses.dataclass(frozen=True)
 class Wrong:
-    """Extra-trees that break one law."""
+    """Extra-trees with one flaw."""
 
-    law: str
+    flaw: str
 
-    def fit(self, u, y, rng):
-        scale, salt = (y.std() or 1.0), np.random.default_rng(None if self.law == "bits" else 0).normal()
-        shift = y.mean() + {"bits": 1e-3 * salt, "scaling": 1.0}.get(self.law, 0.0)
-
-        def predict(points):
-            if self.law == "learned":
-                mu = np.zeros(len(points)) + shift
-            else:
-                mu = shift + (ExtraTrees().fit(u, y, np.random.default_rng(0))(points).mu - y.mean())
-            mu = mu + (len(points) if self.law == "other points" else 0.0)
-            return Prediction.gaussian(mu[:-1] if self.law == "one belief a point" else mu, np.full_like(
-                mu[:-1] if self.law == "one belief a point" else mu, scale))  # fmt: skip
-
-        return predict
+    def fit(self, u: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> Callable[[np.ndarray], Prediction]:
+        if self.flaw == "few" and len(y) < 5:
+            raise ValueError("too few")
+        if self.flaw == "scale":
+            y = np.clip(y, -100.0, 100.0)
+        right = ExtraTrees().fit(u, y, np.random.default_rng() if self.flaw == "bits" else rng)
+        return (lambda v: right(v)) if self.flaw == "pickle" else WrongPredictor(right, self.flaw)
 
 
-@pytest.mark.parametrize("law", ["one belief a point", "bits", "pickle"])
-def test_wrong_metamodels_are_refused(law):
-    with pytest.raises((ContractError, AttributeError), match=r"one belief a point|bit by bit|pickle"):
-        check_metamodel(Wrong(law), dimensions=(2,))
+@pytest.mark.parametrize(
+    ("flaw", "rule"),
+    [
+        ("type", "must return a Prediction"),
+        ("number", "one belief a point"),
+        ("noise", "noise is a part of sigma"),
+        ("batch", "other points"),
+        ("mean", "smooth function"),
+        ("few", "learn from n = d"),
+        ("scale", "scaling and shifting"),
+        ("bits", "bit by bit"),
+        ("pickle", "pickling"),
+    ],
+)
+def test_wrong_metamodels_are_refused(flaw, rule):
+    with pytest.raises(ContractError, match=rule):
+        check_metamodel(Wrong(flaw), dimensions=(2,))
     assert issubclass(ContractError, AssertionError)
 
 

@@ -81,8 +81,8 @@ def _formula(*, condition: bool) -> Callable[[str], str]:
     """Return a check that the text is a formula, and one that gives a truth value or a number as wanted."""
 
     def check(text: str) -> str:
-        rule = Expression(text)
         with np.errstate(all="ignore"):
+            rule = Expression(text)
             value = np.asarray(rule(dict.fromkeys(rule.names(), np.ones(1))))
         if not rule.names():
             raise ValueError(f"must use at least one input, but got '{text}'")

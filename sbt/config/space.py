@@ -47,7 +47,8 @@ def configured_space(config: Configuration, space: ParameterSpace, problems: Pro
 
 def _changed(space: ParameterSpace, step: Mapping[str, Any]) -> ParameterSpace:
     """Return the space with one change, after what it would otherwise check only when it is used."""
-    space = replace(space, **step)
+    with np.errstate(all="ignore"):  # a formula that is not finite is told, not warned of
+        space = replace(space, **step)
     if space.constraints:
         space.feasible_mass  # noqa: B018  (raises where the law gives the constraints no mass)
     space.metamodel_inputs(np.full((1, space.dimension), 0.5))

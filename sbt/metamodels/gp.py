@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from gpytorch.constraints import GreaterThan, Positive
 from gpytorch.priors import LogNormalPrior
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import cho_solve, lapack, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from threadpoolctl import ThreadpoolController
@@ -34,6 +34,7 @@ _THREADS = ThreadpoolController()
 """One thread for fits and predictions: their bits do not depend on the number of cores, and matrices of a
 few hundred rows are solved faster than threads are woken (0.9 s instead of 3.6 s at 500 rows, 2 cores)."""
 _CHUNK = 2048  # points predicted at once
+_BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter
 _NOISE_FLOOR = 1e-4  # variance relative to that of y: keeps the covariance well conditioned
 _FOLDS = 5  # of the noise regression
 _FEWEST_FOR_NOISE = 2 * _FOLDS  # rows
@@ -203,7 +204,7 @@ def _fit_noise_spread(hyper: _Hyperparameters, u: Points, z: Vector, rng: np.ran
     the rows are cross-fitted: a row's own residual says nothing about its noise, or the process would
     trust the rows it happens to fit.
     """
-    solved = _solve(hyper.covariance(u, u) + hyper.noise * np.eye(len(z)), z)
+    solved = _solve(_factor(hyper.covariance(u, u), np.full(len(z), hyper.noise)), z)
     variance = 1.0 / np.diag(solved.inverse)
     log_ratio = np.log((solved.alpha * variance) ** 2 / variance + 1e-4)
     fold = rng.permutation(len(z)) % _FOLDS
@@ -226,38 +227,45 @@ def _condition(
     scale: float,
 ) -> GaussianProcessPredictor:
     """Return the predictor conditioned on all rows; `at_rows` is the relative noise variance there."""
-    solved = _solve(hyper.covariance(u, u) + np.diag(hyper.noise * at_rows), z)
-    return GaussianProcessPredictor(hyper, u, solved.factor, solved.alpha, solved.centre, spread, shift, scale)
+    factor = _factor(hyper.covariance(u, u), hyper.noise * at_rows)
+    by_one, by_z = cho_solve((factor, True), np.stack([np.ones(len(z)), z], axis=1)).T
+    centre = float(by_one @ z / by_one.sum())
+    return GaussianProcessPredictor(hyper, u, factor, by_z - centre * by_one, centre, spread, shift, scale)
+
+
+def _factor(covariance: Points, noise: Vector) -> Points:
+    """Return the (n, n) lower Cholesky factor of covariance + diag(noise); writes on `covariance`.
+
+    Where rounding made the sum indefinite, growing jitter is added to the diagonal.
+    """
+    diagonal = np.diag(covariance) + noise
+    for jitter in (0.0, 1e-8, 1e-6, 1e-4, 1e-2):
+        np.fill_diagonal(covariance, diagonal + jitter)
+        factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
+        if info == 0:
+            return np.asarray(factor)
+    raise InputError("the covariance of a Gaussian process must be positive definite, but is not, with jitter 0.01")
 
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """A covariance factored, and z relative to its generalised least-squares mean solved for."""
+    """What the gradient and the leave-one-out residuals need of a factored covariance."""
 
-    factor: Points  # (n, n) lower
     inverse: Points  # (n, n)
-    alpha: Vector  # (n,)
-    centre: float
+    alpha: Vector  # (n,) inverse (z - its generalised least-squares mean)
     log_likelihood: float
 
 
-def _solve(covariance: Points, z: Vector) -> _Solved:
-    """Factor the covariance (n, n), with growing jitter where rounding made it indefinite."""
-    n = len(z)
-    for jitter in (0.0, 1e-8, 1e-6, 1e-4, 1e-2):
-        factor, info = lapack.dpotrf(covariance + jitter * np.eye(n), lower=1, clean=1)
-        if info == 0:
-            break
-    else:
-        raise InputError("the covariance of the Gaussian process must be positive definite, but is not")
-    inverse = lapack.dpotri(factor, lower=1)[0]
-    inverse = np.tril(inverse) + np.tril(inverse, -1).T
+def _solve(factor: Points, z: Vector) -> _Solved:
+    """Return the inverse of the covariance whose factor this is, and the likelihood of z."""
+    lower = np.tril(lapack.dpotri(factor, lower=1)[0])
+    inverse = lower + np.tril(lower, -1).T
     row_sums = inverse.sum(axis=1)
     centre = float(row_sums @ z / row_sums.sum())
     alpha = inverse @ z - centre * row_sums
-    log_det = 2.0 * np.log(np.diag(factor)).sum()
+    log_det = 2.0 * float(np.log(np.diag(factor)).sum())
     fit = float((z - centre) @ alpha)
-    return _Solved(factor, inverse, alpha, centre, -0.5 * (fit + log_det + n * math.log(2.0 * math.pi)))
+    return _Solved(inverse, alpha, -0.5 * (fit + log_det + len(z) * math.log(2.0 * math.pi)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +322,7 @@ class _Model:
         """
         n = len(z)
         latent, noise = self.kernel.forward(x, x), self.likelihood.noise
-        solved = _solve(latent.detach().numpy() + np.diag(noise.item() * spread), z)
+        solved = _solve(_factor(latent.detach().numpy().copy(), noise.item() * spread), z)
         slope = (0.5 / n) * (solved.inverse - np.outer(solved.alpha, solved.alpha))
         penalties = [
             -prior.log_prob(value_of(module)).sum() / n
@@ -344,7 +352,7 @@ def _fit_posterior(nu: float, u: Points, z: Vector, spread: Vector, start: _Hype
 
     initial = torch.nn.utils.parameters_to_vector(parameters).detach().numpy().copy()
     found = minimize(
-        loss, initial, jac=True, method="L-BFGS-B", bounds=[(-12.0, 8.0)] * len(initial),
+        loss, initial, jac=True, method="L-BFGS-B", bounds=[_BOUNDS] * len(initial),
         options={"maxiter": 100, "ftol": 1e-6},
     )  # fmt: skip
     torch.nn.utils.vector_to_parameters(torch.from_numpy(found.x), parameters)
@@ -364,6 +372,9 @@ def _fit_early_stopped(
     for _ in range(settings.max_epochs):
         model.backward(x, z, ones)
         adam.step()
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.clamp_(*_BOUNDS)
         hyper = model.hyperparameters()
         value = _condition(hyper, u, z, ones, None, 0.0, 1.0)(u_held_out).log_density(z_held_out).mean()
         since += 1

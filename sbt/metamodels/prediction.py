@@ -89,13 +89,13 @@ class Prediction:
 
     @property
     def mu(self) -> Vector:
-        """Mean of the mixture, (n,): the paper's mu(x)."""
+        """Mean of the mixture, (n,): the paper's mu."""
         mean: Vector = self.weight @ self.mean
         return mean
 
     @property
     def sigma(self) -> Vector:
-        """Standard deviation of the mixture (moment-matched), (n,): the paper's sigma(x)."""
+        """Standard deviation of the mixture (moment-matched), (n,): the paper's sigma."""
         if len(self.weight) == 1:
             return np.asarray(self.std[0])
         variance: Vector = self.weight @ (self.std**2 + (self.mean - self.mu) ** 2)

@@ -190,7 +190,8 @@ def _spread(parameter: Parameter, history: History, column: int) -> Vector:
     x = history.x[:, column]
     if parameter.kind != "integer":
         return x
-    return x + 0.6 * ((history.index * 0.6180339887498949 * (column + 1)) % 1.0 - 0.5)
+    moved: Vector = x + 0.6 * ((history.index * 0.6180339887498949 * (column + 1)) % 1.0 - 0.5)
+    return moved
 
 
 def _limits(parameter: Parameter, x: Vector) -> tuple[float, float]:
