@@ -1,5 +1,7 @@
 """Configurations: what is read, what is refused and where, and what it is assembled to."""
 
+# ruff: noqa: E501  (a line of a table is a case)
+
 from __future__ import annotations
 
 import json
@@ -60,10 +62,13 @@ def folder(tmp_path: Path) -> Path:
 
 def errors(text: str, *overrides: str, folder: Path | None = None, assembled: bool = False) -> list[str]:
     """Return the lines of the error that a configuration raises."""
-    with pytest.raises(ConfigError) as caught:
+
+    def read() -> object:
         loaded = parse(text, overrides, name="f.yaml", folder=folder)
-        if assembled:
-            assemble(loaded)
+        return assemble(loaded) if assembled else loaded
+
+    with pytest.raises(ConfigError) as caught:
+        read()
     assert str(caught.value) == "\n".join(caught.value.errors)
     return list(caught.value.errors)
 
@@ -148,6 +153,8 @@ def test_all_errors_at_once_each_at_its_place():
         ("constraints: ['1 < 2']", "constraints.0: must use at least one input, but got '1 < 2'"),
         ("constraints: ['import os']", "constraints.0: an expression must be a formula"),
         ("features: {r: a < b}", "features.r: must be a number such as 'a / b', not a condition, but got 'a < b'"),
+        ("features: {r: a + 1 / 0}", "features.r: must be a formula that can be computed, but got 'a + 1 / 0'"),
+        ("features: {r: min(a)}", "features.r: must be a formula that can be computed, but got 'min(a)'"),
         ("features: {r: a.b}", "features.r: an expression may use numbers"),
         ("ego: {model: IDM}", "ego.kind: is required"),
         ("ego: {kind: x, day: 2020-01-01}", "ego.day: must be plain data"),
@@ -180,10 +187,22 @@ def test_a_wrong_line_is_refused(line: str, expected: str):
         ("# nothing\n", "it is empty"),
         ("- a\n", "f.yaml:1:1: a configuration must be a mapping (key: value), but got ['a']"),
         ("scenario: x\n", "f.yaml:1:1: campaign: is required"),
-        ("campaign: coverge\nscenario: x\n", "campaign: must be boundary or coverage, but got 'coverge' (did you mean 'coverage'?)"),
-        ("campaign: falsification\nscenario: x\n", "campaign: 'falsification' is not in this release; choose boundary or coverage"),
-        ("campaign: coverage\nscenario: x\nacquisition: {kind: boundary}\n", "a coverage campaign draws by even, but got 'boundary'"),
-        ("campaign: coverage\nscenario: x\nstop: {stable: 0.1}\n", "a coverage campaign has the stop rules: none; but got stable"),
+        (
+            "campaign: coverge\nscenario: x\n",
+            "campaign: must be boundary or coverage, but got 'coverge' (did you mean 'coverage'?)",
+        ),
+        (
+            "campaign: falsification\nscenario: x\n",
+            "campaign: 'falsification' is not in this release; choose boundary or coverage",
+        ),
+        (
+            "campaign: coverage\nscenario: x\nacquisition: {kind: boundary}\n",
+            "a coverage campaign draws by even, but got 'boundary'",
+        ),
+        (
+            "campaign: coverage\nscenario: x\nstop: {stable: 0.1}\n",
+            "a coverage campaign has the stop rules: none; but got stable",
+        ),
     ],
 )
 def test_a_wrong_file_is_refused(text: str, expected: str):

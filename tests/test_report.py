@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shlex
@@ -205,8 +206,9 @@ def test_all_failed(tmp_path, d):
     assert "no SUMO" in page.text
 
 
-@pytest.mark.parametrize(("d", "held_out"), [(1, 50), (1, 0), (3, 50), (7, 50), (20, 0)])
-@pytest.mark.parametrize("predictor", [None, predict])
+@pytest.mark.parametrize(
+    ("d", "held_out", "predictor"), [(1, 50, predict), (1, 0, None), (3, 50, predict), (7, 50, None), (20, 0, predict)]
+)
 def test_any_number_of_inputs(tmp_path, d, held_out, predictor):
     scenario = scenario_of(d)
     with fill(tmp_path, scenario, held_out=held_out) as store:
@@ -257,15 +259,29 @@ def test_says_what_limits_the_conclusion(tmp_path):
     assert "never tested" in warned(tmp_path / "d", done, {"n": 0, "n_critical": 0})
 
 
+def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
+    scenario = scenario_of(2)
+    with fill(tmp_path, scenario) as store:
+        narrow = dataclasses.replace(scenario, requirement=Requirement("ttc_min", CriticalInterval(0.0, 0.5)))
+        n = int((store.history().y("ttc_min") < 0).sum())
+        assert f"{n} runs have ttc_min below 0, beyond" in " ".join(warnings_for(Findings.of(store, narrow)))
+        assert "beyond" not in " ".join(warnings_for(Findings.of(store, scenario)))
+
+
 @pytest.mark.parametrize(
     ("result", "expected"),
     [
         ({"critical_fraction": 0.163, "low": 0.12, "high": 0.21}, "16.3 % (95 % interval 12 % to 21 %)"),
+        ({"critical_fraction": 0.163}, "takes 16.3 % of the parameter space"),
+        (
+            {"held_out_fraction": {"critical_fraction": 0.2, "low": 0.1, "high": 0.3, "counted": 50}},
+            "10 % to 30 %), from 50 runs",
+        ),
         ({"first_critical_run": 12, "failure_modes": 3}, "falsified: the first critical run is number 12; 3 distinct"),
         ({"first_critical_run": None}, "not falsified"),
         ({"probability": 1.2e-5, "low": 8e-6, "high": 2e-5, "confidence": 0.95, "hits": 0}, "1.2e-05 (95 % interval 8e-06"),
         ({"probability": 0.0, "exact_bound": 0.003}, "at most 0.003"),
-        ({}, "scenarios drawn at random"),
+        ({}, "from 50 runs spread over it"),
     ],
 )
 def test_conclusion_in_words(tmp_path, result, expected):
@@ -277,7 +293,8 @@ def test_conclusion_in_words(tmp_path, result, expected):
 
 def test_ego_of_the_campaign_is_not_forgotten(tmp_path):
     scenario = scenario_of(2)
-    with fill(tmp_path, scenario, configuration={"ego": {"kind": "acc"}, "store": "runs/a b"}) as store:
+    with fill(tmp_path, scenario, configuration={"ego": {"kind": "acc"}}) as store:
+        store.conclude({"store": "runs/a b"})
         text = page_of(store, scenario, None).text
     assert "which <code>simulate</code> does not know" in text
     assert "replay &#39;runs/a b&#39; RUN" in text

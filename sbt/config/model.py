@@ -81,9 +81,12 @@ def _formula(*, condition: bool) -> Callable[[str], str]:
     """Return a check that the text is a formula, and one that gives a truth value or a number as wanted."""
 
     def check(text: str) -> str:
-        with np.errstate(all="ignore"):
-            rule = Expression(text)
-            value = np.asarray(rule(dict.fromkeys(rule.names(), np.ones(1))))
+        try:
+            with np.errstate(all="ignore"):
+                rule = Expression(text)
+                value = np.asarray(rule(dict.fromkeys(rule.names(), np.ones(1))))
+        except (ArithmeticError, TypeError) as error:
+            raise ValueError(f"must be a formula that can be computed, but got '{text}' ({error})") from None
         if not rule.names():
             raise ValueError(f"must use at least one input, but got '{text}'")
         if (value.dtype == np.bool_) is not condition:
@@ -251,7 +254,7 @@ class Configuration(_Strict):
     )
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel, name: formula.")
     ego: Choice | None = Field(default=None, description="The AV under test: a controller; null: the scenario's own.")
-    simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates.")
+    simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates; default: the scenario's.")
     seed: int = Field(default=0, ge=0, description="Seed of everything random in the campaign.")
     budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
     initial: int = Field(

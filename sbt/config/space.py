@@ -49,9 +49,9 @@ def _changed(space: ParameterSpace, step: Mapping[str, Any]) -> ParameterSpace:
     """Return the space with one change, after what it would otherwise check only when it is used."""
     with np.errstate(all="ignore"):  # a formula that is not finite is told, not warned of
         space = replace(space, **step)
-    if space.constraints:
-        space.feasible_mass  # noqa: B018  (raises where the law gives the constraints no mass)
-    space.metamodel_inputs(np.full((1, space.dimension), 0.5))
+        if space.constraints:
+            space.feasible_mass  # noqa: B018  (raises where the law gives the constraints no mass)
+        space.metamodel_inputs(np.full((1, space.dimension), 0.5))
     return space
 
 
@@ -104,7 +104,8 @@ def _correlation(
 
 def _expressions(key: str, texts: Mapping[Any, str], space: ParameterSpace, problems: Problems) -> list[tuple[Any, Expression]]:
     """Return the formulas by key, after a check that they use inputs only."""
-    found = [(name, Expression(text)) for name, text in texts.items()]
+    with np.errstate(all="ignore"):
+        found = [(name, Expression(text)) for name, text in texts.items()]
     for name, rule in found:
         for used in rule.names():
             if used not in space.names:

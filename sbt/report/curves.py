@@ -109,7 +109,7 @@ def plot_precision_recall(p: Vector, critical: Mask, ax: Axes) -> Axes:
         ylabel="precision (share critical of those flagged)",
     )
     ax.set(xlim=(0.0, 1.03), ylim=(0.0, 1.03))
-    ax.legend(loc="lower left")
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     return ax
 
 
@@ -124,20 +124,9 @@ def plot_reliability(p: Vector, critical: Mask, ax: Axes, *, bins: int = 10) -> 
     some = count > 0
     mean, frequency, count = mean[some], frequency[some], count[some]
     low, high = binomial_interval(np.round(frequency * count), count)
-    ax.plot([0, 1], [0, 1], color="#777777", linestyle="--", linewidth=1.0, label="perfect calibration")
+    ax.plot([0, 1], [0, 1], color="#777777", linestyle="--", linewidth=1.0)
     bars = np.stack([np.maximum(frequency - low, 0.0), np.maximum(high - frequency, 0.0)])
-    ax.errorbar(
-        mean,
-        frequency,
-        yerr=bars,
-        fmt="o-",
-        color=MODEL,
-        markersize=5,
-        linewidth=1.2,
-        elinewidth=1.0,
-        capsize=2.5,
-        label="held-out runs",
-    )
+    ax.errorbar(mean, frequency, yerr=bars, fmt="o-", color=MODEL, markersize=5, linewidth=1.2, elinewidth=1.0, capsize=2.5)
     top = ax.secondary_xaxis("top")
     top.set_xticks((np.flatnonzero(some) + 0.5) / bins, [f"{int(n):,}" for n in count])
     top.tick_params(length=0, pad=1)
@@ -145,7 +134,6 @@ def plot_reliability(p: Vector, critical: Mask, ax: Axes, *, bins: int = 10) -> 
     top.spines["top"].set_visible(False)
     ax.set(xlabel="P(critical) by the metamodel", ylabel="share of runs that were critical")
     ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
-    ax.legend(loc="upper left")
     return ax
 
 
@@ -171,7 +159,7 @@ def plot_metric_histogram(history: History, requirement: Requirement, ax: Axes, 
             label=f"held-out runs: {len(held):,}",
         )
     ax.set(xlabel=label(requirement.metric, unit), ylabel="number of runs", xlim=(low, high))
-    ax.legend(loc="best")
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
     return ax
 
 

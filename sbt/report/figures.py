@@ -28,6 +28,8 @@ __all__ = ["plot_belief", "plot_metric", "plot_probability", "plot_runs"]
 
 _RASTER = 1500
 """More markers than this become an image inside the SVG, which keeps the file small."""
+_R2 = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the R2 sequence, which fills a square evenly."""
 
 
 def plot_runs(
@@ -52,7 +54,7 @@ def plot_runs(
         size: area of a marker in square points; None: by the number of runs.
     """
     across, up = (space.parameters[k] for k in pair)
-    x, y = _spread(across, history, pair[0]), _spread(up, history, pair[1])
+    x, y = (_spread(history, space, k, step) for k, step in zip(pair, _R2, strict=True))
     _scatter(history, requirement, x, y, ax, size)
     ax.set(xlabel=label(across.name, across.unit), ylabel=label(up.name, up.unit))
     ax.set(xlim=_limits(across, x), ylim=_limits(up, y))
@@ -151,12 +153,13 @@ def _heat() -> Any:
 def _scatter(history: History, requirement: Requirement, x: Vector, y: Vector, ax: Axes, size: float | None = None) -> None:
     """Draw the runs by verdict, the rare kinds on top."""
     critical, held = requirement.critical.contains(history.y(requirement.metric)), history.stage == VALIDATION
+    rim = 1.0 if size is not None else 1.0 + min(1e-4 * len(history), 1.0)  # hollow markers stand out among many filled ones
     size = float(np.clip(9000 / max(len(history), 1), 7, 30)) if size is None else size
     kinds: list[tuple[str, Mask, dict[str, Any]]] = [
         ("uncritical", history.ok & ~critical & ~held, _filled("o", UNCRITICAL, 0.8)),
         ("critical", history.ok & critical & ~held, _filled("^", CRITICAL, 1.25)),
-        ("uncritical, held out", history.ok & ~critical & held, _hollow("o", "#3f76a8", 0.8)),
-        ("critical, held out", history.ok & critical & held, _hollow("^", CRITICAL, 1.25)),
+        ("uncritical, held out", history.ok & ~critical & held, _hollow("o", "#1f4e79", 0.8 * rim)),
+        ("critical, held out", history.ok & critical & held, _hollow("^", CRITICAL, 1.25 * rim)),
         ("failed", ~history.ok, {"marker": "x", "color": FAILED, "linewidths": 1.2, "s": 1.1}),
     ]
     for order, (name, mask, look) in enumerate(kinds):
@@ -185,12 +188,12 @@ def _whole_ticks(ax: Axes, *inputs: Parameter) -> None:
             axis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
-def _spread(parameter: Parameter, history: History, column: int) -> Vector:
-    """Return (n,) places of the runs; whole numbers are moved by up to 0.3, by the golden ratio and the index."""
+def _spread(history: History, space: ParameterSpace, column: int, step: float) -> Vector:
+    """Return (n,) places of the runs; whole numbers are moved by up to 0.3, evenly by the run's index."""
     x = history.x[:, column]
-    if parameter.kind != "integer":
+    if space.parameters[column].kind != "integer":
         return x
-    moved: Vector = x + 0.6 * ((history.index * 0.6180339887498949 * (column + 1)) % 1.0 - 0.5)
+    moved: Vector = x + 0.6 * ((history.index * step) % 1.0 - 0.5)
     return moved
 
 

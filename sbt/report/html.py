@@ -58,7 +58,7 @@ def write_report(store: Store, scenario: LogicalScenario, predict: Predict | Non
         "failed": failed_table(found.history, reference),
         "ego": found.configuration.get("ego"),
         "commands": _commands(found, store),
-        "configuration": json.dumps(found.configuration, indent=2, ensure_ascii=False),
+        "configuration": _configuration(found),
     })  # fmt: skip
     _replace(target / REPORT, page)
     return target / REPORT
@@ -131,12 +131,17 @@ def _scores(found: Findings) -> list[tuple[str, str]]:
 
 
 def _commands(found: Findings, store: Store) -> dict[str, str]:
-    folder = str(found.configuration.get("store") or store.folder.name)
+    folder = str(found.conclusion.get("store") or store.folder)
     return {
         "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml"]),
         "replay": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN",
         "export": shlex.join(["sumo-sbt", "export", folder, "--format", "csv"]),
     }
+
+
+def _configuration(found: Findings) -> str:
+    """Return the configuration as the user would write it, or all that the store keeps of it."""
+    return str(found.configuration.get("yaml") or json.dumps(found.configuration, indent=2, ensure_ascii=False))
 
 
 def _replace(path: Path, text: str) -> None:

@@ -125,7 +125,7 @@ def iteration_table(
         *(SCORES[key] for key in scored),
         "how it was chosen",
     )
-    return Table(columns, tuple(rows))
+    return Table(columns, tuple(rows), "Scores are those of the metamodel that chose the batch." if scored else "")
 
 
 def _listed(how: Mapping[str, Any]) -> str:

@@ -56,6 +56,7 @@ class Findings:
         conclusion: as `run --json` prints it, empty while the campaign goes on.
         scores: of the last metamodel on held-out runs, empty where there is none.
         planned: runs without an outcome.
+        direction: "low" where small values of the metric are bad, "high" where large ones are.
     """
 
     history: History
@@ -65,16 +66,17 @@ class Findings:
     conclusion: Mapping[str, Any]
     scores: Mapping[str, Any]
     planned: int
+    direction: str = "low"
 
     @classmethod
     def of(cls, store: Store, scenario: LogicalScenario) -> Findings:
         """Return the findings of a store, at whatever point of the campaign."""
-        units = {metric.name: metric.unit for metric in scenario.metrics}
+        metric = {metric.name: metric for metric in scenario.metrics}.get(scenario.requirement.metric)
         conclusion, fits = store.conclusion or {}, store.fits()
         scores = _result(conclusion).get("validation") or (fits[-1] if fits else {})
         return cls(
-            store.history(), scenario.requirement, units.get(scenario.requirement.metric, ""), store.configuration,
-            conclusion, scores, store.counts.get(PLANNED, 0),
+            store.history(), scenario.requirement, metric.unit if metric is not None else "", store.configuration,
+            conclusion, scores, store.counts.get(PLANNED, 0), metric.direction if metric is not None else "low",
         )  # fmt: skip
 
     @property
@@ -199,21 +201,34 @@ def _falsification(result: Mapping[str, Any]) -> list[str]:
 
 
 def _fraction(found: Findings) -> list[str]:
-    """Return the share of the parameter space that is critical: as concluded, or from held-out runs."""
-    result, held = found.result, found.held_out
-    if result.get("critical_fraction") is not None:
-        within = ""
-        if result.get("low") is not None and result.get("high") is not None:
-            within = f" (95 % interval {share(result['low'])} to {share(result['high'])})"
-        return [f"Critical share of the parameter space: {share(result['critical_fraction'])}{within}."]
-    n, hits = int(held.sum()), int((held & found.critical).sum())
-    if n == 0:
-        return []
-    low, high = (float(end[0]) for end in binomial_interval(np.array([hits]), np.array([n])))
-    return [
-        f"Critical share of scenarios drawn at random: {share(hits / n)} (95 % interval {share(low)} to"
-        f" {share(high)}), from {n:,} held-out runs."
-    ]
+    """Return the share of the parameter space that is critical: as measured, then as the metamodel sees it."""
+    result, said = found.result, []
+    measured = result if result.get("low") is not None else result.get("held_out_fraction")
+    if measured is None:
+        measured = _held_out_fraction(found)
+    if measured.get("critical_fraction") is not None and measured.get("low") is not None:
+        counted = f", from {measured['counted']:,} runs spread over it" if measured.get("counted") else ""
+        said.append(
+            f"Critical share of the parameter space: {share(measured['critical_fraction'])}"
+            f" ({share(measured.get('confidence') or 0.95)} interval {share(measured['low'])} to"
+            f" {share(measured['high'])}){counted}."
+        )
+    if measured is not result and result.get("critical_fraction") is not None:
+        said.append(f"The metamodel takes {share(result['critical_fraction'])} of the parameter space to be critical.")
+    return said
+
+
+def _held_out_fraction(found: Findings) -> dict[str, Any]:
+    """Return the share of critical runs among the held-out ones, which are uniform in the ranges.
+
+    Failed runs count as uncritical for the low end and as critical for the high end.
+    """
+    n, ok = int((found.history.stage == VALIDATION).sum()), int(found.held_out.sum())
+    if ok == 0:
+        return {}
+    hits = int((found.held_out & found.critical).sum())
+    low, high = binomial_interval(np.array([hits, hits + n - ok]), np.array([n, n]))
+    return {"critical_fraction": hits / ok, "low": float(low[0]), "high": float(high[1]), "counted": n}
 
 
 def warnings_for(found: Findings) -> list[str]:
@@ -230,7 +245,8 @@ def _about_progress(found: Findings) -> list[str]:
     if found.conclusion and not found.planned:
         return []
     done, budget = len(found.history), found.configuration.get("budget")
-    of = f" of {budget:,}" if isinstance(budget, int) else ""
+    reference = (found.configuration.get("validation") or {}).get("reference") or 0
+    of = f" of {budget + reference:,}" if isinstance(budget, int) else ""
     waiting = f", {found.planned:,} more are planned" if found.planned else ""
     return [f"The campaign has not concluded: {done:,}{of} runs are done{waiting}. What follows may still change."]
 
@@ -245,6 +261,7 @@ def _about_runs(found: Findings) -> list[str]:
             f"{len(failed):,} of {len(history):,} runs failed ({share(len(failed) / len(history))}) and tell nothing"
             f" about safety. Most frequent reason ({times:,} times): {reason[:200]}"
         )
+    said += _about_far_side(found)
     if history.ok.any() and not found.critical.any():
         n = int(found.held_out.sum())
         bound = (
@@ -254,6 +271,18 @@ def _about_runs(found: Findings) -> list[str]:
     if len({record.versions for record in history.records}) > 1:
         said.append("Runs were made with different versions of the software; see the header.")
     return said
+
+
+def _about_far_side(found: Findings) -> list[str]:
+    """Return how many runs are worse than the bad end of the critical interval, and so count as uncritical."""
+    y, critical, name = found.history.y(found.requirement.metric), found.requirement.critical, found.requirement.metric
+    high = found.direction == "high"
+    n, end = int((y > critical.high).sum() if high else (y < critical.low).sum()), critical.high if high else critical.low
+    if n == 0:
+        return []
+    runs = "1 run has" if n == 1 else f"{n:,} runs have"
+    side, tail = "above" if high else "below", f" {found.unit}" if found.unit else ""
+    return [f"{runs} {name} {side} {end:g}{tail}, beyond the critical interval, and count as uncritical. Is that meant?"]
 
 
 def _about_scores(found: Findings) -> list[str]:

@@ -28,8 +28,8 @@ CO_SPEED = 80 / 3.6
 LANE_CHANGE = 3.0
 """Duration of the lane change (s): a brisk one, naturalistic cut-ins last about 3 to 6 s."""
 LANE_WIDTH = 3.5
-DURATION = 8.0
-"""Longest time that is looked at (s): the lane change and five seconds more."""
+DURATION = 6.0
+"""Longest time that is looked at (s): the lane change and three seconds more."""
 START = 20.0
 CAR = VehicleType(length=5.0, width=1.8)
 MARGIN = (LANE_WIDTH - CAR.width) / 2

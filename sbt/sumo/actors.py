@@ -57,14 +57,11 @@ class State:
         self.angle = 90.0
         self.steered: float | None = None
 
-    def place(self, front_x: float, front_y: float, angle: float) -> None:
-        """Take over SUMO's front-bumper position and its angle (degrees clockwise from north)."""
-        if angle != self.angle:
-            self.angle = angle
-            self.heading = math.radians(90.0 - angle)
-            self.cos, self.sin = math.cos(self.heading), math.sin(self.heading)
-        self.x = front_x - 0.5 * self.length * self.cos
-        self.y = front_y - 0.5 * self.length * self.sin
+    def turn(self, angle: float) -> None:
+        """Take over SUMO's angle (degrees clockwise from north)."""
+        self.angle = angle
+        self.heading = math.radians(90.0 - angle)
+        self.cos, self.sin = math.cos(self.heading), math.sin(self.heading)
 
 
 class Controller(Protocol):

@@ -64,38 +64,31 @@ class AccAeb:
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the acceleration over the next step: the mean of the lag's output at its ends."""
-        demand = self._delay(t, self._demand(own, self._sensor(t, own, others)))
+        demand = self._delay(t, self._demand(own.speed, self._sensor(t, own, others)))
         before = self._reached
         self._reached = after = self._lag(demand, t - self._last)
         self._last = t
         return Action(0.5 * (before + after))
 
-    def _demand(self, own: State, target: Target | None) -> float:
-        """Return the acceleration that ACC and AEB ask for."""
-        cruise = 0.4 * (self._set_speed - own.speed)
+    def _demand(self, speed: float, target: Target | None) -> float:
+        """Return the acceleration that ACC and AEB ask for; AEB brakes on until nothing closes in."""
+        demand = 0.4 * (self._set_speed - speed)
         if target is None:
             self._braking = False
-            return _limited(cruise, self._acc_braking, self._acc_accel)
-        if self._must_brake(target):
-            return -self._aeb_braking
-        follow = 0.1 * (target.gap - self._distance_min - self._time_gap * own.speed) - 0.6 * target.closing
-        return _limited(follow if follow < cruise else cruise, self._acc_braking, self._acc_accel)
-
-    def _must_brake(self, target: Target) -> bool:
-        """Return whether AEB brakes; once it does, it goes on until nothing closes in."""
-        closing = target.closing
-        last_moment = closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
-        if closing > 0 and target.gap < max(last_moment, self._aeb_distance):
-            self._braking = True
-        elif closing <= 0:
-            self._braking = False
-        return self._braking
-
-
-def _limited(demand: float, braking: float, accel: float) -> float:
-    if demand < -braking:
-        return -braking
-    return accel if demand > accel else demand
+        else:
+            gap, closing = target
+            last_moment = closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
+            if closing <= 0:
+                self._braking = False
+            elif gap < last_moment or gap < self._aeb_distance:
+                self._braking = True
+            if self._braking:
+                return -self._aeb_braking
+            follow = 0.1 * (gap - self._distance_min - self._time_gap * speed) - 0.6 * closing
+            demand = min(demand, follow)
+        if demand < -self._acc_braking:
+            return -self._acc_braking
+        return demand if demand < self._acc_accel else self._acc_accel
 
 
 class LaneChange:

@@ -29,7 +29,7 @@ class DeadTime:
         while samples and samples[0][0] <= then:
             self._before = samples.popleft()
         start, now = self._before
-        if not samples or then - start < 1e-6 or start == -math.inf:
+        if then - start < 1e-6 or not samples or start == -math.inf:
             return now
         end, following = samples[0]
         return now + (following - now) * (then - start) / (end - start)

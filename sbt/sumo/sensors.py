@@ -18,8 +18,6 @@ class Target(NamedTuple):
     """bumper to bumper (m)"""
     closing: float
     """rate at which the gap shrinks (m/s)"""
-    speed: float
-    """of the target (m/s)"""
 
 
 class RangeSensor:
@@ -52,28 +50,29 @@ class RangeSensor:
         """Return the latest measurement at time t; None where nothing is in the path."""
         tick = int(t / self._period + 1e-6)
         if tick >= self._next:
-            self._held = self._measure(tick, own, others)
             self._next = tick + 1
+            self._held = self._measure(tick, own, others)
         return self._held
 
     def _measure(self, tick: int, own: State, others: tuple[State, ...]) -> Target | None:
-        cos, sin = own.cos, own.sin
+        x, y, cos, sin = own.x, own.y, own.cos, own.sin
         nearest: State | None = None
         smallest = self._reach
         for other in others:
-            dx, dy = other.x - own.x, other.y - own.y
+            dx, dy = other.x - x, other.y - y
             gap = dx * cos + dy * sin - 0.5 * (own.length + other.length)
             if 0.0 <= gap < smallest and abs(dy * cos - dx * sin) - 0.5 * (own.width + other.width) < self._margin:
                 nearest, smallest = other, gap
         if nearest is None:
             return None
-        noise = self._draw(tick)
-        speed = nearest.speed * (nearest.cos * cos + nearest.sin * sin)
-        closing = own.speed - speed + self._noise[1] * noise[1]
-        return Target(max(smallest + self._noise[0] * noise[0], 0.0), closing, own.speed - closing)
+        noise = self._buffer[tick] if tick < len(self._buffer) else self._draw(tick)
+        closing = own.speed - nearest.speed * (nearest.cos * cos + nearest.sin * sin) + noise[1]
+        gap = smallest + noise[0]
+        return Target(gap if gap > 0.0 else 0.0, closing)
 
     def _draw(self, tick: int) -> tuple[float, float]:
         """Return the noise of one tick: the same whatever was in the path before."""
         while tick >= len(self._buffer):
-            self._buffer += [(a, b) for a, b in self._rng.standard_normal((256, 2)).tolist()]
+            noise = self._rng.standard_normal((256, 2)) * self._noise
+            self._buffer += [(a, b) for a, b in noise.tolist()]
         return self._buffer[tick]

@@ -159,16 +159,18 @@ def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
         (a, s, a.driver.act, tuple(o for o in states if o is not s))
         for a, s in zip(actors, states, strict=True) if a.driver is not None
     ]  # fmt: skip
+    observe = _observer(vehicle, states, dt)
+    near = max(s.length for s in states) * 2
     steps = round(simulation.duration / dt)
     deadline = math.inf if simulation.timeout is None else time.monotonic() + simulation.timeout
     rows: list[tuple[float, ...]] = []
     reported: list[str] = []
     for k in range(steps + 1):
         t = k * dt
-        _observe(vehicle, states, rows, dt)
+        observe(rows)
         if collisions():
             reported += [f"{c.collider}>{c.victim}@{t:.3f}" for c in sumo.simulation.getCollisions()]
-        if _touching(states, rows, dt):
+        if _touching(states, rows, near, dt):
             return _trace(actors, rows, dt, "collision", reported)
         reason = scene.until(t, by_name) if scene.until is not None else None
         if reason is not None:
@@ -184,19 +186,33 @@ def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
     return _trace(actors, rows, dt, "duration", reported)
 
 
-def _observe(vehicle: Any, states: list[State], rows: list[tuple[float, ...]], dt: float) -> None:
-    """Read every actor from SUMO and record it: a row an actor."""
-    first = not rows
-    for state in states:
-        name = state.name
-        x, y = vehicle.getPosition(name)
-        if x == ABSENT:
-            raise RunError(Status.FAILED, f"{name} must stay on the road, but it was gone at t = {len(rows) // len(states) * dt:g} s")
-        state.place(x, y, vehicle.getAngle(name))
-        speed = vehicle.getSpeed(name) if state.steered is None else state.steered
-        state.acceleration = 0.0 if first else (speed - state.speed) / dt
-        state.speed = speed
-        rows.append((state.x, state.y, state.heading, speed, state.acceleration))
+def _observer(vehicle: Any, states: list[State], dt: float) -> Callable[[list[tuple[float, ...]]], None]:
+    """Return what reads every actor from SUMO and records it, a row an actor.
+
+    This runs at every step of every run, so that everything it needs is bound beforehand.
+    """
+    position, angle_of, speed_of = vehicle.getPosition, vehicle.getAngle, vehicle.getSpeed
+    halves = [(s, s.name, 0.5 * s.length) for s in states]
+    rate = 1.0 / dt
+
+    def observe(rows: list[tuple[float, ...]]) -> None:
+        first = not rows
+        for state, name, half in halves:
+            x, y = position(name)
+            if x == ABSENT:
+                t = len(rows) // len(states) * dt
+                raise RunError(Status.FAILED, f"{name} must stay on the road, but it was gone at t = {t:g} s")
+            angle = angle_of(name)
+            if angle != state.angle:
+                state.turn(angle)
+            speed = speed_of(name) if state.steered is None else state.steered
+            state.x = x = x - half * state.cos
+            state.y = y = y - half * state.sin
+            state.acceleration = acceleration = 0.0 if first else (speed - state.speed) * rate
+            state.speed = speed
+            rows.append((x, y, state.heading, speed, acceleration))
+
+    return observe
 
 
 def _apply(vehicle: Any, actor: Actor, own: State, action: Action, dt: float) -> None:
@@ -229,14 +245,14 @@ def _place(vehicle: Any, actor: Actor, own: State, action: Action, speed: float 
     vehicle.moveToXY(actor.name, "", -1, x + half * math.cos(heading), y + half * math.sin(heading), angle, keepRoute=2)
 
 
-def _touching(states: list[State], rows: list[tuple[float, ...]], dt: float) -> bool:
+def _touching(states: list[State], rows: list[tuple[float, ...]], near: float, dt: float) -> bool:
     """Return whether the first actor, the ego, touched another since the last step (exact test only when near)."""
     ego = states[0]
+    x, y, speed = ego.x, ego.y, ego.speed
     for j in range(1, len(states)):
         other = states[j]
-        dx, dy = other.x - ego.x, other.y - ego.y
-        near = ego.length + other.length + (ego.speed + other.speed) * dt
-        if dx * dx + dy * dy < near * near:
+        dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
+        if -reach < dx < reach and -reach < dy < reach:
             last = np.array(rows[-2 * len(states) :]).reshape(-1, len(states), 5)
             if contact_index(_columns(last, 0, ego), _columns(last, j, other)) is not None:
                 return True

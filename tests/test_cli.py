@@ -1,0 +1,400 @@
+"""The command line: verbs, exit codes, JSON, and what is never imported too early."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from sbt import run as sbt_run
+from sbt.campaign import Progress
+from sbt.cli import app, console
+from sbt.errors import InputError, StoreError
+from sbt.problem.outcome import Outcome, Status
+from sbt.store import PlannedRun, Store
+
+SBT = [sys.executable, "-m", "sbt"]
+PLUGIN = """
+import os, sys
+from sbt.errors import RunError
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+
+
+def margin(values, seed):
+    print("noise on stdout")
+    os.write(1, b"noise from C\\n")
+    return {"margin": values["gap"] - values["speed"] / 2 + 1e-3 * (seed % 7)}
+
+
+def refused(values, seed):
+    raise RunError("invalid", "the start is not the one asked for")
+
+
+def broken(values, seed):
+    return {"margin": 1 / 0}
+
+
+calls = []
+
+
+def unsteady(values, seed):
+    calls.append(seed)
+    return {"margin": float(len(calls))}
+
+
+def elsewhere(values, seed):
+    return {"margin": float(os.getpid())}
+
+
+def scenario(evaluate):
+    space = ParameterSpace((Parameter("speed", 0.0, 10.0, "m/s"), Parameter("gap", 1.0, 5.0, "m")))
+    requirement = Requirement("margin", CriticalInterval(high=0.0))
+    return LogicalScenario("plane", space, requirement, evaluate=evaluate, metric_names=("margin",))
+
+
+SCENARIO, REFUSED, BROKEN, UNSTEADY, ELSEWHERE = map(scenario, (margin, refused, broken, unsteady, elsewhere))
+"""
+RESULT: dict[str, Any] = {
+    "campaign": "boundary", "scenario": "plane", "store": "there", "runs": 10, "ok": 9, "failed": 1, "critical": 2,
+    "iterations": 2, "stopped": "budget", "seconds": {"simulate": 1.0, "fit": 0.0, "propose": 0.0},
+    "conclusion": {"critical_fraction": 0.2222222, "validation": {"log_likelihood": -1.25, "rmse": None}},
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "plane.py").write_text(PLUGIN)
+    (tmp_path / "c.yaml").write_text("campaign: boundary\nscenario: plane.py:SCENARIO\nbudget: 20\nmetamodel: {kind: et}\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def campaign(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Replace the campaign by one that returns RESULT at once, and keep what it was given."""
+    given: list[Any] = []
+
+    def run_campaign(loaded: Any, *, progress: Any) -> dict[str, Any]:
+        given.append(loaded)
+        print("noise on stdout")
+        for done in (5, 10):
+            progress(Progress(done, 10, 1, 2, done // 5 - 1, "simulating"))
+        return RESULT
+
+    monkeypatch.setattr(sbt_run, "run_campaign", run_campaign)
+    return given
+
+
+def call(*args: str) -> Any:
+    return CliRunner().invoke(app, args)
+
+
+def process(*args: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*SBT, *args], capture_output=True, text=True, timeout=120, env={**os.environ, **environment})
+
+
+def store(folder: Path, *, concluded: bool = False) -> Path:
+    """Write a store of three runs, one of them failed, and one more planned."""
+    with Store.open(folder, {"names": ["speed"]}) as made:
+        made.plan(0, "initial", [PlannedRun("initial", {"speed": k / 3}) for k in range(4)], [1, 2, 3, 4], {"kind": "even"})
+        for k in range(2):
+            made.append(Outcome(k, Status.OK, {"margin": 0.1 * k}))
+        made.append(Outcome(2, Status.TIMEOUT, reason="too long, 60 s"))
+        made.add_fit(2, 0, {"rmse": 0.5})
+        if concluded:
+            made.conclude(RESULT)
+    return folder
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    start = time.perf_counter()
+    done = subprocess.run([sys.executable, "-X", "importtime", "-m", "sbt", "--help"], capture_output=True, text=True)
+    assert time.perf_counter() - start < 2.0  # 0.2 s alone; the bound is for a busy machine
+    assert done.returncode == 0
+    imported = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines() if "|" in line}
+    heavy = {"torch", "pandas", "libsumo", "scipy", "sklearn", "matplotlib", "pydantic", "numpy", "ruamel", "joblib"}
+    assert "sbt" in imported
+    assert imported & heavy == set()
+
+
+def test_version():
+    assert call("--version").stdout.startswith("sumo-sbt ")
+
+
+@pytest.mark.parametrize("args", [["bogus"], ["run"], ["run", "c.yaml", "--bogus"], ["run", "c.yaml", "--workers", "0"]])
+def test_wrong_usage_ends_with_2(args: list[str]):
+    assert call(*args).exit_code == 2
+
+
+def test_wrong_configuration_is_told_with_its_place(folder: Path):
+    (folder / "bad.yaml").write_text("campaign: boundary\nscenario: plane.py:SCENARIO\nbugdet: 10\nbatch: two\n")
+    done = process("run", "bad.yaml", "--json")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines() == [
+        "bad.yaml:3:1: bugdet: unknown key (did you mean 'budget'?)",
+        "bad.yaml:4:8: batch: must be a whole number, but got 'two'",
+    ]
+
+
+def test_run_prints_one_json_object_and_nothing_else(folder: Path, campaign: list[Any]):
+    done = call("run", "c.yaml", "--json", "--store", "a b: c", "--set", "seed=3", "--workers", "2")
+    assert done.exit_code == 0
+    assert json.loads(done.stdout) == RESULT
+    assert "5/10" not in done.stderr
+    config = campaign[0].config
+    assert (config.store, config.seed, config.executor.workers, campaign[0].folder) == ("a b: c", 3, 2, folder)
+
+
+def test_run_tells_people_the_conclusion(folder: Path, campaign: list[Any]):
+    done = call("run", "c.yaml")
+    assert done.exit_code == 0
+    assert "5/10 runs, iteration 0, 2 critical, 1 failed, simulating" in done.stderr
+    assert re.search(r"critical fraction +0\.2222", done.stdout)
+    assert re.search(r"log likelihood +-1\.25", done.stdout)
+    assert "noise" not in done.stdout
+    assert call("run", "c.yaml", "--quiet").stderr.strip() == "noise on stdout"
+
+
+@pytest.mark.parametrize(
+    ("change", "args", "code"),
+    [
+        ({}, ["--fail-on-critical"], 3),
+        ({"critical": 0}, ["--fail-on-critical"], 0),
+        ({"failed": 5, "ok": 5}, [], 0),
+        ({"failed": 6, "ok": 4}, [], 4),
+        ({"runs": 0, "failed": 0, "critical": 0}, ["--fail-on-critical"], 0),
+    ],
+)
+def test_exit_codes_of_run(
+    folder: Path, campaign: list[Any], monkeypatch: pytest.MonkeyPatch, change: dict[str, int], args: list[str], code: int
+):
+    for key, value in change.items():
+        monkeypatch.setitem(RESULT, key, value)
+    done = call("run", "c.yaml", "--json", *args)
+    assert done.exit_code == code
+    assert json.loads(done.stdout) == RESULT
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (InputError("budget must fit"), 2, "budget must fit\n"),
+        (StoreError("the disk is full"), 1, "the disk is full\n"),
+        (KeyboardInterrupt(), 130, "interrupted, run again to resume\n"),
+        (ZeroDivisionError("oh"), 1, "internal error: ZeroDivisionError: oh (SBT_DEBUG=1 shows where)\n"),
+    ],
+)
+def test_errors_become_exit_codes(folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, text: str):
+    def run_campaign(loaded: Any, *, progress: Any) -> dict[str, Any]:
+        raise error
+
+    monkeypatch.setattr(sbt_run, "run_campaign", run_campaign)
+    done = call("run", "c.yaml", "--json")
+    assert (done.exit_code, done.stdout, done.stderr) == (code, "", text)
+    monkeypatch.setenv("SBT_DEBUG", "1")
+    assert ("Traceback" in call("run", "c.yaml").stderr) is isinstance(error, Exception)
+
+
+def test_sigterm_is_an_interruption(folder: Path):
+    (folder / "slow.py").write_text(
+        PLUGIN + "\n\ndef slow(values, seed):\n    import time\n    time.sleep(60)\n\n\nSLOW = scenario(slow)\n"
+    )
+    running = subprocess.Popen([*SBT, "simulate", "slow.py:SLOW"], stderr=subprocess.PIPE, text=True)
+    time.sleep(3.0)
+    running.send_signal(signal.SIGTERM)
+    _, told = running.communicate(timeout=20)
+    assert (running.returncode, told) == (130, "interrupted\n")
+
+
+def test_simulate_prints_one_json_object_and_nothing_else(folder: Path):
+    done = process("simulate", "plane.py:SCENARIO", "speed=8", "--seed", "3", "--json")
+    assert done.returncode == 0
+    assert done.stdout.count("\n") == 1
+    found = json.loads(done.stdout)
+    assert list(found) == ["scenario", "seed", "inputs", "status", "metrics", "critical", "reason", "seconds"]
+    assert (found["seed"], found["inputs"], found["critical"]) == (3, {"speed": 8.0, "gap": 3.0}, True)
+    assert found["metrics"] == {"margin": 3.0 - 4.0 + 1e-3 * 3}
+    assert "noise from C" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "reason"),
+    [
+        ("REFUSED", "invalid", "the start is not the one asked for"),
+        ("BROKEN", "failed", "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_failed_run_is_told_and_ends_with_4(folder: Path, name: str, status: str, reason: str):
+    done = call("simulate", f"plane.py:{name}", "--json")
+    found = json.loads(done.stdout)
+    assert done.exit_code == 4
+    assert (found["status"], found["reason"], found["metrics"], found["critical"]) == (status, reason, {}, None)
+    assert f"{status}: {reason}" in call("simulate", f"plane.py:{name}").stdout
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        (["sped=3"], "an input must be one of speed, gap, but got 'sped' (did you mean 'speed'?)"),
+        (["speed=11"], "input speed must be in [0, 10] m/s, but got 11"),
+        (["speed=x"], "input speed must be a number, but got 'x'"),
+        (["speed"], "input must be name=value, but got 'speed'"),
+        (["speed=1", "speed=2"], "input speed must be given once, but got it twice"),
+        (["--ego", "gain=2"], "--ego needs kind=NAME, but got gain"),
+        (["--ego", "kind=acc"], "scenario plane offers no choice of ego or step length"),
+        (["--step", "0"], "--step must be > 0 s, but got 0.0"),
+        (["--isolation", "none"], "--isolation must be auto, fresh, reuse or replicas, but got 'none'"),
+        (["--trace", "t.csv"], "--trace needs a scenario that is simulated, but plane gives its metrics directly"),
+    ],
+)
+def test_wrong_input_of_simulate_ends_with_2(folder: Path, args: list[str], expected: str):
+    done = call("simulate", "plane.py:SCENARIO", *args)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.strip() == expected
+
+
+@pytest.mark.sumo
+def test_simulate_writes_the_trace(folder: Path):
+    done = process("simulate", "cut_in", "d_v=60", "d_t=1.2", "--seed", "3", "--json", "--trace", "t.csv")
+    assert json.loads(done.stdout)["status"] == "ok"
+    with (folder / "t.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["actor"] for row in rows} == {"ego", "co"}
+    assert float(rows[0]["time"]) == 0.0
+
+
+@pytest.mark.parametrize("target", ["plane.py:SCENARIO", "c.yaml"])
+def test_check_of_a_sound_scenario(folder: Path, target: str):
+    done = process("check", target)
+    assert done.returncode == 0
+    assert [line[:4] for line in done.stdout.splitlines()] == ["ok  "] * 5
+    assert "critical by margin" in done.stdout.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "rule"),
+    [
+        ("REFUSED", "centre and corners run: 5 of 5 failed; at speed=5, gap=3: invalid: the start is not"),
+        ("UNSTEADY", "same seed, same trace: at speed=5, gap=3: margin 1.0 and 10.0"),
+        ("ELSEWHERE", "same seed, same trace in a worker process: at speed=5, gap=3: margin "),
+    ],
+)
+def test_check_of_an_unsound_scenario(folder: Path, name: str, rule: str):
+    done = process("check", f"plane.py:{name}")
+    assert done.returncode == 2
+    assert f"FAIL  {rule}" in done.stdout
+
+
+@pytest.mark.sumo
+def test_check_compares_the_isolation_levels():
+    done = process("check", "cut_in")
+    assert done.returncode == 0
+    assert "ok    isolation reuse = fresh: 10 runs bit-equal" in done.stdout
+
+
+def test_list_shows_what_is_installed():
+    found = json.loads(call("list", "--json").stdout)
+    assert {"scenarios", "metamodels", "acquisitions", "metrics", "campaigns"} <= set(found)
+    assert all(entry["summary"] for entries in found.values() for entry in entries)
+    assert "boundary" in {entry["name"] for entry in found["campaigns"]}
+    assert call("list", "acquisitions").stdout.startswith("acquisitions:\n")
+    wrong = call("list", "metrcs")
+    assert (wrong.exit_code, "did you mean 'metrics'?" in wrong.stderr) == (2, True)
+
+
+def test_schema_is_json():
+    assert json.loads(call("schema").stdout)["properties"]["scenario"]["type"] == "string"
+
+
+def test_doctor_finds_this_environment_sound(folder: Path):
+    done = process("doctor", "--json", "--store", str(folder / "not" / "yet"))
+    found = json.loads(done.stdout)
+    assert (done.returncode, found["ok"]) == (0, True)
+    states = {check["name"]: check["state"] for check in found["checks"]}
+    assert {states[name] for name in ("python", "libsumo", "torch", "sumo", "sumo_nets", "cores", "sqlite")} == {"ok"}
+    assert list(folder.glob(".sbt-doctor*")) == []
+
+
+def test_doctor_warns_of_a_strange_sumo_home(folder: Path):
+    done = process("doctor", SUMO_HOME=str(folder / "old"))
+    assert re.search(r"warning +SUMO_HOME +'.*old' is no folder; unset SUMO_HOME", done.stdout)
+
+
+def test_status_of_a_store(folder: Path):
+    found = json.loads(call("status", str(store(folder / "s")), "--json").stdout)
+    assert found["runs"] == {"ok": 2, "timeout": 1, "planned": 1}
+    assert (found["iterations"], found["validation"]["rmse"], found["conclusion"]) == (1, 0.5, None)
+    assert "not finished" in call("status", str(folder / "s")).stdout
+    done = call("status", str(store(folder / "d", concluded=True)), "--watch")
+    assert "critical fraction" in done.stdout
+
+
+def test_export_writes_a_table(folder: Path):
+    done = call("export", str(store(folder / "s")))
+    path = Path(done.stdout.strip())
+    assert (done.exit_code, path) == (0, folder / "s" / "exports" / "runs.csv")
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["ok", "ok", "timeout"]
+    assert float(rows[1]["x.speed"]) == 1 / 3
+    assert rows[2]["y.margin"] == ""
+    assert not list(path.parent.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("form", "expected"),
+    [
+        ("dsiod", "--format dsiod is not in this release; choose csv or parquet"),
+        ("xls", "--format must be csv or parquet, but got 'xls'"),
+    ],
+)
+def test_other_forms_of_export_are_refused(folder: Path, form: str, expected: str):
+    done = call("export", str(store(folder / "s")), "--format", form)
+    assert (done.exit_code, done.stderr.strip()) == (2, expected)
+
+
+@pytest.mark.parametrize("verb", ["status", "report", "export"])
+def test_a_folder_without_a_campaign_is_refused(folder: Path, verb: str):
+    done = call(verb, str(folder))
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert "must be the folder of a campaign" in done.stderr
+
+
+def test_report_prints_its_path(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sbt_run, "rebuild_report", lambda folder: folder / "report.html")
+    assert call("report", str(store(folder / "s"))).stdout.strip() == str(folder / "s" / "report.html")
+
+
+def test_progress_without_a_terminal_is_a_line_an_iteration(capsys: pytest.CaptureFixture[str]):
+    with console.ProgressDisplay() as show:
+        for done in range(1, 7):
+            show(Progress(done, 6, 0, 0, (done - 1) // 3, "simulating"))
+    assert [line.split()[0] for line in capsys.readouterr().err.splitlines()] == ["1/6", "4/6", "6/6"]
+
+
+def test_progress_on_a_terminal_is_a_bar(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with console.ProgressDisplay() as show:
+        show(Progress(3, 6, 1, 2, 0, "simulating"))
+        show(Progress(6, 6, 1, 2, 0, "fitting"))
+    assert "6/6" in capsys.readouterr().err
+
+
+def test_numbers_of_numpy_and_infinities_become_json(capsys: pytest.CaptureFixture[str]):
+    import numpy as np
+
+    console.print_json({"a": np.float64(1.5), "b": [np.int64(2), float("inf")], "c": (np.nan, None, True), "d": Path("x")})
+    assert json.loads(capsys.readouterr().out) == {"a": 1.5, "b": [2, None], "c": [None, None, True], "d": "x"}
