@@ -15,6 +15,9 @@ from sbt.errors import InputError
 
 __all__ = ["export", "report", "run", "status"]
 
+_SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
+"""What `status` tells of the last validation."""
+
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign (its store).")]
 
 
@@ -116,7 +119,7 @@ def _status(folder: Path) -> dict[str, Any]:
             "runs": store.counts,
             "iterations": len(iterations),
             "stage": iterations[-1]["stage"] if iterations else None,
-            "validation": fits[-1] if fits else None,
+            "validation": {k: v for k, v in fits[-1].items() if not isinstance(v, str)} if fits else None,
             "conclusion": store.conclusion,
         }
 
@@ -125,14 +128,11 @@ def _status_lines(found: Mapping[str, Any]) -> list[str]:
     counts = ", ".join(f"{n} {name}" for name, n in sorted(found["runs"].items())) or "none planned"
     lines = [f"{found['store']}: {counts}; {found['iterations']} iterations"]
     if found["validation"] is not None:
-        scores = (f"{key} {_number(value)}" for key, value in found["validation"].items() if not isinstance(value, dict | list))
+        scores = (f"{key.replace('_', ' ')} {_number(found['validation'].get(key))}" for key in _SCORES)
         lines.append("  validation: " + ", ".join(scores))
     if found["conclusion"] is None:
         return [*lines, "  not finished"]
-    return [
-        *lines,
-        *(conclusion_lines(found["conclusion"]) if "campaign" in found["conclusion"] else ["  finished"]),
-    ]
+    return [*lines, *conclusion_lines(found["conclusion"])]
 
 
 def report(folder: Folder) -> None:

@@ -13,6 +13,7 @@ import os
 import signal
 import struct
 import tempfile
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -202,9 +203,22 @@ def _mark(folder: str, index: int) -> None:
     os.pwrite(_mark_file(folder), _MARK.pack(index, time.monotonic()), 0)
 
 
+@cache
+def _end_with(parent: int) -> None:
+    """End this process when its driver is gone: a killed driver cannot stop its workers."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="sbt-driver-watch", daemon=True).start()
+
+
 def _prepare(spec: ScenarioSpec, folder: str, workers: int) -> None:
     """Load the scenario in a worker, and wait until every worker does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
+    _end_with(os.getppid())
     spec.resolve().prepare()
     _mark(folder, _IDLE)
     deadline = time.monotonic() + 20.0

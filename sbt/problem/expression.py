@@ -33,10 +33,11 @@ _COMPARE: dict[type, Callable[[Any, Any], Any]] = {
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }
-_FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "log": np.log,
-    "min": np.minimum, "max": np.maximum, "sin": np.sin, "cos": np.cos,
+_FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "abs": (1, np.abs), "sqrt": (1, np.sqrt), "exp": (1, np.exp), "log": (1, np.log), "sin": (1, np.sin),
+    "cos": (1, np.cos), "min": (2, np.minimum), "max": (2, np.maximum),
 }  # fmt: skip
+"""name: number of arguments, and what it computes"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class Expression:
 
     def __post_init__(self) -> None:
         names = self.names()
-        _evaluate(self._tree(), dict.fromkeys(names, np.ones(1)), self.text)
+        with np.errstate(all="ignore"):
+            _evaluate(self._tree(), dict.fromkeys(names, np.ones(1)), self.text)
 
     def _tree(self) -> ast.expr:
         try:
@@ -73,7 +75,7 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
     """Return the value of one node of the syntax tree."""
     match node:
         case ast.Constant(value=int() | float() as value):
-            return float(value)
+            return np.float64(value)
         case ast.Name(id=name):
             if name not in values:
                 raise InputError(f"'{name}' in '{text}' must be an input, one of: {', '.join(values)}")
@@ -92,6 +94,9 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
             pairs = zip(ops, terms[:-1], terms[1:], strict=True)
             return reduce(np.logical_and, (_COMPARE[type(o)](a, b) for o, a, b in pairs))
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS:
-            return _FUNCTIONS[name](*(_evaluate(arg, values, text) for arg in args))
+            count, function = _FUNCTIONS[name]
+            if len(args) != count:
+                raise InputError(f"{name}() in '{text}' takes {count} argument{'s' * (count > 1)}, but got {len(args)}")
+            return function(*(_evaluate(arg, values, text) for arg in args))
     allowed = "numbers, inputs, + - * / **, comparisons, and, or, not, " + ", ".join(_FUNCTIONS)
     raise InputError(f"an expression may use {allowed}, but got '{text}'")

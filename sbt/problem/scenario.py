@@ -42,7 +42,7 @@ class Configurable(Protocol):
     def configured(
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
     ) -> Simulate:
-        """Return a copy with these choices; None leaves one as it is."""
+        """Return a copy with these choices; None leaves one as it is, isolation `auto` is the fastest allowed."""
         ...
 
 
@@ -134,9 +134,7 @@ class LogicalScenario:
         Raises:
             InputError: the scenario does not offer the choice.
         """
-        if isolation == "auto":
-            isolation = self.isolations[-1] if self.isolations else None
-        if ego is None and step_length is None and (isolation is None or not self.isolations):
+        if ego is None and step_length is None and (isolation in (None, "auto") or not self.isolations):
             return self
         if not isinstance(self.simulate, Configurable):
             raise InputError(f"scenario {self.name} offers no choice of ego or step length")

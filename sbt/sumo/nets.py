@@ -24,6 +24,7 @@ def nets_folder() -> Path:
     raise InputError(f"the built-in networks must be in {package / '_nets'}, but they are not: install the package again")
 
 
+@cache
 def net_file(net: str) -> Path:
     """Return the file of a network: a built-in name, or a path to a `.net.xml`.
 

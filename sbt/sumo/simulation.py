@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -75,8 +76,9 @@ class SumoSimulation:
         """Return a copy with another ego, isolation level or step length."""
         chosen = self.ego if ego is None else Ego.of(**ego)
         levels = self.isolations if chosen.deterministic else ("fresh",)
+        level = self.isolation if isolation is None and self.isolation in levels else isolation
         return replace(
-            self, ego=chosen, isolations=levels, isolation=isolation,
+            self, ego=chosen, isolations=levels, isolation=None if level == "auto" else level,
             step_length=self.step_length if step_length is None else step_length,
         )  # fmt: skip
 
@@ -113,8 +115,8 @@ class SumoSimulation:
 
 def _type_name(actor: Actor) -> str:
     """Return an id for the actor's type that is the same in every run."""
-    extra = "".join(f",{k}={v}" for k, v in actor.type.attributes)
-    return f"type:{actor.type.length!r}x{actor.type.width!r}{extra}"
+    extra = zlib.crc32(repr(actor.type.attributes).encode()) if actor.type.attributes else 0
+    return f"type_{actor.type.length!r}_{actor.type.width!r}_{extra:x}"
 
 
 def _insert(sumo: Any, scene: Scene) -> None:

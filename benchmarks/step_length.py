@@ -1,0 +1,71 @@
+"""How much the metric changes when the simulation step is halved, against its noise between seeds.
+
+    python benchmarks/step_length.py [--scenario cut_in] [--points 300] [--seeds 8]
+
+Every Sobol point runs with the same seeds at every step. The noise is the standard deviation of the
+metric over the seeds at the scenario's own step, measured where the metric is neither capped nor 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+import numpy as np
+from scipy.stats import qmc
+
+from sbt.execution.local import LocalExecutor
+from sbt.execution.spec import ScenarioSpec
+from sbt.problem.outcome import Job
+
+
+def metric_at(name: str, step: float, x: np.ndarray, seeds: int) -> np.ndarray:
+    """Return the (points, seeds) metric of the requirement at one step length."""
+    spec = ScenarioSpec(name, step_length=step)
+    scenario = spec.resolve()
+    jobs = [
+        Job(i * seeds + s, dict(zip(scenario.space.names, map(float, row), strict=True)), s)
+        for i, row in enumerate(x) for s in range(seeds)
+    ]  # fmt: skip
+    y = np.full(len(jobs), np.nan)
+    with LocalExecutor(spec, os.cpu_count() or 1, 120.0) as executor:
+        for outcome in executor.run(jobs):
+            y[outcome.index] = outcome.metrics[scenario.requirement.metric]
+    return y.reshape(len(x), seeds)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="cut_in")
+    parser.add_argument("--points", type=int, default=300)
+    parser.add_argument("--seeds", type=int, default=8)
+    args = parser.parse_args()
+    scenario = ScenarioSpec(args.scenario).resolve()
+    u = qmc.Sobol(scenario.space.dimension, rng=3).random(args.points)
+    if args.scenario == "cut_in":  # most of the plane is uneventful: half of the points where it is not
+        u[::2, 1] *= 0.35
+    x = scenario.space.from_unit(u)
+    y = {step: metric_at(args.scenario, step, x, args.seeds) for step in (0.1, 0.05, 0.025, 0.005)}
+    own = y[0.05]
+    moving = (own > 0).all(axis=1) & (own < 9.9).all(axis=1)
+    noise = own.std(axis=1, ddof=1)[moving]
+    critical = scenario.requirement.critical
+    print(f"{args.scenario}: {args.points} points x {args.seeds} seeds, noise where 0 < metric < 9.9 ({moving.sum()} points): "
+          f"median sd {np.median(noise):.4f}, mean sd {noise.mean():.4f}\n")
+    print("| step (s) against 0.005 s | median change | mean change | 95th percentile | share below the noise | sides changed |")
+    print("|---|---|---|---|---|---|")
+    reference = y[0.005]
+    for step in (0.1, 0.05, 0.025):
+        change = np.abs(y[step].mean(axis=1) - reference.mean(axis=1))[moving]
+        sides = float((critical.contains(y[step].ravel()) != critical.contains(reference.ravel())).mean())
+        below = float((change < np.maximum(own.std(axis=1, ddof=1)[moving], 1e-9)).mean())
+        print(f"| {step} | {np.median(change):.4f} | {change.mean():.4f} | {np.quantile(change, 0.95):.4f} | {below:.2f} | {sides:.4f} |")
+    print("\n| halving | median change | mean change | sides changed |\n|---|---|---|---|")
+    for a, b in ((0.1, 0.05), (0.05, 0.025)):
+        change = np.abs(y[a].mean(axis=1) - y[b].mean(axis=1))[moving]
+        sides = float((critical.contains(y[a].ravel()) != critical.contains(y[b].ravel())).mean())
+        print(f"| {a} to {b} | {np.median(change):.4f} | {change.mean():.4f} | {sides:.4f} |")
+
+
+if __name__ == "__main__":
+    main()
