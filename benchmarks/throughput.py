@@ -72,8 +72,7 @@ def traci_load(scenario: LogicalScenario, values: list[dict[str, float]], progra
             for k, v in enumerate(values):
                 fresh.run(v, k)
         finally:
-            traci.close()
-            own._sumo = direct
+            own._sumo = direct  # the subprocess stays, `traci.load` goes on with it
 
     return run
 
@@ -94,7 +93,7 @@ def campaign_rate(name: str, workers: int, n: int) -> float:
     """Runs a second of a whole coverage campaign, the driver and the store included."""
     import tempfile
 
-    from sbt.config.load import loads
+    from sbt.config.load import parse
     from sbt.run import run_campaign
 
     with tempfile.TemporaryDirectory() as folder:
@@ -102,7 +101,7 @@ def campaign_rate(name: str, workers: int, n: int) -> float:
             f"campaign: coverage\nscenario: {name}\nbudget: {n}\nbatch: {n}\nvalidation: {{share: 0}}\n"
             f"executor: {{kind: local, workers: {workers}}}\nstore: {Path(folder) / 'store'}\n"
         )
-        result = run_campaign(loads(text), report=False)
+        result = run_campaign(parse(text), report=False)
         return n / result["seconds"]["simulate"]
 
 

@@ -20,6 +20,9 @@ class Target(NamedTuple):
     """rate at which the gap shrinks (m/s)"""
 
 
+_BLOCK = 128
+
+
 class RangeSensor:
     """A forward-looking radar that measures the nearest road user in the own path.
 
@@ -73,6 +76,6 @@ class RangeSensor:
     def _draw(self, tick: int) -> tuple[float, float]:
         """Return the noise of one tick: the same whatever was in the path before."""
         while tick >= len(self._buffer):
-            noise = self._rng.standard_normal((256, 2)) * self._noise
+            noise = self._rng.standard_normal((_BLOCK, 2)) * self._noise
             self._buffer += [(a, b) for a, b in noise.tolist()]
         return self._buffer[tick]

@@ -27,7 +27,7 @@ from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import VehicleType
 
-__all__ = ["ABSENT", "Setup", "Session", "libsumo", "session"]
+__all__ = ["ABSENT", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
 
 ABSENT = -1073741824.0
 """What SUMO answers for an actor that is not on the road (it does not raise)."""
@@ -47,6 +47,15 @@ def libsumo() -> Any:
     with contextlib.redirect_stdout(io.StringIO()):
         import libsumo as module  # noqa: PLC0415
     return module
+
+
+def direct(sumo: Any, domain: str, name: str) -> Any:
+    """Return a libsumo function without its Python wrapper, which costs a third of a short call.
+
+    Of a module that has no such function (traci), the public one.
+    """
+    binary = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
+    return getattr(binary, f"{domain}_{name}", None) or getattr(getattr(sumo, domain), name)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from sbt.seeds import stream
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
 from sbt.sumo.ego import Ego
 from sbt.sumo.nets import net_file
-from sbt.sumo.session import ABSENT, Setup, check_options, session
+from sbt.sumo.session import ABSENT, Setup, check_options, direct, session
 
 __all__ = ["DEADLINE_STEPS", "SumoSimulation"]
 
@@ -154,14 +154,15 @@ def _verify(sumo: Any, scene: Scene) -> None:
 def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
     """Step until something ends the run, recording every state."""
     actors, dt = scene.actors, simulation.step_length
-    vehicle, step, collisions = sumo.vehicle, sumo.simulation.step, sumo.simulation.getCollidingVehiclesNumber
+    step, collisions = direct(sumo, "simulation", "step"), direct(sumo, "simulation", "getCollidingVehiclesNumber")
+    set_speed = direct(sumo, "vehicle", "setSpeed")
     states = [State(a.name, a.type.length, a.type.width) for a in actors]
     by_name = {s.name: s for s in states}
     driven = [
         (a, s, a.driver.act, tuple(o for o in states if o is not s))
         for a, s in zip(actors, states, strict=True) if a.driver is not None
     ]  # fmt: skip
-    observe = _observer(vehicle, states, dt)
+    observe = _observer(sumo, states, dt)
     near = max(s.length for s in states) * 2
     steps = round(simulation.duration / dt)
     deadline = math.inf if simulation.timeout is None else time.monotonic() + simulation.timeout
@@ -183,17 +184,23 @@ def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
             for actor, own, act, others in driven:
                 action = act(t, own, others)
                 if action is not KEEP:
-                    _apply(vehicle, actor, own, action, dt)
+                    speed = _speed(actor, own, action, dt)
+                    if speed is not None:
+                        set_speed(actor.name, speed)
+                    if action.lane is not None:
+                        sumo.vehicle.changeLane(actor.name, action.lane, 3600.0)
+                    if action.pose is not None:
+                        _place(sumo, actor, own, action.pose, speed)
             step()
     return _trace(actors, rows, dt, "duration", reported)
 
 
-def _observer(vehicle: Any, states: list[State], dt: float) -> Callable[[list[tuple[float, ...]]], None]:
+def _observer(sumo: Any, states: list[State], dt: float) -> Callable[[list[tuple[float, ...]]], None]:
     """Return what reads every actor from SUMO and records it, a row an actor.
 
     This runs at every step of every run, so that everything it needs is bound beforehand.
     """
-    position, angle_of, speed_of = vehicle.getPosition, vehicle.getAngle, vehicle.getSpeed
+    position, angle_of, speed_of = (direct(sumo, "vehicle", name) for name in ("getPosition", "getAngle", "getSpeed"))
     halves = [(s, s.name, 0.5 * s.length) for s in states]
     rate = 1.0 / dt
 
@@ -217,34 +224,29 @@ def _observer(vehicle: Any, states: list[State], dt: float) -> Callable[[list[tu
     return observe
 
 
-def _apply(vehicle: Any, actor: Actor, own: State, action: Action, dt: float) -> None:
-    """Hand one action to SUMO; numbers that are not finite end the run."""
-    acceleration, speed, lane, pose = action
+def _speed(actor: Actor, own: State, action: Action, dt: float) -> float | None:
+    """Return the speed at the end of the step that an action means; None where it means none."""
+    acceleration, speed, _, _ = action
     if acceleration is not None:
         aim, speed = speed, own.speed + acceleration * dt
         if aim is not None:
             speed = max(speed, aim) if acceleration < 0 else min(speed, aim)
         if speed < 0.0:
             speed = 0.0
-    if speed is not None:
-        if not -_FASTEST < speed < _FASTEST:
-            raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
-        vehicle.setSpeed(actor.name, speed)
-    if lane is not None:
-        vehicle.changeLane(actor.name, lane, 3600.0)
-    if pose is not None:
-        _place(vehicle, actor, own, action, speed)
-
-
-def _place(vehicle: Any, actor: Actor, own: State, action: Action, speed: float | None) -> None:
-    """Put an actor on a pose; SUMO loses its speed then, so that it is kept here."""
-    if action.pose is None or not all(math.isfinite(v) for v in action.pose):
+    if speed is not None and not -_FASTEST < speed < _FASTEST:
         raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
-    x, y, heading = action.pose
+    return speed
+
+
+def _place(sumo: Any, actor: Actor, own: State, pose: tuple[float, float, float], speed: float | None) -> None:
+    """Put an actor on a pose; SUMO loses its speed then, so that it is kept here."""
+    if not all(math.isfinite(v) for v in pose):
+        raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave pose {pose}")
+    x, y, heading = pose
     own.steered = own.speed if speed is None else speed
     half = 0.5 * actor.type.length
     angle = (90.0 - math.degrees(heading)) % 360.0
-    vehicle.moveToXY(actor.name, "", -1, x + half * math.cos(heading), y + half * math.sin(heading), angle, keepRoute=2)
+    sumo.vehicle.moveToXY(actor.name, "", -1, x + half * math.cos(heading), y + half * math.sin(heading), angle, keepRoute=2)
 
 
 def _touching(states: list[State], rows: list[tuple[float, ...]], near: float, dt: float) -> bool:

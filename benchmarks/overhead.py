@@ -1,0 +1,97 @@
+"""What the framework costs a run, beside stepping SUMO and the controllers.
+
+    python benchmarks/overhead.py [--runs 2000]
+
+`worker`: everything a worker does for a cut_in run except the steps and the controllers: building the
+scene, inserting and verifying, the trace, all metrics, removing the actors. `driver`: the whole
+campaign with a scenario that does nothing, planned, executed in workers and committed run by run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import qmc
+
+from sbt.config.load import parse
+from sbt.plugins import load
+from sbt.run import run_campaign
+from sbt.sumo import simulation
+
+EMPTY = """
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+
+SCENARIO = LogicalScenario(
+    "empty", ParameterSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))), Requirement("y", CriticalInterval(high=0.5)),
+    evaluate=lambda values, seed: {"y": values["a"]}, metric_names=("y",),
+)
+"""
+
+
+def worker(runs: int) -> list[float]:
+    """Return milliseconds a run outside the loop over the steps, five times."""
+    scenario = load("scenarios", "cut_in")
+    x = scenario.space.from_unit(qmc.Sobol(2, rng=1).random(runs))
+    values = [dict(zip(scenario.space.names, map(float, row), strict=True)) for row in x]
+    inside, original, found = [0.0], simulation._drive, []
+
+    def timed(*args):  # the loop over the steps, without making the trace
+        start = time.perf_counter()
+        trace = original(*args)
+        inside[0] += time.perf_counter() - start
+        return trace
+
+    making, make = [0.0], simulation._trace
+
+    def timed_trace(*args):
+        start = time.perf_counter()
+        trace = make(*args)
+        making[0] += time.perf_counter() - start
+        return trace
+
+    simulation._drive, simulation._trace = timed, timed_trace
+    scenario.run(values[0], 0)
+    for _ in range(5):
+        inside[0] = making[0] = 0.0
+        start = time.perf_counter()
+        for k, v in enumerate(values):
+            scenario.run(v, k)
+        found.append((time.perf_counter() - start - inside[0] + making[0]) / runs * 1e3)
+    simulation._drive, simulation._trace = original, make
+    return found
+
+
+def driver(runs: int) -> list[float]:
+    """Return milliseconds a run of a campaign whose scenario does nothing, five times."""
+    found = []
+    for _ in range(5):
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "empty.py").write_text(textwrap.dedent(EMPTY))
+            text = (
+                f"campaign: coverage\nscenario: {folder}/empty.py:SCENARIO\nbudget: {runs}\nbatch: {runs}\ninitial: {runs}\n"
+                f"executor: {{kind: local, workers: 2}}\nstore: {folder}/store\n"
+            )
+            result = run_campaign(parse(text), report=False)
+            found.append((result["seconds"]["simulate"] + result["seconds"]["propose"]) / runs * 1e3)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=2000)
+    args = parser.parse_args()
+    print("| overhead | ms a run: median (min, max) of 5 |\n|---|---|")
+    for name, values in {"worker, cut_in": worker(min(args.runs, 500)), "driver, empty simulation": driver(args.runs)}.items():
+        print(f"| {name} | {np.median(values):.3f} ({min(values):.3f}, {max(values):.3f}) |")
+
+
+if __name__ == "__main__":
+    main()
