@@ -15,8 +15,11 @@ from sbt.errors import InputError
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import run_job
+from sbt.history import Record
 from sbt.learner import Learner
-from sbt.problem.outcome import Status
+from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.trace import Trace
 from sbt.store import DATABASE, Store
 
 if TYPE_CHECKING:
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
     from sbt.config.load import Loaded
     from sbt.config.model import Configuration
 
-__all__ = ["rebuild_report", "run_campaign"]
+__all__ = ["assembly_of", "rebuild_report", "replay", "run_campaign", "settings_of"]
 
 _RESOLVED = "config.resolved.yaml"
 _MAY_CHANGE = {"budget", "folder", "yaml"}
@@ -121,6 +124,31 @@ def rebuild_report(folder: Path) -> Path:
         kept = store.configuration
         loaded = parse(kept["yaml"], name=str(Path(folder) / _RESOLVED), folder=Path(kept["folder"]))
         return _report(store, settings_of(loaded, assembly_of(loaded)))
+
+
+def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None]:
+    """Execute a stored run again, as the campaign did.
+
+    Returns:
+        The stored row, the outcome now, and the trace; no trace where the scenario has none or the
+        run fails.
+
+    Raises:
+        InputError: the store has no finished run of this index.
+    """
+    from sbt.config.load import parse  # noqa: PLC0415
+
+    with Store.read(folder) as store:
+        kept, records = store.configuration, store.history().records
+    found = [r for r in records if r.index == index]
+    if not found:
+        raise InputError(f"a run must be a finished one of {folder} (0 to {len(records) - 1}), but got {index}")
+    record = found[0]
+    loaded = parse(kept["yaml"], name=str(Path(folder) / _RESOLVED), folder=Path(kept["folder"]))
+    scenario = assembly_of(loaded).spec.resolve()
+    outcome = run_job(scenario, Job(index, record.inputs, record.seed))
+    again = scenario.simulate is not None and outcome.status == Status.OK
+    return record, outcome, scenario.simulate(record.inputs, record.seed) if again and scenario.simulate else None
 
 
 def _report(store: Store, settings: Settings) -> Path:

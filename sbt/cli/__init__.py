@@ -9,6 +9,7 @@ import typer
 from sbt import __version__
 from sbt.cli import campaign, inform, scenario
 from sbt.cli.console import verb
+from sbt.cli.replay import replay
 
 __all__ = ["app", "main"]
 
@@ -25,6 +26,7 @@ for _verb in (
     campaign.status,
     campaign.report,
     campaign.export,
+    replay,
 ):
     app.command()(verb(_verb))
 app.command("list")(verb(inform.list_))

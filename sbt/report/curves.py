@@ -62,7 +62,7 @@ def binomial_interval(hits: Vector, n: Vector, confidence: float = 0.95) -> tupl
 
 def plot_validation(fits: Sequence[Mapping[str, Any]], panel: str, ax: Axes, *, unit: str = "") -> Axes:
     """Draw one of `PANELS` over the number of runs; fits without the score leave a gap."""
-    runs = np.array([fit["runs"] for fit in fits], dtype=np.float64)
+    runs = np.array([fit.get("learned", fit["runs"]) for fit in fits], dtype=np.float64)
     for (key, name), look in zip(PANELS[panel], ("o-", "s--"), strict=False):
         values = np.array([np.nan if fit.get(key) is None else fit[key] for fit in fits], dtype=np.float64)
         if np.isfinite(values).any():
@@ -70,7 +70,7 @@ def plot_validation(fits: Sequence[Mapping[str, Any]], panel: str, ax: Axes, *, 
             ax.plot(runs, values, look, color=colour, markersize=3.5, linewidth=1.4, label=name or None)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best")
-    ax.set(xlabel="number of runs", ylabel=label(panel, unit if "RMSE" in panel else ""))
+    ax.set(xlabel="runs learned from", ylabel=label(panel, unit if "RMSE" in panel else ""))
     if "RMSE" in panel or "error" in panel:
         ax.set_ylim(bottom=0.0)
     elif "precision" in panel:

@@ -19,7 +19,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.report.axes import padded, reach, shade
 from sbt.report.projection import Plane
-from sbt.report.style import CRITICAL, FAILED, MODEL, UNCRITICAL, label
+from sbt.report.style import CRITICAL, FAILED, HELD_OUT, MODEL, UNCRITICAL, label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -156,10 +156,10 @@ def _scatter(history: History, requirement: Requirement, x: Vector, y: Vector, a
     rim = 1.0 if size is not None else 1.0 + min(1e-4 * len(history), 1.0)  # hollow markers stand out among many filled ones
     size = float(np.clip(9000 / max(len(history), 1), 7, 30)) if size is None else size
     kinds: list[tuple[str, Mask, dict[str, Any]]] = [
-        ("uncritical", history.ok & ~critical & ~held, _filled("o", UNCRITICAL, 0.8)),
-        ("critical", history.ok & critical & ~held, _filled("^", CRITICAL, 1.25)),
-        ("uncritical, held out", history.ok & ~critical & held, _hollow("o", "#1f4e79", 0.8 * rim)),
-        ("critical, held out", history.ok & critical & held, _hollow("^", CRITICAL, 1.25 * rim)),
+        ("uncritical, held out", history.ok & ~critical & held, _hollow("o", HELD_OUT, 0.6 * rim)),
+        ("critical, held out", history.ok & critical & held, _hollow("^", CRITICAL, 0.9 * rim)),
+        ("uncritical", history.ok & ~critical & ~held, _filled("o", UNCRITICAL, 1.4)),
+        ("critical", history.ok & critical & ~held, _filled("^", CRITICAL, 1.7)),
         ("failed", ~history.ok, {"marker": "x", "color": FAILED, "linewidths": 1.2, "s": 1.1}),
     ]
     for order, (name, mask, look) in enumerate(kinds):

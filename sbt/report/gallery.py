@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sbt.arrays import Vector
+from sbt.history import VALIDATION
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.projection import Predict, log_probability, most_telling_pairs, probability_plane
@@ -99,13 +100,14 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
     plane = probability_plane(predict, found.requirement.critical, space, pair)
     figure = new_figure(5.4, 4.4)
     ax = figures.plot_probability(plane, space, figure.subplots())
-    if len(pair) == 2 and space.dimension == 2 and len(found.history):
-        shown = np.unique(np.linspace(0, len(found.history) - 1, _MOST_RUNS_ON_MAP).round())
-        runs = found.history.where(np.isin(np.arange(len(found.history)), shown))
-        figures.plot_runs(runs, found.requirement, space, ax, pair=(0, 1), size=5.0)
     caption = "The metamodel's probability that a run is critical."
-    if space.dimension == 2 and len(found.history) > _MOST_RUNS_ON_MAP:
-        caption += f" Markers: {_MOST_RUNS_ON_MAP:,} of the runs, evenly spaced over the campaign."
+    learned = found.history.where(found.history.stage != VALIDATION)
+    if space.dimension == 2 and len(learned):
+        shown = np.unique(np.linspace(0, len(learned) - 1, _MOST_RUNS_ON_MAP).round())
+        figures.plot_runs(learned.where(np.isin(np.arange(len(learned)), shown)), found.requirement, space, ax, size=10.0)
+        caption += " Markers: the runs it could learn from."
+        if len(learned) > _MOST_RUNS_ON_MAP:
+            caption = caption[:-1] + f", {_MOST_RUNS_ON_MAP:,} of them, evenly spaced over the campaign."
     if space.dimension > 2:
         caption += (
             f" Each value is the mean over {plane.averaged} Sobol points of the other {space.dimension - 2}"

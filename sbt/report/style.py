@@ -27,6 +27,7 @@ __all__ = [
 UNCRITICAL = "#5b9bd5"
 CRITICAL = "#8c1515"
 FAILED = "#333333"
+HELD_OUT = "#9aa7b5"
 MODEL = "#1f4e79"
 REGION = "#f6d5c9"
 """light enough to print under black text: the critical side of a figure"""
