@@ -1,0 +1,197 @@
+"""A deep ensemble: small networks that predict mean and variance; the best metamodel from about 1,000 runs on.
+
+All members are trained at once: a layer is one batched matrix product. Each member keeps the weights
+that did best on the rows it was not trained on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+from sbt.metamodels.base import check_rows, standardise
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.torch_tools import check_device, device_of, minibatches, single_threaded
+
+__all__ = ["Ensemble", "EnsemblePredictor"]
+
+_CHUNK = 1024  # points predicted at once
+_CHECKS = 50  # of the validation rows
+_VALIDATION = 500  # most validation rows of a member
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Settings of a deep ensemble.
+
+    Each member is validated on another share 1/members of the rows, so that together they learn from
+    all of them. From 2,500 rows on, training takes more steps: in proportion to the square root of the rows.
+
+    Args:
+        members: number of networks k >= 2.
+        layers: hidden layers of a network >= 1.
+        width: units of a hidden layer >= 1.
+        steps: minibatches >= 1 up to 2,500 rows.
+        batch: rows of a minibatch >= 1.
+        learning_rate: largest step of AdamW, > 0, on a one-cycle schedule.
+        weight_decay: of AdamW, >= 0.
+        beta: exponent in [0, 1] of the variance that weights the loss; 0: likelihood, 1: squared error.
+        sigma_floor: smallest sigma of a member, as a share > 0 of the standard deviation of y.
+        device: auto (CUDA where there is one), cpu or cuda.
+
+    Raises:
+        InputError: a value outside its range; at the fit, a device that is not there.
+
+    Source:
+        Lakshminarayanan et al. (2017); loss: Seitzer et al. (2022), eq. (4).
+    """
+
+    members: int = 5
+    layers: int = 4
+    width: int = 96
+    steps: int = 2500
+    batch: int = 32
+    learning_rate: float = 3e-3
+    weight_decay: float = 0.01
+    beta: float = 0.5
+    sigma_floor: float = 0.01
+    device: str = "cpu"
+
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"members": 3, "width": 48, "steps": 600}}
+
+    def __post_init__(self) -> None:
+        for name, least in (("members", 2), ("layers", 1), ("width", 1), ("steps", 1), ("batch", 1)):
+            if not getattr(self, name) >= least:
+                raise InputError(f"{name} must be >= {least}, but got {getattr(self, name)}")
+        if not (self.learning_rate > 0.0 and self.weight_decay >= 0.0):
+            raise InputError(
+                f"learning_rate must be > 0 and weight_decay >= 0, but got {self.learning_rate} and {self.weight_decay}"
+            )
+        if not (0.0 <= self.beta <= 1.0 and self.sigma_floor > 0.0):
+            raise InputError(f"beta must be in [0, 1] and sigma_floor > 0, but got {self.beta} and {self.sigma_floor}")
+        check_device(self.device)
+
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> EnsemblePredictor:
+        """Return the ensemble trained on u (n, d) and y (n,); see `Metamodel.fit`."""
+        u, y = check_rows(u, y)
+        z, shift, scale = standardise(y)
+        with single_threaded():
+            layers = _train(self, u, z, rng)
+        return EnsemblePredictor(layers, shift, scale, self.sigma_floor, self.device)
+
+
+@dataclass(frozen=True, eq=False)
+class EnsemblePredictor:
+    """A trained ensemble of k networks.
+
+    Args:
+        layers: weights (k, inputs, outputs) and biases (k, 1, outputs) of each layer, float32.
+        shift: y = shift + scale z.
+        scale: see `shift`.
+        sigma_floor: smallest sigma of a member, standardised.
+        device: auto, cpu or cuda.
+    """
+
+    layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+    shift: float
+    scale: float
+    sigma_floor: float
+    device: str
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the belief at u (n, d)."""
+        device = device_of(self.device)
+        layers = [tuple(torch.from_numpy(a).to(device) for a in layer) for layer in self.layers]
+        k, n = len(self.layers[0][0]), len(u)
+        mean, variance = np.empty((k, n)), np.empty((k, n))
+        with single_threaded(), torch.inference_mode():
+            for first in range(0, n, _CHUNK):
+                rows = slice(first, first + _CHUNK)
+                m, v = _forward(layers, _centre(u[rows]).to(device), self.sigma_floor)
+                mean[:, rows], variance[:, rows] = m.cpu().numpy(), v.cpu().numpy()
+        return Prediction(
+            mean=self.shift + self.scale * mean,
+            std=self.scale * np.sqrt(variance),
+            weight=np.full(k, 1.0 / k),
+            noise=self.scale * np.sqrt(variance.mean(axis=0)),
+        )
+
+
+def _centre(u: Points) -> torch.Tensor:
+    """Return u (n, d) with mean 0 and variance 1 over the unit cube, float32."""
+    return torch.from_numpy(((u - 0.5) * math.sqrt(12.0)).astype(np.float32))
+
+
+def _forward(layers: Any, x: torch.Tensor, sigma_floor: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return (k, n) means and (k, n) variances at x (n, d) or (k, n, d), standardised."""
+    hidden = x if x.ndim == 3 else x.expand(len(layers[0][0]), *x.shape)
+    for weight, bias in layers[:-1]:
+        hidden = torch.nn.functional.hardswish(torch.baddbmm(bias, hidden, weight))
+    out = torch.baddbmm(layers[-1][1], hidden, layers[-1][0])
+    return out[..., 0], torch.nn.functional.softplus(out[..., 1]) + sigma_floor**2
+
+
+def _initial(settings: Ensemble, d: int, rng: np.random.Generator) -> list[list[NDArray[np.float32]]]:
+    """Return random weights and biases, uniform within +-1/sqrt(inputs) as PyTorch draws them."""
+    sizes = [d, *[settings.width] * settings.layers, 2]
+    layers = []
+    for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+        bound = 1.0 / math.sqrt(inputs)
+        shapes = ((settings.members, inputs, outputs), (settings.members, 1, outputs))
+        layers.append([rng.uniform(-bound, bound, shape).astype(np.float32) for shape in shapes])
+    return layers
+
+
+def _folds(members: int, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows (k, v) that validate each member and the rows (k, n - v) that train it."""
+    order = rng.permutation(n)
+    v = max(min(n // members, _VALIDATION), 1)
+    own = [np.roll(order, -i * v) for i in range(members)]
+    return np.stack([o[:v] for o in own]), np.stack([o[v:] for o in own])
+
+
+def _train(
+    settings: Ensemble, u: Points, z: Vector, rng: np.random.Generator
+) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]:
+    """Return the layers after training, each member with the weights of its best validation likelihood."""
+    device, n = device_of(settings.device), len(z)
+    layers = [[torch.from_numpy(a).to(device).requires_grad_() for a in layer] for layer in _initial(settings, u.shape[1], rng)]
+    parameters = [p for layer in layers for p in layer]
+    x, target = _centre(u).to(device), torch.from_numpy(z.astype(np.float32)).to(device)
+    validation, training = _folds(settings.members, n, rng)
+    steps = round(settings.steps * max(1.0, math.sqrt(n / 2500)))
+    adam = torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(adam, settings.learning_rate, total_steps=steps + 1)
+    best, best_loss = [p.detach().clone() for p in parameters], torch.full((settings.members,), math.inf, device=device)
+    batches = minibatches(training, settings.batch, rng)
+    for step in range(1, steps + 1):
+        rows = torch.from_numpy(next(batches)).to(device)
+        loss = _loss(layers, x[rows], target[rows], settings, settings.beta).sum()
+        adam.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        adam.step()
+        schedule.step()
+        if step == steps or step % max(steps // _CHECKS, 1) == 0:
+            with torch.no_grad():
+                value = _loss(layers, x[validation], target[validation], settings, 0.0)
+                better = value < best_loss
+                best_loss = torch.where(better, value, best_loss)
+                for kept, parameter in zip(best, parameters, strict=True):
+                    kept[better] = parameter[better]
+    arrays = [p.cpu().numpy() for p in best]
+    return tuple(zip(arrays[::2], arrays[1::2], strict=True))
+
+
+def _loss(layers: Any, x: torch.Tensor, target: torch.Tensor, settings: Ensemble, beta: float) -> torch.Tensor:
+    """Return (k,) mean losses of the members at x (k, m, d), target (k, m)."""
+    mean, variance = _forward(layers, x, settings.sigma_floor)
+    loss = 0.5 * (variance.log() + (target - mean) ** 2 / variance)
+    return (loss * variance.detach() ** beta if beta > 0.0 else loss).mean(dim=1)
