@@ -48,7 +48,8 @@ def reference_set(args: argparse.Namespace, learner: Learner) -> History:
     with LocalExecutor(parts.spec, os.cpu_count() or 1, 60.0) as executor:
         for o in executor.run(jobs):
             job = jobs[o.index]
-            records.append(Record(o.index, VALIDATION, 0, job.inputs, job.seed, str(o.status), o.metrics, o.reason, None, 0.0, "", ""))
+            row = (o.index, VALIDATION, 0, job.inputs, job.seed, str(o.status), o.metrics, o.reason, None, 0.0, "", "")
+            records.append(Record(*row))
     return History(space.names, tuple(sorted(records, key=lambda r: r.index)))
 
 

@@ -59,7 +59,8 @@ def main() -> None:
         change = np.abs(y[step].mean(axis=1) - reference.mean(axis=1))[moving]
         sides = float((critical.contains(y[step].ravel()) != critical.contains(reference.ravel())).mean())
         below = float((change < np.maximum(own.std(axis=1, ddof=1)[moving], 1e-9)).mean())
-        print(f"| {step} | {np.median(change):.4f} | {change.mean():.4f} | {np.quantile(change, 0.95):.4f} | {below:.2f} | {sides:.4f} |")
+        figures = (np.median(change), change.mean(), np.quantile(change, 0.95), below, sides)
+        print(f"| {step} | " + " | ".join(f"{value:.4f}" for value in figures) + " |")
     print("\n| halving | median change | mean change | sides changed |\n|---|---|---|---|")
     for a, b in ((0.1, 0.05), (0.05, 0.025)):
         change = np.abs(y[a].mean(axis=1) - y[b].mean(axis=1))[moving]

@@ -62,7 +62,10 @@ class Log:
 class Stage(Protocol):
     """Proposes batches until it stops; a function of the log alone."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What its iterations are called in the store."""
+        ...
 
     def stop(self, log: Log) -> str | None:
         """Return why the stage is over, None while it goes on."""

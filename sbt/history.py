@@ -108,7 +108,7 @@ class History:
 
     def to_frame(self) -> pd.DataFrame:
         """Return a tidy frame: index, stage, iteration, x.<input>, y.<metric>, status, seed, log_q, ..."""
-        import pandas as pd  # noqa: PLC0415  (1.5 s; only where a frame is asked for)
+        import pandas as pd
 
         data: dict[str, Any] = {"index": self.index, "stage": self.stage, "iteration": self.iteration}
         data |= {f"x.{name}": self.x[:, k] for k, name in enumerate(self.names)}

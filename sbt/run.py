@@ -51,7 +51,7 @@ def run_campaign(
         InputError: the configuration does not fit the scenario, or the store belongs to another one.
         StoreError: the store cannot be written.
     """
-    from sbt.config.load import dump, resumed  # noqa: PLC0415
+    from sbt.config.load import dump, resumed
 
     folder = Path(loaded.config.store)
     loaded = replace(loaded, config=resumed(loaded.config, _stored(folder)))
@@ -78,7 +78,7 @@ def run_campaign(
 
 def assembly_of(loaded: Loaded) -> Assembly:
     """Return the objects that a configuration names."""
-    from sbt.config.assemble import assemble  # noqa: PLC0415
+    from sbt.config.assemble import assemble
 
     return assemble(loaded)
 
@@ -93,7 +93,7 @@ def _stored(folder: Path) -> dict[str, Any]:
 
 def _kept(loaded: Loaded, settings: Settings) -> dict[str, Any]:
     """Return what the store remembers of a configuration: plain JSON, and the YAML to read back."""
-    from sbt.config.load import dump, fingerprint  # noqa: PLC0415
+    from sbt.config.load import dump, fingerprint
 
     return {
         **fingerprint(loaded.config), "budget": loaded.config.budget, "names": list(settings.scenario.space.names),
@@ -118,7 +118,7 @@ def rebuild_report(folder: Path) -> Path:
     Raises:
         StoreError: the folder holds no campaign.
     """
-    from sbt.config.load import parse  # noqa: PLC0415
+    from sbt.config.load import parse
 
     with Store.read(folder) as store:
         kept = store.configuration
@@ -136,7 +136,7 @@ def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None]:
     Raises:
         InputError: the store has no finished run of this index.
     """
-    from sbt.config.load import parse  # noqa: PLC0415
+    from sbt.config.load import parse
 
     with Store.read(folder) as store:
         kept, records = store.configuration, store.history().records
@@ -152,7 +152,7 @@ def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None]:
 
 
 def _report(store: Store, settings: Settings) -> Path:
-    from sbt.report.html import write_report  # noqa: PLC0415
+    from sbt.report.html import write_report
 
     belief = settings.learner.fit(store.history()) if settings.learner is not None else None
     return write_report(store, settings.scenario, None if belief is None else belief.predict)

@@ -161,7 +161,9 @@ class Store:
         with self._transaction():
             self._set_meta("conclusion", dict(conclusion))
 
-    def plan(self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: Mapping[str, Any]) -> None:
+    def plan(
+        self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: Mapping[str, Any]
+    ) -> None:
         """Write a batch before it runs, all of it or nothing.
 
         Args:
@@ -228,7 +230,10 @@ class Store:
                 "SELECT idx, stage, iteration, inputs, seed, status, metrics, reason, log_q, seconds, collisions, versions"
                 " FROM runs WHERE status != ? ORDER BY idx", (PLANNED,),
             ).fetchall()  # fmt: skip
-        records = tuple(Record(*row[:3], json.loads(row[3]), row[4], row[5], json.loads(row[6]), *row[7:]) for row in rows)
+        records = tuple(
+            Record(index, stage, iteration, json.loads(inputs), seed, status, json.loads(metrics), *rest)
+            for index, stage, iteration, inputs, seed, status, metrics, *rest in rows
+        )
         return History(tuple(self.configuration["names"]), records)
 
 

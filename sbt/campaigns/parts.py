@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,7 @@ class BatchStage:
             return "budget"
         if s.stable is not None and len(log.fits) >= 3:
             sides = [fit["sides"] for fit in log.fits[-3:]]
-            moved = [changed_share(a, b) for a, b in zip(sides, sides[1:], strict=False)]
+            moved = [changed_share(a, b) for a, b in pairwise(sides)]
             if max(moved) < s.stable:
                 return "stable"
         return None

@@ -47,5 +47,5 @@ def replay(
             print(f"  {name:<23} {value:.6g}")
         print("identical to the stored run" if same else "NOT identical to the stored run")
     if not same:
-        stored = f"{record.status} {dict(record.metrics)}"
-        raise fail(f"a replay must equal the stored run, but got {outcome.status} {dict(outcome.metrics)}, not {stored}", Exit.INTERNAL)
+        now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
+        raise fail(f"a replay must equal the stored run, but got {now}, not {stored}", Exit.INTERNAL)

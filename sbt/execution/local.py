@@ -66,8 +66,8 @@ class LocalExecutor:
             self._marks.cleanup()
 
     def _start(self) -> None:
-        from joblib.externals.loky.backend import get_context  # noqa: PLC0415  (only where workers are wanted)
-        from joblib.externals.loky.process_executor import ProcessPoolExecutor  # noqa: PLC0415
+        from joblib.externals.loky.backend import get_context
+        from joblib.externals.loky.process_executor import ProcessPoolExecutor
 
         self._pool = ProcessPoolExecutor(max_workers=self._workers, context=get_context("loky"), timeout=None, env=_THREADS)
         ready = [self._pool.submit(_prepare, self._spec, self._folder, self._workers) for _ in range(self._workers)]
@@ -187,7 +187,7 @@ class LocalExecutor:
 
 def _broken() -> type[BaseException]:
     """Return the error of a pool whose worker died."""
-    from joblib.externals.loky.process_executor import BrokenProcessPool  # noqa: PLC0415
+    from joblib.externals.loky.process_executor import BrokenProcessPool
 
     error: type[BaseException] = BrokenProcessPool
     return error

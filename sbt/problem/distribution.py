@@ -67,7 +67,7 @@ class Distribution:
 
     def frozen(self) -> Any:
         """Return SciPy's frozen distribution, None for `uniform` (the range itself is the law)."""
-        from scipy import stats  # noqa: PLC0415  (half a second, not needed for uniform inputs)
+        from scipy import stats
 
         given = dict(self.parameters)
         if self.kind == "scipy":
@@ -103,7 +103,7 @@ class Distribution:
         if law is None:
             if not math.isfinite(low + high):
                 raise InputError(f"a uniform input needs a finite range, but got [{low}, {high}]")
-            from scipy import stats  # noqa: PLC0415
+            from scipy import stats
 
             law = stats.uniform(low, high - low)
         return TruncatedLaw(law, low, high)

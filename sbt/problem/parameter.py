@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbt.arrays import Vector
+from sbt.arrays import Mask, Vector
 from sbt.errors import InputError
 from sbt.problem.distribution import Distribution, TruncatedLaw
 
@@ -88,7 +88,7 @@ class Parameter:
         low, high = self.bounds
         return float(math.floor((low + high) / 2)) if self.kind == "integer" else (low + high) / 2
 
-    def contains(self, x: Vector) -> Vector:
+    def contains(self, x: Vector) -> Mask:
         """Return (n,) booleans: the value is in the range (and whole, for integers)."""
         x = np.asarray(x, dtype=np.float64)
         inside = (x >= self.low) & (x <= self.high)

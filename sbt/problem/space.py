@@ -89,7 +89,7 @@ class ParameterSpace:
         if not self.constraints:
             return 1.0
         u = qmc.Sobol(self.dimension, scramble=True, rng=0).random(_MASS_POINTS)
-        from scipy.special import ndtri  # noqa: PLC0415
+        from scipy.special import ndtri
 
         mass = float(self.feasible(self.from_normal(ndtri(np.clip(u, 1e-12, 1 - 1e-12)))).mean())
         if mass == 0.0:

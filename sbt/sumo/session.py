@@ -45,7 +45,7 @@ _OPTIONS = (
 def libsumo() -> Any:
     """Import libsumo once, keeping what it prints off standard output (0.8 s)."""
     with contextlib.redirect_stdout(io.StringIO()):
-        import libsumo as module  # noqa: PLC0415
+        import libsumo as module
     return module
 
 

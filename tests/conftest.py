@@ -1,0 +1,188 @@
+"""What several tests share: an analytic scenario in a file of its own, and campaigns of it."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ANALYTIC = '''
+"""A disc of radius 0.3 in the unit square (pi 0.09 of it is critical), a line, and things that go wrong."""
+
+import dataclasses
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from sbt.errors import RunError
+from sbt.metamodels.prediction import Prediction
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+
+SQUARE = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
+
+
+def disc(values, seed):
+    return {"y": float(np.hypot(values["a"] - 0.5, values["b"] - 0.5)) - 0.3, "noise": (seed % 1000) / 1000}
+
+
+def line(values, seed):
+    return {"y": values["a"] - 0.25, "noise": 0.0}
+
+
+def slow(values, seed):
+    time.sleep(0.004)
+    return disc(values, seed)
+
+
+def some_fail(values, seed):
+    if values["a"] < 0.3:
+        raise RunError("invalid", "a < 0.3 cannot be realised")
+    return disc(values, seed)
+
+
+def all_fail(values, seed):
+    return {"y": 1 / 0}
+
+
+def awkward(values, seed):
+    """a is a number that says what goes wrong."""
+    kind = round(values["a"] * 100)
+    if kind == 1:
+        os._exit(7)
+    if kind == 2:
+        while True:
+            pass
+    if kind == 3:
+        raise KeyError("no such thing")  # marked
+    if kind == 4:
+        return {"y": float("nan")}
+    if kind == 5:
+        time.sleep(0.1)
+    return disc(values, seed)
+
+
+def scenario(evaluate, space=SQUARE):
+    requirement = Requirement("y", CriticalInterval(high=0.0))
+    return LogicalScenario(evaluate.__name__, space, requirement, evaluate=evaluate, metric_names=("y", "noise"))
+
+
+SCENARIO, SLOW, SOME_FAIL, ALL_FAIL, AWKWARD = map(scenario, (disc, slow, some_fail, all_fail, awkward))
+LINE = scenario(line, ParameterSpace((Parameter("a", 0.0, 1.0),)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Nearest:
+    """Believes the value of the nearest row, more doubtful far away; writes down what it was taught."""
+
+    log: str = ""
+
+    def fit(self, u, y, rng):
+        if self.log:
+            with Path(self.log).open("a") as file:
+                file.write(" ".join(repr(float(v)) for v in y) + "\\n")
+
+        def predict(asked):
+            if len(asked) == 0:
+                return Prediction.gaussian(np.zeros(0), np.ones(0))
+            distance = np.linalg.norm(asked[:, None, :] - u[None], axis=2)
+            near = distance.argmin(axis=1)
+            return Prediction.gaussian(y[near], 0.02 + distance[np.arange(len(asked)), near])
+
+        return predict
+
+
+@dataclasses.dataclass(frozen=True)
+class Shifting:
+    """Another belief at each of the rounds: everything critical, then nothing, then always half of it."""
+
+    rounds: str = "cnhhhhhhhhhhhhhhhhhhhh"
+    first: int = 8
+    batch: int = 4
+
+    def fit(self, u, y, rng):
+        kind = self.rounds[(len(y) - self.first) // self.batch]
+
+        def predict(asked):
+            mean = {"c": -1.0 + 0 * asked[:, 0], "n": 1.0 + 0 * asked[:, 0], "h": asked[:, 0] - 0.5}[kind]
+            return Prediction.gaussian(mean, np.full(len(asked), 0.1))
+
+        return predict
+
+
+@dataclasses.dataclass(frozen=True)
+class Raising:
+    """Learns once and then no more."""
+
+    rows: int = 20
+
+    def fit(self, u, y, rng):
+        if len(y) > self.rows:
+            raise RuntimeError("the matrix is singular")  # marked
+        return Nearest().fit(u, y, rng)
+'''
+
+
+@pytest.fixture
+def analytic(tmp_path: Path) -> Path:
+    """A file with analytic scenarios and quick metamodels; the folder is the test's own."""
+    path = tmp_path / "analytic.py"
+    path.write_text(ANALYTIC)
+    return path
+
+
+@pytest.fixture
+def configured(analytic: Path) -> Callable[..., Path]:
+    """Write a configuration of an analytic scenario; keyword arguments replace its keys."""
+
+    def write(name: str = "c", scenario: str = "SCENARIO", **keys: Any) -> Path:
+        settings = {
+            "campaign": "boundary", "scenario": f"analytic.py:{scenario}", "seed": 3, "budget": 60, "initial": 20, "batch": 20,
+            "metamodel": {"kind": "analytic.py:Nearest"}, "executor": {"kind": "serial"}, "store": str(analytic.parent / name),
+        }  # fmt: skip
+        path = analytic.parent / f"{name}.yaml"
+        path.write_text(json.dumps(settings | keys))  # JSON is YAML
+        return path
+
+    return write
+
+
+@pytest.fixture
+def campaign(configured: Callable[..., Path]) -> Callable[..., dict[str, Any]]:
+    """Run a campaign of an analytic scenario in this process; no report unless it is asked for."""
+    from sbt.config.load import load
+    from sbt.run import run_campaign
+
+    def run(name: str = "c", scenario: str = "SCENARIO", *, report: bool = False, **keys: Any) -> dict[str, Any]:
+        return run_campaign(load(configured(name, scenario, **keys)), report=report)
+
+    return run
+
+
+@pytest.fixture
+def rows() -> Iterator[Callable[[Path | str], dict[str, list[Any]]]]:
+    """Read what a store must hold bit by bit, however it came about: everything but seconds."""
+
+    def read(folder: Path | str) -> dict[str, list[Any]]:
+        db = sqlite3.connect(Path(folder) / "campaign.sqlite")
+        try:
+            assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+            return {
+                "runs": db.execute(
+                    "SELECT idx, stage, iteration, inputs, seed, log_q, status, metrics, reason, collisions FROM runs ORDER BY idx"
+                ).fetchall(),
+                "iterations": db.execute("SELECT * FROM iterations ORDER BY iteration").fetchall(),
+                "fits": db.execute("SELECT * FROM fits ORDER BY runs").fetchall(),
+            }
+        finally:
+            db.close()
+
+    yield read
