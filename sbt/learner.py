@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Mask, Points
+from sbt.arrays import Mask, Points, Vector
 from sbt.history import History
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
@@ -65,14 +65,20 @@ class Learner:
         def predict(points: Points) -> Prediction:
             return predictor(space.metamodel_inputs(points))
 
-        return Belief(predict, self._scores(predict, history.held_out), len(training), seconds)
+        return Belief(predict, self._scores(predict, history), len(training), seconds)
 
-    def _scores(self, predict: Predictor, held_out: History) -> dict[str, Any]:
-        critical = self.scenario.requirement.critical
-        found: dict[str, Any] = {}
-        if len(held_out):
-            u = self.scenario.space.to_unit(held_out.x)
-            found = scores(predict(u), held_out.y(self.scenario.requirement.metric), critical)
+    def unseen(self, history: History) -> tuple[Points, Vector]:
+        """Return x (n, d) and y (n,) that no metamodel learned from: held-out runs, or a table's rows not chosen."""
+        metric, pool = self.scenario.requirement.metric, self.scenario.pool
+        if pool is None:
+            return history.held_out.x, history.held_out.y(metric)
+        left = ~pool.taken(history.x)
+        return pool.x[left], pool.metrics[metric][left]
+
+    def _scores(self, predict: Predictor, history: History) -> dict[str, Any]:
+        critical, space = self.scenario.requirement.critical, self.scenario.space
+        x, y = self.unseen(history)
+        found: dict[str, Any] = scores(_chunked(predict, space.to_unit(x)), y, critical) if len(y) else {}
         p = self._probe(predict)
         found["critical_fraction"] = float(p.mean())
         found["sides"] = np.packbits(p > 0.5).tobytes().hex()
@@ -84,8 +90,18 @@ class Learner:
         u = SobolSequence(space.dimension, self.seed).points(0, _PROBE)
         if space.constraints:
             u = u[space.feasible(space.from_unit(u))]
-        critical = self.scenario.requirement.critical
-        return np.concatenate([predict(u[k : k + _CHUNK]).probability(critical) for k in range(0, len(u), _CHUNK)])
+        return predict(u).probability(self.scenario.requirement.critical)
+
+
+def _chunked(predict: Predictor, u: Points) -> Prediction:
+    """Return the belief at many points, a few thousand at a time."""
+    parts = [predict(u[k : k + _CHUNK]) for k in range(0, len(u), _CHUNK)]
+    if len(parts) == 1:
+        return parts[0]
+    return Prediction(
+        np.concatenate([p.mean for p in parts], axis=1), np.concatenate([p.std for p in parts], axis=1), parts[0].weight,
+        np.concatenate([p.noise for p in parts]),
+    )  # fmt: skip
 
 
 def changed_share(before: str, after: str) -> float:

@@ -19,7 +19,8 @@ from sbt.errors import InputError, PluginError
 
 __all__ = ["KINDS", "load", "names"]
 
-KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
+KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns", "sources")
+"""`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
 
 
@@ -49,6 +50,9 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
     if ".py:" in name:
         path, _, attribute = name.rpartition(":")
         return _from_file(str((folder or Path.cwd()) / Path(path).expanduser()), attribute)
+    source, _, rest = name.partition(":")
+    if kind == "scenarios" and rest and source in _entries("sources"):
+        return load("sources", source)(rest, folder or Path.cwd())
     entries = _entries(kind)
     if name not in entries:
         near = difflib.get_close_matches(name, entries, 1)

@@ -103,11 +103,12 @@ def _kept(loaded: Loaded, settings: Settings) -> dict[str, Any]:
 
 def settings_of(loaded: Loaded, parts: Assembly) -> Settings:
     """Return what the campaigns are built from."""
-    config = loaded.config
+    config, recorded = loaded.config, parts.scenario.pool is not None
     learner = None if parts.metamodel is None else Learner(parts.scenario, parts.metamodel, config.seed)
     return Settings(
         parts.scenario, config.seed, config.budget, config.initial, config.batch,
-        config.validation.share if learner is not None else 0.0, config.validation.reference, learner,
+        config.validation.share if learner is not None and not recorded else 0.0,
+        0 if recorded else config.validation.reference, learner,
         parts.acquisition, config.stop.stable,
     )  # fmt: skip
 

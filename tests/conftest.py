@@ -9,6 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("fixed", derandomize=True, deadline=None)  # the same examples every time
+settings.load_profile("fixed")
 
 ANALYTIC = '''
 """A disc of radius 0.3 in the unit square (pi 0.09 of it is critical), a line, and things that go wrong."""

@@ -67,7 +67,7 @@ def test_every_kind_of_law_is_among_the_tested(kind):
 
 @pytest.mark.parametrize("name", LAWS)
 @given(u=unit)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_maps_of_a_continuous_input_invert(name, u):
     p = LAWS[name]
     low, high = p.bounds
@@ -146,7 +146,7 @@ def test_samples_follow_the_law(name):
 
 
 @given(st.floats(0.001, 0.999), st.floats(0.001, 0.999))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_maps_of_a_space_invert_with_and_without_copula(u, v):
     for space in (SQUARE, COPULA):
         x = space.from_unit(np.array([[u, v]]))
@@ -164,15 +164,14 @@ def test_the_corners_of_the_box_come_back_from_their_normal_scores(space):
 
 
 def test_copula_density_integrates_to_one_and_has_the_marginals_and_the_correlation():
-    x, y = (np.linspace(*p.bounds, 400) for p in COPULA.parameters)
+    ends = [p.bounds for p in COPULA.parameters]
+    x, y = (low + (high - low) * (np.arange(1200) + 0.5) / 1200 for low, high in ends)
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    inner = grid[1:-1, 1:-1]
-    density = np.zeros(grid.shape[:2])
-    density[1:-1, 1:-1] = np.exp(COPULA.log_density(inner.reshape(-1, 2))).reshape(inner.shape[:2])
-    assert integrate.simpson(integrate.simpson(density, x=y), x=x) == pytest.approx(1.0, abs=4e-3)
+    density = np.exp(COPULA.log_density(grid.reshape(-1, 2))).reshape(len(x), len(y))
+    assert density.sum() * (x[1] - x[0]) * (y[1] - y[0]) == pytest.approx(1.0, abs=2e-3)
     p = COPULA.parameters[0]
-    middle = slice(80, 200)
-    np.testing.assert_allclose(integrate.simpson(density, x=y)[middle], np.exp(p.log_density(x))[middle], rtol=0.02)
+    middle = slice(240, 600)
+    np.testing.assert_allclose(density.sum(axis=1)[middle] * (y[1] - y[0]), np.exp(p.log_density(x))[middle], rtol=0.02)
     sample = COPULA.sample(20_000, stream(2))
     rank = stats.spearmanr(sample[:, 0], sample[:, 1]).statistic
     assert rank == pytest.approx(6 / math.pi * math.asin(0.7 / 2), abs=0.02)
@@ -300,7 +299,7 @@ def test_errors_survive_pickling():
 
 def trees(depth: int) -> st.SearchStrategy[str]:
     """Formulas over x and y whose value is a number."""
-    leaf = st.sampled_from(["x", "y"]) | st.integers(0, 9).map(str) | st.floats(0.1, 9, width=16).map(repr)
+    leaf = st.sampled_from(["x", "y"]) | st.integers(0, 9).map(str) | st.floats(0.125, 9, width=16).map(repr)
 
     def grow(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
         return (
@@ -315,7 +314,7 @@ def trees(depth: int) -> st.SearchStrategy[str]:
 
 
 @given(trees(8), trees(4), st.sampled_from(["<", "<=", ">", ">="]), st.sampled_from(["and", "or"]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_expressions_equal_python(number, other, comparison, joint):
     names = {"x": np.array([0.5, -1.25, 3.0]), "y": np.array([2.0, 0.75, -4.0])}
     condition = f"{number} {comparison} {other} {joint} not x < y"

@@ -19,6 +19,7 @@ from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
+from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
@@ -79,6 +80,8 @@ class BatchStage:
         s = self.settings
         if log.iterations and len(log.history) - s.reference >= s.budget:
             return "budget"
+        if s.scenario.pool is not None and len(log.history) >= len(s.scenario.pool.x):
+            return "no rows left"
         if s.stable is not None and len(log.fits) >= 3:
             sides = [fit["sides"] for fit in log.fits[-3:]]
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
@@ -96,7 +99,7 @@ class BatchStage:
         belief = s.learner.fit(log.history) if s.learner is not None and not first else None
         draw = self._draw(belief, log, size - held_out)
         stage = "initial" if first else self.name
-        chosen = [PlannedRun(stage, _inputs(s.scenario, row)) for row in s.scenario.space.from_unit(draw.u)]
+        chosen = [PlannedRun(stage, _inputs(s.scenario, row)) for row in self._values(draw, log)]
         random = self._held_out(log.iteration, held_out + (s.reference if first else 0))
         how = {
             "method": draw.method, "candidates": draw.candidates, "acceptance": draw.acceptance,
@@ -107,7 +110,6 @@ class BatchStage:
     def _draw(self, belief: Belief | None, log: Log, n: int) -> RoiDraw:
         """Draw from the region of interest; evenly where there is no metamodel to ask."""
         s, space = self.settings, self.settings.scenario.space
-        start = int(log.iterations[-1][_POSITION]) if log.iterations else 0
         critical = s.scenario.requirement.critical
 
         def score(u: Points) -> Vector:
@@ -115,10 +117,31 @@ class BatchStage:
                 return np.zeros(len(u))
             return s.acquisition(belief.predict(u), critical, space.log_density(space.from_unit(u)))
 
-        return rejection(
-            score, SobolSequence(space.dimension, s.seed), n, start=start, seed=s.seed, label=log.iteration,
-            accept_filter=(lambda u: space.feasible(space.from_unit(u))) if space.constraints else None,
-        )  # fmt: skip
+        admissible = (lambda u: space.feasible(space.from_unit(u))) if space.constraints else None
+        pool = self._pool(log)
+        if pool is not None:
+            n = min(n, len(pool))
+            return rejection(
+                score, pool, n, start=0, seed=s.seed, label=log.iteration, max_candidates=len(pool), accept_filter=admissible
+            )
+        start = int(log.iterations[-1][_POSITION]) if log.iterations else 0
+        sobol = SobolSequence(space.dimension, s.seed)
+        return rejection(score, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=admissible)
+
+    def _pool(self, log: Log) -> PoolSequence | None:
+        """Return the recorded rows that are left to choose from; None where runs are simulated."""
+        scenario = self.settings.scenario
+        if scenario.pool is None:
+            return None
+        u = np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0)
+        return PoolSequence(u, scenario.pool.taken(log.history.x), self.settings.seed)
+
+    def _values(self, draw: RoiDraw, log: Log) -> Points:
+        """Return the drawn points in the inputs' units, exactly as recorded where they are."""
+        scenario, pool = self.settings.scenario, self._pool(log)
+        if scenario.pool is None or pool is None:
+            return scenario.space.from_unit(draw.u)
+        return scenario.pool.x[pool.rows[draw.positions]]
 
     def _held_out(self, iteration: int, n: int) -> list[PlannedRun]:
         """Return n uniform random runs of the box, with their log density."""

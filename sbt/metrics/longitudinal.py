@@ -21,8 +21,8 @@ from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
 __all__ = [
-    "BESIDE", "HORIZON", "OVERTAKEN", "Encounter", "collision", "d_min", "drac_max", "encounter",
-    "impact_speed", "thw_min", "ttc_min",
+    "BESIDE", "DRAC_LIMIT", "FAR", "HORIZON", "OVERTAKEN", "Encounter", "collision", "d_min", "drac_max", "encounter",
+    "first_contact", "impact_speed", "thw_min", "ttc_min",
 ]  # fmt: skip
 
 HORIZON = 10.0
@@ -64,7 +64,8 @@ class Encounter:
 
 
 @lru_cache(maxsize=8)
-def _contact(trace: Trace, ego: str, other: str) -> int | None:
+def first_contact(trace: Trace, ego: str, other: str) -> int | None:
+    """Return the index of the first contact of two actors, None without one; kept for the last few traces."""
     return contact_index(trace.actor(ego), trace.actor(other))
 
 
@@ -80,7 +81,7 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
     in_path = offset < 0.5 * (a.width + b.width) + margin
     behind = gap <= -(a.length + b.length)
     ahead = in_path & (gap >= 0)
-    contact = _contact(trace, ego, other)
+    contact = first_contact(trace, ego, other)
     rear_end = contact is not None and (bool(ahead[contact]) or (contact > 0 and bool(ahead[contact - 1])))
     return Encounter(
         gap, a.speed - b.speed * turn, in_path, ahead, in_path & (gap < 0) & ~behind, a.speed,
@@ -174,7 +175,7 @@ def collision(ego: str = "ego") -> Metric:
     """Return 1 where ego's rectangle touches another's at any time, steps in between included, else 0."""
 
     def function(trace: Trace) -> float:
-        return float(any(_contact(trace, ego, other) is not None for other in trace.actors if other != ego))
+        return float(any(first_contact(trace, ego, other) is not None for other in trace.actors if other != ego))
 
     return Metric("collision", function, "", "high", 0.0, "the ego's rectangle touched another one")
 
@@ -183,7 +184,7 @@ def impact_speed(ego: str = "ego", other: str = "co") -> Metric:
     """Return the speed of ego relative to the other at the first contact (m/s), 0 without one."""
 
     def function(trace: Trace) -> float:
-        k = _contact(trace, ego, other)
+        k = first_contact(trace, ego, other)
         if k is None:
             return 0.0
         a, b = trace.actor(ego), trace.actor(other)

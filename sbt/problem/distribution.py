@@ -127,6 +127,11 @@ class TruncatedLaw:
         return bool(self.low > self.law.ppf(0.5))
 
     @cached_property
+    def _lower(self) -> bool:
+        """Work with distribution functions: the range lies below the median."""
+        return bool(self.high < self.law.ppf(0.5))
+
+    @cached_property
     def mass(self) -> float:
         """Probability of the range under the law before truncation."""
         if self._upper:
@@ -142,7 +147,7 @@ class TruncatedLaw:
     def sf(self, x: Vector) -> Vector:
         """Return P(X > x)."""
         x = np.clip(x, self.low, self.high)
-        part = self.law.sf(x) - self.law.sf(self.high)
+        part = self.law.cdf(self.high) - self.law.cdf(x) if self._lower else self.law.sf(x) - self.law.sf(self.high)
         return np.clip(part / self.mass, 0.0, 1.0)
 
     def ppf(self, q: Vector) -> Vector:
@@ -155,7 +160,11 @@ class TruncatedLaw:
 
     def isf(self, q: Vector) -> Vector:
         """Return the value that is exceeded with probability q: precise where q is tiny."""
-        return np.clip(self.law.isf(self.law.sf(self.high) + np.asarray(q) * self.mass), self.low, self.high)
+        if self._lower:
+            x = self.law.ppf(self.law.cdf(self.high) - np.asarray(q) * self.mass)
+        else:
+            x = self.law.isf(self.law.sf(self.high) + np.asarray(q) * self.mass)
+        return np.clip(x, self.low, self.high)
 
     def log_density(self, x: Vector) -> Vector:
         """Return the log density, -inf outside the range."""

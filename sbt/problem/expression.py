@@ -57,9 +57,10 @@ class Expression:
 
     def _tree(self) -> ast.expr:
         try:
-            return ast.parse(self.text, mode="eval").body
-        except SyntaxError as error:
-            raise InputError(f"an expression must be a formula, but got '{self.text}' ({error.msg})") from None
+            return ast.parse(self.text.strip(), mode="eval").body
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            reason = getattr(error, "msg", None) or str(error) or "nested too deeply"
+            raise InputError(f"an expression must be a formula, but got '{self.text}' ({reason})") from None
 
     def names(self) -> tuple[str, ...]:
         """Return the inputs that the formula uses, in order of appearance."""
@@ -74,7 +75,7 @@ class Expression:
 def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
     """Return the value of one node of the syntax tree."""
     match node:
-        case ast.Constant(value=int() | float() as value):
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return np.float64(value)
         case ast.Name(id=name):
             if name not in values:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
+from sbt.arrays import Mask, Points, Vector
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
-__all__ = ["Configurable", "LogicalScenario", "Metric", "Simulate"]
+__all__ = ["Configurable", "LogicalScenario", "Metric", "Pool", "Simulate"]
 
 
 class Simulate(Protocol):
@@ -80,6 +84,28 @@ class Metric:
         return value
 
 
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Recorded outcomes to choose among instead of simulating: x (n, d), metrics of (n,) each."""
+
+    x: Points
+    metrics: Mapping[str, Vector]
+
+    @cached_property
+    def _rows(self) -> dict[bytes, int]:
+        return {row.tobytes(): k for k, row in enumerate(self.x)}
+
+    def row(self, x: Vector) -> int | None:
+        """Return the index of the row with exactly these inputs, None where there is none."""
+        return self._rows.get(np.ascontiguousarray(x, dtype=np.float64).tobytes())
+
+    def taken(self, x: Points) -> Mask:
+        """Return (n,) booleans: the row is among the points (m, d)."""
+        mask = np.zeros(len(self.x), dtype=bool)
+        mask[[k for k in map(self.row, x) if k is not None]] = True
+        return mask
+
+
 @dataclass(frozen=True)
 class LogicalScenario:
     """A parametrized traffic situation and its requirement.
@@ -94,6 +120,7 @@ class LogicalScenario:
         evaluate: values and seed to metrics directly (analytic functions, recorded tables), instead
             of `simulate`: there is no trace to look at.
         metric_names: the metrics that `evaluate` gives.
+        pool: recorded outcomes; campaigns then choose among these rows only.
 
     Raises:
         InputError: neither or both of simulate and evaluate, or a requirement on an absent metric.
@@ -107,6 +134,7 @@ class LogicalScenario:
     description: str = ""
     evaluate: Callable[[Mapping[str, float], int], Mapping[str, float]] | None = None
     metric_names: tuple[str, ...] = ()
+    pool: Pool | None = None
 
     def __post_init__(self) -> None:
         if (self.simulate is None) == (self.evaluate is None):

@@ -20,6 +20,8 @@ __all__ = ["ParameterSpace"]
 Formula = Callable[[Mapping[str, Vector]], Vector]
 _MASS_POINTS = 2**15
 _MIN_FEASIBLE = 1e-3
+_FARTHEST = 38.0
+"""Normal score from which on float64 knows no probability."""
 
 
 @dataclass(frozen=True)
@@ -125,15 +127,16 @@ class ParameterSpace:
         return np.column_stack([p.from_normal(z[:, k]) for k, p in enumerate(self.parameters)])
 
     def to_normal(self, x: Points) -> Points:
-        """Map (n, d) physical values to independent standard-normal scores."""
+        """Map (n, d) physical values to independent standard-normal scores, finite also at the ends of a range."""
         scores = self._scores(as_points(x, self.dimension))
         if self._factor is None:
             return scores
         return np.ascontiguousarray(solve_triangular(self._factor, scores.T, lower=True).T)
 
     def _scores(self, x: Points) -> Points:
-        """Return the (n, d) normal scores of each input alone."""
-        return np.column_stack([p.to_normal(x[:, k]) for k, p in enumerate(self.parameters)])
+        """Return the (n, d) normal scores of each input alone, the ends of a range at +-38."""
+        scores = np.column_stack([p.to_normal(x[:, k]) for k, p in enumerate(self.parameters)])
+        return np.clip(scores, -_FARTHEST, _FARTHEST)
 
     def log_density(self, x: Points) -> Vector:
         """Return (n,) log p(x): the marginals, the copula, the constraints.
@@ -144,7 +147,7 @@ class ParameterSpace:
         x = as_points(x, self.dimension)
         log_p = np.sum([p.log_density(x[:, k]) for k, p in enumerate(self.parameters)], axis=0)
         if self._factor is not None:
-            scores = np.clip(self._scores(x), -38.0, 38.0)
+            scores = self._scores(x)
             whitened = solve_triangular(self._factor, scores.T, lower=True)
             log_p += 0.5 * (scores**2).sum(axis=1) - 0.5 * (whitened**2).sum(axis=0)
             log_p -= np.log(np.diag(self._factor)).sum()

@@ -7,6 +7,7 @@ where the trace is recorded.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,6 +49,7 @@ class Trace:
         length, width: (m,) size of the rectangle (m).
         ended: why the run ended, such as "collision" or "duration".
         reported: SUMO's own collision list ("collider>victim@time"), a cross-check only.
+        signals: name to (t,) numbers recorded beside the states, such as what the ego perceived.
 
     Two traces are the same where `identical` says so; as keys they count by identity.
 
@@ -66,12 +68,16 @@ class Trace:
     width: Vector
     ended: str = ""
     reported: tuple[str, ...] = field(default=())
+    signals: Mapping[str, Vector] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.actors))
         for name in ("x", "y", "heading", "speed", "acceleration"):
             if getattr(self, name).shape != shape:
                 raise ValueError(f"trace.{name} must have shape {shape}, but got {getattr(self, name).shape}")
+        for name, values in self.signals.items():
+            if values.shape != shape[:1]:
+                raise ValueError(f"trace.signals['{name}'] must have shape {shape[:1]}, but got {values.shape}")
 
     def actor(self, name: str) -> ActorTrace:
         """Return the columns of one actor.
@@ -88,10 +94,23 @@ class Trace:
             float(self.length[k]), float(self.width[k]),
         )  # fmt: skip
 
+    def signal(self, name: str) -> Vector:
+        """Return the (t,) values of one signal.
+
+        Raises:
+            RunError: there is no such signal in this trace.
+        """
+        if name not in self.signals:
+            known = ", ".join(self.signals) or "none"
+            raise RunError(Status.FAILED, f"no signal '{name}' in the trace, there are: {known}")
+        return self.signals[name]
+
     def identical(self, other: Trace) -> bool:
-        """Return whether two traces agree to the last bit, SUMO's collision list included."""
+        """Return whether two traces agree to the last bit, signals and SUMO's collision list included."""
         arrays = ("time", "x", "y", "heading", "speed", "acceleration", "length", "width")
         same = all(np.array_equal(getattr(self, name), getattr(other, name)) for name in arrays)
+        same = same and list(self.signals) == list(other.signals)
+        same = same and all(np.array_equal(values, other.signals[name]) for name, values in self.signals.items())
         return same and (self.actors, self.ended, self.reported) == (other.actors, other.ended, other.reported)
 
     def rows(self) -> list[dict[str, float | str]]:

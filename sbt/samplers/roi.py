@@ -9,17 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbt.arrays import Mask, Points, Vector
 from sbt.errors import InputError
-from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 
-__all__ = ["Positions", "RoiDraw", "rejection"]
+__all__ = ["Positions", "RoiDraw", "Sequence", "rejection"]
+
+class Sequence(Protocol):
+    """Candidates addressed by position: a `SobolSequence`, or the rows of a table."""
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates."""
+        ...
+
+    def points(self, start: int, stop: int) -> Points:
+        """Return the (m, d) points at positions start, ..., stop - 1."""
+        ...
+
 
 Positions = NDArray[np.int64]
 """(n,) positions in the Sobol sequence."""
@@ -52,7 +64,7 @@ class RoiDraw:
 
 def rejection(
     score: Callable[[Points], Vector],
-    sobol: SobolSequence,
+    sobol: Sequence,
     n: int,
     *,
     start: int,
@@ -163,7 +175,7 @@ def _fall_back(accepted: _Candidates, rejected: _Candidates, n: int, scored: int
 
 def _score(
     score: Callable[[Points], Vector],
-    sobol: SobolSequence,
+    sobol: Sequence,
     start: int,
     stop: int,
     accept_filter: Callable[[Points], Mask] | None,

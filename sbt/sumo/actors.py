@@ -14,7 +14,10 @@ from typing import NamedTuple, Protocol
 
 from sbt.errors import InputError
 
-__all__ = ["KEEP", "Action", "Actor", "Controller", "Scene", "State", "Until", "VehicleType"]
+__all__ = ["KEEP", "Action", "Actor", "Controller", "Obstacle", "Pose", "Scene", "State", "Until", "VehicleType"]
+
+Pose = tuple[float, float, float]
+"""x and y of the centre (m) and heading (rad)."""
 
 
 class Action(NamedTuple):
@@ -28,7 +31,7 @@ class Action(NamedTuple):
     acceleration: float | None = None
     speed: float | None = None
     lane: int | None = None
-    pose: tuple[float, float, float] | None = None
+    pose: Pose | None = None
 
 
 KEEP = Action()
@@ -44,12 +47,16 @@ class State:
         speed, acceleration: along the heading (m/s, m/s^2).
         length, width: of the rectangle (m).
         steered: the speed commanded with a pose (SUMO does not keep it), None for lane-bound actors.
+        step: time until its controller is asked again (s).
     """
 
-    __slots__ = ("acceleration", "angle", "cos", "heading", "length", "name", "sin", "speed", "steered", "width", "x", "y")
+    __slots__ = (
+        "acceleration", "angle", "cos", "heading", "length", "name", "sin", "speed", "steered", "step", "width", "x", "y",
+    )  # fmt: skip
 
-    def __init__(self, name: str, length: float, width: float):
+    def __init__(self, name: str, length: float, width: float, step: float = 0.05):
         self.name = name
+        self.step = step
         self.length = length
         self.width = width
         self.x = self.y = self.heading = self.speed = self.acceleration = 0.0
@@ -91,16 +98,22 @@ class VehicleType:
 
 @dataclass(frozen=True)
 class Actor:
-    """One vehicle and where it starts.
+    """One vehicle or person and where it starts.
 
     Args:
-        name: unique in the scene, also SUMO's vehicle id.
+        name: unique in the scene, also SUMO's id.
         route: edges, the first is where it starts.
         lane: index on that edge, 0 is the right one.
         position: of the front bumper on that lane (m).
         speed: at the start (m/s).
         driver: its controller; None lets SUMO's models drive it.
         type: its SUMO type.
+        pose: where it starts instead, on or off the lanes; its controller then gives a pose at every
+            step, and `lane` and `position` only say where SUMO lets it in.
+        person: a SUMO person; it needs a pose and is round, `type.width` wide.
+
+    Raises:
+        InputError: numbers that are not finite, a person without a pose, a pose without a controller.
     """
 
     name: str
@@ -110,12 +123,43 @@ class Actor:
     speed: float
     driver: Controller | None = None
     type: VehicleType = field(default_factory=VehicleType)
+    pose: Pose | None = None
+    person: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.position) and math.isfinite(self.speed) and self.speed >= 0):
             raise InputError(
                 f"actor {self.name}: position must be finite and speed >= 0, but got {self.position} m, {self.speed} m/s"
             )
+        if self.pose is not None and not all(math.isfinite(v) for v in self.pose):
+            raise InputError(f"actor {self.name}: a pose must be finite, but got {self.pose}")
+        if self.person and self.pose is None:
+            raise InputError(f"actor {self.name}: a person must have a pose, but got none")
+        if self.pose is not None and self.driver is None:
+            raise InputError(f"actor {self.name}: a pose needs a controller that goes on from it, but SUMO would drive")
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A rectangle that stands and hides what is behind it; shown in SUMO and in the trace, in nobody's way.
+
+    Args:
+        name: unique in the scene, also the id of SUMO's polygon.
+        pose: of its centre.
+        length, width: along and across its heading (m).
+    """
+
+    name: str
+    pose: Pose
+    length: float
+    width: float
+
+    @property
+    def corners(self) -> tuple[tuple[float, float], ...]:
+        """Four (x, y), counter-clockwise from the front left."""
+        x, y, heading = self.pose
+        cos, sin, a, b = math.cos(heading), math.sin(heading), 0.5 * self.length, 0.5 * self.width
+        return tuple((x + u * cos - v * sin, y + u * sin + v * cos) for u, v in ((a, b), (-a, b), (-a, -b), (a, -b)))
 
 
 Until = Callable[[float, Mapping[str, State]], str | None]
@@ -124,7 +168,16 @@ Until = Callable[[float, Mapping[str, State]], str | None]
 
 @dataclass(frozen=True)
 class Scene:
-    """The actors of one concrete scenario and when it is over (apart from collision and duration)."""
+    """One concrete scenario: who takes part, and when it is over (apart from collision and duration).
+
+    Args:
+        actors: the first one is the ego.
+        until: ends the run.
+        obstacles: what stands around.
+        signals: name to a function that is read after every step's actions, into `Trace.signals`.
+    """
 
     actors: tuple[Actor, ...]
     until: Until | None = None
+    obstacles: tuple[Obstacle, ...] = ()
+    signals: Mapping[str, Callable[[], float]] = field(default_factory=dict)

@@ -9,7 +9,7 @@ from sbt.sumo.actors import KEEP, Action, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag
 from sbt.sumo.sensors import RangeSensor, Target
 
-__all__ = ["AccAeb", "Braking", "LaneChange"]
+__all__ = ["AccAeb", "Braking", "LaneChange", "SpeedProfile"]
 
 
 class AccAeb:
@@ -25,12 +25,13 @@ class AccAeb:
         rng: source of the sensor noise.
         set_speed: cruising speed (m/s).
         reaction_time: dead time from measurement to actuation (s).
-        lag: time constant of the actuation (s).
+        lag, lag_2: time constants of the actuation, one after the other (s).
         time_gap: wanted headway (s).
         distance_min: wanted gap at standstill (m).
         acc_accel, acc_braking: comfort limits of ACC (m/s^2), both positive.
         aeb_braking: deceleration that AEB demands and the vehicle can reach (m/s^2), positive.
-        aeb_reserve: time that AEB keeps in hand beyond the last moment to brake (s).
+        aeb_reserve: time that AEB keeps in hand beyond the last moment to brake (s); None: AEB knows
+            `aeb_distance` only.
         aeb_distance: gap below which AEB brakes whenever the target closes in (m).
         gap_noise, speed_noise: standard deviations of the sensor (m, m/s).
         sensor_range: of the radar (m).
@@ -41,13 +42,15 @@ class AccAeb:
     """
 
     def __init__(
-        self, rng: np.random.Generator, set_speed: float, *, reaction_time: float = 0.2, lag: float = 0.1,
+        self, rng: np.random.Generator, set_speed: float, *, reaction_time: float = 0.2, lag: float = 0.1, lag_2: float = 0.0,
         time_gap: float = 1.5, distance_min: float = 3.0, acc_accel: float = 2.0, acc_braking: float = 3.5,
-        aeb_braking: float = 9.0, aeb_reserve: float = 0.5, aeb_distance: float = 1.0, gap_noise: float = 0.25,
+        aeb_braking: float = 9.0, aeb_reserve: float | None = 0.5, aeb_distance: float = 1.0, gap_noise: float = 0.25,
         speed_noise: float = 0.15, sensor_range: float = 200.0, path_margin: float = 0.85,
     ):  # fmt: skip
         given = {k: v for k, v in locals().items() if k not in ("self", "rng")}
         for name, value in given.items():
+            if name == "aeb_reserve" and value is None:
+                continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= 0:
                 raise InputError(f"ego.{name} must be a number >= 0, but got {value!r}")
         self._set_speed = set_speed
@@ -59,6 +62,7 @@ class AccAeb:
         )
         self._delay = DeadTime(reaction_time)
         self._lag = FirstOrderLag(lag)
+        self._lag_2 = FirstOrderLag(lag_2) if lag_2 > 0 else None
         self._last = self._reached = 0.0
         self._braking = False
 
@@ -66,7 +70,10 @@ class AccAeb:
         """Return the acceleration over the next step: the mean of the lag's output at its ends."""
         demand = self._delay(t, self._demand(own.speed, self._sensor(t, own, others)))
         before = self._reached
-        self._reached = after = self._lag(demand, t - self._last)
+        after = self._lag(demand, t - self._last)
+        if self._lag_2 is not None:
+            after = self._lag_2(after, t - self._last)
+        self._reached = after
         self._last = t
         return Action(0.5 * (before + after))
 
@@ -77,10 +84,9 @@ class AccAeb:
             self._braking = False
         else:
             gap, closing = target
-            last_moment = closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
             if closing <= 0:
                 self._braking = False
-            elif gap < last_moment or gap < self._aeb_distance:
+            elif gap < self._aeb_distance or gap < self._last_moment(closing):
                 self._braking = True
             if self._braking:
                 return -self._aeb_braking
@@ -89,6 +95,13 @@ class AccAeb:
         if demand < -self._acc_braking:
             return -self._acc_braking
         return demand if demand < self._acc_accel else self._acc_accel
+
+
+    def _last_moment(self, closing: float) -> float:
+        """Return the gap at which AEB brakes because of the closing speed (m)."""
+        if self._aeb_reserve is None:
+            return 0.0
+        return closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
 
 
 class LaneChange:
@@ -120,3 +133,35 @@ class Braking:
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the braking, which ends at the final speed."""
         return self._action
+
+
+class SpeedProfile:
+    """Accelerates from a speed to another, holds it, brakes to a stop: exact at every step, however long.
+
+    Args:
+        acceleration: of the first part (m/s^2), positive.
+        speed: that is held (m/s).
+        hold: time for which it is held (s).
+        deceleration: of the last part (m/s^2), positive.
+    """
+
+    def __init__(self, acceleration: float, speed: float, hold: float, deceleration: float):
+        self._acceleration, self._speed, self._deceleration = acceleration, speed, deceleration
+        self._brakes = speed / acceleration + hold
+        self.end = self._brakes + speed / deceleration
+        """When it stands still again (s)."""
+
+    def at(self, t: float) -> float:
+        """Return the speed at time t (m/s)."""
+        return max(min(self._acceleration * t, self._speed, self._speed - self._deceleration * (t - self._brakes)), 0.0)
+
+    def distance(self, t: float) -> float:
+        """Return the distance covered by time t (m)."""
+        rise, fall = self._speed / self._acceleration, self._speed / self._deceleration
+        first, last = min(t, rise), min(max(t - self._brakes, 0.0), fall)
+        held = min(max(t - rise, 0.0), self._brakes - rise)
+        return 0.5 * self._acceleration * first**2 + self._speed * (held + last) - 0.5 * self._deceleration * last**2
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the speed at the end of the step."""
+        return Action(speed=self.at(t + own.step))

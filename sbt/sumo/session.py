@@ -111,7 +111,7 @@ class Session:
         self._sumo = libsumo()
         self._setup: Setup | None = None
         self._routes: set[tuple[str, ...]] = set()
-        self._inside: list[str] = []
+        self._inside: list[tuple[str, str]] = []
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
 
     @contextlib.contextmanager
@@ -140,9 +140,9 @@ class Session:
             self._routes.add(edges)
         return name
 
-    def inserted(self, name: str) -> None:
-        """Remember an actor that the end of the run has to remove."""
-        self._inside.append(name)
+    def inserted(self, name: str, domain: str = "vehicle") -> None:
+        """Remember a vehicle, person or polygon that the end of the run has to remove."""
+        self._inside.append((domain, name))
 
     def _load(self, setup: Setup, seed: int, isolation: str) -> None:
         if isolation == "reuse" and setup == self._setup:
@@ -158,8 +158,8 @@ class Session:
 
     def _clear(self) -> None:
         if self._setup is not None:
-            for name in self._inside:
-                self._sumo.vehicle.remove(name)
+            for domain, name in self._inside:
+                getattr(self._sumo, domain).remove(name)
         self._inside.clear()
 
     @contextlib.contextmanager

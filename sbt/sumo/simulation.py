@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,6 +18,7 @@ from sbt.seeds import stream
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
 from sbt.sumo.ego import Ego
 from sbt.sumo.nets import net_file
+from sbt.sumo.placing import insert, mover, type_name, verify
 from sbt.sumo.session import ABSENT, Setup, check_options, direct, session
 
 __all__ = ["DEADLINE_STEPS", "SumoSimulation"]
@@ -27,7 +27,6 @@ SceneBuilder = Callable[[Mapping[str, float], Ego, np.random.Generator], Scene]
 
 DEADLINE_STEPS = 256
 """The wall clock is looked at once in so many steps."""
-_TOLERANCE = 1e-6
 _FASTEST = 1e4
 
 
@@ -103,52 +102,14 @@ class SumoSimulation:
                 not the one asked for, or it takes too long.
         """
         scene = self.scene(values, self.ego, stream(seed, "scene"))
-        types = tuple(sorted({_type_name(a): a.type for a in scene.actors}.items()))
+        types = tuple(sorted({type_name(a): a.type for a in scene.actors}.items()))
         setup = Setup(str(net_file(self.net)), types, self.step_length, self.lane_change_duration, self.options)
         level = self.isolation or self.isolations[-1]
         with session().run(setup, seed, level) as sumo:
-            _insert(sumo, scene)
+            insert(sumo, scene)
             sumo.simulationStep()
-            _verify(sumo, scene)
+            verify(sumo, scene)
             return _drive(sumo, scene, self)
-
-
-def _type_name(actor: Actor) -> str:
-    """Return an id for the actor's type that is the same in every run."""
-    extra = zlib.crc32(repr(actor.type.attributes).encode()) if actor.type.attributes else 0
-    return f"type_{actor.type.length!r}_{actor.type.width!r}_{extra:x}"
-
-
-def _insert(sumo: Any, scene: Scene) -> None:
-    """Ask SUMO to put every actor on the road in the next step, with its own checks off."""
-    here = session()
-    for actor in scene.actors:
-        sumo.vehicle.add(
-            actor.name, here.route(actor.route), typeID=_type_name(actor), depart="now",
-            departLane=str(actor.lane), departPos=repr(actor.position), departSpeed=repr(actor.speed),
-        )  # fmt: skip
-        here.inserted(actor.name)
-        if actor.driver is not None:
-            sumo.vehicle.setSpeedMode(actor.name, 32)
-            sumo.vehicle.setLaneChangeMode(actor.name, 0)
-
-
-def _verify(sumo: Any, scene: Scene) -> None:
-    """Compare what SUMO realised with what was asked for."""
-    for actor in scene.actors:
-        position = sumo.vehicle.getLanePosition(actor.name)
-        if position == ABSENT:
-            raise RunError(Status.INVALID, f"{actor.name} must be on the road at the start, but SUMO did not insert it")
-        realised = {
-            "position": (actor.position, position, "m"),
-            "speed": (actor.speed, sumo.vehicle.getSpeed(actor.name), "m/s"),
-            "lane": (actor.lane, sumo.vehicle.getLaneIndex(actor.name), ""),
-        }
-        for what, (asked, got, unit) in realised.items():
-            if abs(asked - got) > _TOLERANCE:
-                raise RunError(
-                    Status.INVALID, f"{actor.name} must start with {what} {asked:.6g} {unit}, but SUMO gave {got:.6g} {unit}"
-                )
 
 
 def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
@@ -156,13 +117,18 @@ def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
     actors, dt = scene.actors, simulation.step_length
     step, collisions = direct(sumo, "simulation", "step"), direct(sumo, "simulation", "getCollidingVehiclesNumber")
     set_speed = direct(sumo, "vehicle", "setSpeed")
-    states = [State(a.name, a.type.length, a.type.width) for a in actors]
+    states = [State(a.name, a.type.length, a.type.width, dt) for a in actors]
+    for actor, state in zip(actors, states, strict=True):
+        state.steered = None if actor.pose is None else actor.speed
     by_name = {s.name: s for s in states}
     driven = [
-        (a, s, a.driver.act, tuple(o for o in states if o is not s))
+        (a, s, a.driver.act, tuple(o for o in states if o is not s), mover(sumo, a))
         for a, s in zip(actors, states, strict=True) if a.driver is not None
     ]  # fmt: skip
-    observe = _observer(sumo, states, dt)
+    observe = _observer(sumo, actors, states, dt)
+    solid = [k for k, a in enumerate(actors) if not a.person][1:]
+    probes = tuple(scene.signals.values())
+    heard: list[tuple[float, ...]] = []
     near = max(s.length for s in states) * 2
     steps = round(simulation.duration / dt)
     deadline = math.inf if simulation.timeout is None else time.monotonic() + simulation.timeout
@@ -173,40 +139,56 @@ def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
         observe(rows)
         if collisions():
             reported += [f"{c.collider}>{c.victim}@{t:.3f}" for c in sumo.simulation.getCollisions()]
-        if _touching(states, rows, near, dt):
-            return _trace(actors, rows, dt, "collision", reported)
+        if _touching(states, solid, rows, near, dt):
+            reason = "collision"
+            break
         reason = scene.until(t, by_name) if scene.until is not None else None
         if reason is not None:
-            return _trace(actors, rows, dt, reason, reported)
+            break
         if k % DEADLINE_STEPS == 0 and time.monotonic() > deadline:
             raise RunError(Status.TIMEOUT, f"a run must take at most {simulation.timeout:g} s, but it was at t = {t:g} s")
         if k < steps:
-            for actor, own, act, others in driven:
+            for actor, own, act, others, place in driven:
                 action = act(t, own, others)
                 if action is not KEEP:
                     speed = _speed(actor, own, action, dt)
-                    if speed is not None:
+                    if speed is not None and not actor.person:
                         set_speed(actor.name, speed)
                     if action.lane is not None:
                         sumo.vehicle.changeLane(actor.name, action.lane, 3600.0)
                     if action.pose is not None:
-                        _place(sumo, actor, own, action.pose, speed)
+                        own.steered = own.speed if speed is None else speed
+                        place(action.pose)
+            if probes:
+                heard.append(tuple([float(probe()) for probe in probes]))
             step()
-    return _trace(actors, rows, dt, "duration", reported)
+    else:
+        reason = "duration"
+    if probes:
+        heard.append(tuple([float(probe()) for probe in probes]))
+    return _trace(scene, rows, heard, dt, reason, reported)
 
 
-def _observer(sumo: Any, states: list[State], dt: float) -> Callable[[list[tuple[float, ...]]], None]:
+def _observer(
+    sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float
+) -> Callable[[list[tuple[float, ...]]], None]:
     """Return what reads every actor from SUMO and records it, a row an actor.
 
-    This runs at every step of every run, so that everything it needs is bound beforehand.
+    This runs at every step of every run, so that everything it needs is bound beforehand. SUMO's
+    position is a vehicle's front bumper and a person's centre.
     """
-    position, angle_of, speed_of = (direct(sumo, "vehicle", name) for name in ("getPosition", "getAngle", "getSpeed"))
-    halves = [(s, s.name, 0.5 * s.length) for s in states]
+    getters = {
+        person: tuple(direct(sumo, "person" if person else "vehicle", name) for name in ("getPosition", "getAngle", "getSpeed"))
+        for person in {a.person for a in actors}
+    }
+    watched = [
+        (s, s.name, 0.0 if a.person else 0.5 * s.length, *getters[a.person]) for a, s in zip(actors, states, strict=True)
+    ]
     rate = 1.0 / dt
 
     def observe(rows: list[tuple[float, ...]]) -> None:
         first = not rows
-        for state, name, half in halves:
+        for state, name, half, position, angle_of, speed_of in watched:
             x, y = position(name)
             if x == ABSENT:
                 t = len(rows) // len(states) * dt
@@ -238,22 +220,11 @@ def _speed(actor: Actor, own: State, action: Action, dt: float) -> float | None:
     return speed
 
 
-def _place(sumo: Any, actor: Actor, own: State, pose: tuple[float, float, float], speed: float | None) -> None:
-    """Put an actor on a pose; SUMO loses its speed then, so that it is kept here."""
-    if not all(math.isfinite(v) for v in pose):
-        raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave pose {pose}")
-    x, y, heading = pose
-    own.steered = own.speed if speed is None else speed
-    half = 0.5 * actor.type.length
-    angle = (90.0 - math.degrees(heading)) % 360.0
-    sumo.vehicle.moveToXY(actor.name, "", -1, x + half * math.cos(heading), y + half * math.sin(heading), angle, keepRoute=2)
-
-
-def _touching(states: list[State], rows: list[tuple[float, ...]], near: float, dt: float) -> bool:
-    """Return whether the first actor, the ego, touched another since the last step (exact test only when near)."""
+def _touching(states: list[State], solid: list[int], rows: list[tuple[float, ...]], near: float, dt: float) -> bool:
+    """Return whether the first actor, the ego, touched another rectangle since the last step (exact test only when near)."""
     ego = states[0]
     x, y, speed = ego.x, ego.y, ego.speed
-    for j in range(1, len(states)):
+    for j in solid:
         other = states[j]
         dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
         if -reach < dx < reach and -reach < dy < reach:
@@ -269,11 +240,20 @@ def _columns(rows: np.ndarray, k: int, state: State) -> ActorTrace:
     return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width)
 
 
-def _trace(actors: tuple[Actor, ...], rows: list[tuple[float, ...]], dt: float, ended: str, reported: list[str]) -> Trace:
-    """Return the recorded rows as a trace."""
-    table = np.array(rows, dtype=np.float64).reshape(-1, len(actors), 5)
+def _trace(
+    scene: Scene, rows: list[tuple[float, ...]], heard: list[tuple[float, ...]], dt: float, ended: str, reported: list[str]
+) -> Trace:
+    """Return the recorded rows as a trace, obstacles as actors that stand."""
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(scene.actors), 5)
+    sizes = [(a.type.length, a.type.width) for a in scene.actors]
+    if scene.obstacles:
+        standing = np.array([(*o.pose, 0.0, 0.0) for o in scene.obstacles])
+        table = np.concatenate([table, np.broadcast_to(standing, (len(table), *standing.shape))], axis=1)
+        sizes += [(o.length, o.width) for o in scene.obstacles]
     x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
+    length, width = np.array(sizes).T
+    signals = {name: np.array([row[k] for row in heard]) for k, name in enumerate(scene.signals)}
+    names = tuple(thing.name for thing in (*scene.actors, *scene.obstacles))
     return Trace(
-        np.arange(len(table)) * dt, tuple(a.name for a in actors), x, y, heading, speed, acceleration,
-        np.array([a.type.length for a in actors]), np.array([a.type.width for a in actors]), ended, tuple(reported),
-    )  # fmt: skip
+        np.arange(len(table)) * dt, names, x, y, heading, speed, acceleration, length, width, ended, tuple(reported), signals
+    )

@@ -1,0 +1,70 @@
+"""A deep sigma-point process: a deep Gaussian process whose mixture is learned instead of sampled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+from sbt.metamodels.base import check_rows, standardise
+from sbt.metamodels.sparse import SparsePredictor, Training, train
+
+__all__ = ["DeepSigmaPointProcess"]
+
+
+@dataclass(frozen=True)
+class DeepSigmaPointProcess:
+    """Settings of a deep sigma-point process (DSPP): one hidden process per input, then one for y.
+
+    The likelihood of the mixture itself is maximised, with learned sites and weights. The last 80 % of
+    the rows train it; the first 20 % stop it.
+
+    Args:
+        kernel: rq (rational quadratic), matern_0.5, matern_1.5 or matern_2.5; one length scale per input.
+        inducing: most inducing points of a process, >= 1.
+        sites: quadrature sites >= 1, the Gaussians of the mixture (the paper's "mixture components").
+        learning_rate: step of Adam, > 0.
+        batch: rows of a minibatch >= 1.
+        patience: epochs >= 1 without an improvement of 0.01 of the validation log likelihood.
+        max_epochs: most epochs >= 1.
+        device: auto (CUDA where there is one), cpu or cuda.
+
+    Raises:
+        InputError: a value outside its range; at the fit, a device that is not there.
+
+    Source:
+        Jankowiak et al. (2020), Deep sigma point processes; preset: Winkelmann et al. (2022), table of
+        hyperparameters.
+    """
+
+    kernel: str = "rq"
+    inducing: int = 100
+    sites: int = 9
+    learning_rate: float = 0.01
+    batch: int = 1024
+    patience: int = 200
+    max_epochs: int = 2000
+    device: str = "cpu"
+
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "paper": {"kernel": "rq", "inducing": 100, "sites": 9, "learning_rate": 0.01, "patience": 200}
+    }
+
+    def __post_init__(self) -> None:
+        self._training()
+
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparsePredictor:
+        """Return the process trained on u (n, d) and y (n,); see `Metamodel.fit`."""
+        u, y = check_rows(u, y)
+        z, shift, scale = standardise(y)
+        return train(self._training(), u, z, shift, scale, rng)
+
+    def _training(self) -> Training:
+        return Training(
+            deep=True, kernel=self.kernel, inducing=self.inducing, sites=self.sites, objective="predictive",
+            learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
+            max_epochs=self.max_epochs, device=self.device,
+        )  # fmt: skip

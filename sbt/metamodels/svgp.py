@@ -1,0 +1,63 @@
+"""A sparse variational Gaussian process, for many runs: cost grows with the rows, not with their cube."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+from sbt.metamodels.base import check_rows, standardise
+from sbt.metamodels.sparse import SparsePredictor, Training, train
+
+__all__ = ["SparseGaussianProcess"]
+
+
+@dataclass(frozen=True)
+class SparseGaussianProcess:
+    """Settings of a sparse variational Gaussian process (SVGP).
+
+    Args:
+        kernel: rq (rational quadratic), matern_0.5, matern_1.5 or matern_2.5; one length scale per input.
+        inducing: most inducing points, >= 1.
+        objective: predictive (the likelihood of what is predicted; its variance depends on the input) or
+            elbo (the evidence lower bound).
+        learning_rate: first step of Adam, > 0, on a cosine schedule.
+        batch: rows of a minibatch >= 1.
+        steps: minibatches >= 1, at least one pass over the rows.
+        device: auto (CUDA where there is one), cpu or cuda.
+
+    Raises:
+        InputError: a value outside its range; at the fit, a device that is not there.
+
+    Source:
+        Hensman et al. (2015); objective: Jankowiak et al. (2020), Parametric Gaussian process regressors.
+    """
+
+    kernel: str = "matern_1.5"
+    inducing: int = 300
+    objective: Literal["predictive", "elbo"] = "predictive"
+    learning_rate: float = 0.02
+    batch: int = 512
+    steps: int = 1000
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        if not self.steps >= 1:
+            raise InputError(f"steps must be >= 1, but got {self.steps}")
+        self._training(2)
+
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparsePredictor:
+        """Return the process trained on u (n, d) and y (n,); see `Metamodel.fit`."""
+        u, y = check_rows(u, y)
+        z, shift, scale = standardise(y)
+        return train(self._training(len(z)), u, z, shift, scale, rng)
+
+    def _training(self, n: int) -> Training:
+        return Training(
+            deep=False, kernel=self.kernel, inducing=self.inducing, sites=1, objective=self.objective,
+            learning_rate=self.learning_rate, batch=self.batch, patience=None,
+            max_epochs=max(round(self.steps / max(n // self.batch, 1)), 1), device=self.device,
+        )  # fmt: skip

@@ -1,0 +1,130 @@
+"""Recorded outcomes as a scenario: `table:FOLDER`, in the layout of the public DSIOD data set.
+
+The folder holds `config.yml` (inputs with type, unit, min, max and explanation; outputs with unit)
+and one table of rows, parquet or csv. A campaign on it chooses among the recorded rows instead of
+simulating, and is scored on all rows that it has not chosen.
+
+Source:
+    Driving Scenario Input Output Dataset, Winkelmann et al. (2022), appendix of
+    doi 10.1109/TITS.2022.3206882.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sbt.errors import InputError, RunError
+from sbt.problem.outcome import Status
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario, Pool
+from sbt.problem.space import ParameterSpace
+
+__all__ = ["from_folder"]
+
+_SUFFIXES = (".parquet", ".csv")
+
+
+def from_folder(name: str, folder: Path) -> LogicalScenario:
+    """Return the scenario of a folder with recorded outcomes.
+
+    Args:
+        name: path of the folder, relative to `folder`; `PATH/FILE.parquet` picks one of several tables.
+        folder: where relative paths start.
+
+    Returns:
+        A scenario whose requirement is the first output below 0, which a configuration replaces.
+
+    Raises:
+        InputError: no config.yml, no or several tables, columns missing, or values outside the ranges.
+    """
+    path = (Path(folder) / name).resolve()
+    table = _table_of(path)
+    described = _described(table.parent / "config.yml")
+    rows = _read(table)
+    inputs, outputs = described.get("inputs", {}), described.get("outputs", {})
+    missing = [column for column in [*inputs, *outputs] if column not in rows]
+    if missing or not inputs or not outputs:
+        absent = ", ".join(missing) or "all"
+        raise InputError(f"{table}: every input and output of config.yml must be a column, but missing: {absent}")
+    complete = np.flatnonzero(np.all([np.isfinite(rows[column]) for column in [*inputs, *outputs]], axis=0))
+    x = np.column_stack([rows[column] for column in inputs])
+    kept = complete[np.sort(np.unique(x[complete], axis=0, return_index=True)[1])]  # of equal inputs the first
+    x = x[kept]
+    if len(x) < 2:
+        raise InputError(f"{table}: a table needs at least two complete rows, but got {len(x)}")
+    space = ParameterSpace(tuple(_parameter(key, entry, x[:, k]) for k, (key, entry) in enumerate(inputs.items())))
+    pool = Pool(x, {column: rows[column][kept] for column in outputs})
+    title, text = str(described.get("title", path.name)), str(described.get("logical_scenario", ""))
+    return LogicalScenario(
+        name=f"table:{name}", space=space, requirement=Requirement(next(iter(outputs)), CriticalInterval(high=0.0)),
+        evaluate=_Lookup(space.names, pool), metric_names=tuple(outputs), description=f"{title} (recorded)\n{text}", pool=pool,
+    )  # fmt: skip
+
+
+class _Lookup:
+    """Gives the recorded outcome of exactly these inputs."""
+
+    def __init__(self, names: tuple[str, ...], pool: Pool):
+        self._names, self._pool = names, pool
+
+    def __call__(self, values: Mapping[str, float], seed: int) -> dict[str, float]:
+        row = self._pool.row(np.array([values[name] for name in self._names]))
+        if row is None:
+            raise RunError(Status.INVALID, f"a recorded table has only its own rows, but none with {dict(values)}")
+        return {name: float(column[row]) for name, column in self._pool.metrics.items()}
+
+
+def _table_of(path: Path) -> Path:
+    """Return the one table that is meant."""
+    if path.is_file() and path.suffix in _SUFFIXES:
+        return path
+    if not path.is_dir():
+        raise InputError(f"table: needs a folder with config.yml and a parquet or csv file, but got '{path}'")
+    found = sorted(p for p in path.iterdir() if p.suffix in _SUFFIXES)
+    if len(found) != 1:
+        names = ", ".join(p.name for p in found) or "none"
+        raise InputError(f"table:{path} needs one table, or one of several by name (table:FOLDER/FILE), but there are: {names}")
+    return found[0]
+
+
+def _described(path: Path) -> dict[str, Any]:
+    from ruamel.yaml import YAML, YAMLError
+
+    try:
+        loaded = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"a table needs {path}, but: {error.strerror}") from None
+    except YAMLError as error:
+        raise InputError(f"{path} must be YAML, but: {error}") from None
+    if not isinstance(loaded, dict):
+        raise InputError(f"{path} must be a mapping with inputs and outputs, but got {type(loaded).__name__}")
+    return loaded
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the columns as float64."""
+    import pandas as pd
+
+    try:
+        frame = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
+    except ImportError:
+        raise InputError(f"{path.name} needs pyarrow (pip install 'sumo-sbt[parquet]'); or save it as csv") from None
+    except Exception as error:  # pandas and pyarrow raise whatever they like about a broken file
+        raise InputError(f"{path} must be a readable table, but: {error}") from None
+    return {str(name): pd.to_numeric(frame[name], errors="coerce").to_numpy(np.float64) for name in frame}
+
+
+def _parameter(name: str, entry: Mapping[str, Any], column: np.ndarray) -> Parameter:
+    """Return an input; min may exceed max in the data set, and rows may lie a rounding outside."""
+    low, high = sorted((float(entry.get("min", column.min())), float(entry.get("max", column.max()))))
+    low, high = min(low, float(column.min())), max(high, float(column.max()))
+    whole = str(entry.get("type", "continuous")) in ("integer", "discrete") and bool((column % 1 == 0).all())
+    return Parameter(
+        name, low, high, str(entry.get("unit", "")), kind="integer" if whole else "continuous",
+        description=str(entry.get("explanation", "")),
+    )  # fmt: skip

@@ -1,0 +1,109 @@
+"""Recorded tables as scenarios: a campaign chooses among the rows, each at most once, and is scored on the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sbt.config.load import parse
+from sbt.errors import InputError
+from sbt.plugins import load
+from sbt.run import run_campaign
+from sbt.samplers.pool import PoolSequence
+from sbt.seeds import stream
+from sbt.store import Store
+
+CONFIG = """
+title: "Disc"
+logical_scenario: "A disc in a box."
+inputs:
+  a: {type: continuous, unit: m, min: 1, max: -1, explanation: "first"}
+  k: {type: integer, unit: "", min: 0, max: 5, explanation: "second"}
+outputs:
+  "dist*": {type: continuous, unit: m}
+"""
+RECORDED = Path(__file__).resolve().parents[2] / "shared" / "data" / "dsiod_jaywalking"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    rng = stream(0, "table")
+    a, k = rng.uniform(-1, 1, 200), rng.integers(0, 6, 200)
+    rows = ["a,k,dist*", *(f"{x!r},{n},{abs(x) + n / 5 - 0.4!r}" for x, n in zip(a.tolist(), k.tolist(), strict=True))]
+    rows += [rows[1], "0.5,2,"]  # a duplicate and an incomplete row
+    (tmp_path / "table").mkdir()
+    (tmp_path / "table" / "rows.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "table" / "config.yml").write_text(CONFIG)
+    return tmp_path / "table"
+
+
+def configuration(folder: Path, campaign: str, store: str, budget: int = 60) -> str:
+    return (
+        f"campaign: {campaign}\nscenario: 'table:{folder}'\nrequirement: {{metric: 'dist*', critical: [-.inf, 0.0]}}\n"
+        f"budget: {budget}\ninitial: 20\nbatch: 20\nmetamodel: {{kind: et}}\nexecutor: {{kind: serial}}\nstore: {folder.parent / store}\n"
+    )
+
+
+def test_table_is_a_scenario(folder: Path) -> None:
+    scenario = load("scenarios", f"table:{folder.name}", folder.parent)
+    assert scenario.space.names == ("a", "k")
+    assert (scenario.space.parameters[0].low, scenario.space.parameters[0].high) == (-1.0, 1.0)
+    assert scenario.space.parameters[1].kind == "integer"
+    assert len(scenario.pool.x) == 200
+    for x, y in zip(scenario.pool.x, scenario.pool.metrics["dist*"], strict=True):
+        assert scenario.run(dict(zip(("a", "k"), x.tolist(), strict=True)), seed=1) == {"dist*": y}
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "coverage"])
+def test_every_row_is_chosen_at_most_once_and_the_rest_is_the_validation(folder: Path, campaign: str) -> None:
+    result = run_campaign(parse(configuration(folder, campaign, "s")), report=False)
+    with Store.read(folder.parent / "s") as store:
+        x = store.history().x
+    pool = load("scenarios", f"table:{folder}").pool
+    assert len(np.unique(x, axis=0)) == len(x) == result["runs"] == 60
+    assert pool.taken(x).sum() == 60
+    assert result["conclusion"]["validation"]["n"] == 140
+    assert result["failed"] == 0
+
+
+def test_a_campaign_ends_with_the_table(folder: Path) -> None:
+    result = run_campaign(parse(configuration(folder, "coverage", "all", budget=500)), report=False)
+    assert result["runs"] == 200
+    assert result["stopped"] == "no rows left"
+
+
+def test_pool_order_is_one_permutation_whatever_was_taken() -> None:
+    u = stream(1, "u").random((50, 2))
+    taken = np.zeros(50, dtype=bool)
+    order = PoolSequence(u, taken, 3).rows
+    taken[order[5:20]] = True
+    assert PoolSequence(u, taken, 3).rows.tolist() == [*order[:5], *order[20:]]
+    assert sorted(order.tolist()) == list(range(50))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: (f / "config.yml").unlink(), "config.yml"),
+        (lambda f: (f / "rows.csv").unlink(), "needs one table"),
+        (lambda f: (f / "more.csv").write_text("a,k\n"), "several by name"),
+        (lambda f: (f / "rows.csv").write_text("a,k\n1,2\n"), "missing: dist"),
+        (lambda f: (f / "config.yml").write_text("[1, 2]"), "must be a mapping"),
+        (lambda f: (f / "config.yml").write_text("a: [1"), "must be YAML"),
+    ],
+)
+def test_broken_tables_are_refused(folder: Path, change: object, message: str) -> None:
+    change(folder)  # type: ignore[operator]
+    with pytest.raises(InputError, match=message):
+        load("scenarios", f"table:{folder}")
+
+
+@pytest.mark.skipif(not RECORDED.is_dir(), reason="the recorded data are not beside the checkout")
+def test_the_public_data_set_loads() -> None:
+    pytest.importorskip("pyarrow", reason="parquet needs pyarrow")
+    scenario = load("scenarios", f"table:{RECORDED}")
+    assert scenario.pool.x.shape == (2000, 7)
+    assert set(scenario.measured) == {"min_dist*", "carla_collision"}
+    assert 0.05 < (scenario.pool.metrics["min_dist*"] < 0).mean() < 0.12
