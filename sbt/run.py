@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sbt.config.load import Loaded
     from sbt.config.model import Configuration
 
-__all__ = ["assembly_of", "rebuild_report", "replay", "run_campaign", "settings_of"]
+__all__ = ["assembly_of", "loaded_from", "rebuild_report", "replay", "run_campaign", "settings_of"]
 
 _RESOLVED = "config.resolved.yaml"
 _MAY_CHANGE = {"budget", "folder", "yaml"}
@@ -119,12 +119,17 @@ def rebuild_report(folder: Path) -> Path:
     Raises:
         StoreError: the folder holds no campaign.
     """
+    with Store.read(folder) as store:
+        loaded = loaded_from(store)
+        return _report(store, settings_of(loaded, assembly_of(loaded)))
+
+
+def loaded_from(store: Store) -> Loaded:
+    """Return the configuration that a store was made with."""
     from sbt.config.load import parse
 
-    with Store.read(folder) as store:
-        kept = store.configuration
-        loaded = parse(kept["yaml"], name=str(Path(folder) / _RESOLVED), folder=Path(kept["folder"]))
-        return _report(store, settings_of(loaded, assembly_of(loaded)))
+    kept = store.configuration
+    return parse(kept["yaml"], name=str(store.folder / _RESOLVED), folder=Path(kept["folder"]))
 
 
 def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None]:
@@ -137,15 +142,12 @@ def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None]:
     Raises:
         InputError: the store has no finished run of this index.
     """
-    from sbt.config.load import parse
-
     with Store.read(folder) as store:
-        kept, records = store.configuration, store.history().records
+        loaded, records = loaded_from(store), store.history().records
     found = [r for r in records if r.index == index]
     if not found:
         raise InputError(f"a run must be a finished one of {folder} (0 to {len(records) - 1}), but got {index}")
     record = found[0]
-    loaded = parse(kept["yaml"], name=str(Path(folder) / _RESOLVED), folder=Path(kept["folder"]))
     scenario = assembly_of(loaded).spec.resolve()
     outcome = run_job(scenario, Job(index, record.inputs, record.seed))
     again = scenario.simulate is not None and outcome.status == Status.OK

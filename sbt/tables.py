@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import InputError, RunError
+from sbt.history import History
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario, Pool
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["from_folder"]
+__all__ = ["from_folder", "to_folder"]
 
 _SUFFIXES = (".parquet", ".csv")
 
@@ -77,6 +78,42 @@ class _Lookup:
         if row is None:
             raise RunError(Status.INVALID, f"a recorded table has only its own rows, but none with {dict(values)}")
         return {name: float(column[row]) for name, column in self._pool.metrics.items()}
+
+
+def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix: str = ".csv") -> Path:
+    """Write the finished runs in the data set's layout: `config.yml` and one table.
+
+    Args:
+        history: runs; those without metrics are left out.
+        scenario: describes inputs and outputs.
+        folder: is made where it is missing.
+        suffix: `.csv`, or `.parquet` where pyarrow is installed.
+
+    Returns:
+        The table's file; `from_folder` reads the folder back to the same rows.
+    """
+    import pandas as pd
+    from ruamel.yaml import YAML
+
+    done = history.where(history.ok)
+    units = {metric.name: metric.unit for metric in scenario.metrics}
+    title, _, text = scenario.description.partition("\n")
+    described = {
+        "title": title or scenario.name, "introduction": "", "functional_scenario": title, "logical_scenario": text,
+        "concrete_scenarios": f"runs of a campaign on {scenario.name}",
+        "inputs": {p.name: {
+            "type": p.kind, "unit": p.unit, "min": p.bounds[0], "max": p.bounds[1], "explanation": p.description,
+        } for p in scenario.space.parameters},
+        "outputs": {name: {"type": "continuous", "unit": units.get(name, "")} for name in done.metrics},
+    }  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "config.yml").open("w", encoding="utf-8") as file:
+        YAML().dump(described, file)
+    columns = {name: done.x[:, k] for k, name in enumerate(done.names)} | {name: done.y(name) for name in done.metrics}
+    path = folder / f"runs{suffix}"
+    frame = pd.DataFrame(columns)
+    frame.to_csv(path, index=False) if suffix == ".csv" else frame.to_parquet(path, index=False)
+    return path
 
 
 def _table_of(path: Path) -> Path:

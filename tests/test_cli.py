@@ -354,16 +354,9 @@ def test_export_writes_a_table(folder: Path):
     assert not list(path.parent.glob("*.part"))
 
 
-@pytest.mark.parametrize(
-    ("form", "expected"),
-    [
-        ("dsiod", "--format dsiod is not in this release; choose csv or parquet"),
-        ("xls", "--format must be csv or parquet, but got 'xls'"),
-    ],
-)
-def test_other_forms_of_export_are_refused(folder: Path, form: str, expected: str):
-    done = call("export", str(store(folder / "s")), "--format", form)
-    assert (done.exit_code, done.stderr.strip()) == (2, expected)
+def test_other_forms_of_export_are_refused(folder: Path):
+    done = call("export", str(store(folder / "s")), "--format", "xls")
+    assert (done.exit_code, done.stderr.strip()) == (2, "--format must be csv, parquet or dsiod, but got 'xls'")
 
 
 @pytest.mark.parametrize("verb", ["status", "report", "export"])

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from sbt.cli import app
 from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.plugins import load
@@ -42,7 +44,8 @@ def folder(tmp_path: Path) -> Path:
 def configuration(folder: Path, campaign: str, store: str, budget: int = 60) -> str:
     return (
         f"campaign: {campaign}\nscenario: 'table:{folder}'\nrequirement: {{metric: 'dist*', critical: [-.inf, 0.0]}}\n"
-        f"budget: {budget}\ninitial: 20\nbatch: 20\nmetamodel: {{kind: et}}\nexecutor: {{kind: serial}}\nstore: {folder.parent / store}\n"
+        f"budget: {budget}\ninitial: 20\nbatch: 20\nmetamodel: {{kind: et}}\nexecutor: {{kind: serial}}\n"
+        f"store: {folder.parent / store}\n"
     )
 
 
@@ -107,3 +110,15 @@ def test_the_public_data_set_loads() -> None:
     assert scenario.pool.x.shape == (2000, 7)
     assert set(scenario.measured) == {"min_dist*", "carla_collision"}
     assert 0.05 < (scenario.pool.metrics["min_dist*"] < 0).mean() < 0.12
+
+
+def test_export_in_the_data_set_layout_reads_back_the_same_rows(folder: Path) -> None:
+    run_campaign(parse(configuration(folder, "coverage", "out")), report=False)
+    done = CliRunner().invoke(app, ["export", str(folder.parent / "out"), "--format", "dsiod"])
+    assert done.exit_code == 0, done.output
+    with Store.read(folder.parent / "out") as store:
+        history = store.history()
+    again = load("scenarios", f"table:{folder.parent / 'out' / 'exports' / 'dsiod'}")
+    assert again.space.names == history.names
+    assert np.array_equal(again.pool.x, history.x)
+    assert np.array_equal(again.pool.metrics["dist*"], history.y("dist*"))

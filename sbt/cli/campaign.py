@@ -6,12 +6,15 @@ import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
 from sbt.errors import InputError
+
+if TYPE_CHECKING:
+    from sbt.store import Store
 
 __all__ = ["export", "report", "run", "status"]
 
@@ -147,31 +150,43 @@ def report(folder: Folder) -> None:
 def export(
     folder: Folder,
     *,
-    form: Annotated[str, typer.Option("--format", metavar="csv|parquet", help="Form of the file.")] = "csv",
+    form: Annotated[str, typer.Option("--format", metavar="csv|parquet|dsiod", help="Form of the table.")] = "csv",
 ) -> None:
     """Write the runs of a campaign as a table."""
     import importlib.util
 
     from sbt.store import Store
 
-    if form == "dsiod":
-        raise InputError("--format dsiod is not in this release; choose csv or parquet")
-    if form not in ("csv", "parquet"):
-        raise InputError(f"--format must be csv or parquet, but got '{form}'")
+    if form not in ("csv", "parquet", "dsiod"):
+        raise InputError(f"--format must be csv, parquet or dsiod, but got '{form}'")
     if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise InputError("--format parquet needs pyarrow: pip install 'sumo-sbt[parquet]', or choose csv")
-    with clean_stdout():
-        with Store.read(_with_store(folder)) as store:
-            frame = store.history().to_frame()
-        path = folder / "exports" / f"runs.{form}"
-        path.parent.mkdir(exist_ok=True)
-        part = path.with_suffix(".part")
-        if form == "csv":
-            frame.to_csv(part, index=False)
-        else:
-            frame.to_parquet(part, index=False)
-        part.replace(path)
+    with clean_stdout(), Store.read(_with_store(folder)) as store:
+        path = _as_data_set(store) if form == "dsiod" else _as_frame(store, form)
     print(path)
+
+
+def _as_frame(store: Store, form: str) -> Path:
+    """Write one row a run."""
+    frame = store.history().to_frame()
+    path = store.folder / "exports" / f"runs.{form}"
+    path.parent.mkdir(exist_ok=True)
+    part = path.with_suffix(".part")
+    if form == "csv":
+        frame.to_csv(part, index=False)
+    else:
+        frame.to_parquet(part, index=False)
+    part.replace(path)
+    return path
+
+
+def _as_data_set(store: Store) -> Path:
+    """Write the runs in the layout of the public data set, which `table:FOLDER` reads."""
+    from sbt.run import assembly_of, loaded_from
+    from sbt.tables import to_folder
+
+    scenario = assembly_of(loaded_from(store)).scenario
+    return to_folder(store.history(), scenario, store.folder / "exports" / "dsiod")
 
 
 def _with_store(folder: Path) -> Path:
