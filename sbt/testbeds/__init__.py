@@ -1,0 +1,87 @@
+"""Analytic problems with known truth, as logical scenarios: `testbed:NAME`.
+
+Campaigns are measured on them: a truth, not another estimate, says what is right. `testbed:NAME:box`
+is the same problem with every input uniform in its box, for searches that ignore the law.
+
+>>> scenario = from_name("four_branch_7", Path())
+>>> scenario.space.names, scenario.requirement.critical.high
+(('x1', 'x2'), 0.0)
+>>> float(values("four_branch_7", np.zeros((1, 2)))[0]), truth("four_branch_7").modes
+(3.0, 4)
+"""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+import numpy as np
+
+from sbt.arrays import Points, Vector, as_points, as_vector
+from sbt.errors import InputError
+from sbt.problem.scenario import LogicalScenario
+from sbt.testbeds import reliability, search, traffic
+from sbt.testbeds.problem import Problem, Truth, analytic, noisy
+
+__all__ = ["Problem", "Truth", "analytic", "find", "from_name", "names", "truth", "values"]
+
+_PROBLEMS = {p.name: p for p in (*reliability.PROBLEMS, *traffic.PROBLEMS, *search.PROBLEMS)}
+_BOX = ":box"
+
+
+def names() -> list[str]:
+    """Return the names of all testbeds; each of them also takes the ending `:box`."""
+    return list(_PROBLEMS)
+
+
+def find(name: str) -> Problem:
+    """Return a testbed by name, `NAME:box` with every input uniform in its box.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    plain = name.removesuffix(_BOX)
+    if plain not in _PROBLEMS:
+        near = difflib.get_close_matches(plain, _PROBLEMS, 1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise InputError(f"a testbed must be one of {', '.join(_PROBLEMS)}, or one of them with {_BOX}, but got '{name}'{hint}")
+    found = _PROBLEMS[plain]
+    return found.in_box() if name.endswith(_BOX) else found
+
+
+def from_name(name: str, folder: Path) -> LogicalScenario:
+    """Return the logical scenario `testbed:NAME`; its only metric is `y`.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    return find(name).scenario()
+
+
+def truth(name: str) -> Truth:
+    """Return what is known about a testbed: probability, standard error, modes, critical share of the box.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    return find(name).truth
+
+
+def values(name: str, x: Points, rng: np.random.Generator | None = None) -> Vector:
+    """Return the metric at many points at once.
+
+    Args:
+        name: of the testbed.
+        x: (n, d) physical values.
+        rng: draws the noise where the testbed has some; None: without noise.
+
+    Returns:
+        (n,) metrics.
+
+    Raises:
+        InputError: there is no testbed of this name.
+        ValueError: x is not (n, d) or not finite.
+    """
+    found = find(name)
+    x = as_points(x, len(found.parameters))
+    return noisy(as_vector(found.function(x), len(x)), found.noise, rng)
