@@ -1,61 +1,112 @@
-"""Seconds to fit and predictions per second of the metamodels, as a markdown table.
+"""The metamodels: seconds to fit and predictions per second, or quality on recorded runs, as a markdown table.
 
 OMP_NUM_THREADS=1 python benchmarks/metamodels.py --rows 50 200 500 --inputs 2 7
+OMP_NUM_THREADS=1 python benchmarks/metamodels.py --jaywalking FOLDER --rows 200 500 1000 --seeds 5
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, build
-from sbt.metamodels.et import ExtraTrees
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.base import Metamodel, build
+from sbt.metamodels.scores import scores
+from sbt.plugins import load, names
+from sbt.problem.requirement import CriticalInterval
 from sbt.seeds import stream
 
-KINDS: dict[str, Metamodel] = {
-    "et": ExtraTrees(),
-    "et paper": build(ExtraTrees, "paper"),
-    "gp": GaussianProcess(),
-    "gp paper": build(GaussianProcess, "paper"),
+FAST = ("et", "et paper", "gp", "gp paper", "ensemble", "auto")
+SCORES = {
+    "log_likelihood": "ll",
+    "log_likelihood_mixture": "ll mixture",
+    "rmse": "RMSE",
+    "average_precision": "AP",
+    "precision_at_recall_90": "P@R90",
+    "calibration_error": "ECE",
+    "coverage_95": "cov95",
+    "log_likelihood_critical": "ll critical",
 }
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description="Time the metamodels.")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    kinds = {name: build(load("metamodels", name)) for name in names("metamodels")}
+    for name in names("metamodels"):
+        for preset in getattr(load("metamodels", name), "PRESETS", {}):
+            kinds[f"{name} {preset}"] = build(load("metamodels", name), preset)
+    parser = argparse.ArgumentParser(description="Time or score the metamodels.")
+    parser.add_argument("--kinds", nargs="+", choices=kinds, default=list(FAST))
     parser.add_argument("--rows", nargs="+", type=int, default=[50, 200, 500], help="numbers of rows n")
-    parser.add_argument("--inputs", nargs="+", type=int, default=[2, 7], help="numbers of inputs d")
+    parser.add_argument("--inputs", nargs="+", type=int, default=[2, 7], help="numbers of inputs d (timing only)")
     parser.add_argument("--points", type=int, default=8192, help="points predicted at a time")
-    parser.add_argument("--repeat", type=int, default=3, help="the median of so many is shown")
+    parser.add_argument("--repeat", type=int, default=3, help="the median of so many is shown (timing only)")
+    parser.add_argument("--jaywalking", type=Path, help="folder of the recorded runs: scores on all rows not learned from")
+    parser.add_argument("--seeds", type=int, default=3, help="random splits, the mean is shown")
+    parser.add_argument("--first-seed", type=int, default=100)
     args = parser.parse_args()
+    chosen = {kind: kinds[kind] for kind in args.kinds}
+    if args.jaywalking is not None:
+        _print_quality(chosen, args)
+    else:
+        _print_times(chosen, args)
+
+
+def _print_times(kinds: dict[str, Metamodel], args: argparse.Namespace) -> None:
     print("| metamodel | d | n | fit [s] | predictions/s |")
     print("|---|---|---|---|---|")
-    for kind in args.kinds:
+    for kind, metamodel in kinds.items():
         for d in args.inputs:
             for n in args.rows:
-                fit_s, predict_s = _time(KINDS[kind], n, d, args.points, args.repeat)
+                rng = stream(0, "benchmark", n, d)
+                u, asked = rng.random((n, d)), rng.random((args.points, d))
+                y = _time_to_collision(u, rng)
+                metamodel.fit(u[:20], y[:20], stream(0, "warm up"))(asked[:20])
+                runs = [_run(metamodel, u, y, asked, i)[1:] for i in range(args.repeat)]
+                fit_s, predict_s = np.median(runs, axis=0)
                 print(f"| {kind} | {d} | {n} | {fit_s:.2f} | {args.points / predict_s:,.0f} |", flush=True)
 
 
-def _time(metamodel: Metamodel, n: int, d: int, points: int, repeat: int) -> tuple[float, float]:
-    """Return the median wall seconds of a fit and of a prediction, after one fit to warm up."""
-    rng = stream(0, "benchmark", n, d)
-    u, asked = rng.random((n, d)), rng.random((points, d))
-    y = _time_to_collision(u, rng)
-    metamodel.fit(u[:20], y[:20], stream(0, "warm up"))(asked)
-    fits, predictions = [], []
-    for i in range(repeat):
-        start = time.perf_counter()
-        predictor: Predictor = metamodel.fit(u, y, stream(0, "fit", i))
-        fits.append(time.perf_counter() - start)
-        start = time.perf_counter()
-        predictor(asked)
-        predictions.append(time.perf_counter() - start)
-    return float(np.median(fits)), float(np.median(predictions))
+def _print_quality(kinds: dict[str, Metamodel], args: argparse.Namespace) -> None:
+    u, y = _read_jaywalking(args.jaywalking)
+    print(f"Mean of {args.seeds} random splits (seeds {args.first_seed} to {args.first_seed + args.seeds - 1}); CPU seconds.\n")
+    print(f"| n | metamodel | {' | '.join(SCORES.values())} | fit [s] | predictions/s |")
+    print(f"|{'---|' * (len(SCORES) + 4)}")
+    for n in args.rows:
+        for kind, metamodel in kinds.items():
+            table = []
+            for seed in range(args.first_seed, args.first_seed + args.seeds):
+                order = np.random.default_rng(seed).permutation(len(y))
+                train, test = order[:n], order[n:]
+                asked = np.resize(u[test], (args.points, u.shape[1]))
+                predictor, fit_s, predict_s = _run(metamodel, u[train], y[train], asked, seed)
+                found = scores(predictor(u[test]), y[test], CriticalInterval(high=0.0))
+                table.append([*(found[key] for key in SCORES), fit_s, args.points / predict_s])
+            *quality, fit_s, speed = np.mean(table, axis=0)
+            cells = " | ".join(f"{value:.3f}" for value in quality)
+            print(f"| {n} | {kind} | {cells} | {fit_s:.1f} | {speed:,.0f} |", flush=True)
+
+
+def _run(metamodel: Metamodel, u: np.ndarray, y: np.ndarray, asked: np.ndarray, seed: int):
+    """Return a predictor and the CPU seconds of its fit and of its predictions at `asked`."""
+    start = time.process_time()
+    predictor = metamodel.fit(u, y, stream(0, "fit", seed))
+    fitted = time.process_time()
+    predictor(asked)
+    return predictor, fitted - start, time.process_time() - fitted
+
+
+def _read_jaywalking(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the recorded runs: inputs in the unit cube and the metric min_dist* (critical below 0)."""
+    import pandas as pd
+    from ruamel.yaml import YAML
+
+    inputs = YAML(typ="safe").load((folder / "config.yml").read_text())["inputs"]
+    table = pd.read_parquet(folder / "quasi_random.parquet")  # needs the extra "parquet"
+    u = np.stack([(table[name] - i["min"]) / (i["max"] - i["min"]) for name, i in inputs.items()], axis=1)
+    return u, table["min_dist*"].to_numpy()
 
 
 def _time_to_collision(u: np.ndarray, rng: np.random.Generator) -> np.ndarray:

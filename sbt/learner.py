@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sbt.arrays import Mask, Points, Vector
+from sbt.errors import SbtError
+from sbt.execution.worker import place_of
 from sbt.history import History
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
@@ -59,11 +62,14 @@ class Learner:
         space = self.scenario.space
         y = training.y(self.scenario.requirement.metric)
         u = space.metamodel_inputs(space.to_unit(training.x))
-        predictor = self.metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
+        with self._named(len(training)):
+            predictor = self.metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
         seconds = time.perf_counter() - start
 
         def predict(points: Points) -> Prediction:
-            return predictor(space.metamodel_inputs(points))
+            inputs = space.metamodel_inputs(points)
+            with self._named(len(training)):
+                return predictor(inputs)
 
         return Belief(predict, self._scores(predict, history), len(training), seconds)
 
@@ -74,6 +80,17 @@ class Learner:
             return history.held_out.x, history.held_out.y(metric)
         left = ~pool.taken(history.x)
         return pool.x[left], pool.metrics[metric][left]
+
+    @contextmanager
+    def _named(self, n: int) -> Iterator[None]:
+        """Say which metamodel raised, and where: it may be the user's own."""
+        try:
+            yield
+        except SbtError:
+            raise
+        except Exception as error:
+            name, raised = type(self.metamodel).__name__, f"{type(error).__name__}: {error} ({place_of(error)})"
+            raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {raised}") from error
 
     def _scores(self, predict: Predictor, history: History) -> dict[str, Any]:
         critical, space = self.scenario.requirement.critical, self.scenario.space

@@ -20,7 +20,7 @@ from sbt.history import Record
 from sbt.learner import Learner
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.trace import Trace
-from sbt.store import DATABASE, Store
+from sbt.store import Store
 
 if TYPE_CHECKING:
     from sbt.config.assemble import Assembly
@@ -85,7 +85,7 @@ def assembly_of(loaded: Loaded) -> Assembly:
 
 def _stored(folder: Path) -> dict[str, Any]:
     """Return the configuration of the store that is there, empty without one."""
-    if not (folder / DATABASE).is_file():
+    if not Store.begun(folder):
         return {}
     with Store.read(folder) as store:
         return store.configuration

@@ -10,7 +10,7 @@ import fcntl
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,18 +89,21 @@ class Store:
     @classmethod
     def read(cls, folder: Path) -> Store:
         """Open for reading only; works while a campaign writes."""
-        path = Path(folder) / DATABASE
-        if not path.is_file():
-            raise StoreError(f"a store is a folder with {DATABASE}, but there is none in {folder}")
+        if not cls.begun(folder):
+            raise StoreError(f"a store is a folder with a campaign in its {DATABASE}, but there is none in {folder}")
         with _reported(Path(folder)):
-            try:
-                db = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, isolation_level=None)
-                db.execute("PRAGMA schema_version").fetchone()
-            except sqlite3.OperationalError:  # a WAL file that may not be written beside: read what is committed
-                db = sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True, isolation_level=None)
-            store = cls(Path(folder), db)
+            store = cls(Path(folder), _connected(Path(folder) / DATABASE))
             store._check_version()
             return store
+
+    @classmethod
+    def begun(cls, folder: Path) -> bool:
+        """Return whether a campaign is in the folder; False also where its driver died before the file had its tables."""
+        path = Path(folder) / DATABASE
+        if not path.is_file():
+            return False
+        with _reported(Path(folder)), closing(_connected(path)) as db:
+            return bool(db.execute("PRAGMA user_version").fetchone()[0])
 
     def __enter__(self) -> Store:
         """Return the store itself."""
@@ -239,6 +242,18 @@ class Store:
 
 def _dump(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"), allow_nan=False)
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    """Open a file for reading only."""
+    address = path.resolve().as_uri()
+    db = sqlite3.connect(f"{address}?mode=ro", uri=True, isolation_level=None)
+    try:
+        db.execute("PRAGMA schema_version").fetchone()
+    except sqlite3.OperationalError:  # a WAL file that may not be written beside: read what is committed
+        db.close()
+        db = sqlite3.connect(f"{address}?immutable=1", uri=True, isolation_level=None)
+    return db
 
 
 def _set_journal(db: sqlite3.Connection) -> None:

@@ -6,8 +6,10 @@ that broke it; it returns nothing where all hold.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +20,12 @@ from sbt.errors import SbtError
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
+from sbt.problem.scenario import Metric
+from sbt.problem.trace import Trace
+from sbt.scenario_check import check_scenario
 from sbt.seeds import stream
 
-__all__ = ["ContractError", "check_acquisition", "check_metamodel", "check_sampler"]
+__all__ = ["ContractError", "check_acquisition", "check_metamodel", "check_metric", "check_sampler", "check_scenario"]
 
 _INTERVALS = (
     CriticalInterval(high=0.0),
@@ -121,6 +126,53 @@ def check_sampler(propose: Callable[[int, int], Points], *, dimension: int, seed
         _require(distinct == n, "a sampler must return distinct points", f"{distinct} of {n}")
         again = np.array_equal(points, np.asarray(propose(n, seed)))
         _require(again, "the same seed must give the same points, bit by bit", f"other points for n = {n}")
+
+
+def check_metric(metric: Metric, traces: Iterable[Trace]) -> None:
+    """Check a safety metric: a finite, pure function of the trace that says what it gives without an interaction.
+
+    Args:
+        metric: measures the actors `ego` and `co`, or all of them.
+        traces: examples to measure, of runs with and without a critical encounter.
+
+    Raises:
+        ContractError: a law is broken.
+    """
+    _require(math.isfinite(metric.without), "a metric must say its value without an interaction", str(metric.without))
+    _require(metric.direction in ("low", "high"), "a metric's direction must be low or high", repr(metric.direction))
+    for trace in traces:
+        before, y = _copy(trace), _measured(metric, trace)
+        _require(trace.identical(before), "a metric must not change the trace", f"another trace after {metric.name}")
+        again = _measured(metric, before)
+        _require(again == y, "the same trace must give the same value, bit by bit", f"{again} after {y}")
+        later = _measured(metric, dataclasses.replace(before, time=before.time + 64.0))
+        _close(np.array([later]), np.array([y]), 1e-9, "a metric must not depend on when the run began")
+    alone = _measured(metric, _apart())
+    _close(np.array([alone]), np.array([metric.without]), 1e-9, "where the two never meet a metric must give its `without`")
+
+
+def _measured(metric: Metric, trace: Trace) -> float:
+    """Return the value, finite."""
+    try:
+        value = float(metric(trace))
+    except Exception as error:
+        raise ContractError(f"a metric must measure every trace, but {metric.name} raised {error!r}") from error
+    _require(math.isfinite(value), "a metric must be finite", f"{value} of {metric.name}")
+    return value
+
+
+def _copy(trace: Trace) -> Trace:
+    """Return an equal trace that shares no array with this one."""
+    copied: Trace = pickle.loads(pickle.dumps(trace))
+    return copied
+
+
+def _apart() -> Trace:
+    """Return ego and co, 5 km beside each other at constant 20 m/s, for 5 s."""
+    t = np.arange(0.0, 5.01, 0.1)
+    both, zero = np.ones((len(t), 2)), np.zeros((len(t), 2))
+    y = zero + np.array([0.0, 5000.0])
+    return Trace(t, ("ego", "co"), 20.0 * t[:, None] * both, y, zero, 20.0 * both, zero, np.full(2, 5.0), np.full(2, 1.8))
 
 
 def _check_belief(belief: Prediction, n: int, case: str) -> None:

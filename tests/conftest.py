@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +116,7 @@ class Shifting:
         kind = self.rounds[(len(y) - self.first) // self.batch]
 
         def predict(asked):
-            mean = {"c": -1.0 + 0 * asked[:, 0], "n": 1.0 + 0 * asked[:, 0], "h": asked[:, 0] - 0.5}[kind]
+            mean = {"c": 0 * asked[:, 0] - 0.05, "n": 0 * asked[:, 0] + 0.05, "h": asked[:, 0] - 0.5}[kind]
             return Prediction.gaussian(mean, np.full(len(asked), 0.1))
 
         return predict
@@ -172,21 +172,20 @@ def campaign(configured: Callable[..., Path]) -> Callable[..., dict[str, Any]]:
 
 
 @pytest.fixture
-def rows() -> Iterator[Callable[[Path | str], dict[str, list[Any]]]]:
+def rows() -> Callable[[Path | str], dict[str, list[Any]]]:
     """Read what a store must hold bit by bit, however it came about: everything but seconds."""
 
     def read(folder: Path | str) -> dict[str, list[Any]]:
+        columns = "idx, stage, iteration, inputs, seed, log_q, status, metrics, reason, collisions"
         db = sqlite3.connect(Path(folder) / "campaign.sqlite")
         try:
             assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
             return {
-                "runs": db.execute(
-                    "SELECT idx, stage, iteration, inputs, seed, log_q, status, metrics, reason, collisions FROM runs ORDER BY idx"
-                ).fetchall(),
+                "runs": db.execute(f"SELECT {columns} FROM runs ORDER BY idx").fetchall(),
                 "iterations": db.execute("SELECT * FROM iterations ORDER BY iteration").fetchall(),
                 "fits": db.execute("SELECT * FROM fits ORDER BY runs").fetchall(),
             }
         finally:
             db.close()
 
-    yield read
+    return read

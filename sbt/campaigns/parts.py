@@ -82,8 +82,9 @@ class BatchStage:
             return "budget"
         if s.scenario.pool is not None and len(log.history) >= len(s.scenario.pool.x):
             return "no rows left"
-        if s.stable is not None and len(log.fits) >= 3:
-            sides = [fit["sides"] for fit in log.fits[-3:]]
+        chose = [fit for fit in log.fits if fit["iteration"] < log.iteration]  # a concluding fit chose no batch
+        if s.stable is not None and len(chose) >= 3:
+            sides = [fit["sides"] for fit in chose[-3:]]
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
             if max(moved) < s.stable:
                 return "stable"

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sbt import __version__
-from sbt.cli import campaign, inform, scenario
+from sbt.cli import campaign, inform, metrics, scenario
 from sbt.cli.console import verb
 from sbt.cli.replay import replay
 
@@ -29,6 +29,7 @@ for _verb in (
     replay,
 ):
     app.command()(verb(_verb))
+app.command()(verb(metrics.metrics))
 app.command("list")(verb(inform.list_))
 app.command()(verb(inform.schema))
 app.command()(verb(inform.doctor))

@@ -12,7 +12,7 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["run_job"]
+__all__ = ["place_of", "run_job"]
 
 
 def run_job(scenario: LogicalScenario, job: Job) -> Outcome:
@@ -30,7 +30,7 @@ def run_job(scenario: LogicalScenario, job: Job) -> Outcome:
     except InputError as error:
         status, reason = Status.FAILED, str(error)
     except Exception as error:  # a user's scenario may raise anything; the night goes on
-        status, reason = Status.FAILED, f"{type(error).__name__}: {error} ({_place(error)})"
+        status, reason = Status.FAILED, f"{type(error).__name__}: {error} ({place_of(error)})"
     return Outcome(job.index, status, {}, reason, time.perf_counter() - start)
 
 
@@ -50,7 +50,7 @@ def _check_trace(trace: Trace) -> None:
             raise RunError(Status.FAILED, f"every state must be finite, but trace.{name} is not")
 
 
-def _place(error: BaseException) -> str:
+def place_of(error: BaseException) -> str:
     """Return file:line where the error was raised."""
     frames = traceback.extract_tb(error.__traceback__)
     return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "no place"

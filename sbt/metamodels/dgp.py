@@ -64,6 +64,6 @@ class DeepGaussianProcess:
     def _training(self) -> Training:
         return Training(
             deep=True, kernel=self.kernel, inducing=self.inducing, sites=self.samples, objective="elbo",
-            learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
+            penalty=1.0, learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
             max_epochs=self.max_epochs, device=self.device,
         )  # fmt: skip

@@ -14,6 +14,8 @@ from sbt.metamodels.sparse import SparsePredictor, Training, train
 
 __all__ = ["DeepSigmaPointProcess"]
 
+_PENALTY = 0.05  # weight of the KL divergence, as Jankowiak et al. (2020) recommend
+
 
 @dataclass(frozen=True)
 class DeepSigmaPointProcess:
@@ -65,6 +67,6 @@ class DeepSigmaPointProcess:
     def _training(self) -> Training:
         return Training(
             deep=True, kernel=self.kernel, inducing=self.inducing, sites=self.sites, objective="predictive",
-            learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
+            penalty=_PENALTY, learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
             max_epochs=self.max_epochs, device=self.device,
         )  # fmt: skip

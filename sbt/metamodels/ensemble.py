@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from sbt.metamodels.torch_tools import check_device, device_of, minibatches, sin
 
 __all__ = ["Ensemble", "EnsemblePredictor"]
 
+_ROWS = 2500  # up to which the number of steps does not grow
 _CHUNK = 1024  # points predicted at once
 _CHECKS = 50  # of the validation rows
 _VALIDATION = 500  # most validation rows of a member
@@ -33,7 +35,7 @@ class Ensemble:
     """Settings of a deep ensemble.
 
     Each member is validated on another share 1/members of the rows, so that together they learn from
-    all of them. From 2,500 rows on, training takes more steps: in proportion to the square root of the rows.
+    all of them. Beyond 2,500 rows, training takes more steps, in proportion to the rows.
 
     Args:
         members: number of networks k >= 2.
@@ -42,7 +44,7 @@ class Ensemble:
         steps: minibatches >= 1 up to 2,500 rows.
         batch: rows of a minibatch >= 1.
         learning_rate: largest step of AdamW, > 0, on a one-cycle schedule.
-        weight_decay: of AdamW, >= 0.
+        decay: weight decay of AdamW times the number of rows, >= 0: a prior that counts less with more rows.
         beta: exponent in [0, 1] of the variance that weights the loss; 0: likelihood, 1: squared error.
         sigma_floor: smallest sigma of a member, as a share > 0 of the standard deviation of y.
         device: auto (CUDA where there is one), cpu or cuda.
@@ -54,27 +56,25 @@ class Ensemble:
         Lakshminarayanan et al. (2017); loss: Seitzer et al. (2022), eq. (4).
     """
 
-    members: int = 5
+    members: int = 10
     layers: int = 4
-    width: int = 96
+    width: int = 48
     steps: int = 2500
     batch: int = 32
     learning_rate: float = 3e-3
-    weight_decay: float = 0.01
+    decay: float = 200.0
     beta: float = 0.5
     sigma_floor: float = 0.01
     device: str = "cpu"
 
-    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"members": 3, "width": 48, "steps": 600}}
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"wide": {"members": 5, "width": 96}}
 
     def __post_init__(self) -> None:
         for name, least in (("members", 2), ("layers", 1), ("width", 1), ("steps", 1), ("batch", 1)):
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be >= {least}, but got {getattr(self, name)}")
-        if not (self.learning_rate > 0.0 and self.weight_decay >= 0.0):
-            raise InputError(
-                f"learning_rate must be > 0 and weight_decay >= 0, but got {self.learning_rate} and {self.weight_decay}"
-            )
+        if not (self.learning_rate > 0.0 and self.decay >= 0.0):
+            raise InputError(f"learning_rate must be > 0 and decay >= 0, but got {self.learning_rate} and {self.decay}")
         if not (0.0 <= self.beta <= 1.0 and self.sigma_floor > 0.0):
             raise InputError(f"beta must be in [0, 1] and sigma_floor > 0, but got {self.beta} and {self.sigma_floor}")
         check_device(self.device)
@@ -143,7 +143,7 @@ def _initial(settings: Ensemble, d: int, rng: np.random.Generator) -> list[list[
     """Return random weights and biases, uniform within +-1/sqrt(inputs) as PyTorch draws them."""
     sizes = [d, *[settings.width] * settings.layers, 2]
     layers = []
-    for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+    for inputs, outputs in pairwise(sizes):
         bound = 1.0 / math.sqrt(inputs)
         shapes = ((settings.members, inputs, outputs), (settings.members, 1, outputs))
         layers.append([rng.uniform(-bound, bound, shape).astype(np.float32) for shape in shapes])
@@ -167,8 +167,9 @@ def _train(
     parameters = [p for layer in layers for p in layer]
     x, target = _centre(u).to(device), torch.from_numpy(z.astype(np.float32)).to(device)
     validation, training = _folds(settings.members, n, rng)
-    steps = round(settings.steps * max(1.0, math.sqrt(n / 2500)))
-    adam = torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
+    steps = round(settings.steps * max(1.0, n / _ROWS))
+    decay = min(settings.decay / n, 0.1 / settings.learning_rate)  # at most a tenth of the weights a step
+    adam = torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=decay, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(adam, settings.learning_rate, total_steps=steps + 1)
     best, best_loss = [p.detach().clone() for p in parameters], torch.full((settings.members,), math.inf, device=device)
     batches = minibatches(training, settings.batch, rng)

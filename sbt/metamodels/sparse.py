@@ -29,7 +29,6 @@ _NOISE_FLOOR = 1e-4  # variance relative to that of y
 _JITTER = 1e-6
 _CHUNK = 4096  # pairs of point and site predicted at once
 _DRAWS = 10  # of the hidden layer, a training step; GPyTorch's default
-_PENALTY = 0.05  # weight of the KL divergence in the predictive objective; as Jankowiak et al. (2020)
 _Array = NDArray[np.float64]
 
 
@@ -43,6 +42,7 @@ class Training:
         inducing: most inducing points of a process, >= 1 (not more than rows).
         sites: Gaussians of the mixture, >= 1; 1 without a second layer.
         objective: `elbo` (sampled hidden layer) or `predictive` (likelihood of the mixture itself).
+        penalty: weight of the KL divergence in the objective.
         learning_rate: step of Adam, > 0.
         batch: rows of a minibatch >= 1.
         patience: epochs >= 1 without an improvement of 0.01 of the validation log likelihood; None: no
@@ -59,6 +59,7 @@ class Training:
     inducing: int
     sites: int
     objective: Literal["elbo", "predictive"]
+    penalty: float
     learning_rate: float
     batch: int
     patience: int | None
@@ -277,12 +278,12 @@ def _loss(model: _Model, how: Training, x: torch.Tensor, z: torch.Tensor, n: int
         total = variance + noise
         log_density = -0.5 * ((z - mean) ** 2 / total + total.log() + math.log(2.0 * math.pi))
         log_weight = torch.log_softmax(model.log_weight, 0)[:, None]
-        return -(log_weight + log_density).logsumexp(0).mean() + _PENALTY * complexity
+        return -(log_weight + log_density).logsumexp(0).mean() + how.penalty * complexity
     shape = (_DRAWS if how.deep else 1, len(z), model.sites.shape[1])
     draws = torch.from_numpy(rng.standard_normal(shape)).to(x.device)
     mean, variance = _forward(model.layers, how.kernel, x, draws)
     expected = -0.5 * (((z - mean) ** 2 + variance) / noise + noise.log() + math.log(2.0 * math.pi))
-    return -expected.mean() + complexity
+    return -expected.mean() + how.penalty * complexity
 
 
 def _forward(layers: tuple[SparseLayer, ...], kernel: str, x: torch.Tensor, sites: torch.Tensor) -> tuple[Any, Any]:
@@ -323,7 +324,7 @@ def _correlation(kernel: str, a: torch.Tensor, b: torch.Tensor, log_shape: torch
         return (1.0 + square / (2.0 * shape)) ** -shape
     nu = float(kernel.removeprefix("matern_"))
     r = (2.0 * nu * square + 1e-15).sqrt()
-    polynomial = {0.5: 1.0, 1.5: 1.0 + r, 2.5: 1.0 + r + r**2 / 3.0}[nu]
+    polynomial: Any = {0.5: 1.0, 1.5: 1.0 + r, 2.5: 1.0 + r + r**2 / 3.0}[nu]
     return polynomial * torch.exp(-r)
 
 

@@ -14,6 +14,8 @@ from sbt.metamodels.sparse import SparsePredictor, Training, train
 
 __all__ = ["SparseGaussianProcess"]
 
+_FEWEST = 20  # inducing points that few rows may have
+
 
 @dataclass(frozen=True)
 class SparseGaussianProcess:
@@ -21,7 +23,7 @@ class SparseGaussianProcess:
 
     Args:
         kernel: rq (rational quadratic), matern_0.5, matern_1.5 or matern_2.5; one length scale per input.
-        inducing: most inducing points, >= 1.
+        inducing: most inducing points, >= 1; from 20 on not more than a fifth of the rows.
         objective: predictive (the likelihood of what is predicted; its variance depends on the input) or
             elbo (the evidence lower bound).
         learning_rate: first step of Adam, > 0, on a cosine schedule.
@@ -37,7 +39,7 @@ class SparseGaussianProcess:
     """
 
     kernel: str = "matern_1.5"
-    inducing: int = 300
+    inducing: int = 200
     objective: Literal["predictive", "elbo"] = "predictive"
     learning_rate: float = 0.02
     batch: int = 512
@@ -57,7 +59,7 @@ class SparseGaussianProcess:
 
     def _training(self, n: int) -> Training:
         return Training(
-            deep=False, kernel=self.kernel, inducing=self.inducing, sites=1, objective=self.objective,
-            learning_rate=self.learning_rate, batch=self.batch, patience=None,
+            deep=False, kernel=self.kernel, inducing=min(self.inducing, max(n // 5, _FEWEST)), sites=1, objective=self.objective,
+            penalty=1.0, learning_rate=self.learning_rate, batch=self.batch, patience=None,
             max_epochs=max(round(self.steps / max(n // self.batch, 1)), 1), device=self.device,
         )  # fmt: skip

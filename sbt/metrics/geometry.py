@@ -9,7 +9,7 @@ import numpy as np
 from sbt.arrays import Vector
 from sbt.problem.trace import ActorTrace
 
-__all__ = ["contact_index", "corners", "rectangle_distance", "swept_contact", "time_to_contact"]
+__all__ = ["contact_index", "corners", "part", "rectangle_distance", "swept_contact", "time_to_contact"]
 
 
 def corners(actor: ActorTrace) -> np.ndarray:
@@ -60,7 +60,7 @@ def _overlap_span(start: np.ndarray, rate: np.ndarray, reach: np.ndarray) -> tup
 
     (t, 4) each: distance of the centres along each axis at time 0, its rate, and the half extents' sum.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         first = (-np.sign(rate) * reach - start) / rate
         last = (np.sign(rate) * reach - start) / rate
     still = rate == 0
@@ -97,14 +97,14 @@ def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
     if near.size == 0:
         return None
     first, last = max(int(near[0]) - 1, 0), int(near[-1]) + 1
-    hits = np.flatnonzero(np.isfinite(swept_contact(_part(a, first, last), _part(b, first, last))))
+    hits = np.flatnonzero(np.isfinite(swept_contact(part(a, first, last), part(b, first, last))))
     return first + int(hits[0]) if hits.size else None
 
 
-def _part(actor: ActorTrace, first: int, last: int) -> ActorTrace:
+def part(actor: ActorTrace, first: int, last: int) -> ActorTrace:
     """Return the instants first to last - 1 of an actor."""
-    arrays = (actor.x, actor.y, actor.heading, actor.speed, actor.acceleration)
-    return ActorTrace(*(values[first:last] for values in arrays), actor.length, actor.width)
+    i = slice(first, last)
+    return ActorTrace(actor.x[i], actor.y[i], actor.heading[i], actor.speed[i], actor.acceleration[i], actor.length, actor.width)
 
 
 def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:

@@ -22,7 +22,7 @@ from sbt.problem.trace import Trace
 
 __all__ = [
     "BESIDE", "DRAC_LIMIT", "FAR", "HORIZON", "OVERTAKEN", "Encounter", "collision", "d_min", "drac_max", "encounter",
-    "first_contact", "impact_speed", "thw_min", "ttc_min",
+    "first_contact", "impact_speed", "thw_min", "time_to_collision", "ttc_min",
 ]  # fmt: skip
 
 HORIZON = 10.0
@@ -47,7 +47,7 @@ class Encounter:
         in_path: the other is in ego's path.
         ahead, beside: it is in the path and ahead of ego's front, or level with ego.
         speed: of ego (m/s).
-        contact: first index with contact, None without.
+        contact: first index with contact, None without; nobody is in the path after it.
         rear_end: the contact came from behind.
         overtaken: at the end the ego is past the other.
     """
@@ -61,6 +61,12 @@ class Encounter:
     contact: int | None
     rear_end: bool
     overtaken: bool
+
+    def held(self, values: Vector, at_contact: float) -> Vector:
+        """Return (t,) values that are `at_contact` from a rear-end contact on."""
+        if self.contact is None or not self.rear_end:
+            return values
+        return np.where(np.arange(len(values)) >= self.contact, at_contact, values)
 
 
 @lru_cache(maxsize=8)
@@ -80,8 +86,11 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
     offset = np.abs(-dx * sin + dy * cos)
     in_path = offset < 0.5 * (a.width + b.width) + margin
     behind = gap <= -(a.length + b.length)
-    ahead = in_path & (gap >= 0)
     contact = first_contact(trace, ego, other)
+    if contact is not None:  # what follows the first contact does not count
+        in_path[contact + 1 :] = False
+        behind[contact + 1 :] = behind[contact]
+    ahead = in_path & (gap >= 0)
     rear_end = contact is not None and (bool(ahead[contact]) or (contact > 0 and bool(ahead[contact - 1])))
     return Encounter(
         gap, a.speed - b.speed * turn, in_path, ahead, in_path & (gap < 0) & ~behind, a.speed,
@@ -89,50 +98,54 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
     )  # fmt: skip
 
 
-def _ttc_min(trace: Trace, ego: str, other: str, margin: float) -> float:
-    e = encounter(trace, ego, other, margin)
-    shared = e.ahead | e.beside
-    if not shared.any():
-        return OVERTAKEN if e.overtaken else HORIZON
+def time_to_collision(e: Encounter) -> Vector:
+    """Return the (t,) TTC along ego's heading (s); it means something where the other is in the path."""
     ratio = e.gap / np.where(e.closing > 0, e.closing, np.inf)
     ttc = np.where(e.closing > 0, np.minimum(ratio, HORIZON), HORIZON)
     ttc = np.where(e.beside, np.where(e.closing > 0, np.maximum(ratio, BESIDE), BESIDE), ttc)
     if e.contact is not None and e.rear_end:
         ttc[e.contact] = 0.0
-        shared = shared & (np.arange(len(ttc)) <= e.contact)
-    return float(ttc[shared].min())
+    return ttc
 
 
-def ttc_min(ego: str = "ego", other: str = "co", margin: float = 0.0) -> Metric:
+def _ttc_min(trace: Trace, ego: str, other: str, margin: float, passed: float) -> float:
+    e = encounter(trace, ego, other, margin)
+    shared = e.ahead | e.beside
+    if not shared.any():
+        return passed if e.overtaken else HORIZON
+    return float(time_to_collision(e)[shared].min())
+
+
+def ttc_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: float = OVERTAKEN) -> Metric:
     """Return the smallest time to collision along ego's heading (s).
 
-    0 for a rear-end collision; in [-5, 0) where the other comes into the path beside ego; -10 where
+    0 for a rear-end collision; in [-5, 0) where the other comes into the path beside ego; `passed` where
     ego had passed it by then; 10 where they do not close in, or take longer than that to.
     """
     return Metric(
-        "ttc_min", lambda trace: _ttc_min(trace, ego, other, margin), "s", "low", HORIZON,
+        "ttc_min", lambda trace: _ttc_min(trace, ego, other, margin, passed), "s", "low", HORIZON,
         "smallest time to collision at constant speeds, along the ego's heading",
         "Hayward (1972), Near-miss determination through use of a scale of danger",
     )  # fmt: skip
 
 
-def _d_min(trace: Trace, ego: str, other: str, margin: float) -> float:
+def _d_min(trace: Trace, ego: str, other: str, margin: float, passed: float) -> float:
     e = encounter(trace, ego, other, margin)
     shared = e.ahead | e.beside
     if not shared.any():
-        return OVERTAKEN if e.overtaken else FAR
+        return passed if e.overtaken else FAR
     gap = np.where(np.arange(len(e.gap)) == e.contact, 0.0, e.gap) if e.rear_end else e.gap
     return float(min(gap[shared].min(), FAR))
 
 
-def d_min(ego: str = "ego", other: str = "co", margin: float = 0.0) -> Metric:
+def d_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: float = OVERTAKEN) -> Metric:
     """Return the smallest gap along ego's heading while the other is in the path (m).
 
-    0 for a rear-end collision, negative beside, -10 where ego had passed before, 1,000 without a
+    0 for a rear-end collision, negative beside, `passed` where ego had passed before, 1,000 without a
     shared path.
     """
     return Metric(
-        "d_min", lambda trace: _d_min(trace, ego, other, margin), "m", "low", FAR,
+        "d_min", lambda trace: _d_min(trace, ego, other, margin, passed), "m", "low", FAR,
         "smallest gap along the ego's heading while the other is in its path",
     )  # fmt: skip
 

@@ -52,7 +52,7 @@ class Distribution:
         InputError: unknown kind, or missing, surplus or impossible parameters.
 
     >>> Distribution.of(kind="normal", mean=40, std=15).truncated(0, 120).ppf(np.array([0.5])).round(2)
-    array([40.06])
+    array([40.07])
     """
 
     kind: str

@@ -76,12 +76,14 @@ SCENARIO = LogicalScenario(
             Parameter("d_t", 0.1, 10.0, "s", description="time gap from ego's front to co's rear at ego's speed"),
         )
     ),
-    simulate=SumoSimulation(
-        net="straight", scene=scene, duration=DURATION, step_length=0.05, lane_change_duration=LANE_CHANGE
-    ),
+    simulate=SumoSimulation(net="straight", scene=scene, duration=DURATION, step_length=0.05, lane_change_duration=LANE_CHANGE),
     metrics=(
-        ttc_min(margin=MARGIN), d_min(margin=MARGIN), collision(), impact_speed(), thw_min(margin=MARGIN),
+        ttc_min(margin=MARGIN),
+        d_min(margin=MARGIN),
+        collision(),
+        impact_speed(),
+        thw_min(margin=MARGIN),
         drac_max(margin=MARGIN),
-    ),  # fmt: skip
+    ),
     requirement=Requirement("ttc_min", CriticalInterval(-5.0, 0.5)),
 )

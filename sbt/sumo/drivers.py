@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.sumo.actors import KEEP, Action, State
-from sbt.sumo.dynamics import DeadTime, FirstOrderLag
+from sbt.sumo.actors import KEEP, Action, Pose, State
+from sbt.sumo.dynamics import DeadTime, FirstOrderLag, Gust
 from sbt.sumo.sensors import RangeSensor, Target
 
-__all__ = ["AccAeb", "Braking", "LaneChange", "SpeedProfile"]
+__all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stand", "Walk"]
 
 
 class AccAeb:
@@ -57,9 +59,7 @@ class AccAeb:
         self._time_gap, self._distance_min = time_gap, distance_min
         self._acc_accel, self._acc_braking = acc_accel, acc_braking
         self._aeb_braking, self._aeb_reserve, self._aeb_distance = aeb_braking, aeb_reserve, aeb_distance
-        self._sensor = RangeSensor(
-            rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise
-        )
+        self._sensor = RangeSensor(rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise)
         self._delay = DeadTime(reaction_time)
         self._lag = FirstOrderLag(lag)
         self._lag_2 = FirstOrderLag(lag_2) if lag_2 > 0 else None
@@ -95,7 +95,6 @@ class AccAeb:
         if demand < -self._acc_braking:
             return -self._acc_braking
         return demand if demand < self._acc_accel else self._acc_accel
-
 
     def _last_moment(self, closing: float) -> float:
         """Return the gap at which AEB brakes because of the closing speed (m)."""
@@ -165,3 +164,60 @@ class SpeedProfile:
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the speed at the end of the step."""
         return Action(speed=self.at(t + own.step))
+
+
+class Walk:
+    """Walks straight on at a constant speed, pushed by gusts of wind along and across.
+
+    Args:
+        start: where it starts and which way it walks.
+        speed: m/s.
+        along, across: what the wind adds forwards and to the left.
+    """
+
+    def __init__(self, start: Pose, speed: float, along: Gust, across: Gust):
+        self._start, self._speed, self._along, self._across = start, speed, along, across
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the pose and the speed at the end of the step."""
+        end = t + own.step
+        x, y, heading = self._start
+        cos, sin = math.cos(heading), math.sin(heading)
+        ahead, left = self._speed * end + self._along.distance(end), self._across.distance(end)
+        return Action(
+            speed=self._speed + self._along.speed(end), pose=(x + ahead * cos - left * sin, y + ahead * sin + left * cos, heading)
+        )
+
+
+class Stand:
+    """Stands where it is."""
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the pose it has."""
+        return Action(speed=0.0, pose=(own.x, own.y, own.heading))
+
+
+class ArcExit:
+    """Drives out on an arc to the left: accelerates from standstill, holds its speed, brakes to a stop.
+
+    Args:
+        start: where it stands.
+        radius: of the arc of its middle (m).
+        acceleration, speed, hold, deceleration: as of a `SpeedProfile`.
+    """
+
+    def __init__(self, start: Pose, radius: float, acceleration: float, speed: float, hold: float, deceleration: float):
+        self._start, self._radius = start, radius
+        self._profile = SpeedProfile(acceleration, speed, hold, deceleration)
+        self.end = self._profile.end
+        """When it stands again (s)."""
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the pose and the speed at the end of the step."""
+        end = t + own.step
+        turn = self._profile.distance(end) / self._radius
+        x, y, heading = self._start
+        chord = 2.0 * self._radius * math.sin(0.5 * turn)
+        course = heading + 0.5 * turn
+        pose = (x + chord * math.cos(course), y + chord * math.sin(course), heading + turn)
+        return Action(speed=self._profile.at(end), pose=pose)

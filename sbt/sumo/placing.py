@@ -110,5 +110,5 @@ def _front(actor: Actor) -> float:
 
 def _show(sumo: Any, obstacle: Obstacle) -> None:
     """Draw an obstacle as a polygon."""
-    sumo.polygon.add(obstacle.name, list(obstacle.corners), _COLOR, True, "obstacle")  # noqa: FBT003
+    sumo.polygon.add(obstacle.name, list(obstacle.corners), _COLOR, True, "obstacle")
     session().inserted(obstacle.name, "polygon")

@@ -116,15 +116,11 @@ def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
     """Step until something ends the run, recording every state."""
     actors, dt = scene.actors, simulation.step_length
     step, collisions = direct(sumo, "simulation", "step"), direct(sumo, "simulation", "getCollidingVehiclesNumber")
-    set_speed = direct(sumo, "vehicle", "setSpeed")
     states = [State(a.name, a.type.length, a.type.width, dt) for a in actors]
     for actor, state in zip(actors, states, strict=True):
         state.steered = None if actor.pose is None else actor.speed
     by_name = {s.name: s for s in states}
-    driven = [
-        (a, s, a.driver.act, tuple(o for o in states if o is not s), mover(sumo, a))
-        for a, s in zip(actors, states, strict=True) if a.driver is not None
-    ]  # fmt: skip
+    control = _controls(sumo, actors, states, dt)
     observe = _observer(sumo, actors, states, dt)
     solid = [k for k, a in enumerate(actors) if not a.person][1:]
     probes = tuple(scene.signals.values())
@@ -140,38 +136,53 @@ def _drive(sumo: Any, scene: Scene, simulation: SumoSimulation) -> Trace:
         if collisions():
             reported += [f"{c.collider}>{c.victim}@{t:.3f}" for c in sumo.simulation.getCollisions()]
         if _touching(states, solid, rows, near, dt):
-            reason = "collision"
+            ended = "collision"
             break
-        reason = scene.until(t, by_name) if scene.until is not None else None
-        if reason is not None:
+        ended = (scene.until(t, by_name) or "") if scene.until is not None else ""
+        if ended:
             break
         if k % DEADLINE_STEPS == 0 and time.monotonic() > deadline:
             raise RunError(Status.TIMEOUT, f"a run must take at most {simulation.timeout:g} s, but it was at t = {t:g} s")
         if k < steps:
-            for actor, own, act, others, place in driven:
-                action = act(t, own, others)
-                if action is not KEEP:
-                    speed = _speed(actor, own, action, dt)
-                    if speed is not None and not actor.person:
-                        set_speed(actor.name, speed)
-                    if action.lane is not None:
-                        sumo.vehicle.changeLane(actor.name, action.lane, 3600.0)
-                    if action.pose is not None:
-                        own.steered = own.speed if speed is None else speed
-                        place(action.pose)
+            control(t)
             if probes:
                 heard.append(tuple([float(probe()) for probe in probes]))
             step()
     else:
-        reason = "duration"
+        ended = "duration"
     if probes:
         heard.append(tuple([float(probe()) for probe in probes]))
-    return _trace(scene, rows, heard, dt, reason, reported)
+    return _trace(scene, rows, heard, dt, ended, reported)
 
 
-def _observer(
-    sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float
-) -> Callable[[list[tuple[float, ...]]], None]:
+def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float) -> Callable[[float], None]:
+    """Return what asks every controller and passes its action on to SUMO."""
+    set_speed = direct(sumo, "vehicle", "setSpeed")
+    driven = [
+        (a, s, a.driver.act, tuple(o for o in states if o is not s), mover(sumo, a))
+        for a, s in zip(actors, states, strict=True)
+        if a.driver is not None
+    ]
+
+    def control(t: float) -> None:
+        for actor, own, act, others, place in driven:
+            action = act(t, own, others)
+            if action is not KEEP:
+                speed = _speed(actor, own, action, dt)
+                if speed is not None and not actor.person:
+                    set_speed(actor.name, speed)
+                if action.lane is not None:
+                    sumo.vehicle.changeLane(actor.name, action.lane, 3600.0)
+                if action.pose is not None:
+                    own.steered = own.speed if speed is None else speed
+                    place(action.pose)
+                elif own.steered is not None:
+                    raise RunError(Status.FAILED, f"{actor.name} moves by pose, but its controller gave {action}")
+
+    return control
+
+
+def _observer(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float) -> Callable[[list[tuple[float, ...]]], None]:
     """Return what reads every actor from SUMO and records it, a row an actor.
 
     This runs at every step of every run, so that everything it needs is bound beforehand. SUMO's
@@ -181,9 +192,7 @@ def _observer(
         person: tuple(direct(sumo, "person" if person else "vehicle", name) for name in ("getPosition", "getAngle", "getSpeed"))
         for person in {a.person for a in actors}
     }
-    watched = [
-        (s, s.name, 0.0 if a.person else 0.5 * s.length, *getters[a.person]) for a, s in zip(actors, states, strict=True)
-    ]
+    watched = [(s, s.name, 0.0 if a.person else 0.5 * s.length, *getters[a.person]) for a, s in zip(actors, states, strict=True)]
     rate = 1.0 / dt
 
     def observe(rows: list[tuple[float, ...]]) -> None:
@@ -246,14 +255,26 @@ def _trace(
     """Return the recorded rows as a trace, obstacles as actors that stand."""
     table = np.array(rows, dtype=np.float64).reshape(-1, len(scene.actors), 5)
     sizes = [(a.type.length, a.type.width) for a in scene.actors]
+    names = [a.name for a in scene.actors]
     if scene.obstacles:
         standing = np.array([(*o.pose, 0.0, 0.0) for o in scene.obstacles])
         table = np.concatenate([table, np.broadcast_to(standing, (len(table), *standing.shape))], axis=1)
         sizes += [(o.length, o.width) for o in scene.obstacles]
+        names += [o.name for o in scene.obstacles]
     x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
-    length, width = np.array(sizes).T
+    length, width = np.array([a for a, _ in sizes]), np.array([b for _, b in sizes])
     signals = {name: np.array([row[k] for row in heard]) for k, name in enumerate(scene.signals)}
-    names = tuple(thing.name for thing in (*scene.actors, *scene.obstacles))
     return Trace(
-        np.arange(len(table)) * dt, names, x, y, heading, speed, acceleration, length, width, ended, tuple(reported), signals
+        np.arange(len(table)) * dt,
+        tuple(names),
+        x,
+        y,
+        heading,
+        speed,
+        acceleration,
+        length,
+        width,
+        ended,
+        tuple(reported),
+        signals,
     )

@@ -1,0 +1,80 @@
+"""The verb for recorded traffic: metrics."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sbt.cli.console import clean_stdout, print_json
+from sbt.errors import InputError, RunError
+
+__all__ = ["metrics"]
+
+
+def metrics(
+    file: Annotated[Path, typer.Argument(metavar="FCD_FILE", help="SUMO's FCD output: .xml[.gz], .csv[.gz], .parquet.")],
+    *,
+    pairs: Annotated[
+        str, typer.Option(metavar="within=METRES", help="Only pairs of road users that come so near (centres, m).")
+    ] = "within=100",
+    length: Annotated[float, typer.Option(help="Length of vehicles whose length is not in the file (m).")] = 5.0,
+    width: Annotated[float, typer.Option(help="Width of vehicles whose width is not in the file (m).")] = 1.8,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write the table there.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compute every installed metric for every pair of road users of recorded traffic, each as ego in turn."""
+    with clean_stdout():
+        from sbt.metrics.fcd import catalogue, encounters, read_fcd
+
+        within = _within(pairs)
+        measured = catalogue()
+        recording = read_fcd(file, length=length, width=width)
+        rows = [
+            {"ego": ego, "other": other, "begin": float(trace.time[0]), "end": float(trace.time[-1])}
+            | {metric.name: _value(metric, trace) for metric in measured}
+            for ego, other, trace in encounters(recording, within)
+        ]  # fmt: skip
+    columns = ["ego", "other", "begin", "end", *(metric.name for metric in measured)]
+    if out is not None:
+        try:
+            with out.open("w", newline="") as target:
+                _write(target, columns, rows)
+        except OSError as error:
+            raise InputError(f"--out must be a file that can be written, but got '{out}': {error.strerror}") from None
+    if as_json:
+        units = {metric.name: metric.unit for metric in measured}
+        print_json({"file": str(file), "road_users": len(recording.names), "steps": len(recording.time),
+                    "within": within, "units": units, "pairs": rows})  # fmt: skip
+    elif out is None:
+        _write(sys.stdout, columns, rows)
+    else:
+        print(f"{len(rows)} rows of {len(recording.names)} road users over {len(recording.time)} time steps in {out}")
+
+
+def _within(text: str) -> float:
+    key, _, value = text.partition("=")
+    try:
+        within = float(value)
+    except ValueError:
+        within = -1.0
+    if key != "within" or not 0 < within < float("inf"):
+        raise InputError(f"--pairs must be within=METRES with a number > 0, but got '{text}'")
+    return within
+
+
+def _value(metric: Any, trace: Any) -> float | None:
+    """Return a metric of a trace, None where it has none (a stranger's metric may need another actor)."""
+    try:
+        return float(metric(trace))
+    except RunError:
+        return None
+
+
+def _write(target: Any, columns: list[str], rows: list[dict[str, Any]]) -> None:
+    writer = csv.DictWriter(target, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)

@@ -1,0 +1,175 @@
+"""The default: a Gaussian process, extra-trees and a deep ensemble, mixed by how well they predict.
+
+What each is worth is decided by runs that it had not seen, not by the number of runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+from sbt.metamodels.base import Metamodel, Predictor, check_rows
+from sbt.metamodels.ensemble import Ensemble
+from sbt.metamodels.et import ExtraTrees
+from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.torch_tools import check_device
+
+__all__ = ["Auto", "Choice", "MixturePredictor"]
+
+_FEWEST = 10  # rows from which on a score on held-out rows says something
+_LEAST = 0.02  # weight below which a model is left out
+
+
+@dataclass(frozen=True)
+class Auto:
+    """Settings of the automatic choice.
+
+    Each model is scored on rows it was not fitted to (cross-validation); the weights are those of
+    largest likelihood of the mixture there, shrunk a little to equal ones. Then all models are fitted
+    to all rows. Too few rows to score: equal weights of `gp` and `et`.
+
+    Args:
+        folds: of the cross-validation, >= 2.
+        prior: rows >= 0 that speak for equal weights.
+        ensemble_rows: rows from which on the ensemble takes part, >= 2.
+        gp_rows: rows up to which the Gaussian process takes part, >= 2.
+        device: auto (CUDA where there is one), cpu or cuda; for the ensemble.
+
+    Raises:
+        InputError: a value outside its range; at the fit, a device that is not there.
+
+    Source:
+        Yao et al. (2018), Using stacking to average Bayesian predictive distributions.
+    """
+
+    folds: int = 3
+    prior: float = 5.0
+    ensemble_rows: int = 100
+    gp_rows: int = 4000
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        for name in ("folds", "ensemble_rows", "gp_rows"):
+            if not getattr(self, name) >= 2:
+                raise InputError(f"{name} must be >= 2, but got {getattr(self, name)}")
+        if not self.prior >= 0.0:
+            raise InputError(f"prior must be >= 0, but got {self.prior}")
+        check_device(self.device)
+
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
+        """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
+        u, y = check_rows(u, y)
+        models = self._models(len(y))
+        if len(y) < _FEWEST:
+            weights, held_out = np.full(len(models), 1.0 / len(models)), None
+        else:
+            held_out = _held_out(models, u, y, self.folds, rng)
+            weights = _stack(held_out, self.prior)
+        choice = _explain(list(models), weights, held_out, len(y), self)
+        kept = {name: model for name, model in models.items() if choice.weights[name] > 0.0}
+        predictors = tuple(model.fit(u, y, rng) for model in kept.values())
+        return MixturePredictor(predictors, np.array([choice.weights[name] for name in kept]), choice)
+
+    def _models(self, n: int) -> dict[str, Metamodel]:
+        """Return the models that take part with n rows."""
+        models: dict[str, Metamodel] = {}
+        if n <= self.gp_rows:
+            models["gp"] = GaussianProcess()
+        models["et"] = ExtraTrees()
+        if n >= self.ensemble_rows:
+            models["ensemble"] = Ensemble(device=self.device)
+        return models
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen and why.
+
+    Attributes:
+        weights: of each model that took part, by name; 0: left out.
+        scores: mean log likelihood of each model on rows it was not fitted to, and of the `mixture`;
+            empty where there were too few rows.
+        reason: the same in words.
+    """
+
+    weights: Mapping[str, float]
+    scores: Mapping[str, float]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class MixturePredictor:
+    """A mixture of predictors.
+
+    Args:
+        predictors: of each model with a weight > 0.
+        weight: of each, > 0, sum 1.
+        choice: what was chosen and why.
+    """
+
+    predictors: tuple[Predictor, ...]
+    weight: Vector
+    choice: Choice
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the belief at u (n, d)."""
+        return Prediction.mixture_of([predict(u) for predict in self.predictors], self.weight)
+
+
+def _held_out(models: Mapping[str, Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator) -> Points:
+    """Return (models, n) log densities of each row under models fitted to the other folds."""
+    fold = rng.permutation(len(y)) % folds
+    log_density = np.empty((len(models), len(y)))
+    for i in range(folds):
+        out = fold == i
+        for row, model in zip(log_density, models.values(), strict=True):
+            row[out] = model.fit(u[~out], y[~out], rng)(u[out]).log_density(y[out])
+    return log_density
+
+
+def _stack(log_density: Points, prior: float) -> Vector:
+    """Return the (k,) weights of the mixture of largest likelihood, by expectation maximisation.
+
+    Args:
+        log_density: (k, n) of each row under each model.
+        prior: rows that speak for equal weights.
+
+    >>> _stack(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
+    [1.0, 0.0]
+    """
+    k, n = log_density.shape
+    density = np.exp(log_density - log_density.max(axis=0))
+    weights = np.full(k, 1.0 / k)
+    for _ in range(500):
+        joint = weights[:, None] * density
+        new = ((joint / joint.sum(axis=0)).sum(axis=1) + prior / k) / (n + prior)
+        moved, weights = np.abs(new - weights).max(), new
+        if moved < 1e-6:
+            break
+    return np.asarray(weights / weights.sum())
+
+
+def _explain(names: list[str], weights: Vector, held_out: Points | None, n: int, settings: Auto) -> Choice:
+    """Return the choice, models with little weight left out."""
+    kept = np.where(weights >= _LEAST, weights, 0.0)
+    kept /= kept.sum()
+    shares = {name: float(w) for name, w in zip(names, kept, strict=True)}
+    mixed = ", ".join(f"{100 * w:.0f} % {name}" for name, w in shares.items() if w > 0.0)
+    if held_out is None:
+        reason = f"{mixed}: {n} rows are too few to compare models (from {_FEWEST} on)"
+        return Choice(shares, {}, reason)
+    with np.errstate(divide="ignore"):
+        mixture = np.logaddexp.reduce(held_out + np.log(kept)[:, None], axis=0).mean()
+    scores = {name: float(row.mean()) for name, row in zip(names, held_out, strict=True)} | {"mixture": float(mixture)}
+    listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
+    reason = f"{mixed}: mean log likelihood of {n} rows, each predicted from other rows ({settings.folds} folds): {listed}"
+    if "ensemble" not in names:
+        reason += f"; the ensemble takes part from {settings.ensemble_rows} rows on"
+    if "gp" not in names:
+        reason += f"; the gp takes part up to {settings.gp_rows} rows"
+    return Choice(shares, scores, reason)

@@ -1,0 +1,44 @@
+"""How the ego drives, whoever else is there: jerk and braking."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sbt.arrays import Vector
+from sbt.problem.scenario import Metric
+from sbt.problem.trace import ActorTrace, Trace
+
+__all__ = ["deceleration_max", "jerk", "jerk_max"]
+
+
+def jerk(actor: ActorTrace, time: Vector) -> Vector:
+    """Return the (t,) rate of the acceleration over the step that led to each instant (m/s^3).
+
+    0 at the first two instants: a trace's first acceleration is not measured, so that there is no
+    change of it either.
+    """
+    result = np.zeros(len(time))
+    result[2:] = np.diff(actor.acceleration[1:]) / np.diff(time[1:])
+    return result
+
+
+def jerk_max(ego: str = "ego") -> Metric:
+    """Return the largest absolute jerk along the heading (m/s^3), from steps as long as the trace's."""
+
+    def function(trace: Trace) -> float:
+        return float(np.abs(jerk(trace.actor(ego), trace.time)).max())
+
+    return Metric("jerk_max", function, "m/s^3", "high", 0.0, "largest absolute rate of the ego's acceleration")
+
+
+def deceleration_max(ego: str = "ego") -> Metric:
+    """Return the strongest braking (m/s^2), 0 where the ego never brakes."""
+
+    def function(trace: Trace) -> float:
+        return float(max(0.0, -trace.actor(ego).acceleration.min()))
+
+    return Metric("deceleration_max", function, "m/s^2", "high", 0.0, "strongest deceleration of the ego")
+
+
+JERK_MAX = jerk_max()
+DECELERATION_MAX = deceleration_max()

@@ -1,0 +1,157 @@
+"""Criticality metrics in the plane, for any two road users on any paths: 2-D TTC, distance, PET, severity.
+
+All of them speak of two rectangles that may turn, and count a contact between two instants.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sbt.arrays import Vector
+from sbt.metrics.geometry import contact_index, part, rectangle_distance, time_to_contact
+from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
+from sbt.problem.scenario import Metric
+from sbt.problem.trace import ActorTrace, Trace
+
+__all__ = ["distance", "distance_min", "pet", "post_encroachment_time", "severity", "ttc_2d", "ttc_2d_min"]
+
+_HALVINGS = 10
+"""The PET is exact to the step of the trace divided by 2 to this power."""
+
+
+def _touched(trace: Trace, ego: str, other: str, values: Vector) -> Vector:
+    """Return (t,) values that are 0 at the first contact, which may have been before that instant."""
+    k = first_contact(trace, ego, other)
+    if k is not None:
+        values[k] = 0.0
+    return values
+
+
+def ttc_2d(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Vector:
+    """Return the (t,) time until the rectangles touch if both go straight on at their speeds (s), at most 10."""
+    a, b = trace.actor(ego), trace.actor(other)
+    return _touched(trace, ego, other, np.minimum(time_to_contact(a, b), HORIZON))
+
+
+def ttc_2d_min(ego: str = "ego", other: str = "co") -> Metric:
+    """Return the smallest 2-D time to collision (s), 0 for a collision, 10 where their courses do not meet by then."""
+    return Metric(
+        "ttc_2d_min", lambda trace: float(ttc_2d(trace, ego, other).min()), "s", "low", HORIZON,
+        "smallest time until the rectangles would touch at constant speeds and headings",
+        "swept separating axes, Ericson (2005), Real-Time Collision Detection, 5.5.8",
+    )  # fmt: skip
+
+
+def distance(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Vector:
+    """Return the (t,) distance between the rectangles (m), at most 1,000, 0 where they overlap."""
+    values = rectangle_distance(trace.actor(ego), trace.actor(other))
+    return _touched(trace, ego, other, np.minimum(values, FAR))
+
+
+def distance_min(ego: str = "ego", other: str = "co") -> Metric:
+    """Return the smallest distance between the rectangles (m), 0 for a collision, at most 1,000."""
+    return Metric(
+        "distance_min", lambda trace: float(distance(trace, ego, other).min()), "m", "low", FAR,
+        "smallest Euclidean distance between the rectangles",
+    )  # fmt: skip
+
+
+def severity(ego: str = "ego", other: str = "co") -> Metric:
+    """Return the smallest distance (m) or, after a collision, minus the impact speed (m/s).
+
+    It goes on past the crash, where distances saturate: what a metamodel can learn. The two units meet
+    at 0 in a touch without relative speed.
+    """
+    impact = impact_speed(ego, other)
+
+    def function(trace: Trace) -> float:
+        if first_contact(trace, ego, other) is not None:
+            return 0.0 - impact(trace)
+        return float(distance(trace, ego, other).min())
+
+    return Metric("severity", function, "m; -m/s", "low", FAR, "smallest distance, or minus the impact speed where they collide")
+
+
+def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") -> float:
+    """Return the smallest time between one road user leaving a spot and the other reaching it (s), at most 10.
+
+    Computed as the smallest shift in time of one of the two with which the rectangles would touch: the
+    shifts grow step by step until the swept rectangles meet (`contact_index`), and the last step is
+    halved down to step / 1,024. 0 for a collision. Only what is in the trace counts.
+
+    Where straight paths cross at right angles this is the time from the first leaving the conflict area
+    of both paths to the second entering it (at an acute angle the conflict area is emptied later and
+    entered earlier than any one spot of it, and its PET is smaller). Behind one another on one path it
+    is the time gap, which a conflict area does not have.
+    """
+    a, b = trace.actor(ego), trace.actor(other)
+    n = len(trace.time)
+    if first_contact(trace, ego, other) is not None:
+        return 0.0
+    if n < 2 or not _paths_near(a, b):
+        return HORIZON
+    step = float(trace.time[-1] - trace.time[0]) / (n - 1)
+    for k in range(1, min(n - 1, int(HORIZON / step)) + 1):
+        found = [sign for sign in (1, -1) if _meet(*_shifted(a, b, sign * k))]
+        if found:
+            return min(HORIZON, step * min(_halved(a, b, sign, k) for sign in found))
+    return HORIZON
+
+
+def _halved(a: ActorTrace, b: ActorTrace, sign: int, k: int) -> float:
+    """Return the shift in (k - 1, k] steps from which on the rectangles touch."""
+    apart, touching = k - 1.0, float(k)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (apart + touching)
+        if _meet(*_shifted(a, b, sign * middle)):
+            touching = middle
+        else:
+            apart = middle
+    return touching
+
+
+def _meet(a: ActorTrace, b: ActorTrace) -> bool:
+    return contact_index(a, b) is not None
+
+
+def _shifted(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:
+    """Return the parts that meet where b comes `shift` steps earlier (later, if negative)."""
+    if shift < 0:
+        later, earlier = _shifted(b, a, -shift)
+        return earlier, later
+    whole, share = int(shift), shift - int(shift)
+    n = len(a.x) - whole - (share > 0)
+    here, there = part(a, 0, n), part(b, whole, whole + n)
+    if share == 0:
+        return here, there
+    after = part(b, whole + 1, whole + 1 + n)
+    turn = after.heading - there.heading
+    return here, replace(
+        there,
+        x=there.x + share * (after.x - there.x),
+        y=there.y + share * (after.y - there.y),
+        heading=there.heading + share * np.arctan2(np.sin(turn), np.cos(turn)),
+    )
+
+
+def _paths_near(a: ActorTrace, b: ActorTrace) -> bool:
+    """Return whether the boxes around both paths overlap."""
+    reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width))
+    return all(u.min() - reach <= v.max() and v.min() - reach <= u.max() for u, v in ((a.x, b.x), (a.y, b.y)))
+
+
+def pet(ego: str = "ego", other: str = "co") -> Metric:
+    """Return the post-encroachment time (s), 0 for a collision, 10 where neither comes where the other was by then."""
+    return Metric(
+        "pet", lambda trace: post_encroachment_time(trace, ego, other), "s", "low", HORIZON,
+        "smallest time between one leaving a spot and the other reaching it",
+        "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions",
+    )  # fmt: skip
+
+
+TTC_2D_MIN = ttc_2d_min()
+DISTANCE_MIN = distance_min()
+SEVERITY = severity()
+PET = pet()

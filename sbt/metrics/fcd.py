@@ -1,0 +1,291 @@
+"""Recorded traffic: SUMO's floating car data (FCD) as traces of pairs of road users.
+
+Reads XML (also gzipped), CSV (`,` or `;`, also gzipped) and Parquet, with SUMO's own names of elements
+and columns (`timestep_time`, `vehicle_x`, `person_x`, ...) or the bare ones (`time`, `id`, `x`, `y`,
+`angle`, `speed`). SUMO's positions are those of the front bumper's centre and its angles are degrees
+clockwise from north: both are converted here, once. Sizes and accelerations are taken where the file
+has them (`length`, `width`, `acceleration`); else sizes are the reader's arguments, and accelerations
+are differences of the speeds. SUMO writes two digits by default: `--precision 6` is worth its bytes.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sbt.arrays import Vector
+from sbt.errors import InputError
+from sbt.metrics.longitudinal import FAR, HORIZON, d_min, ttc_min
+from sbt.plugins import load, names
+from sbt.problem.scenario import Metric
+from sbt.problem.trace import Trace
+
+__all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", "pair_traces", "read_fcd"]
+
+PERSON_SIZE = (0.215, 0.478)
+"""Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
+_FASTEST = 150.0
+"""A road user whose position changes faster was taken elsewhere (m/s): it starts anew there."""
+_COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width")
+_REQUIRED = ("time", "id", "x", "y", "angle", "speed")
+_KINDS = ("vehicle", "person")
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """States of m road users, a row each at a time, sorted by road user and then by time.
+
+    Attributes:
+        names: of the road users.
+        time: (s,) the time steps of the file (s).
+        start: (m + 1,) where the rows of each road user start.
+        step: (n,) index of each row's time.
+        x, y: (n,) centre of the rectangle (m).
+        heading: (n,) radians, counter-clockwise from +x.
+        speed, acceleration: (n,) along the heading (m/s, m/s^2).
+        length, width: (m,) size of the rectangles (m).
+    """
+
+    names: tuple[str, ...]
+    time: Vector
+    start: Integers
+    step: Integers
+    x: Vector
+    y: Vector
+    heading: Vector
+    speed: Vector
+    acceleration: Vector
+    length: Vector
+    width: Vector
+
+
+def read_fcd(path: Path, *, length: float = 5.0, width: float = 1.8) -> Recording:
+    """Read an FCD file.
+
+    Args:
+        path: `.xml`, `.xml.gz`, `.csv`, `.csv.gz` or `.parquet`.
+        length: of vehicles whose length is not in the file (m).
+        width: of vehicles whose width is not in the file (m).
+
+    Raises:
+        InputError: it cannot be read, is not FCD, or declares a document type or entities.
+    """
+    if not (0 < length < math.inf and 0 < width < math.inf):
+        raise InputError(f"a vehicle needs length > 0 and width > 0, but got {length} m x {width} m")
+    suffixes = [s for s in path.suffixes if s != ".gz"]
+    readers = {".xml": _read_xml, ".csv": _read_table, ".parquet": _read_table}
+    if not suffixes or suffixes[-1] not in readers:
+        raise InputError(f"an FCD file must end in .xml, .csv or .parquet (or .gz of the first two), but got '{path}'")
+    try:
+        ids, kinds, columns = readers[suffixes[-1]](path)
+    except OSError as error:
+        raise InputError(f"an FCD file must be readable, but got '{path}': {error.strerror or error}") from None
+    if not len(columns["time"]):
+        raise InputError(f"an FCD file must have road users in it, but there is none in '{path}'")
+    return _recording(path, ids, kinds, columns, (length, width))
+
+
+def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: tuple[float, float]) -> Recording:
+    """Return sorted and converted rows; (n,) `ids`, `kinds` (1: a person) and columns, NaN where there is nothing."""
+    users, user = np.unique(np.asarray(ids, dtype=str), return_inverse=True)
+    data = {name: np.asarray(values, dtype=np.float64) for name, values in columns.items()}
+    for name in (*_REQUIRED[2:], "time"):
+        if not np.isfinite(data[name]).all():
+            raise InputError(f"{name} of every road user in an FCD file must be a finite number, but is not in '{path}'")
+    time, step = np.unique(data["time"], return_inverse=True)
+    order = np.lexsort((step, user))
+    user, step = user[order], step[order]
+    data = {name: values[order] for name, values in data.items()}
+    twice = np.flatnonzero((np.diff(user) == 0) & (np.diff(step) == 0))
+    if twice.size:
+        k = int(twice[0])
+        where = f"'{users[user[k]]}' at {time[step[k]]:g} s"
+        raise InputError(f"a road user of an FCD file must be there once at a time, but in '{path}' {where} is not")
+    start = np.searchsorted(user, np.arange(len(users) + 1))
+    _check_metres(path, data, user)
+    person = np.asarray(kinds)[order][start[:-1]] == 1
+    lengths, widths = (
+        np.where(np.isnan(given), np.where(person, small, big), given)
+        for given, small, big in zip((data["length"][start[:-1]], data["width"][start[:-1]]), PERSON_SIZE, size, strict=True)
+    )
+    heading = np.radians(90.0 - data["angle"])
+    half = 0.5 * lengths[user]
+    acceleration = _differences(data["speed"], time[step], start)
+    acceleration = np.where(np.isnan(data["acceleration"]), acceleration, data["acceleration"])
+    return Recording(
+        tuple(users.tolist()), time, start, step.astype(np.int64), data["x"] - half * np.cos(heading),
+        data["y"] - half * np.sin(heading), heading, data["speed"], acceleration, lengths, widths,
+    )  # fmt: skip
+
+
+def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
+    """Check that the road users move as far as their speeds say, at least about."""
+    same = np.diff(user) == 0
+    moved = np.hypot(np.diff(data["x"]), np.diff(data["y"]))[same].sum()
+    expected = (np.diff(data["time"]) * data["speed"][1:])[same].sum()
+    if expected > 10.0 and moved < 0.01 * expected:
+        raise InputError(
+            f"positions of an FCD file must be in metres, but in '{path}' the road users move {moved:.3g} "
+            f"instead of about {expected:.3g} m (was it written with --fcd-output.geo?)"
+        )
+
+
+def _differences(speed: Vector, time: Vector, start: Integers) -> Vector:
+    """Return (n,) the rate of the speed since the row before, 0 in a road user's first row."""
+    rate = np.zeros(len(speed))
+    gone = np.diff(time)
+    rate[1:] = np.diff(speed) / np.where(gone > 0, gone, np.inf)
+    rate[start[:-1]] = 0.0
+    return rate
+
+
+def _read_xml(path: Path) -> tuple[list[str], array[int], dict[str, array[float]]]:
+    """Return ids, kinds and columns of an XML file, which is never held as a whole."""
+    parser = expat.ParserCreate()
+    ids: list[str] = []
+    kinds: array[int] = array("b")
+    columns = {name: array("d") for name in _COLUMNS}
+    now = math.nan
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal now
+        if tag == "timestep":
+            now = _seconds(attributes["time"])
+        elif tag in _KINDS:
+            columns["time"].append(now)
+            ids.append(attributes["id"])
+            kinds.append(_KINDS.index(tag))
+            for name in _COLUMNS[1:5]:
+                columns[name].append(float(attributes[name]))
+            for name in _COLUMNS[5:]:
+                columns[name].append(float(attributes.get(name, math.nan)))
+
+    def refuse(*_: Any) -> None:
+        raise InputError(f"an FCD file must not declare a document type or entities, but '{path}' does")
+
+    parser.StartElementHandler = begin
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    parser.buffer_text = True
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            parser.ParseFile(file)
+    except (expat.ExpatError, EOFError, gzip.BadGzipFile) as error:
+        raise InputError(f"an FCD file must be whole, but '{path}' is not: {error}") from None
+    except (KeyError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        what = f"attribute {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"'{path}', line {parser.CurrentLineNumber}: {what}") from None
+    return ids, kinds, columns
+
+
+def _seconds(text: str) -> float:
+    """Return a time of SUMO, which may be written as [days:]hours:minutes:seconds."""
+    seconds, parts = 0.0, text.split(":")
+    for part, unit in zip(parts[::-1], (1.0, 60.0, 3600.0, 86400.0), strict=False):
+        seconds += float(part) * unit
+    return seconds
+
+
+def _read_table(path: Path) -> tuple[Any, Any, dict[str, Any]]:
+    """Return ids, kinds and columns of a CSV or Parquet file."""
+    import pandas as pd
+
+    try:
+        if path.suffix == ".parquet":
+            table = pd.read_parquet(path)
+        else:
+            with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
+                separator = ";" if ";" in file.readline() else ","
+            table = pd.read_csv(path, sep=separator, dtype={"id": str, "vehicle_id": str, "person_id": str}, low_memory=False)
+    except ImportError:
+        raise InputError(f"reading '{path}' needs pyarrow: pip install 'sumo-sbt[parquet]'") from None
+    except (ValueError, EOFError) as error:  # what pandas and pyarrow raise for files that are none
+        raise InputError(f"an FCD file must be a table, but '{path}' cannot be read: {str(error).splitlines()[0]}") from None
+    parts = []
+    for kind, prefix in enumerate(("", *(f"{name}_" for name in _KINDS))):
+        if f"{prefix}id" in table:
+            called = {c: f"{prefix}{c}" if f"{prefix}{c}" in table else f"timestep_{c}" for c in ("id", *_COLUMNS)}
+            rows = pd.DataFrame({c: table[name] for c, name in called.items() if name in table})
+            rows = rows[rows["id"].notna()]
+            parts.append(rows.assign(kind=max(kind - 1, 0)))
+    found = pd.concat(parts) if parts else pd.DataFrame()
+    missing = [c for c in _REQUIRED if c not in found]
+    if missing:
+        raise InputError(f"an FCD table must have {', '.join(_REQUIRED)}, but in '{path}' {', '.join(missing)} is missing")
+    try:
+        columns = {c: found.get(c, pd.Series(math.nan, found.index)).to_numpy(dtype=np.float64) for c in _COLUMNS}
+    except ValueError as error:
+        raise InputError(f"the columns of an FCD table must be numbers, but in '{path}': {error}") from None
+    return found["id"].astype(str).to_numpy(), found["kind"].to_numpy(), columns
+
+
+def catalogue() -> tuple[Metric, ...]:
+    """Return every installed metric, as it is meant for recorded traffic, where to have overtaken is no verdict."""
+    recorded = {m.name: m for m in (ttc_min(passed=HORIZON), d_min(passed=FAR))}
+    return tuple(recorded.get(name) or load("metrics", name) for name in names("metrics"))
+
+
+def near_pairs(recording: Recording, within: float) -> list[tuple[int, int]]:
+    """Return the pairs of road users whose centres are at some time at most `within` apart (m), sorted."""
+    m = len(recording.names)
+    user = np.repeat(np.arange(m), np.diff(recording.start))
+    order = np.argsort(recording.step, kind="stable")
+    ends = np.searchsorted(recording.step[order], np.arange(len(recording.time) + 1))
+    points = np.stack([recording.x, recording.y], axis=1)
+    found: set[int] = set()  # smaller * m + larger
+    for first, last in pairwise(ends.tolist()):
+        rows = order[first:last]
+        near = cKDTree(points[rows]).query_pairs(within, output_type="ndarray")
+        one, two = user[rows[near[:, 0]]], user[rows[near[:, 1]]]
+        found.update((np.minimum(one, two) * m + np.maximum(one, two)).tolist())
+    return [divmod(code, m) for code in sorted(found)]
+
+
+def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
+    """Yield a trace of the actors `ego` and `co` for every stretch of time steps at which both are there.
+
+    A stretch ends where a time step of the file lacks one of them, or where one was taken elsewhere. Its
+    time starts at the file's.
+    """
+    spans = [slice(recording.start[k], recording.start[k + 1]) for k in (ego, other)]
+    step_ego, step_other = (recording.step[s] for s in spans)
+    steps, at_ego, at_other = np.intersect1d(step_ego, step_other, assume_unique=True, return_indices=True)
+    rows = np.stack([at_ego + spans[0].start, at_other + spans[1].start], axis=1)  # (t, 2)
+    time = recording.time[steps]
+    moved = np.hypot(np.diff(recording.x[rows], axis=0), np.diff(recording.y[rows], axis=0)).max(axis=1)
+    cut = (np.diff(steps) > 1) | (moved > _FASTEST * np.diff(time))
+    who = [ego, other]
+    for part in np.split(np.arange(len(steps)), np.flatnonzero(cut) + 1):
+        if len(part) > 1:
+            r = rows[part]
+            yield Trace(
+                time[part], ("ego", "co"), recording.x[r], recording.y[r], recording.heading[r], recording.speed[r],
+                recording.acceleration[r], recording.length[who], recording.width[who], "recorded",
+            )  # fmt: skip
+
+
+def encounters(recording: Recording, within: float) -> Iterator[tuple[str, str, Trace]]:
+    """Yield ego, other and trace of every pair that comes near, each of the two as ego in turn.
+
+    Args:
+        recording: the traffic.
+        within: largest distance of the centres at which two matter to each other (m).
+    """
+    for one, two in near_pairs(recording, within):
+        for ego, other in ((one, two), (two, one)):
+            for trace in pair_traces(recording, ego, other):
+                yield recording.names[ego], recording.names[other], trace

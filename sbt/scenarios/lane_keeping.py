@@ -1,0 +1,152 @@
+"""Lane keeping: a winding road whose markings are hidden in places.
+
+Inputs, ranges, metric and critical interval are those of the scenario `Lane-Keeping` of the Driving
+Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882), whose frame is
+kept: the middle of ego's lane passes (-38, 121) at 3.9 degrees. What its text leaves open, the road's
+course and where the bars stand, is chosen here and named as a constant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from sbt.errors import InputError
+from sbt.metrics.lateral import Curve, lateral_metrics
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.space import ParameterSpace
+from sbt.problem.trace import Trace
+from sbt.sumo.actors import Actor, Obstacle, Scene, State, Until, VehicleType
+from sbt.sumo.ego import Ego
+from sbt.sumo.lane_keeping import LaneKeeping
+from sbt.sumo.simulation import SumoSimulation
+
+__all__ = ["BARS", "ROAD", "SCENARIO", "bars"]
+
+BEFORE = 30.0
+"""Road behind the start (m), so that the sensor sees markings all around."""
+_HEADING = math.radians(3.9)
+ROAD = Curve(
+    (-38.0 - BEFORE * math.cos(_HEADING), 121.0 - BEFORE * math.sin(_HEADING), _HEADING),
+    (
+        (BEFORE + 15.0, 0.0),
+        (15.0, 1 / 40), (42.0, 1 / 40),     # the left-hand bend
+        (20.0, -1 / 45), (35.0, -1 / 45),   # right-hand bends
+        (15.0, -1 / 35), (32.0, -1 / 35), (15.0, 0.0),
+        (25.0, 0.0),
+        (15.0, -1 / 40), (35.0, -1 / 40), (15.0, 0.0),
+        (30.0, 0.0),
+    ),
+)  # fmt: skip
+"""Middle of the lane; the network `winding` has this shape. Clothoids join straights and arcs."""
+LANE = 3.5
+"""Width of the lane (m)."""
+DASH, DASH_GAP = 4.0, 8.0
+"""Lengths of the dashes on the left and of the gaps between them (m); the right marking is continuous."""
+SPACING = 1.0
+"""Distance of the points along a marking that the sensor tells apart (m)."""
+BAR = (20.0, 2.5)
+"""Length and width of a bar (m): an articulated lorry's."""
+BARS = ((52.0, 6.0), (92.0, -6.0), (150.0, 7.0), (262.0, -5.0))
+"""Where the middle of each bar is: distance after the start along the road, and to its left (m). From there it
+turns with its input, so that it lies beside the road or with one end over it. It hides, but bars nobody's way."""
+END = 20.0
+"""The run ends so far before the end of the road (m)."""
+LOST = 6.0
+"""Distance from the middle of the lane at which the run ends as lost (m)."""
+DURATION = 70.0
+CAR = VehicleType(length=5.0, width=1.8)
+
+
+def bars(values: Mapping[str, float]) -> tuple[Obstacle, ...]:
+    """Return the four bars, turned as the inputs say."""
+    placed = []
+    for k, (s, left) in enumerate(BARS, start=1):
+        x, y = ROAD.beside(np.array([BEFORE + s]), left)[0]
+        placed.append(Obstacle(f"bar_{k}", (float(x), float(y), math.radians(values[f"theta_obs_{k}"])), *BAR))
+    return tuple(placed)
+
+
+def markings() -> tuple[np.ndarray, np.ndarray]:
+    """Return the (n, 2) points of the dashed left and of the continuous right marking."""
+    s = np.arange(0.0, ROAD.length, SPACING)
+    return ROAD.beside(s[s % (DASH + DASH_GAP) <= DASH], 0.5 * LANE), ROAD.beside(s, -0.5 * LANE)
+
+
+LEFT, RIGHT = markings()
+
+
+def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
+    """Return ego at its pose, and the bars."""
+    speed = values["v_ego"] / 3.6
+    hidden_by = bars(values)
+    driver = ego.driver(
+        rng, speed, preview=values["f_t"], p=values["f_p"], i=values["f_i"], d=values["f_d"], lag_1=values["v_t_1"],
+        lag_2=values["v_t_2"], delay=values["v_delay"], left=LEFT, right=RIGHT, lane=LANE, obstacles=hidden_by,
+    )  # fmt: skip
+    if driver is None:
+        raise InputError("ego.kind must be a controller in lane_keeping: SUMO's own models see no markings")
+    pose = (values["x_ego"], values["y_ego"], math.radians(values["theta_ego"]))
+    signals = {}
+    if isinstance(driver, LaneKeeping):
+        sensor = driver.sensor
+        signals = {"seen_left": lambda: float(sensor.seen[0]), "seen_right": lambda: float(sensor.seen[1])}
+    return Scene((Actor("ego", ("road",), 0, BEFORE, speed, driver, CAR, pose),), until_over(), hidden_by, signals)
+
+
+def until_over() -> Until:
+    """Return the rule that ends the run: ego has come to the end of the road, or lost it."""
+
+    def over(t: float, states: Mapping[str, State]) -> str | None:
+        s, left, _ = ROAD.project(states["ego"].x, states["ego"].y)
+        if abs(left) > LOST:
+            return "lost"
+        return "passed" if s > ROAD.length - END else None
+
+    return over
+
+
+def _lane_lost(trace: Trace) -> float:
+    if "seen_left" not in trace.signals:
+        return 0.0
+    return float(min(trace.signal("seen_left").min(), trace.signal("seen_right").min()) < 1.0)
+
+
+LANE_LOST = Metric("lane_lost", _lane_lost, "", "high", 0.0, "the sensor saw nothing of one marking at some time")
+
+SCENARIO = LogicalScenario(
+    name="lane_keeping",
+    description=(
+        "Lane keeping: a winding road whose markings are hidden in places.\n"
+        "A one-lane road with a left-hand bend, right-hand bends, a straight and a right-hand bend. Ego's sensor sees the "
+        "markings within 20 m except where one of four bars hides them; a PID with preview keeps it in the lane."
+    ),
+    space=ParameterSpace(
+        (
+            Parameter("x_ego", -38.5, -37.5, "m", description="x of ego at the start"),
+            Parameter("y_ego", 120.5, 121.5, "m", description="y of ego at the start"),
+            Parameter("theta_ego", 3.7, 4.1, "deg", description="heading of ego at the start"),
+            Parameter("v_ego", 20.0, 40.0, "km/h", description="speed of ego"),
+            Parameter("theta_obs_1", -120.0, -45.0, "deg", description="orientation of bar 1"),
+            Parameter("theta_obs_2", -105.0, 25.0, "deg", description="orientation of bar 2"),
+            Parameter("theta_obs_3", 90.0, 110.0, "deg", description="orientation of bar 3"),
+            Parameter("theta_obs_4", 90.0, 110.0, "deg", description="orientation of bar 4"),
+            Parameter("f_t", 0.2, 0.4, "s", description="preview time of the controller"),
+            Parameter("f_p", 0.15, 0.25, "1/s^2", description="gain on the lateral error"),
+            Parameter("f_i", 0.002, 0.005, "1/s^3", description="gain on its integral"),
+            Parameter("f_d", 0.6, 1.2, "1/s", description="gain on its rate"),
+            Parameter("v_t_1", 0.1, 0.2, "s", description="first lag of the steering"),
+            Parameter("v_t_2", 0.005, 0.015, "s", description="second lag of the steering"),
+            Parameter("v_delay", 0.0, 0.1, "s", description="dead time of the steering"),
+        )
+    ),
+    simulate=SumoSimulation(
+        net="winding", scene=scene, duration=DURATION, step_length=0.05, ego=Ego("lane_keeping"),
+    ),
+    metrics=(*lateral_metrics(ROAD), LANE_LOST),
+    requirement=Requirement("pos_lat_abs_err_max", CriticalInterval(low=3.0)),
+)  # fmt: skip

@@ -1,0 +1,268 @@
+"""The store: what was acknowledged is there, whatever happened afterwards."""
+
+from __future__ import annotations
+
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sbt.errors import StoreError
+from sbt.history import VALIDATION, History
+from sbt.problem.outcome import Outcome, Status
+from sbt.store import DATABASE, PlannedRun, Store
+
+CONFIGURATION = {"names": ["a", "b"], "seed": 3}
+BATCH = [PlannedRun("initial", {"a": 0.1 * k, "b": 1 / 3}, -0.5 if k % 2 else None) for k in range(5)]
+
+
+def planned(folder: Path) -> Store:
+    store = Store.open(folder, CONFIGURATION)
+    store.plan(0, "initial", BATCH, [10, 11, 12, 13, 14], {"method": "rejection"})
+    return store
+
+
+def outcome(k: int, y: float = 0.1) -> Outcome:
+    return Outcome(k, Status.OK, {"y": y + k, "z": -1 / 3}, "", 0.01, "ego>co@1.2")
+
+
+def test_rows_come_back_to_the_last_bit(tmp_path: Path):
+    with planned(tmp_path / "s") as store:
+        assert [(j.index, j.inputs, j.seed) for j in store.unfinished()] == [
+            (k, {"a": 0.1 * k, "b": 1 / 3}, 10 + k) for k in range(5)
+        ]
+        for k in (3, 0):
+            store.append(outcome(k), "sbt 1")
+        store.append(Outcome(1, Status.TIMEOUT, {}, "too long: 60 s ünd 'quotes'"))
+        store.add_fit(3, 1, {"rmse": 0.1, "sides": "ff"})
+        assert [j.index for j in store.unfinished()] == [2, 4]
+        assert store.counts == {"ok": 2, "timeout": 1, "planned": 2}
+    with Store.read(tmp_path / "s") as store:
+        history = store.history()
+        assert (store.planned, len(history)) == (5, 3)
+        assert store.configuration == CONFIGURATION
+        assert store.iterations() == [{"iteration": 0, "stage": "initial", "method": "rejection"}]
+        assert store.fits() == [{"runs": 3, "iteration": 1, "rmse": 0.1, "sides": "ff"}]
+    np.testing.assert_array_equal(history.index, [0, 1, 3])
+    np.testing.assert_array_equal(history.x, [[0.0, 1 / 3], [0.1, 1 / 3], [0.1 * 3, 1 / 3]])
+    np.testing.assert_array_equal(history.y("y"), [0.1, np.nan, 3.1])
+    np.testing.assert_array_equal(history.ok, [True, False, True])
+    assert history.records[1].reason == "too long: 60 s ünd 'quotes'"
+    assert [r.log_q for r in history.records] == [None, -0.5, -0.5]
+    assert history.records[0].collisions == "ego>co@1.2"
+
+
+def test_a_frame_has_one_column_an_input_and_a_metric(tmp_path: Path):
+    with planned(tmp_path) as store:
+        store.append(outcome(0))
+        store.append(Outcome(1, Status.FAILED, {}, "why"))
+        frame = store.history().to_frame()
+    assert list(frame.columns) == [
+        "index", "stage", "iteration", "x.a", "x.b", "y.y", "y.z", "log_q", "status", "reason", "seed", "collisions", "seconds",
+        "versions",
+    ]  # fmt: skip
+    assert frame["status"].tolist() == ["ok", "failed"]
+    assert np.isnan(frame["y.y"][1])
+    assert np.isnan(frame["log_q"][0])
+    assert frame["log_q"][1] == -0.5
+    empty = History(("a",)).to_frame()
+    assert (len(empty), "x.a" in empty.columns) == (0, True)
+
+
+def test_a_history_keeps_held_out_runs_apart(tmp_path: Path):
+    with Store.open(tmp_path, CONFIGURATION) as store:
+        store.plan(0, "s", [*BATCH[:3], PlannedRun(VALIDATION, BATCH[3].inputs, 0.0)], [1, 2, 3, 4], {})
+        for k in (0, 2, 3):
+            store.append(outcome(k))
+        store.append(Outcome(1, Status.FAILED, {}, "no"))
+        history = store.history()
+    assert [r.index for r in history.training.records] == [0, 2]
+    assert [r.index for r in history.held_out.records] == [3]
+    assert History(("a", "b")).x.shape == (0, 2)
+    assert History(("a", "b")).metrics == ()
+
+
+def test_a_plan_is_all_or_nothing(tmp_path: Path):
+    with Store.open(tmp_path, CONFIGURATION) as store:
+        with pytest.raises(ValueError, match="Out of range"):
+            store.plan(0, "s", [*BATCH[:2], PlannedRun("s", {"a": float("nan")})], [1, 2, 3], {})
+        with pytest.raises(IndexError):
+            store.plan(0, "s", BATCH, [1, 2], {})
+        with pytest.raises(ValueError, match="Out of range"):
+            store.plan(0, "s", BATCH, [1, 2, 3, 4, 5], {"acceptance": float("inf")})
+        assert (store.planned, store.iterations()) == (0, [])
+        store.plan(0, "s", BATCH, [1, 2, 3, 4, 5], {})
+        with pytest.raises(StoreError):
+            store.plan(0, "s", BATCH, [1, 2, 3, 4, 5], {})  # the iteration is there already
+        assert store.planned == 5
+        assert len(store.history()) == 0
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from sbt.problem.outcome import Outcome, Status
+from sbt.store import PlannedRun, Store
+
+store = Store.open(Path(sys.argv[1]), {"names": ["a"]})
+store.plan(0, "s", [PlannedRun("s", {"a": k / 7}) for k in range(100000)], range(100000), {})
+for k in range(100000):
+    store.append(Outcome(k, Status.OK, {"y": k / 3}))
+    print(k, flush=True)
+"""
+
+
+def test_what_was_acknowledged_survives_a_kill(tmp_path: Path):
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path / "s")], stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    acknowledged = [int(writer.stdout.readline()) for _ in range(60)]
+    with Store.read(tmp_path / "s") as reader:  # while it is being written
+        first = len(reader.history())
+        assert first >= 60
+        assert reader.configuration == {"names": ["a"]}
+    writer.kill()
+    acknowledged += [int(line) for line in writer.stdout.read().splitlines()]
+    writer.wait()
+    writer.stdout.close()
+    db = sqlite3.connect(tmp_path / "s" / DATABASE)
+    assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    db.close()
+    with Store.open(tmp_path / "s", {}) as store:  # the lock went with the process
+        history = store.history()
+        assert store.planned == 100_000
+        assert len(history) - len(acknowledged) in (0, 1)  # the last one may be written and not told
+        assert [r.metrics["y"] for r in history.records] == [k / 3 for k in range(len(history))]
+
+
+def test_every_commit_is_synchronous(tmp_path: Path):
+    with planned(tmp_path) as store:
+        assert store._db.execute("PRAGMA synchronous").fetchone() == (2,)
+        assert store._db.execute("PRAGMA journal_mode").fetchone()[0] in ("wal", "delete")
+
+
+def test_one_writer_any_number_of_readers(tmp_path: Path):
+    with planned(tmp_path) as store:
+        with pytest.raises(StoreError, match="takes one writer, but another process is writing"):
+            Store.open(tmp_path, CONFIGURATION)
+        with Store.read(tmp_path) as one, Store.read(tmp_path) as two:
+            store.append(outcome(0))
+            assert len(one.history()) == len(two.history()) == 1
+            with pytest.raises(StoreError, match="must be readable and writable"):
+                one.append(outcome(1))
+        store.append(outcome(1))
+    with Store.open(tmp_path, CONFIGURATION) as store:
+        store.close()
+        store.close()
+
+
+def test_a_store_of_another_version_is_refused_and_untouched(tmp_path: Path):
+    planned(tmp_path).close()
+    db = sqlite3.connect(tmp_path / DATABASE)
+    db.execute("PRAGMA user_version = 99")
+    db.close()
+    for way in (Store.read, lambda folder: Store.open(folder, CONFIGURATION)):
+        with pytest.raises(StoreError, match="reads stores of version 1, but got version 99"):
+            way(tmp_path)
+        with pytest.raises(StoreError, match="version 99"):  # and not: another process is writing
+            way(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"SQLite format 3\x00" + b"\x00" * 50, b"not a database at all" * 400])
+def test_a_file_that_is_no_store_is_told(tmp_path: Path, content: bytes):
+    (tmp_path / DATABASE).write_bytes(content)
+    with pytest.raises(StoreError):
+        Store.read(tmp_path)
+
+
+def test_a_folder_that_cannot_be_is_told(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(StoreError, match="must be readable and writable"):
+            Store.open(folder, CONFIGURATION)
+    with pytest.raises(StoreError, match="there is none in"):
+        Store.read(tmp_path / "nothing")
+    (tmp_path / "folder" / DATABASE).mkdir(parents=True)
+    with pytest.raises(StoreError):
+        Store.open(tmp_path / "folder", CONFIGURATION)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_folder_can_be_read_and_not_written(tmp_path: Path):
+    with planned(tmp_path / "s") as store:
+        store.append(outcome(0))
+    (tmp_path / "s").chmod(0o500)
+    try:
+        with Store.read(tmp_path / "s") as store:
+            assert len(store.history()) == 1
+        with pytest.raises(StoreError, match="must be readable and writable"):
+            Store.open(tmp_path / "s", CONFIGURATION)
+    finally:
+        (tmp_path / "s").chmod(0o700)
+
+
+def full(folder: Path, monkeypatch: pytest.MonkeyPatch, pages: int) -> None:
+    """Let the disk be full after so many pages of 4 KiB."""
+    connect = sqlite3.connect
+
+    def limited(*args: Any, **settings: Any) -> sqlite3.Connection:
+        db = connect(*args, **settings)
+        db.execute(f"PRAGMA max_page_count = {pages}")
+        return db
+
+    monkeypatch.setattr("sbt.store.sqlite3.connect", limited)
+
+
+def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    planned(tmp_path).close()
+    size = (tmp_path / DATABASE).stat().st_size // 4096
+    with monkeypatch.context() as patch:
+        full(tmp_path, patch, size + 1)
+        with Store.open(tmp_path, CONFIGURATION) as store:
+            store.append(outcome(0))
+            with pytest.raises(StoreError, match="database or disk is full"):
+                store.append(Outcome(1, Status.OK, {"y": 1.0}, "x" * 20_000))
+            assert [r.index for r in store.history().records] == [0]
+            store.append(outcome(2))  # the failed transaction is not left open
+    with Store.open(tmp_path, CONFIGURATION) as store:
+        store.append(outcome(1))
+        assert [r.index for r in store.history().records] == [0, 1, 2]
+
+
+def test_a_campaign_on_a_full_disk_goes_on_when_there_is_room(
+    campaign: Callable[..., dict[str, Any]], rows: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+):
+    whole = campaign("whole", budget=300, initial=40, batch=40)
+    with monkeypatch.context() as patch:
+        full(Path(), patch, 20)
+        with pytest.raises(StoreError, match="database or disk is full"):
+            campaign("part", budget=300, initial=40, batch=40)
+    with Store.read(Path(whole["store"]).parent / "part") as store:
+        assert 0 < len(store.history()) < 300
+    assert campaign("part", budget=300, initial=40, batch=40)["runs"] == 300
+    assert rows(Path(whole["store"]).parent / "part") == rows(whole["store"])
+
+
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, 120_000))
+import signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+sys.argv = ["sumo-sbt", "run", sys.argv[1], "--json"]
+from sbt.cli import main
+main()
+"""
+
+
+def test_a_disk_that_refuses_ends_the_campaign_with_one_line(configured: Callable[..., Path], rows: Callable[..., Any]):
+    config = configured("c", budget=600, initial=100, batch=100)
+    done = subprocess.run([sys.executable, "-c", LIMITED, str(config)], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(r"the store must be readable and writable, but .*/c is not: .*\n", done.stderr)
+    assert 0 < len(rows(config.parent / "c")["runs"]) < 600

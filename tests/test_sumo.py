@@ -1,0 +1,379 @@
+"""The SUMO room: the same seed gives the same bits, the start is the one asked for, and no error gets through."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sbt import plugins
+from sbt.errors import InputError, RunError
+from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import run_job
+from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.problem.trace import Trace
+from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import run_seed, stream
+from sbt.sumo.actors import KEEP, Action, Actor, Scene, State, VehicleType
+from sbt.sumo.ego import Ego
+from sbt.sumo.session import libsumo
+from sbt.sumo.simulation import DEADLINE_STEPS, SumoSimulation
+
+pytestmark = pytest.mark.sumo
+
+CUT_IN: LogicalScenario = plugins.load("scenarios", "cut_in")
+BRAKING: LogicalScenario = plugins.load("scenarios", "emergency_braking")
+
+
+def points(scenario: LogicalScenario, n: int, seed: int = 0) -> list[dict[str, float]]:
+    """Even points where something happens: of the time gap the lower third."""
+    u = SobolSequence(scenario.space.dimension, seed).points(0, n)
+    u[:, scenario.space.names.index("d_t")] *= 0.3
+    return [dict(zip(scenario.space.names, row.tolist(), strict=True)) for row in scenario.space.from_unit(u)]
+
+
+def simulated(scenario: LogicalScenario, values: Mapping[str, float], seed: int = 1) -> Trace:
+    assert scenario.simulate is not None
+    return scenario.simulate(values, seed)
+
+
+class Constant:
+    """Gives the same action at every step."""
+
+    def __init__(self, action: Action):
+        self.action = action
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        return self.action
+
+
+class Calling:
+    """Acts as a function says."""
+
+    def __init__(self, function: Callable[[float, State], Action]):
+        self.function = function
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        return self.function(t, own)
+
+
+def driving(*actors: Actor, **settings: Any) -> SumoSimulation:
+    """A simulation of these actors on the straight road, 1 s long."""
+    chosen: dict[str, Any] = {"net": "straight", "duration": 1.0, "step_length": 0.05} | settings
+    return SumoSimulation(scene=lambda values, ego, rng: Scene(actors), **chosen)
+
+
+def car(name: str = "ego", position: float = 100.0, speed: float = 20.0, lane: int = 1, act: Any = None) -> Actor:
+    driver = Calling(act) if callable(act) else Constant(Action(speed=speed) if act is None else act)
+    return Actor(name, ("road",), lane, position, speed, driver, VehicleType(5.0, 1.8))
+
+
+def outcome(simulation: SumoSimulation, **inputs: float) -> Outcome:
+    requirement = Requirement("collision", CriticalInterval(low=1.0))
+    metrics = tuple(m for m in CUT_IN.metrics if m.name == "collision")
+    scenario = LogicalScenario("test", ParameterSpace(CUT_IN.space.parameters), requirement, simulation, metrics)
+    return run_job(scenario, Job(0, inputs, 1))
+
+
+def healthy() -> Trace:
+    return simulated(CUT_IN, {"d_v": 70.0, "d_t": 1.0}, 7)
+
+
+def test_the_seed_decides_every_bit():
+    for scenario in (CUT_IN, BRAKING):
+        differ = []
+        for values in points(scenario, 8):
+            one, two, other = (simulated(scenario, values, seed) for seed in (5, 5, 6))
+            assert one.identical(two)
+            assert not np.shares_memory(one.x, two.x)
+            differ.append(not one.identical(other))
+        assert sum(differ) >= 4  # the sensor's noise; where nothing is in the way it does not matter
+
+
+def test_a_kept_simulation_is_a_fresh_one_whatever_ran_before():
+    work = [(s, v, run_seed(1, k)) for s in (CUT_IN, BRAKING) for k, v in enumerate(points(s, 10))]
+    work = [work[k] for k in stream(2).permutation(len(work))]
+    kept = [simulated(s, v, seed) for s, v, seed in work]
+    for (scenario, values, seed), trace in zip(work, kept, strict=True):
+        assert isinstance(scenario.simulate, SumoSimulation)
+        assert scenario.simulate.isolations == ("fresh", "reuse")
+        assert replace(scenario.simulate, isolation="fresh")(values, seed).identical(trace)
+    assert len({(t.ended, len(t.time)) for t in kept}) > 8
+
+
+def test_positions_are_centres_and_start_as_asked():
+    trace = driving(car(position=100.0, speed=20.0, lane=0), car("co", 180.0, 10.0, 2))({}, 0)
+    assert trace.actors == ("ego", "co")
+    np.testing.assert_allclose(trace.x[0], [97.5, 177.5], atol=1e-9)  # front bumpers less half a length
+    np.testing.assert_allclose(trace.y[0], [-8.75, -1.75], atol=1e-9)
+    np.testing.assert_array_equal(trace.heading, 0.0)
+    np.testing.assert_array_equal(trace.speed, np.tile([20.0, 10.0], (21, 1)))
+    np.testing.assert_allclose(trace.x[-1] - trace.x[0], [20.0, 10.0], atol=1e-9)
+    np.testing.assert_allclose(trace.time, np.arange(21) * 0.05)
+    assert trace.ended == "duration"
+
+
+def test_a_controller_that_changes_nothing_keeps_its_speed():
+    trace = driving(car(act=KEEP), car("co", 180.0, 10.0, 2, act=Action(lane=0)))({}, 0)
+    np.testing.assert_array_equal(trace.speed, np.tile([20.0, 10.0], (21, 1)))
+
+
+def test_acceleration_is_integrated_by_the_trapezoidal_rule():
+    trace = driving(car(speed=20.0, act=Action(acceleration=-4.0)), duration=8.0)({}, 0)
+    t = np.minimum(trace.time, 5.0)
+    np.testing.assert_allclose(trace.speed[:, 0], 20 - 4 * t, atol=1e-9)
+    np.testing.assert_allclose(trace.x[:, 0] - trace.x[0, 0], 20 * t - 2 * t**2, atol=1e-6)
+    assert (trace.speed >= 0).all()
+    assert trace.acceleration[:100].min() == pytest.approx(-4.0)
+
+
+def test_two_at_the_same_place_are_a_collision_at_once_and_no_error():
+    found = outcome(driving(car(), car("co")))
+    assert (found.status, found.metrics["collision"]) == (Status.OK, 1.0)
+    assert driving(car(), car("co"))({}, 0).ended == "collision"
+
+
+@pytest.mark.parametrize(
+    ("actor", "reason"),
+    [
+        (car("co", position=5000.0), "co"),
+        (car("co", lane=7), "co"),
+        (car("co", speed=150.0), "co"),
+    ],
+    ids=["beyond the lane", "no such lane", "faster than the vehicle can"],
+)
+def test_a_start_that_sumo_does_not_give_is_invalid_or_failed_never_another(actor: Actor, reason: str):
+    found = outcome(driving(car(), actor))
+    assert found.status in (Status.INVALID, Status.FAILED)
+    assert reason in found.reason
+    assert found.metrics == {}
+    assert healthy().identical(healthy())
+
+
+def test_a_start_that_differs_tells_what_was_asked_and_what_was_given(monkeypatch: pytest.MonkeyPatch):
+    real = libsumo().vehicle.getSpeed
+    monkeypatch.setattr(libsumo().vehicle, "getSpeed", lambda name: real(name) - 0.5)
+    found = outcome(driving(car(speed=20.0)))
+    assert (found.status, found.reason) == (Status.INVALID, "ego must start with speed 20 m/s, but SUMO gave 19.5 m/s")
+
+
+def test_a_vehicle_that_leaves_the_road_fails_the_run():
+    found = outcome(driving(car(position=3990.0, speed=40.0)))
+    assert (found.status, "ego" in found.reason, found.metrics) == (Status.FAILED, True, {})
+    assert healthy().identical(healthy())
+
+
+@pytest.mark.parametrize(
+    "action",
+    [Action(acceleration=math.nan), Action(speed=math.nan), Action(speed=math.inf), Action(pose=(math.nan, 0.0, 0.0))],
+    ids=lambda a: repr(tuple(a)),
+)
+def test_numbers_that_are_not_finite_fail_the_run(action: Action):
+    before = healthy()
+    found = outcome(driving(car(act=action)))
+    assert (found.status, found.metrics) == (Status.FAILED, {})
+    assert "the controller of ego must give finite numbers, but gave" in found.reason
+    assert healthy().identical(before)
+
+
+def test_a_controller_that_raises_fails_the_run_at_its_line():
+    def act(t: float, own: State) -> Action:
+        if t > 0.3:
+            raise LookupError("no map here")
+        return KEEP
+
+    before = healthy()
+    found = outcome(driving(car(act=act)))
+    line = act.__code__.co_firstlineno + 2
+    assert (found.status, found.reason) == (Status.FAILED, f"LookupError: no map here ({__file__}:{line})")
+    assert healthy().identical(before)
+
+
+def test_what_sumo_says_on_its_error_stream_is_the_reason(capfd: pytest.CaptureFixture[str]):
+    before = healthy()
+    for simulation in (
+        driving(car(), options=("--route-files", "/nowhere/at_all.rou.xml")),
+        driving(car(), options=("--no-such-option", "1")),
+        driving(car(), replace(car("co"), route=("no_such_edge",))),
+    ):
+        found = outcome(simulation)
+        assert found.status == Status.FAILED
+        assert found.reason.startswith("SUMO: ")
+        assert any(word in found.reason for word in ("at_all.rou.xml", "no-such-option", "no_such_edge")), found.reason
+        assert "TraCIException" not in found.reason
+        assert healthy().identical(before)
+        assert pickle.loads(pickle.dumps(found)) == found
+    assert capfd.readouterr() == ("", "")
+
+
+def test_every_error_of_a_run_can_cross_a_process_border():
+    with pytest.raises(RunError) as caught:
+        driving(car(), replace(car("co"), route=("no_such_edge",)))({}, 0)
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert (again.status, again.reason) == (caught.value.status, caught.value.reason)
+
+
+def test_a_slow_run_is_a_timeout():
+    def act(t: float, own: State) -> Action:
+        import time
+
+        time.sleep(0.001)
+        return Action(speed=1.0)
+
+    slow = driving(car(act=act, speed=0.0), duration=0.05 * (DEADLINE_STEPS + 50))
+    assert outcome(slow.limited(30.0)).status == Status.OK
+    found = outcome(slow.limited(0.1))
+    assert found.status == Status.TIMEOUT
+    assert found.reason.startswith("a run must take at most 0.1 s, but it was at t = ")
+    assert outcome(slow.limited(None)).status == Status.OK
+
+
+def test_a_missing_network_is_told_before_the_first_run(tmp_path: Path):
+    for net in ("strait", str(tmp_path / "my.net.xml")):
+        with pytest.raises(InputError, match=r"a network must be one of .*straight.*, or an existing .net.xml file, but got '"):
+            driving(car(), net=net).prepare()
+    for content, reason in (("", "broken.net.xml"), ("<routes/>", "Invalid network")):
+        (tmp_path / "broken.net.xml").write_text(content)
+        found = outcome(driving(car(), net=str(tmp_path / "broken.net.xml")))
+        assert (found.status, reason in found.reason) == (Status.FAILED, True)
+        assert healthy().identical(healthy())
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: driving(step_length=0.0125), "whole milliseconds, but got step_length 0.0125 s"),
+        (lambda: driving(step_length=2.0), "0 < step_length <= duration must hold"),
+        (lambda: driving(duration=-1.0), "0 < step_length <= duration must hold"),
+        (lambda: driving(isolation="replicas"), "auto or fresh, reuse here, but got 'replicas'"),
+        (lambda: driving(options=("--seed", "3")), "--seed is set by sbt already"),
+        (lambda: VehicleType(length=0.0), "length > 0 and width > 0, but got 0.0 m"),
+        (lambda: Actor("a", ("road",), 0, math.nan, 1.0), "position must be finite"),
+        (lambda: Actor("a", ("road",), 0, 1.0, -1.0), "speed >= 0, but got"),
+        (lambda: Ego.of("acc_aab"), "did you mean 'acc_aeb'"),
+        (lambda: Ego.of("acc_aeb", reaction_tme=0.2), "ego settings must be ones that 'acc_aeb' takes, but got"),
+        (lambda: Ego.of("acc_aeb", aeb_braking=-3.0), "ego.aeb_braking must be a number >= 0, but got -3.0"),
+        (lambda: Ego.of("acc_aeb", aeb_braking="hard"), "ego.aeb_braking must be a number >= 0, but got 'hard'"),
+        (lambda: Ego.of("sumo", tau=[1]), "must be vType attributes"),
+        (lambda: ScenarioSpec("cut_in", ego={"kind": "sumo", "model": "IDM"}, isolation="reuse").resolve(), "auto or fresh here"),
+        (lambda: ScenarioSpec("cut_in", step_length=0.0333).resolve(), "whole milliseconds"),
+    ],
+)  # fmt: skip
+def test_wrong_settings_are_told_with_rule_and_value(build: Callable[[], Any], message: str):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_an_ego_of_sumo_runs_fresh_only_and_is_reproducible():
+    scenario = ScenarioSpec("cut_in", ego={"kind": "sumo", "model": "IDM", "tau": 1.2}).resolve()
+    assert scenario.isolations == ("fresh",)
+    values = {"d_v": 40.0, "d_t": 2.0}
+    one = simulated(scenario, values, 3)
+    assert one.identical(simulated(scenario, values, 3))
+    assert not one.identical(simulated(CUT_IN, values, 3))
+    assert one.speed[:, 0].min() < one.speed[0, 0] - 1  # it brakes
+    wrong = ScenarioSpec("cut_in", ego={"kind": "sumo", "model": "NoSuchModel"}).resolve()
+    found = run_job(wrong, Job(0, values, 1))
+    assert (found.status, "NoSuchModel" in found.reason) == (Status.FAILED, True)
+
+
+def test_an_own_controller_comes_from_a_file(tmp_path: Path):
+    (tmp_path / "own.py").write_text(
+        "from sbt.sumo.actors import Action\n\n\nclass Coward:\n"
+        "    def __init__(self, rng, set_speed, *, braking=1.0):\n        self.braking = braking\n\n"
+        "    def act(self, t, own, others):\n        return Action(acceleration=-self.braking)\n\n\nNOTHING = dict\n"
+    )
+    spec = ScenarioSpec("cut_in", ego={"kind": f"{tmp_path}/own.py:Coward", "braking": 2.5})
+    trace = simulated(spec.resolve(), {"d_v": 50.0, "d_t": 2.0})
+    assert trace.acceleration[1:, 0] == pytest.approx(-2.5)
+    for wrong in ({"kind": f"{tmp_path}/own.py:NOTHING"}, {"kind": f"{tmp_path}/own.py:Coward", "breaking": 1}):
+        with pytest.raises(InputError):
+            replace(spec, ego=wrong).resolve()
+
+
+def test_cut_in_has_both_sides_where_a_driver_expects_them():
+    critical = CUT_IN.requirement.critical
+    y = {
+        name: CUT_IN.measure(simulated(CUT_IN, {"d_v": v, "d_t": t}))
+        for name, (v, t) in {"far": (10.0, 9.0), "same speed": (0.0, 2.0), "near": (110.0, 0.5), "close": (60.0, 0.3)}.items()
+    }
+    assert not critical.contains(y["far"]["ttc_min"])
+    assert not critical.contains(y["same speed"]["ttc_min"])
+    assert critical.contains(y["near"]["ttc_min"])
+    assert critical.contains(y["close"]["ttc_min"])
+    assert y["far"]["collision"] == 0.0
+
+
+def test_ego_brakes_within_its_limits_and_never_drives_backwards():
+    hardest = 0.0
+    for scenario in (CUT_IN, BRAKING):
+        for k, values in enumerate(points(scenario, 16, seed=3)):
+            trace = simulated(scenario, values, k)
+            ego = trace.actors.index("ego")
+            assert trace.speed.min() >= 0.0
+            assert np.diff(trace.x[:, ego]).min() >= 0.0
+            hardest = min(hardest, float(trace.acceleration[:, ego].min()))
+            assert trace.acceleration[:, ego].max() <= 2.0 + 1e-6
+    assert -9.0 - 1e-6 <= hardest < -6.0  # aeb_braking is reached, and not exceeded
+
+
+def _median_ttc(scenario: LogicalScenario, values: Mapping[str, float], seeds: int = 5) -> float:
+    return float(np.median([scenario.measure(simulated(scenario, values, s))["ttc_min"] for s in range(seeds)]))
+
+
+def test_more_room_or_less_speed_makes_no_cut_in_worse():
+    for d_v in (30.0, 60.0, 90.0):
+        y = [_median_ttc(CUT_IN, {"d_v": d_v, "d_t": d_t}) for d_t in (1.0, 1.5, 2.0, 3.0, 5.0)]
+        assert (np.diff(y) >= -0.1).all(), (d_v, y)
+        assert y[-1] > y[0]
+
+
+def test_harsher_braking_ahead_makes_nothing_safer():
+    for d_t, v_co, v_ego in ((0.6, 120.0, 120.0), (1.0, 100.0, 130.0), (2.0, 90.0, 140.0)):
+        values = {"v_co_min_frac": 0.1, "d_t": d_t, "v_co": v_co, "v_ego": v_ego}
+        y = [_median_ttc(BRAKING, {**values, "a_co": a}) for a in (-1.0, -3.0, -5.0, -7.0, -10.0)]
+        assert (np.diff(y) <= 0.05).all(), (values, y)
+        assert y[-1] < y[0]
+
+
+def test_the_collision_verdict_is_sumos_where_sumo_has_one():
+    """SUMO looks at states only, we also between them; lateral contacts in a lane change are where they may differ."""
+    disagree, hits, n = [], 0, 0
+    for scenario in (CUT_IN, BRAKING):
+        for k, values in enumerate(points(scenario, 60, seed=5)):
+            trace = simulated(scenario, values, k)
+            collided = scenario.measure(trace)["collision"] == 1.0
+            assert collided == (trace.ended == "collision")
+            hits, n = hits + collided, n + 1
+            if collided != bool(trace.reported):
+                disagree.append((scenario.name, values, trace.reported))
+    assert hits > 10
+    assert len(disagree) <= 0.05 * n, disagree
+
+
+def test_ending_early_changes_no_metric():
+    simulation = CUT_IN.simulate
+    assert isinstance(simulation, SumoSimulation)
+
+    def endless(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
+        return replace(simulation.scene(values, ego, rng), until=None)
+
+    whole = replace(simulation, scene=endless)
+    ended = []
+    for k, values in enumerate(points(CUT_IN, 60, seed=9)):
+        trace = simulation(values, k)
+        ended.append(trace.ended)
+        if trace.ended in ("passed", "resolved"):
+            longer = whole(values, k)
+            assert len(longer.time) >= len(trace.time)
+            assert CUT_IN.measure(longer)["ttc_min"] == CUT_IN.measure(trace)["ttc_min"], values
+    assert ended.count("passed") + ended.count("resolved") > 10
