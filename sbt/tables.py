@@ -130,7 +130,8 @@ def _table_of(path: Path) -> Path:
 
 
 def _described(path: Path) -> dict[str, Any]:
-    from ruamel.yaml import YAML, YAMLError
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
 
     try:
         loaded = YAML(typ="safe").load(path.read_text(encoding="utf-8"))

@@ -117,8 +117,10 @@ class Trace:
         """Return one dictionary a time and actor, for a CSV file."""
         columns = ("x", "y", "heading", "speed", "acceleration")
         return [
-            {"time": float(t), "actor": name} | {c: float(getattr(self, c)[i, k]) for c in columns}
-            | {"length": float(self.length[k]), "width": float(self.width[k])}
+            {
+                "time": float(t), "actor": name, **{c: float(getattr(self, c)[i, k]) for c in columns},
+                "length": float(self.length[k]), "width": float(self.width[k]),
+            }
             for i, t in enumerate(self.time)
             for k, name in enumerate(self.actors)
         ]  # fmt: skip

@@ -58,6 +58,8 @@ END = 20.0
 """The run ends so far before the end of the road (m)."""
 LOST = 6.0
 """Distance from the middle of the lane at which the run ends as lost (m)."""
+BLIND = 1.0
+"""Time for which one marking is wholly unseen before it counts as lost (s)."""
 DURATION = 70.0
 CAR = VehicleType(length=5.0, width=1.8)
 
@@ -113,10 +115,14 @@ def until_over() -> Until:
 def _lane_lost(trace: Trace) -> float:
     if "seen_left" not in trace.signals:
         return 0.0
-    return float(min(trace.signal("seen_left").min(), trace.signal("seen_right").min()) < 1.0)
+    blind = np.minimum(trace.signal("seen_left"), trace.signal("seen_right")) < 1.0
+    last_seen = np.maximum.accumulate(np.where(blind, -np.inf, trace.time))
+    return float(np.any(trace.time - np.maximum(last_seen, 0.0) >= BLIND))
 
 
-LANE_LOST = Metric("lane_lost", _lane_lost, "", "high", 0.0, "the sensor saw nothing of one marking at some time")
+LANE_LOST = Metric(
+    "lane_lost", _lane_lost, "", "high", 0.0, f"the sensor saw nothing of one marking for {BLIND:g} s (0 for an own ego)"
+)
 
 SCENARIO = LogicalScenario(
     name="lane_keeping",

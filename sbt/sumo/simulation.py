@@ -265,7 +265,7 @@ def _trace(
     length, width = np.array([a for a, _ in sizes]), np.array([b for _, b in sizes])
     signals = {name: np.array([row[k] for row in heard]) for k, name in enumerate(scene.signals)}
     return Trace(
-        np.arange(len(table)) * dt,
+        np.arange(len(table), dtype=np.float64) * dt,
         tuple(names),
         x,
         y,
