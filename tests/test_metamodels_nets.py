@@ -33,7 +33,7 @@ from sbt.testing import check_metamodel
 
 JAYWALKING = Path(__file__).resolve().parents[2] / "shared" / "data" / "dsiod_jaywalking"
 QUICK = {
-    "ensemble": Ensemble(members=3, layers=2, width=24, steps=60, learning_rate=0.02),
+    "ensemble": Ensemble(members=3, layers=2, width=24, steps=80, learning_rate=0.02, decay=20.0),
     "bnn": BayesianNetwork(widths=(32, 32), max_steps=80, samples=10, learning_rate=0.02),
     "dgp": DeepGaussianProcess(inducing=15, samples=5, max_epochs=12, learning_rate=0.1),
     "dspp": DeepSigmaPointProcess(inducing=15, max_epochs=12, learning_rate=0.1),

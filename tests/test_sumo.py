@@ -241,7 +241,7 @@ def test_a_missing_network_is_told_before_the_first_run(tmp_path: Path):
     for net in ("strait", str(tmp_path / "my.net.xml")):
         with pytest.raises(InputError, match=r"a network must be one of .*straight.*, or an existing .net.xml file, but got '"):
             driving(car(), net=net).prepare()
-    for content, reason in (("", "broken.net.xml"), ("<routes/>", "Invalid network")):
+    for content, reason in (("", "well-formed"), ("<routes/>", "root <net")):
         (tmp_path / "broken.net.xml").write_text(content)
         found = outcome(driving(car(), net=str(tmp_path / "broken.net.xml")))
         assert (found.status, reason in found.reason) == (Status.FAILED, True)
@@ -377,3 +377,22 @@ def test_ending_early_changes_no_metric():
             assert len(longer.time) >= len(trace.time)
             assert CUT_IN.measure(longer)["ttc_min"] == CUT_IN.measure(trace)["ttc_min"], values
     assert ended.count("passed") + ended.count("resolved") > 10
+
+
+@pytest.mark.parametrize("text", ["<net></net>", "<net version='1.20'><edge", "no xml", "<routes version='1'/>"])
+def test_a_file_that_is_no_network_is_refused_before_sumo_sees_it(tmp_path: Path, text: str):
+    (tmp_path / "bad.net.xml").write_text(text)
+    with pytest.raises(InputError, match="a network must"):
+        driving(car(), net=str(tmp_path / "bad.net.xml")).prepare()
+
+
+def test_an_error_between_a_move_and_the_next_step_leaves_the_next_run_whole():
+    # SUMO keeps a pointer to what moveToXY moved until its next step, and a new load deletes that vehicle
+    before = healthy()
+    for _ in range(3):
+        first = Action(pose=(120.0, -5.25, 0.0), speed=10.0)
+        moved = Actor("mover", ("road",), 1, 100.0, 20.0, Constant(first), VehicleType(5.0, 1.8), pose=(97.5, -5.25, 0.0))
+        broken = car("ego", 200.0, act=lambda t, own: Action(speed=float("nan")))
+        with pytest.raises(RunError, match="finite"):
+            driving(moved, broken)({}, 0)
+        assert healthy().identical(before)

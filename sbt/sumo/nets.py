@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import xml.parsers.expat
 from functools import cache
 from pathlib import Path
 
@@ -35,4 +37,24 @@ def net_file(net: str) -> Path:
     if not path.is_file():
         known = ", ".join(sorted(p.name for p in nets_folder().iterdir() if p.is_dir()))
         raise InputError(f"a network must be one of {known}, or an existing .net.xml file, but got '{net}'")
+    _check_well_formed(path)
     return path.resolve()
+
+
+def _check_well_formed(path: Path) -> None:
+    """Refuse a file that is no network: libsumo does not raise on one, it ends the process."""
+    roots: list[tuple[str, dict[str, str]]] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if not roots:
+            roots.append((tag, attributes))
+
+    parser = xml.parsers.expat.ParserCreate()
+    parser.StartElementHandler = start
+    try:
+        with (gzip.open(path) if path.suffix == ".gz" else path.open("rb")) as file:
+            parser.ParseFile(file)
+    except (xml.parsers.expat.ExpatError, OSError, EOFError) as error:
+        raise InputError(f"a network must be well-formed XML, but {path} is not: {error}") from None
+    if not roots or roots[0][0] != "net" or "version" not in roots[0][1]:
+        raise InputError(f"a network must have the root <net version=...>, but {path} has not; make it with netconvert")

@@ -44,6 +44,7 @@ def insert(sumo: Any, scene: Scene) -> None:
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(actor.name, 32)
                 sumo.vehicle.setLaneChangeMode(actor.name, 0)
+                sumo.vehicle.setSpeed(actor.name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
         if actor.pose is not None:
             mover(sumo, actor)(actor.pose)
     for obstacle in scene.obstacles:

@@ -130,6 +130,7 @@ class Session:
                 self._setup = None
                 if isinstance(error, (self._sumo.TraCIException, self._sumo.FatalTraCIError)):
                     raise RunError(Status.FAILED, self._reason(error)) from None
+                self._flush()
                 raise
 
     def route(self, edges: tuple[str, ...]) -> str:
@@ -155,6 +156,11 @@ class Session:
         else:
             self._sumo.start(["sumo", *command])
         self._setup = setup if isolation == "reuse" else None
+
+    def _flush(self) -> None:
+        """Step once: SUMO keeps pointers to actors that were moved since the last step, which the next load deletes."""
+        with contextlib.suppress(self._sumo.TraCIException, self._sumo.FatalTraCIError):
+            self._sumo.simulationStep()
 
     def _clear(self) -> None:
         if self._setup is not None:
