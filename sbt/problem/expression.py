@@ -55,8 +55,9 @@ class Expression:
         with np.errstate(all="ignore"):
             _evaluate(self._tree(), dict.fromkeys(names, np.ones(1)), self.text)
             for node in ast.walk(self._tree()):
-                constant = isinstance(node, ast.BinOp) and not any(isinstance(n, ast.Name) for n in ast.walk(node))
-                if constant and not np.isfinite(_evaluate(node, {}, self.text)):
+                if not isinstance(node, ast.BinOp) or any(isinstance(part, ast.Name) for part in ast.walk(node)):
+                    continue
+                if not np.isfinite(_evaluate(node, {}, self.text)):
                     raise InputError(f"a constant in '{self.text}' must be finite, but got {ast.unparse(node)}")
 
     def _tree(self) -> ast.expr:
