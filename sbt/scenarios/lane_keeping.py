@@ -49,15 +49,18 @@ DASH, DASH_GAP = 4.0, 8.0
 """Lengths of the dashes on the left and of the gaps between them (m); the right marking is continuous."""
 SPACING = 1.0
 """Distance of the points along a marking that the sensor tells apart (m)."""
-BAR = (20.0, 2.5)
-"""Length and width of a bar (m): an articulated lorry's."""
-BARS = ((52.0, 6.0), (92.0, -6.0), (150.0, 7.0), (262.0, -5.0))
-"""Where the middle of each bar is: distance after the start along the road, and to its left (m). From there it
-turns with its input, so that it lies beside the road or with one end over it. It hides, but bars nobody's way."""
+BAR = (20.0, 4.0)
+"""Length and width of a bar (m)."""
+BARS = ((52.0, 2.0), (92.0, -2.0), (150.0, 2.0), (262.0, -2.0))
+"""Where the middle of each bar is: distance after the start along the road, and to the left of the middle of the
+lane (m), just beyond the marking. There it turns with its input: along the road it lies beside it and over its edge,
+else across it. It hides, but bars nobody's way."""
 END = 20.0
 """The run ends so far before the end of the road (m)."""
 LOST = 6.0
 """Distance from the middle of the lane at which the run ends as lost (m)."""
+LOOK = 0.2
+"""Period at which the end of the run is looked for (s)."""
 BLIND = 1.0
 """Time for which one marking is wholly unseen before it counts as lost (s)."""
 DURATION = 70.0
@@ -101,9 +104,14 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def until_over() -> Until:
-    """Return the rule that ends the run: ego has come to the end of the road, or lost it."""
+    """Return the rule that ends the run: ego has come to the end of the road, or lost it; looked at every 0.2 s."""
+    due = 0.0
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
+        nonlocal due
+        if t < due - 1e-9:
+            return None
+        due = t + LOOK
         s, left, _ = ROAD.project(states["ego"].x, states["ego"].y)
         if abs(left) > LOST:
             return "lost"

@@ -35,12 +35,13 @@ class MarkingSensor:
         seen: how many points of the left and of the right marking were seen last.
     """
 
-    _MEMORY = 0.3 * np.array([0.05, 2.0, 200.0, 2e5])
-    """Weight of the last fit's coefficients against that of one near point: (0.1 m noise / what may change in a tick)^2."""
+    _MEMORY = np.array([1.5, 60.0, 6e3, 6e6])
+    """Weight of the last coefficients in points^2 of information: little against two markings in full sight
+    (40, 3e3, 8e5, 2e8), much against the few points in front of an obstacle, so that noise does not steer."""
 
     def __init__(
         self, rng: np.random.Generator, left: np.ndarray, right: np.ndarray, *, lane: float,
-        obstacles: tuple[Obstacle, ...] = (), reach: float = 20.0, noise: float = 0.1,
+        obstacles: tuple[Obstacle, ...] = (), reach: float = 20.0, noise: float = 0.05,
     ):  # fmt: skip
         self._rng, self._reach, self._noise = rng, reach, noise
         self._points = np.concatenate([left, right])
@@ -54,18 +55,19 @@ class MarkingSensor:
         noise = self._noise * self._rng.standard_normal(len(self._points))
         eye = np.array([own.x, own.y])
         offset = self._points - eye
-        ahead = offset @ np.array([own.cos, own.sin])
-        near = np.flatnonzero((ahead > 0.0) & ((offset * offset).sum(axis=1) < self._reach**2))
+        ahead, left = (offset @ np.array([[own.cos, -own.sin], [own.sin, own.cos]])).T
+        near = np.flatnonzero((ahead > 0.0) & (ahead * ahead + left * left < self._reach**2))
         near = near[~self._boxes.hides(eye, self._points[near])]
         side = self._side[near]
-        self.seen = (int((side > 0).sum()), int((side < 0).sum()))
+        self.seen = (int(np.count_nonzero(side > 0)), int(np.count_nonzero(side < 0)))
         x = ahead[near]
-        y = offset[near] @ np.array([-own.sin, own.cos]) + noise[near]
+        y = left[near] + noise[near]
         _, c1, c2, c3 = self._fit
         turn = np.arctan(c1 + x * (2.0 * c2 + 3.0 * c3 * x))  # from a marking to the middle, across the lane as known
         x, y = x + side * np.sin(turn), y - side * np.cos(turn)
-        terms = np.array([np.ones_like(x), x, x * x, x * x * x])  # (4, n)
-        weighted = terms / (1.0 + (x / self._reach) ** 2)
+        square = x * x
+        terms = np.array([np.ones(len(x)), x, square, square * x])  # (4, n)
+        weighted = terms / (1.0 + square / self._reach**2)
         normal = weighted @ terms.T
         normal.flat[::5] += self._MEMORY
         self._fit = np.linalg.solve(normal, weighted @ y + self._MEMORY * self._fit)

@@ -52,7 +52,7 @@ def _check_well_formed(path: Path) -> None:
     parser = xml.parsers.expat.ParserCreate()
     parser.StartElementHandler = start
     try:
-        with (gzip.open(path) if path.suffix == ".gz" else path.open("rb")) as file:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             parser.ParseFile(file)
     except (xml.parsers.expat.ExpatError, OSError, EOFError) as error:
         raise InputError(f"a network must be well-formed XML, but {path} is not: {error}") from None

@@ -64,8 +64,9 @@ class Boxes:
         along = (points - eye) @ self._axes  # (m, n, 2)
         along = np.where(along == 0.0, _NEVER, along)
         first, last = (-self._half - start) / along, (self._half - start) / along
-        enter = np.minimum(first, last).max(axis=2)  # (m, n)
-        leave = np.maximum(first, last).min(axis=2)
+        near, far = np.minimum(first, last), np.maximum(first, last)
+        enter = np.maximum(near[..., 0], near[..., 1])  # (m, n); faster than a reduction over two
+        leave = np.minimum(far[..., 0], far[..., 1])
         hit = (enter < leave) & (leave > 0.0) & (enter < 1.0)
         return np.asarray(hit.any(axis=0))
 
