@@ -109,7 +109,7 @@ def settings_of(loaded: Loaded, parts: Assembly) -> Settings:
         parts.scenario, config.seed, config.budget, config.initial, config.batch,
         config.validation.share if learner is not None and not recorded else 0.0,
         0 if recorded else config.validation.reference, learner,
-        parts.acquisition, config.stop.stable,
+        parts.acquisition, config.acquisition.kind, config.stop.model_dump(),
     )  # fmt: skip
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -44,8 +44,9 @@ class Settings:
         share: of every batch that is drawn at random and held out.
         reference: further held-out runs beyond the budget.
         learner: fits and scores the metamodel; None: no metamodel.
-        acquisition: log score of candidates.
-        stable: share of the space that may still change sides at the stop; None: go on to the budget.
+        acquisition: log score of candidates; None where the campaign chooses by a method of its own.
+        method: name of the acquisition or method, as configured.
+        stop: rules by name, None where one is off.
     """
 
     scenario: LogicalScenario
@@ -56,8 +57,9 @@ class Settings:
     share: float
     reference: int
     learner: Learner | None
-    acquisition: Acquisition
-    stable: float | None = None
+    acquisition: Acquisition | None
+    method: str = ""
+    stop: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -83,10 +85,11 @@ class BatchStage:
         if s.scenario.pool is not None and len(log.history) >= len(s.scenario.pool.x):
             return "no rows left"
         chose = [fit for fit in log.fits if fit["iteration"] < log.iteration]  # a concluding fit chose no batch
-        if s.stable is not None and len(chose) >= 3:
+        stable = s.stop.get("stable")
+        if stable is not None and len(chose) >= 3:
             sides = [fit["sides"] for fit in chose[-3:]]
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
-            if max(moved) < s.stable:
+            if max(moved) < stable:
                 return "stable"
         return None
 
@@ -114,7 +117,7 @@ class BatchStage:
         critical = s.scenario.requirement.critical
 
         def score(u: Points) -> Vector:
-            if belief is None or not self.adaptive:
+            if belief is None or s.acquisition is None or not self.adaptive:
                 return np.zeros(len(u))
             return s.acquisition(belief.predict(u), critical, space.log_density(space.from_unit(u)))
 

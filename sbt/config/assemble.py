@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from sbt.acquisition import Acquisition, even
 from sbt.config.load import Loaded
-from sbt.config.model import Choice
+from sbt.config.model import CAMPAIGNS, Choice
 from sbt.config.source import Key, Problems, must_be_one_of
 from sbt.config.space import configured_space
 from sbt.execution.spec import ScenarioSpec
@@ -35,13 +35,13 @@ class Assembly:
         scenario: with the configured inputs and requirement.
         spec: the same scenario for other processes, as plain data.
         metamodel: settings, not fitted; None where the campaign learns nothing.
-        acquisition: how much a candidate is worth.
+        acquisition: how much a candidate is worth; None where the campaign has its own way (`methods`).
     """
 
     scenario: LogicalScenario
     spec: ScenarioSpec
     metamodel: Metamodel | None
-    acquisition: Acquisition
+    acquisition: Acquisition | None
 
 
 def assemble(loaded: Loaded) -> Assembly:
@@ -76,8 +76,8 @@ def metamodel_of(loaded: Loaded) -> Metamodel | None:
     return _without_problems(loaded, _metamodel)
 
 
-def acquisition_of(loaded: Loaded) -> Acquisition:
-    """Return the acquisition function.
+def acquisition_of(loaded: Loaded) -> Acquisition | None:
+    """Return the acquisition function, None where the campaign has its own way to choose.
 
     Raises:
         ConfigError: there is no such acquisition.
@@ -156,8 +156,10 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
     return made
 
 
-def _acquisition(loaded: Loaded, problems: Problems) -> Acquisition:
+def _acquisition(loaded: Loaded, problems: Problems) -> Acquisition | None:
     kind = loaded.config.acquisition.kind
+    if kind in CAMPAIGNS[loaded.config.campaign].methods:
+        return None
     found = problems.attempt(("acquisition", "kind"), lambda: load("acquisitions", kind, loaded.folder))
     if found is not None and not callable(found):
         problems.add(("acquisition", "kind"), f"an acquisition must be a function, but '{kind}' is not")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -38,22 +38,40 @@ __all__ = [
 
 @dataclass(frozen=True)
 class CampaignKind:
-    """What a campaign takes: its default acquisition, its stop rules, and whether it learns where to go."""
+    """What a campaign takes: its default acquisition, its stop rules, and whether it learns where to go.
+
+    Args:
+        description: for people.
+        acquisition: the default.
+        stop: its stop rules with their defaults; None: off unless asked for.
+        adaptive: it needs a metamodel.
+        methods: values of `acquisition.kind` that are the campaign's own ways to choose a batch, beside
+            the installed acquisition functions.
+    """
 
     description: str
     acquisition: str
-    stop: tuple[str, ...] = ()
+    stop: Mapping[str, float | int | None] = field(default_factory=dict)
     adaptive: bool = True
+    methods: tuple[str, ...] = ()
 
 
 CAMPAIGNS: Mapping[str, CampaignKind] = {
-    "boundary": CampaignKind("identify where critical meets uncritical", "boundary", stop=("stable",)),
+    "boundary": CampaignKind("identify where critical meets uncritical", "boundary", stop={"stable": None}),
+    "falsification": CampaignKind(
+        "find critical concrete scenarios, and distinct failure modes", "portfolio",
+        stop={"failures": None, "modes": None}, methods=("portfolio",),
+    ),
+    "estimation": CampaignKind(
+        "probability of a critical scenario under the inputs' distribution", "difference",
+        stop={"cov": 0.1}, methods=("difference",),
+    ),
     "coverage": CampaignKind("evenly distributed points: the baseline, and data sets", "even", adaptive=False),
 }
-"""The campaigns of this release."""
+"""The campaigns."""
 EXECUTORS = ("serial", "local")
 """The executors of this release."""
-_LATER = ("falsification", "estimation", "dask")
+_LATER = ("dask",)
 
 
 def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
@@ -275,7 +293,9 @@ class Configuration(_Strict):
         default_factory=_acquisition,
         description="How much a candidate is worth; default: boundary for boundary, even for coverage.",
     )
-    stop: StopRules = Field(default=StopRules(), description="When to stop before the budget is used up.")
+    stop: StopRules = Field(
+        default_factory=StopRules, validate_default=True, description="When to stop before the budget is used up."
+    )
     executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")
     store: Name = Field(default_factory=_store, description="Folder of the results; default: runs/<campaign>_<scenario>.")
 
@@ -305,10 +325,13 @@ class Configuration(_Strict):
     @field_validator("stop")
     @classmethod
     def _rules_fit_campaign(cls, value: StopRules, info: ValidationInfo) -> StopRules:
+        """Refuse another campaign's rules; what is not given has the campaign's default."""
         name = info.data.get("campaign")
-        allowed = CAMPAIGNS[name].stop if name is not None else tuple(StopRules.model_fields)
-        surplus = [rule for rule, limit in value.model_dump().items() if limit is not None and rule not in allowed]
+        if name is None:
+            return value
+        default = CAMPAIGNS[name].stop
+        surplus = [rule for rule, limit in value.model_dump().items() if limit is not None and rule not in default]
         if surplus:
-            known = ", ".join(allowed) or "none"
+            known = ", ".join(default) or "none"
             raise ValueError(f"a {name} campaign has the stop rules: {known}; but got {', '.join(surplus)}")
-        return value
+        return value.model_copy(update={k: v for k, v in default.items() if k not in value.model_fields_set})
