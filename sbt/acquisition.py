@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.special import ndtr
 
 from sbt.arrays import Vector
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Acquisition", "boundary", "even", "importance"]
+__all__ = ["Acquisition", "boundary", "even", "expected_feasibility", "importance", "straddle"]
 
 Acquisition = Callable[[Prediction, CriticalInterval, Vector], Vector]
 """(prediction, critical, log_density (n,)) -> (n,) log scores."""
@@ -89,3 +90,63 @@ def importance(prediction: Prediction, critical: CriticalInterval, log_density: 
     [-0.693, -1.386]
     """
     return prediction.log_probability(critical)[0] + log_density
+
+
+def straddle(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
+    """Ambiguity and uncertainty in one: log of max(1.96 sigma - |mu - z|, 0), z the nearest end of M_c.
+
+    In the unit of y and so not bounded by 0: for greedy choices, not for rejection.
+
+    Args:
+        prediction: belief about y at n points; its moments are used.
+        critical: M_c, in the unit of y.
+        log_density: (n,) log p(x); not used.
+
+    Returns:
+        (n,) log scores; -inf where the 95 % interval holds no end of M_c.
+
+    Source:
+        Bryan et al. (2005), Active learning for identifying function threshold boundaries, eq. (5).
+    """
+    del log_density
+    gap = np.min([np.abs(prediction.mu - z) for z in _ends(critical)], axis=0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.maximum(1.96 * prediction.sigma - gap, 0.0)))
+
+
+def expected_feasibility(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
+    """Expected feasibility: log E[max(2 sigma - |y - z|, 0)], the largest over the ends z of M_c.
+
+    In the unit of y and so not bounded by 0: for greedy choices, not for rejection.
+
+    Args:
+        prediction: belief about y at n points; its moments are used.
+        critical: M_c, in the unit of y.
+        log_density: (n,) log p(x); not used.
+
+    Returns:
+        (n,) log scores.
+
+    Source:
+        Bichon et al. (2008), doi 10.2514/1.34321, eq. (17), with epsilon = 2 sigma.
+    """
+    del log_density
+    mu, sigma = prediction.mu, prediction.sigma
+    best = np.zeros(len(mu))
+    for z in _ends(critical):
+        t = (z - mu) / sigma
+        (at, below, above), (p_at, p_below, p_above) = _normal(t, t - 2.0, t + 2.0)
+        value = 2.0 * (p_above - p_below) - (2.0 * at - below - above) - t * (2.0 * p_at - p_below - p_above)
+        best = np.maximum(best, sigma * value)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.maximum(best, 0.0)))
+
+
+def _normal(*t: Vector) -> tuple[list[Vector], list[Vector]]:
+    """Return the standard normal densities and distribution functions."""
+    return [np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) for x in t], [ndtr(x) for x in t]
+
+
+def _ends(critical: CriticalInterval) -> list[float]:
+    """Return the finite ends of the interval: where critical meets uncritical."""
+    return [z for z in (critical.low, critical.high) if np.isfinite(z)]

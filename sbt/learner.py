@@ -34,7 +34,9 @@ class Belief:
     Attributes:
         predict: (n, d) unit-cube points of the inputs to a `Prediction`.
         scores: on held-out runs, empty without them; plus `sides`, the classification of 4,096
-            fixed Sobol points as hexadecimal bits, and `critical_fraction`, the mean P(critical) there.
+            fixed Sobol points as hexadecimal bits, and over these points `critical_fraction`, the mean
+            P(critical), `expected_misclassified`, the mean of the smaller of P and 1 - P, and
+            `ambiguous_volume`, the share with P between 0.05 and 0.95.
         runs: rows it learned from.
         seconds: the fit took.
     """
@@ -98,6 +100,8 @@ class Learner:
         found: dict[str, Any] = scores(_chunked(predict, space.to_unit(x)), y, critical) if len(y) else {}
         p = self._probe(predict)
         found["critical_fraction"] = float(p.mean())
+        found["expected_misclassified"] = float(np.minimum(p, 1.0 - p).mean())
+        found["ambiguous_volume"] = float(((p > 0.05) & (p < 0.95)).mean())
         found["sides"] = np.packbits(p > 0.5).tobytes().hex()
         return found
 

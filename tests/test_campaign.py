@@ -127,7 +127,7 @@ def test_the_budget_is_kept_to_the_run(campaign: Run, budget: int, initial: int,
 
 
 def test_the_first_batch_is_the_sobol_sequence_and_no_point_comes_twice(campaign: Run):
-    found = history(campaign(budget=120, initial=40, batch=20, validation={"share": 0}))
+    found = history(campaign(budget=120, initial=40, batch=20, validation={"share": 0}, acquisition={"kind": "boundary"}))
     sequence = SobolSequence(2, 3).points(0, 20_000)
     np.testing.assert_array_equal(found.x[:40], sequence[:40])
     position = {tuple(u): k for k, u in enumerate(sequence.tolist())}

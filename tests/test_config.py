@@ -77,7 +77,7 @@ def test_every_key_has_a_default_but_campaign_and_scenario():
     config = parse(BASE).config
     assert (config.budget, config.initial, config.batch, config.seed) == (500, 50, 50, 0)
     assert config.metamodel is not None
-    assert (config.metamodel.kind, config.acquisition.kind) == ("gp", "boundary")
+    assert (config.metamodel.kind, config.acquisition.kind) == ("gp", "mix")
     assert config.store == "runs/boundary_plugin"
     assert config.executor.workers >= 1
 
@@ -162,7 +162,7 @@ def test_all_errors_at_once_each_at_its_place():
         ("simulation: {step_length: .inf}", "simulation.step_length: must be a finite number"),
         ("metamodel: null", "metamodel: a boundary campaign needs a metamodel, but got null"),
         ("metamodel: gp", "metamodel: must be a mapping (key: value), but got 'gp'"),
-        ("stop: {failures: 3}", "stop: a boundary campaign has the stop rules: stable; but got failures"),
+        ("stop: {failures: 3}", "stop: a boundary campaign has the stop rules: stable, misclassified; but got failures"),
         ("store: ' '", "store: must not be empty"),
         ("seed: 1\nseed: 2", "f.yaml:4:1: seed: a key must stand once in its mapping, but 'seed' stands already in line 3"),
         ("1: 2", "keys must be text, but got 1"),

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+from sbt.acquisition import boundary, expected_feasibility, straddle
 from sbt.campaign import Campaign, Fit, Log
+from sbt.campaigns.choices import Choice, from_roi, greedily, mixed
 from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
 from sbt.errors import InputError
 from sbt.history import VALIDATION
 
 __all__ = ["recipe"]
 
-_INTERNAL = ("sides", "critical_fraction")
+_VOLUMES = ("critical_fraction", "expected_misclassified", "ambiguous_volume")
+_INTERNAL = ("sides", *_VOLUMES)
+_GREEDY = {"u": boundary, "straddle": straddle, "expected_feasibility": expected_feasibility}
 
 
 def recipe(settings: Settings) -> Campaign:
     """Return the campaign: even first, then batches from the acquisition's region of interest.
 
-    The conclusion holds `critical_fraction`, the share of the input space that is critical as the
-    metamodel sees it (mean P(critical)), `held_out_fraction`, the same from the held-out random runs
-    with its interval and free of any model, and the validation scores on those runs.
+    The acquisition decides how: `mix` (greedy, a_BI at random, space filling), `u`, `straddle` and
+    `expected_feasibility` greedily, any acquisition function by rejection (`boundary`: the paper's).
+
+    The conclusion holds shares of the input space as the metamodel sees them: `critical_fraction`, the
+    mean P(critical), `expected_misclassified`, the mean of min(P, 1 - P), and `ambiguous_volume`,
+    where P lies between 0.05 and 0.95; `held_out_fraction`, the critical share from the held-out random
+    runs with its interval and free of any model; and the validation scores on those runs.
 
     Raises:
         InputError: no metamodel.
@@ -34,14 +43,21 @@ def recipe(settings: Settings) -> Campaign:
     def conclude(log: Log) -> tuple[dict[str, Any], Fit | None]:
         belief = learner.fit(log.history)
         held_out = log.history.where(log.history.stage == VALIDATION)
-        conclusion: dict[str, Any] = {"critical_fraction": None, "validation": None}
+        conclusion: dict[str, Any] = {**dict.fromkeys(_VOLUMES), "validation": None}
         if belief is not None:
-            conclusion["critical_fraction"] = belief.scores["critical_fraction"]
+            conclusion |= {name: belief.scores[name] for name in _VOLUMES}
             conclusion["validation"] = validation_of(belief.scores)
         conclusion["held_out_fraction"] = critical_share(held_out, settings.scenario)
         return conclusion, fit_of(belief)
 
-    return Campaign((BatchStage("boundary", settings, adaptive=True),), conclude)
+    return Campaign((BatchStage("boundary", *_choice(settings)),), conclude)
+
+
+def _choice(settings: Settings) -> tuple[Settings, Choice]:
+    """Return the rule that chooses batches, and the settings with its criterion."""
+    if settings.method in _GREEDY:
+        return replace(settings, acquisition=_GREEDY[settings.method]), greedily
+    return settings, from_roi if settings.acquisition is not None else mixed
 
 
 def validation_of(scores: dict[str, Any]) -> dict[str, Any] | None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from sbt.campaign import Campaign, Fit, Log
 from sbt.campaigns.boundary import validation_of
+from sbt.campaigns.choices import evenly
 from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
 
 __all__ = ["recipe"]
@@ -25,4 +26,4 @@ def recipe(settings: Settings) -> Campaign:
             conclusion["validation"] = validation_of(belief.scores)
         return conclusion, fit_of(belief)
 
-    return Campaign((BatchStage("even", settings, adaptive=False),), conclude)
+    return Campaign((BatchStage("even", settings, evenly),), conclude)

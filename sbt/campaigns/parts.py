@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -13,72 +13,36 @@ from scipy.special import betaincinv
 
 from sbt.arrays import Points, Vector
 from sbt.campaign import Batch, Fit, Log
+from sbt.campaigns.choices import Choice, evenly
+from sbt.campaigns.settings import Settings
 from sbt.history import VALIDATION, History
-from sbt.learner import Belief, Learner, changed_share
-from sbt.metamodels.prediction import Prediction
-from sbt.problem.requirement import CriticalInterval
+from sbt.learner import Belief, changed_share
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
-from sbt.samplers.pool import PoolSequence
-from sbt.samplers.roi import RoiDraw, rejection
-from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store import PlannedRun
 
-__all__ = ["Acquisition", "BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of"]
-
-Acquisition = Callable[[Prediction, CriticalInterval, Vector], Vector]
-
-_POSITION = "next_position"
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What every campaign is built from.
-
-    Args:
-        scenario: with the campaign's own space and requirement.
-        seed: of the campaign.
-        budget: runs, the held-out share included.
-        initial, batch: runs of the first and of each further iteration.
-        share: of every batch that is drawn at random and held out.
-        reference: further held-out runs beyond the budget.
-        learner: fits and scores the metamodel; None: no metamodel.
-        acquisition: log score of candidates; None where the campaign chooses by a method of its own.
-        method: name of the acquisition or method, as configured.
-        stop: rules by name, None where one is off.
-    """
-
-    scenario: LogicalScenario
-    seed: int
-    budget: int
-    initial: int
-    batch: int
-    share: float
-    reference: int
-    learner: Learner | None
-    acquisition: Acquisition | None
-    method: str = ""
-    stop: Mapping[str, Any] = field(default_factory=dict)
+__all__ = ["BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of"]
 
 
 @dataclass(frozen=True)
 class BatchStage:
-    """Batches from the region of interest, the first one evenly distributed.
+    """Batches chosen by one rule, the first one evenly distributed.
 
-    Each batch is drawn by rejection from one Sobol sequence that is continued from batch to batch; a
-    share of it is drawn at random instead and only scores the metamodel.
+    A share of each batch is drawn at random instead and only scores the metamodel.
 
-    Source:
-        Winkelmann et al. (2022), section V.
+    Args:
+        name: what its iterations are called in the store.
+        settings: of the campaign.
+        choose: the rule.
     """
 
     name: str
     settings: Settings
-    adaptive: bool
+    choose: Choice
 
     def stop(self, log: Log) -> str | None:
-        """Return `budget` once it is used up, `stable` where the boundary no longer moves."""
+        """Return why the stage is over: `budget`, `no rows left`, `stable` or `misclassified`; None: go on."""
         s = self.settings
         if log.iterations and len(log.history) - s.reference >= s.budget:
             return "budget"
@@ -91,7 +55,15 @@ class BatchStage:
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
             if max(moved) < stable:
                 return "stable"
-        return None
+        return "misclassified" if chose and self._sure(chose[-1]) else None
+
+    def _sure(self, fit: Mapping[str, Any]) -> bool:
+        """Say whether so little of the space is expected on the wrong side, and held-out runs do not deny it."""
+        target = self.settings.stop.get("misclassified")
+        if target is None or fit["expected_misclassified"] > target or not fit.get("n"):
+            return False
+        wrong = round(fit["error_rate"] * fit["n"])
+        return clopper_pearson(wrong, fit["n"])[0] <= target
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
@@ -101,51 +73,11 @@ class BatchStage:
         held_out = math.floor(s.share * (spent + size)) - math.floor(s.share * spent)
         held_out = min(held_out, size - 1) if size > 1 else 0
         belief = s.learner.fit(log.history) if s.learner is not None and not first else None
-        draw = self._draw(belief, log, size - held_out)
+        found = (evenly if first else self.choose)(s, belief, log, size - held_out)
         stage = "initial" if first else self.name
-        chosen = [PlannedRun(stage, _inputs(s.scenario, row)) for row in self._values(draw, log)]
+        chosen = [PlannedRun(stage, _inputs(s.scenario, row)) for row in found.x]
         random = self._held_out(log.iteration, held_out + (s.reference if first else 0))
-        how = {
-            "method": draw.method, "candidates": draw.candidates, "acceptance": draw.acceptance,
-            _POSITION: draw.next_position, "held_out": len(random),
-        }  # fmt: skip
-        return Batch((*chosen, *random), how, fit_of(belief))
-
-    def _draw(self, belief: Belief | None, log: Log, n: int) -> RoiDraw:
-        """Draw from the region of interest; evenly where there is no metamodel to ask."""
-        s, space = self.settings, self.settings.scenario.space
-        critical = s.scenario.requirement.critical
-
-        def score(u: Points) -> Vector:
-            if belief is None or s.acquisition is None or not self.adaptive:
-                return np.zeros(len(u))
-            return s.acquisition(belief.predict(u), critical, space.log_density(space.from_unit(u)))
-
-        admissible = (lambda u: space.feasible(space.from_unit(u))) if space.constraints else None
-        pool = self._pool(log)
-        if pool is not None:
-            n = min(n, len(pool))
-            return rejection(
-                score, pool, n, start=0, seed=s.seed, label=log.iteration, max_candidates=len(pool), accept_filter=admissible
-            )
-        start = int(log.iterations[-1][_POSITION]) if log.iterations else 0
-        sobol = SobolSequence(space.dimension, s.seed)
-        return rejection(score, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=admissible)
-
-    def _pool(self, log: Log) -> PoolSequence | None:
-        """Return the recorded rows that are left to choose from; None where runs are simulated."""
-        scenario = self.settings.scenario
-        if scenario.pool is None:
-            return None
-        u = np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0)
-        return PoolSequence(u, scenario.pool.taken(log.history.x), self.settings.seed)
-
-    def _values(self, draw: RoiDraw, log: Log) -> Points:
-        """Return the drawn points in the inputs' units, exactly as recorded where they are."""
-        scenario, pool = self.settings.scenario, self._pool(log)
-        if scenario.pool is None or pool is None:
-            return scenario.space.from_unit(draw.u)
-        return scenario.pool.x[pool.rows[draw.positions]]
+        return Batch((*chosen, *random), {**found.how, "held_out": len(random)}, fit_of(belief))
 
     def _held_out(self, iteration: int, n: int) -> list[PlannedRun]:
         """Return n uniform random runs of the box, with their log density."""

@@ -57,7 +57,10 @@ class CampaignKind:
 
 
 CAMPAIGNS: Mapping[str, CampaignKind] = {
-    "boundary": CampaignKind("identify where critical meets uncritical", "boundary", stop={"stable": None}),
+    "boundary": CampaignKind(
+        "identify where critical meets uncritical", "mix", stop={"stable": None, "misclassified": None},
+        methods=("mix", "u", "straddle", "expected_feasibility"),
+    ),
     "falsification": CampaignKind(
         "find critical concrete scenarios, and distinct failure modes", "portfolio",
         stop={"failures": None, "modes": None}, methods=("portfolio",),
@@ -175,9 +178,12 @@ class MetamodelChoice(Choice):
 
 
 class AcquisitionChoice(_Strict):
-    """The acquisition: how much a candidate is worth."""
+    """How runs are chosen: an acquisition function, or a method of the campaign."""
 
-    kind: Name = Field(description="even, boundary, importance, another installed name, or file.py:NAME.")
+    kind: Name = Field(
+        description="even, boundary, importance, another installed function, file.py:NAME, or a method of the campaign: "
+        + "; ".join(f"{name}: {', '.join(kind.methods)}" for name, kind in CAMPAIGNS.items() if kind.methods)
+    )
 
 
 class InputChange(_Strict):
@@ -217,6 +223,10 @@ class StopRules(_Strict):
     failures: int | None = Field(default=None, ge=1, description="Falsification: number of critical runs.")
     modes: int | None = Field(default=None, ge=1, description="Falsification: number of distinct failure modes.")
     stable: float | None = Field(default=None, gt=0, lt=1, description="Boundary: share of the space that still changes sides.")
+    misclassified: float | None = Field(
+        default=None, gt=0, lt=1,
+        description="Boundary: expected share of the space on the wrong side, not denied by held-out runs.",
+    )  # fmt: skip
     cov: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Estimation: coefficient of variation.")
 
 
@@ -291,7 +301,8 @@ class Configuration(_Strict):
     )
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,
-        description="How much a candidate is worth; default: boundary for boundary, even for coverage.",
+        description="How runs are chosen; default: mix for boundary, portfolio for falsification, "
+        "difference for estimation, even for coverage.",
     )
     stop: StopRules = Field(
         default_factory=StopRules, validate_default=True, description="When to stop before the budget is used up."

@@ -32,7 +32,7 @@ def scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> dic
     - `log_likelihood_critical`, `rmse_critical`: the same over critical runs.
     - `average_precision`, `precision_at_recall_90`: of P(y in M_c) as a ranking; the second is the
       largest precision among thresholds that find at least 90 % of the critical runs.
-    - `f1`: of the classification P(y in M_c) >= 0.5.
+    - `f1`, `error_rate`: of the classification P(y in M_c) >= 0.5.
     - `calibration_error`: expected calibration error of P(y in M_c), 15 bins of equal width.
     - `coverage_95`: share of y within the central 95 % of the mixture.
     - `base_rate`, `n`, `n_critical`: share of critical runs, runs, critical runs.
@@ -122,6 +122,7 @@ def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> di
         "calibration_error": _calibration_error(np.exp(log_p), mask),
         "coverage_95": _mean((level >= 0.025) & (level <= 0.975)),
         "base_rate": _mean(mask),
+        "error_rate": _mean((log_p >= log_not) != mask),
     }
     return {**result, "n": len(y), "n_critical": int(mask.sum())}
 

@@ -50,7 +50,8 @@ class RoiDraw:
         next_position: the position at which the next draw starts.
         candidates: admissible candidates that were scored.
         method: "rejection" (the exact density); "pool" (some points were picked from the rejected
-            candidates, see `rejection`); "even" (no candidate had a score above -inf).
+            candidates, see `rejection`); "even" (no candidate had a score above -inf); "smc" (particles
+            that took the place of a pool).
         acceptance: share of the scored candidates that rejection accepted, in [0, 1].
     """
 
@@ -58,7 +59,7 @@ class RoiDraw:
     positions: Positions
     next_position: int
     candidates: int
-    method: Literal["rejection", "pool", "even"]
+    method: Literal["rejection", "pool", "even", "smc"]
     acceptance: float
 
 

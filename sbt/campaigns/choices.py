@@ -1,0 +1,218 @@
+"""Ways to choose the runs of a batch: evenly, from the region of interest, and the boundary's mix.
+
+A choice is a function of the settings, the belief, the log and the number of runs wanted: nothing is
+remembered between batches but what the log says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sbt.acquisition import boundary, even
+from sbt.arrays import Mask, Points, Vector
+from sbt.campaign import Log
+from sbt.campaigns.settings import Acquisition, Settings
+from sbt.learner import Belief
+from sbt.samplers.greedy import diverse, influence, refined
+from sbt.samplers.pool import PoolSequence
+from sbt.samplers.roi import RoiDraw, rejection
+from sbt.samplers.smc import smc
+from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import stream
+
+__all__ = ["Choice", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
+
+_POSITION = "next_position"
+_FEW = 2**15  # candidates that the mix looks at by rejection before it turns to particles
+_CANDIDATES = 4096
+_RANDOM, _FILLING = 0.25, 0.15  # shares of the mix; the rest is chosen greedily
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The runs chosen, (n, d) in the inputs' units, and how (JSON)."""
+
+    x: Points
+    how: Mapping[str, Any]
+
+
+Choice = Callable[[Settings, Belief | None, Log, int], Chosen]
+
+
+def evenly(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
+    """Return the next n points of the Sobol sequence, or of a table's random order."""
+    del belief
+    draw, x = _draw(settings, None, even, log, n)
+    return Chosen(x, _how(draw))
+
+
+def from_roi(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
+    """Return n points with a density proportional to the acquisition, by rejection from the Sobol sequence.
+
+    Where that takes more than half a million candidates the points are particles of a sequential Monte
+    Carlo sampler instead (`method: smc`).
+
+    Source:
+        Winkelmann et al. (2022), section V-A.
+    """
+    acquisition = settings.acquisition if settings.acquisition is not None else boundary
+    draw, x = _draw(settings, belief, acquisition, log, n)
+    return Chosen(x, _how(draw))
+
+
+def greedily(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
+    """Return the n candidates of the highest acquisition that are far from each other and from earlier runs."""
+    if belief is None:
+        return evenly(settings, belief, log, n)
+    acquisition = settings.acquisition if settings.acquisition is not None else boundary
+    start = _position(log)
+    x, looked = _greedy(settings, belief, acquisition, log, n, np.empty((0, settings.scenario.space.dimension)))
+    if len(x) == n:
+        return Chosen(x, {"method": "greedy", "candidates": looked, "acceptance": None, _POSITION: start})
+    draw, rest = _draw(settings, belief, even, log, n - len(x), taken=x)
+    how = {"method": "greedy", "candidates": looked, "acceptance": None, _POSITION: draw.next_position, "even": len(rest)}
+    return Chosen(np.concatenate([x, rest]), how)
+
+
+def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
+    """Return a batch of three parts: greedy, random from a_BI, and space filling.
+
+    15 % fill the space, 25 % are drawn from a_BI as in the paper (they insure against a missed
+    mode), the others are chosen one by one by a_BI times the squared distance to the nearest run.
+    """
+    if belief is None:
+        return evenly(settings, belief, log, n)
+    filling, random = _rounded(_FILLING * n, log), _rounded(_RANDOM * n, log)
+    filling, random = min(filling, n), min(random, n - min(filling, n))
+    first, fill = _draw(settings, belief, even, log, filling)
+    second, drawn = _draw(settings, belief, boundary, log, random, taken=fill, start=first.next_position, most=_FEW)
+    so_far = np.concatenate([fill, drawn])
+    greedy, looked = _greedy(settings, belief, boundary, log, n - len(so_far), so_far)
+    so_far, last = np.concatenate([so_far, greedy]), second
+    if len(so_far) < n:  # nothing is in doubt
+        last, more = _draw(settings, belief, even, log, n - len(so_far), taken=so_far, start=second.next_position)
+        so_far = np.concatenate([so_far, more])
+    how = {
+        "method": "mix", "random": second.method, "candidates": second.candidates + looked,
+        "acceptance": second.acceptance, _POSITION: last.next_position, "filling": len(fill), "drawn": len(drawn),
+        "greedy": len(greedy),
+    }  # fmt: skip
+    return Chosen(so_far, how)
+
+
+def _rounded(wanted: float, log: Log) -> int:
+    """Return the number rounded so that over the iterations the share is right."""
+    return math.floor(wanted * (log.iteration + 1)) - math.floor(wanted * log.iteration)
+
+
+def _how(draw: RoiDraw) -> dict[str, Any]:
+    return {
+        "method": draw.method, "candidates": draw.candidates, "acceptance": draw.acceptance, _POSITION: draw.next_position,
+    }  # fmt: skip
+
+
+def _position(log: Log) -> int:
+    """Return where the Sobol sequence goes on."""
+    return int(log.iterations[-1][_POSITION]) if log.iterations else 0
+
+
+def _score(settings: Settings, belief: Belief | None, acquisition: Acquisition) -> Callable[[Points], Vector]:
+    space, critical = settings.scenario.space, settings.scenario.requirement.critical
+
+    def score(u: Points) -> Vector:
+        if belief is None or acquisition is even:
+            return np.zeros(len(u))
+        return acquisition(belief.predict(u), critical, space.log_density(space.from_unit(u)))
+
+    return score
+
+
+def _admissible(settings: Settings) -> Callable[[Points], Mask] | None:
+    space = settings.scenario.space
+    return (lambda u: space.feasible(space.from_unit(u))) if space.constraints else None
+
+
+def _draw(
+    settings: Settings, belief: Belief | None, acquisition: Acquisition, log: Log, n: int, *,
+    taken: Points | None = None, start: int | None = None, most: int = 2**19,
+) -> tuple[RoiDraw, Points]:  # fmt: skip
+    """Return n points drawn by an acquisition, and their values exactly as recorded where they are.
+
+    `taken` (k, d) are the rows of this batch so far in the inputs' units, `start` the position in the Sobol
+    sequence (None: where the last batch ended), `most` the candidates to look at before particles are used.
+    """
+    scenario = settings.scenario
+    score, label = _score(settings, belief, acquisition), f"{log.iteration}/{0 if taken is None else len(taken)}"
+    if scenario.pool is not None:
+        rows = _rows(settings, log, taken)
+        n = min(n, len(rows))
+        draw = rejection(
+            score, rows, n, start=0, seed=settings.seed, label=label, max_candidates=max(len(rows), 1),
+            accept_filter=_admissible(settings),
+        )  # fmt: skip
+        return draw, scenario.pool.x[rows.rows[draw.positions]]
+    sobol = SobolSequence(scenario.space.dimension, settings.seed)
+    begin = _position(log) if start is None else start
+    draw = rejection(
+        score, sobol, n, start=begin, seed=settings.seed, label=label, max_candidates=max(most, n),
+        accept_filter=_admissible(settings),
+    )  # fmt: skip
+    if draw.method == "pool":
+        draw = _particles(settings, score, draw, label, n)
+    return draw, scenario.space.from_unit(draw.u)
+
+
+def _particles(settings: Settings, score: Callable[[Points], Vector], draw: RoiDraw, label: str, n: int) -> RoiDraw:
+    """Return the draw with points of a sequential Monte Carlo sampler instead of picks among the rejected."""
+    rng, admissible = stream(settings.seed, "smc", label), _admissible(settings)
+
+    def inside(u: Points) -> Vector:
+        value = score(u)
+        return value if admissible is None else np.where(admissible(u), value, -np.inf)
+
+    found = smc(inside, settings.scenario.space.dimension, rng, particles=max(1024, 4 * n), start=max(4096, 4 * n))
+    if found is None:
+        return draw
+    distinct = np.unique(found.u, axis=0, return_index=True)[1]
+    if len(distinct) < n:
+        return draw
+    picks = rng.choice(distinct, n, replace=False)
+    return RoiDraw(found.u[picks], draw.positions, draw.next_position, draw.candidates, "smc", draw.acceptance)
+
+
+def _rows(settings: Settings, log: Log, taken: Points | None) -> PoolSequence:
+    """Return the recorded rows that are left to choose from."""
+    scenario = settings.scenario
+    if scenario.pool is None:
+        raise ValueError("only a recorded table has rows")
+    u = np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0)
+    gone = scenario.pool.taken(log.history.x)
+    if taken is not None and len(taken):
+        gone = gone | scenario.pool.taken(taken)
+    return PoolSequence(u, gone, settings.seed)
+
+
+def _greedy(
+    settings: Settings, belief: Belief, acquisition: Acquisition, log: Log, n: int, taken: Points
+) -> tuple[Points, int]:
+    """Return up to n points in the inputs' units, and the number of candidates looked at."""
+    scenario, space = settings.scenario, settings.scenario.space
+    rng = stream(settings.seed, "greedy", log.iteration)
+    score, admissible = _score(settings, belief, acquisition), _admissible(settings)
+    scale = influence(belief.predict, space.dimension, rng)
+    there = np.clip(space.to_unit(np.concatenate([log.history.x, taken])), 0.0, 1.0)
+    if scenario.pool is not None:
+        rows = _rows(settings, log, taken)
+        u = rows.points(0, len(rows))
+        picks = diverse(u, score(u), there, n, scale)
+        return scenario.pool.x[rows.rows[picks]], len(u)
+    u, value = refined(score, rng.random((_CANDIDATES, space.dimension)), scale, rng)
+    u = np.clip(space.to_unit(space.from_unit(u)), 0.0, 1.0)  # integers are what will be run
+    if admissible is not None:
+        value = np.where(admissible(u), value, -np.inf)
+    return space.from_unit(u[diverse(u, value, there, n, scale)]), len(u)

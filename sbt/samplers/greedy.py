@@ -1,0 +1,93 @@
+"""Greedy batches: the best candidates that are also far from every run there is.
+
+The score of a candidate is multiplied by its squared distance to the nearest run, measured in the
+inputs' influence on the metamodel's mean: an input without influence separates nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sbt.arrays import Points, Vector
+from sbt.metamodels.prediction import Prediction
+
+__all__ = ["diverse", "influence", "refined"]
+
+_KEEP, _CHILDREN, _ROUNDS = 60, 16, 3
+_PROBES = 128
+_LEAST = 0.05  # of the largest influence: an input the metamodel calls irrelevant may not be
+
+
+def influence(predict: Callable[[Points], Prediction], dimension: int, rng: np.random.Generator) -> Vector:
+    """Return (d,) how much each input moves the mean, the largest 1 and none below 0.05.
+
+    The root mean squared change of mu when one input is drawn anew, the others kept: the square root of
+    the total effect.
+
+    Source:
+        Jansen (1999), doi 10.1016/S0010-4655(98)00154-4.
+    """
+    base = rng.random((_PROBES, dimension))
+    changed = np.repeat(base[None], dimension, axis=0)  # (d, m, d)
+    for k, fresh in enumerate(rng.random((dimension, _PROBES))):
+        changed[k, :, k] = fresh
+    mu = predict(np.concatenate([base, changed.reshape(-1, dimension)])).mu
+    effect = np.sqrt(np.mean((mu[_PROBES:].reshape(dimension, _PROBES) - mu[:_PROBES]) ** 2, axis=1))
+    largest = effect.max()
+    return np.maximum(effect / largest, _LEAST) if largest > 0 else np.ones(dimension)
+
+
+def refined(
+    score: Callable[[Points], Vector], u: Points, scale: Vector, rng: np.random.Generator
+) -> tuple[Points, Vector]:
+    """Return candidates (m, d) and their log scores (m,): the given ones and ever closer ones around the best.
+
+    Args:
+        score: (m, d) points -> (m,) log scores.
+        u: (n, d) candidates to begin with.
+        scale: (d,) influence of the inputs; steps are longer where there is little.
+        rng: the only source of randomness.
+    """
+    found, value = u, score(u)
+    width = 0.1 / scale
+    for _ in range(_ROUNDS):
+        best = found[np.argsort(-value, kind="stable")[:_KEEP]]
+        step = width * rng.standard_normal((len(best) * _CHILDREN, u.shape[1]))
+        near = np.clip(np.repeat(best, _CHILDREN, axis=0) + step, 1e-9, 1 - 1e-9)
+        found, value = np.concatenate([found, near]), np.concatenate([value, score(near)])
+        width = width / 2.5
+    return found, value
+
+
+def diverse(u: Points, log_score: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
+    """Return the indices (<= n) of candidates chosen one by one by log score plus log squared distance.
+
+    Args:
+        u: (m, d) candidates.
+        log_score: (m,) what each is worth by itself.
+        there: (k, d) points that exist already.
+        n: how many to choose.
+        scale: (d,) what a unit of each input counts in the distance.
+
+    Returns:
+        (<= n,) indices of candidates with a score above -inf that are nobody's duplicate.
+
+    Source:
+        The product of misclassification probability and squared distance to the nearest run: a batch
+        form of the U criterion of Echard et al. (2011), doi 10.1016/j.strusafe.2011.01.002.
+    """
+    at = u * scale
+    nearest = cKDTree(there * scale).query(at)[0] ** 2 if len(there) else np.full(len(u), float(len(scale)))
+    chosen: list[int] = []
+    while len(chosen) < n:
+        with np.errstate(divide="ignore"):
+            value = log_score + np.log(nearest)
+        best = int(np.argmax(value))
+        if np.isneginf(value[best]):
+            break
+        chosen.append(best)
+        nearest = np.minimum(nearest, ((at - at[best]) ** 2).sum(axis=1))
+    return np.array(chosen, dtype=np.int64)

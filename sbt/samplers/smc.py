@@ -1,0 +1,139 @@
+"""Sequential Monte Carlo: points of a region of interest that is too small for rejection.
+
+Particles move from the uniform distribution to the density proportional to exp(score) through tempered
+ones, exp(t score) with t from 0 to 1. Unlike rejection the draws are only asymptotically of that density:
+they are marked as such in the log, and are never weighted as if the density were known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+
+__all__ = ["SmcDraw", "smc"]
+
+_MOVES = 4
+_TARGET_ESS = 0.5
+_TARGET_ACCEPTANCE = 0.3
+_MAX_LEVELS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class SmcDraw:
+    """Particles of the region of interest.
+
+    Args:
+        u: (m, d) particles in the unit cube.
+        log_score: (m,) their log scores.
+        log_mean: log of the mean of exp(score) over the cube, estimated.
+        levels: tempering steps that were needed.
+    """
+
+    u: Points
+    log_score: Vector
+    log_mean: float
+    levels: int
+
+
+def smc(
+    score: Callable[[Points], Vector], dimension: int, rng: np.random.Generator, *, particles: int = 1024, start: int = 4096
+) -> SmcDraw | None:
+    """Draw particles with a density proportional to exp(score(u)) on the unit cube.
+
+    Args:
+        score: (m, d) points -> (m,) log scores; -inf outside the region.
+        dimension: d.
+        rng: the only source of randomness.
+        particles: how many.
+        start: uniform points the first level is resampled from, at least as many.
+
+    Returns:
+        The particles; None where no uniform point has a score above -inf.
+
+    Raises:
+        InputError: start < particles or a score that is NaN.
+
+    Source:
+        Del Moral, Doucet and Jasra (2006), doi 10.1111/j.1467-9868.2006.00553.x; tempering with a bisected
+        effective sample size: Jasra et al. (2011).
+    """
+    if not 2 <= particles <= start:
+        raise InputError(f"smc needs 2 <= particles <= start, but got particles = {particles}, start = {start}")
+    u = rng.random((start, dimension))
+    log_score = _checked(score, u)
+    if np.isneginf(log_score).all():
+        return None
+    temper, log_mean, scale, levels = 0.0, 0.0, 0.3, 0
+    while temper < 1.0 and levels < _MAX_LEVELS:
+        step = _next(log_score, temper)
+        log_weight = step * log_score if levels else np.where(np.isneginf(log_score), -np.inf, step * log_score)
+        log_mean += float(logsumexp(log_weight) - np.log(len(log_weight)))
+        keep = _systematic(np.exp(log_weight - logsumexp(log_weight)), particles, rng)
+        u, log_score, temper, levels = u[keep], log_score[keep], temper + step, levels + 1
+        u, log_score, scale = _move(score, u, log_score, temper, scale, rng)
+    return SmcDraw(u, log_score, log_mean, levels)
+
+
+def _checked(score: Callable[[Points], Vector], u: Points) -> Vector:
+    found = np.asarray(score(u), dtype=np.float64)
+    if np.isnan(found).any():
+        raise InputError("a log score must not be NaN")
+    return found
+
+
+def _next(log_score: Vector, temper: float) -> float:
+    """Return the largest step of the temperature that keeps half of the effective sample size."""
+    left = 1.0 - temper
+
+    def size(step: float) -> float:
+        log_weight = np.where(np.isneginf(log_score), -np.inf, step * log_score)
+        return float(np.exp(2 * logsumexp(log_weight) - logsumexp(2 * log_weight)))
+
+    alive = int((~np.isneginf(log_score)).sum())
+    if size(left) >= _TARGET_ESS * alive:
+        return left
+    low, high = 0.0, left
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if size(middle) >= _TARGET_ESS * alive else (low, middle)
+    return max(low, 1e-12)
+
+
+def _systematic(weight: Vector, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Return n indices, each drawn in proportion to its weight."""
+    at = (rng.random() + np.arange(n)) / n
+    return np.minimum(np.searchsorted(np.cumsum(weight), at), len(weight) - 1)
+
+
+def _move(
+    score: Callable[[Points], Vector], u: Points, log_score: Vector, temper: float, scale: float, rng: np.random.Generator
+) -> tuple[Points, Vector, float]:
+    """Return the particles after a few Metropolis steps at this temperature, and the scale adapted to them.
+
+    The proposal is a difference of two other particles (it has their shape) plus a little of its own,
+    reflected at the faces of the cube.
+    """
+    n, d = u.shape
+    for _ in range(_MOVES):
+        a, b = rng.permutation(n), rng.permutation(n)
+        jump = scale * (u[a] - u[b]) + 0.02 * scale * rng.standard_normal((n, d))
+        proposed = _reflected(u + jump)
+        new = _checked(score, proposed)
+        gain = np.where(np.isneginf(new), -np.inf, temper * (new - np.where(np.isneginf(log_score), -1e300, log_score)))
+        accepted = np.log(rng.random(n)) < gain
+        u = np.where(accepted[:, None], proposed, u)
+        log_score = np.where(accepted, new, log_score)
+        scale = float(np.clip(scale * np.exp(accepted.mean() - _TARGET_ACCEPTANCE), 0.01, 1.5))
+    return u, log_score, scale
+
+
+def _reflected(u: Points) -> Points:
+    """Return points folded back into the unit cube."""
+    folded = np.abs(np.mod(u, 2.0))
+    return np.clip(np.where(folded > 1.0, 2.0 - folded, folded), 1e-12, 1.0 - 1e-12)

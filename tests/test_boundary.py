@@ -1,0 +1,145 @@
+"""Laws of what the boundary campaign chooses: particles, greedy picks, the mix, and when it is sure."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sbt.acquisition import expected_feasibility, straddle
+from sbt.config.load import parse
+from sbt.history import VALIDATION
+from sbt.metamodels.prediction import Prediction
+from sbt.problem.requirement import CriticalInterval
+from sbt.run import run_campaign
+from sbt.samplers.greedy import diverse, influence, refined
+from sbt.samplers.smc import smc
+from sbt.seeds import stream
+from sbt.store import Store
+
+
+def test_particles_have_the_density_of_the_score():
+    centre, width = np.array([0.3, 0.7, 0.5]), 0.02
+
+    def score(u: np.ndarray) -> np.ndarray:
+        return -0.5 * (((u - centre) / width) ** 2).sum(axis=1)
+
+    draw = smc(score, 3, stream(1, "smc"), particles=2000)
+    assert draw is not None
+    np.testing.assert_allclose(draw.u.mean(axis=0), centre, atol=4 * width / math.sqrt(500))
+    np.testing.assert_allclose(draw.u.std(axis=0), width, rtol=0.15)
+    assert draw.log_mean == pytest.approx(1.5 * math.log(2 * math.pi) + 3 * math.log(width), abs=0.3)
+
+
+def test_mean_of_nominal_over_proposal_is_the_volume_of_the_support():
+    """With q = a / Z on a support of volume V, the mean of Z / a over draws from q is V: of p / q it is 1."""
+
+    def score(u: np.ndarray) -> np.ndarray:
+        inside = (np.abs(u - 0.25) < 0.05).all(axis=1)
+        return np.where(inside, np.log(np.maximum(0.2 + 8.0 * (u[:, 0] - 0.2), 0.1)), -np.inf)
+
+    ratios = []
+    for seed in range(8):
+        draw = smc(score, 2, stream(seed, "law"), particles=1000)
+        assert draw is not None
+        assert np.isfinite(draw.log_score).all()
+        ratios.append(np.mean(np.exp(draw.log_mean - draw.log_score)) / 0.01)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=4 * np.std(ratios, ddof=1) / math.sqrt(8))
+    assert np.std(ratios) < 0.3
+
+
+def test_no_region_no_particles():
+    assert smc(lambda u: np.full(len(u), -np.inf), 2, stream(0, "none")) is None
+
+
+def test_influence_is_the_root_of_the_total_effect():
+    def predict(u: np.ndarray) -> Prediction:
+        return Prediction.gaussian(4 * u[:, 0] + 2 * u[:, 1], np.ones(len(u)))
+
+    found = influence(predict, 3, stream(0, "influence"))
+    np.testing.assert_allclose(found[:2], [1.0, 0.5], rtol=0.25)
+    assert found[2] == 0.05
+
+
+def test_greedy_picks_are_good_and_apart():
+    rng = stream(2, "greedy")
+    u = rng.random((2000, 2))
+    log_score = -50 * np.abs(u[:, 0] - 0.5)
+    there = np.array([[0.5, 0.5]])
+    picks = diverse(u, log_score, there, 12, np.ones(2))
+    assert len(set(picks.tolist())) == 12
+    assert (np.abs(u[picks, 0] - 0.5) < 0.06).all()
+    chosen = np.vstack([there, u[picks]])
+    gaps = np.linalg.norm(chosen[:, None] - chosen[None], axis=2)[np.triu_indices(13, 1)]
+    assert gaps.min() > 0.04
+    assert len(diverse(u, np.full(2000, -np.inf), there, 3, np.ones(2))) == 0
+    assert len(diverse(there, np.zeros(1), there, 3, np.ones(2))) == 0  # nobody's duplicate
+
+
+def test_refinement_finds_a_small_region():
+    def score(u: np.ndarray) -> np.ndarray:
+        return -np.linalg.norm(u - 0.123, axis=1)
+
+    start = stream(3, "start").random((500, 4))
+    u, value = refined(score, start, np.ones(4), stream(3, "refine"))
+    np.testing.assert_array_equal(value, score(u))
+    assert value.max() > 0.4 * score(start).max()
+
+
+@pytest.mark.parametrize("critical", [CriticalInterval(high=0.3), CriticalInterval(low=-1.0, high=0.5)])
+def test_expected_feasibility_is_the_expectation(critical: CriticalInterval):
+    rng = stream(4, "mc")
+    mu, sigma = rng.normal(size=6), rng.uniform(0.2, 2.0, 6)
+    y = mu + sigma * rng.standard_normal((200_000, 6))
+    ends = [z for z in (critical.low, critical.high) if math.isfinite(z)]
+    expected = np.max([np.maximum(2 * sigma - np.abs(y - z), 0).mean(axis=0) for z in ends], axis=0)
+    got = np.exp(expected_feasibility(Prediction.gaussian(mu, sigma), critical, np.zeros(6)))
+    np.testing.assert_allclose(got, expected, rtol=0.03, atol=2e-3)
+
+
+def test_straddle():
+    belief = Prediction.gaussian([0.0, 3.0, 3.0], [1.0, 1.0, 4.0])
+    got = np.exp(straddle(belief, CriticalInterval(high=0.0), np.zeros(3)))
+    np.testing.assert_allclose(got, [1.96, 0.0, 1.96 * 4 - 3])
+
+
+def run(folder: Path, **keys: Any) -> dict[str, Any]:
+    lines = [f"{key}: {value}" for key, value in keys.items()]
+    base = ["campaign: boundary", "executor: {kind: serial}", f"store: {folder / 'store'}"]
+    return run_campaign(parse("\n".join([*base, *lines])), report=False)
+
+
+@pytest.mark.parametrize("method", ["mix", "boundary", "u", "straddle", "expected_feasibility"])
+def test_every_rule_finds_the_boundary(tmp_path: Path, method: str):
+    result = run(
+        tmp_path, scenario="'testbed:cut_in_crash:box'", budget=90, initial=30, batch=20, acquisition=f"{{kind: {method}}}",
+        validation="{share: 0, reference: 400}",
+    )  # fmt: skip
+    assert result["conclusion"]["validation"]["f1"] > 0.85
+    with Store.read(tmp_path / "store") as store:
+        history = store.history()
+    chosen = history.x[(history.stage != VALIDATION)]
+    assert len(np.unique(chosen, axis=0)) == len(chosen) == 90
+
+
+def test_shares_of_the_mix(tmp_path: Path):
+    run(tmp_path, scenario="'testbed:cut_in_crash:box'", budget=120, initial=40, batch=20, validation="{share: 0.1}")
+    with Store.read(tmp_path / "store") as store:
+        hows = store.iterations()[1:]
+    assert [how["method"] for how in hows] == ["mix"] * 4
+    drawn, filling, greedy, held_out = (sum(how[k] for how in hows) for k in ("drawn", "filling", "greedy", "held_out"))
+    assert drawn + filling + greedy == 72
+    assert held_out == 8
+    assert 15 <= drawn <= 20
+    assert 8 <= filling <= 12
+
+
+def test_stops_where_little_is_expected_on_the_wrong_side(tmp_path: Path):
+    keys = {"scenario": "'testbed:wavy_level_d3:box'", "budget": 400, "initial": 40, "batch": 40, "seed": 1}
+    result = run(tmp_path, **keys, stop="{misclassified: 0.01}")
+    assert result["stopped"] == "misclassified"
+    assert result["runs"] < 400
+    assert result["conclusion"]["expected_misclassified"] <= 0.012
