@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from sbt import testbeds
 from sbt.acquisition import expected_feasibility, straddle
+from sbt.cli import app
 from sbt.config.load import parse
 from sbt.history import VALIDATION
 from sbt.metamodels.prediction import Prediction
@@ -17,6 +20,7 @@ from sbt.problem.requirement import CriticalInterval
 from sbt.run import run_campaign
 from sbt.samplers.greedy import diverse, influence, refined
 from sbt.samplers.smc import smc
+from sbt.samplers.surface import crossings
 from sbt.seeds import stream
 from sbt.store import Store
 
@@ -143,3 +147,24 @@ def test_stops_where_little_is_expected_on_the_wrong_side(tmp_path: Path):
     assert result["stopped"] == "misclassified"
     assert result["runs"] < 400
     assert result["conclusion"]["expected_misclassified"] <= 0.012
+
+
+def test_crossings_lie_on_the_boundary():
+    u = stream(5, "cross").random((3000, 3))
+    found = crossings(lambda v: 1 / (1 + np.exp(-40 * (v.sum(axis=1) - 2.2))), u, 100)
+    assert found.shape == (100, 3)
+    np.testing.assert_allclose(found.sum(axis=1), 2.2, atol=1e-6)
+    assert crossings(lambda v: np.zeros(len(v)), u, 100).shape == (0, 3)
+
+
+def test_boundary_points_are_exported(tmp_path: Path):
+    run(tmp_path, scenario="'testbed:cut_in_crash:box'", budget=60, initial=30, batch=30)
+    done = CliRunner().invoke(app, ["export", str(tmp_path / "store"), "--format", "boundary"])
+    assert done.exit_code == 0, done.output
+    rows = np.loadtxt(tmp_path / "store" / "exports" / "boundary.csv", delimiter=",", skiprows=1)
+    scenario = testbeds.find("cut_in_crash:box").scenario()
+    anywhere = scenario.space.from_unit(stream(6, "anywhere").random((2000, 4)))
+    critical = [scenario.requirement.critical.contains(testbeds.values("cut_in_crash:box", x)) for x in (rows, anywhere)]
+    assert len(rows) > 100
+    assert 0.25 < critical[0].mean() < 0.75  # half on either side, where 14 % are critical
+    assert critical[1].mean() < 0.2

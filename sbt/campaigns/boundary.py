@@ -6,13 +6,16 @@ from dataclasses import replace
 from typing import Any
 
 from sbt.acquisition import boundary, expected_feasibility, straddle
+from sbt.arrays import Points
 from sbt.campaign import Campaign, Fit, Log
 from sbt.campaigns.choices import Choice, from_roi, greedily, mixed
 from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
 from sbt.errors import InputError
-from sbt.history import VALIDATION
+from sbt.history import VALIDATION, History
+from sbt.samplers.sobol import SobolSequence
+from sbt.samplers.surface import crossings
 
-__all__ = ["recipe"]
+__all__ = ["boundary_points", "recipe", "validation_of"]
 
 _VOLUMES = ("critical_fraction", "expected_misclassified", "ambiguous_volume")
 _INTERNAL = ("sides", *_VOLUMES)
@@ -58,6 +61,22 @@ def _choice(settings: Settings) -> tuple[Settings, Choice]:
     if settings.method in _GREEDY:
         return replace(settings, acquisition=_GREEDY[settings.method]), greedily
     return settings, from_roi if settings.acquisition is not None else mixed
+
+
+def boundary_points(settings: Settings, history: History, most: int = 500) -> Points:
+    """Return up to `most` points (m, d) in the inputs' units where P(critical) crosses 0.5.
+
+    Raises:
+        InputError: there is no metamodel, or fewer than two runs to learn from.
+    """
+    belief = settings.learner.fit(history) if settings.learner is not None else None
+    if belief is None:
+        raise InputError("boundary points need a metamodel and two finished runs, but there are none")
+    space, critical = settings.scenario.space, settings.scenario.requirement.critical
+    u = SobolSequence(space.dimension, settings.seed).points(0, 8192)
+    found = crossings(lambda points: belief.predict(points).probability(critical), u, most)
+    x = space.from_unit(found)
+    return x[space.feasible(x)]
 
 
 def validation_of(scores: dict[str, Any]) -> dict[str, Any] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -150,32 +150,56 @@ def report(folder: Folder) -> None:
 def export(
     folder: Folder,
     *,
-    form: Annotated[str, typer.Option("--format", metavar="csv|parquet|dsiod", help="Form of the table.")] = "csv",
+    form: Annotated[
+        str,
+        typer.Option("--format", metavar="csv|parquet|dsiod|boundary", help="boundary: points where P(critical) is 0.5."),
+    ] = "csv",
 ) -> None:
     """Write the runs of a campaign as a table."""
     import importlib.util
 
     from sbt.store import Store
 
-    if form not in ("csv", "parquet", "dsiod"):
-        raise InputError(f"--format must be csv, parquet or dsiod, but got '{form}'")
+    forms = {"csv": _as_csv, "parquet": _as_parquet, "dsiod": _as_data_set, "boundary": _as_boundary}
+    if form not in forms:
+        raise InputError(f"--format must be {', '.join(forms)}, but got '{form}'")
     if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise InputError("--format parquet needs pyarrow: pip install 'sumo-sbt[parquet]', or choose csv")
     with clean_stdout(), Store.read(_with_store(folder)) as store:
-        path = _as_data_set(store) if form == "dsiod" else _as_frame(store, form)
+        path = forms[form](store)
     print(path)
 
 
-def _as_frame(store: Store, form: str) -> Path:
+def _as_csv(store: Store) -> Path:
     """Write one row a run."""
-    frame = store.history().to_frame()
-    path = store.folder / "exports" / f"runs.{form}"
+    return _written(store.folder / "exports" / "runs.csv", lambda part: store.history().to_frame().to_csv(part, index=False))
+
+
+def _as_parquet(store: Store) -> Path:
+    """Write one row a run."""
+    return _written(
+        store.folder / "exports" / "runs.parquet", lambda part: store.history().to_frame().to_parquet(part, index=False)
+    )
+
+
+def _as_boundary(store: Store) -> Path:
+    """Write points of the inputs' space where the metamodel says P(critical) = 0.5."""
+    import pandas as pd
+
+    from sbt.campaigns.boundary import boundary_points
+    from sbt.run import assembly_of, loaded_from, settings_of
+
+    loaded = loaded_from(store)
+    settings = settings_of(loaded, assembly_of(loaded))
+    points = pd.DataFrame(boundary_points(settings, store.history()), columns=list(settings.scenario.space.names))
+    return _written(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
+
+
+def _written(path: Path, write: Callable[[Path], None]) -> Path:
+    """Write a file as a whole or not at all."""
     path.parent.mkdir(exist_ok=True)
     part = path.with_suffix(".part")
-    if form == "csv":
-        frame.to_csv(part, index=False)
-    else:
-        frame.to_parquet(part, index=False)
+    write(part)
     part.replace(path)
     return path
 
