@@ -43,7 +43,9 @@ def influence(predict: Callable[[Points], Prediction], dimension: int, rng: np.r
 def refined(
     score: Callable[[Points], Vector], u: Points, scale: Vector, rng: np.random.Generator
 ) -> tuple[Points, Vector]:
-    """Return candidates (m, d) and their log scores (m,): the given ones and ever closer ones around the best.
+    """Return candidates (m, d) and their log scores (m,): the given ones and ever closer ones around good ones.
+
+    What is looked around is good and apart, so that one region does not take all.
 
     Args:
         score: (m, d) points -> (m,) log scores.
@@ -54,7 +56,7 @@ def refined(
     found, value = u, score(u)
     width = 0.1 / scale
     for _ in range(_ROUNDS):
-        best = found[np.argsort(-value, kind="stable")[:_KEEP]]
+        best = found[diverse(found, value, np.empty((0, u.shape[1])), _KEEP, scale)]
         step = width * rng.standard_normal((len(best) * _CHILDREN, u.shape[1]))
         near = np.clip(np.repeat(best, _CHILDREN, axis=0) + step, 1e-9, 1 - 1e-9)
         found, value = np.concatenate([found, near]), np.concatenate([value, score(near)])
