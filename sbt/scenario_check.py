@@ -5,17 +5,18 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
 
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.seeds import run_seed
@@ -95,16 +96,27 @@ def _points(space: ParameterSpace) -> Iterator[dict[str, float]]:
 def _runs(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run]:
     """Return the runs of these values and seeds, in this order, in this process."""
     scenario = spec.resolve().limited(_RUN_DEADLINE)
-    return [_run(scenario, values, seed) for values, seed in jobs]
+    simulate = scenario.simulate
+    if isinstance(simulate, Batched) and simulate.batched:
+        return [_run(scenario, partial(_given, trace)) for trace in simulate.simulate_many(jobs)]
+    if simulate is not None:
+        return [_run(scenario, partial(simulate, values, seed)) for values, seed in jobs]
+    return [_run(scenario, partial(scenario.run, values, seed)) for values, seed in jobs]
 
 
-def _run(scenario: LogicalScenario, values: Values, seed: int) -> _Run:
+def _given(trace: Trace | Exception) -> Trace:
+    if isinstance(trace, Exception):
+        raise trace
+    return trace
+
+
+def _run(scenario: LogicalScenario, execute: Callable[[], Trace | dict[str, float]]) -> _Run:
     """Return one run; whatever the user's code raises is its problem, not ours."""
     try:
-        if scenario.simulate is None:
-            return _Run(tuple(scenario.run(values, seed).items()))
-        trace = scenario.simulate(values, seed)
-        return _Run(tuple(scenario.measure(trace).items()), _digest(trace))
+        result = execute()
+        if not isinstance(result, Trace):
+            return _Run(tuple(result.items()))
+        return _Run(tuple(scenario.measure(result).items()), _digest(result))
     except RunError as error:
         return _Run(problem=f"{error.status}: {error.reason}")
     except Exception as error:

@@ -1,14 +1,15 @@
 """Worker processes on this machine: spawned by loky, kept alive, one libsumo each, one thread each.
 
-A worker that dies breaks loky's whole pool, so the recovery is ours: every worker notes which run it
+A worker that dies breaks loky's whole pool, so the recovery is ours: every worker notes which runs it
 is at in a file of its own. After a death the runs that were at work are tried again alone; one that
 kills its worker again is `crashed`, all others go on as if nothing had happened. A run that hangs
 inside SUMO cannot be stopped from within (the step holds the interpreter's lock): the driver kills
-exactly that process.
+exactly that process. Runs that share a simulation are suspects together, and tried again one by one.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import struct
@@ -19,18 +20,19 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
+from sbt.execution.protocol import CHUNK
 from sbt.execution.spec import ScenarioSpec
-from sbt.execution.worker import run_job
+from sbt.execution.worker import run_jobs
 from sbt.problem.outcome import Job, Outcome, Status
 
 __all__ = ["LocalExecutor"]
 
-_MARK = struct.Struct("<qd")
-_IDLE = -1
+_MARK = struct.Struct("<dq")
+"""The time of the note, and how many indices of runs follow."""
 _TARGET = 0.05
 """Runs are handed out in chunks of about so many seconds."""
 _TICK = 0.25
@@ -134,7 +136,7 @@ class LocalExecutor:
             return [], {}
         yield from self._rescued(flying)
         missing = [job for chunk in flying.values() for job in chunk] + list(queue)
-        dead = {index: Status.CRASHED for index, _, _ in self._at_work()} | overdue
+        dead = {index: Status.CRASHED for runs, _, _ in self._at_work() for index in runs} | overdue
         self._restart()
         return missing, dead
 
@@ -154,29 +156,29 @@ class LocalExecutor:
     def _chunk(self, queue: deque[Job]) -> list[Job]:
         """Take so many jobs that a chunk lasts about 50 ms and every worker stays busy to the end."""
         size = int(_TARGET / max(self._seconds, 1e-4))
-        size = max(1, min(size, 64, len(queue) // (2 * self._workers)))
+        size = max(1, min(size, CHUNK, len(queue) // (2 * self._workers)))
         return [queue.popleft() for _ in range(min(size, len(queue)))]
 
-    def _at_work(self) -> list[tuple[int, int, float]]:
-        """Return (index of the run, process, start on the monotonic clock) of every run at work."""
+    def _at_work(self) -> list[tuple[tuple[int, ...], int, float]]:
+        """Return (indices of the runs, process, time on the monotonic clock) of every worker with runs at work."""
         found = []
         for path in Path(self._folder).iterdir():
             data = path.read_bytes()
-            if len(data) == _MARK.size:
-                index, start = _MARK.unpack(data)
-                if index != _IDLE:
-                    found.append((index, int(path.name), start))
+            if len(data) >= _MARK.size:
+                since, n = _MARK.unpack_from(data)
+                if n and len(data) >= _MARK.size + 8 * n:
+                    found.append((struct.unpack_from(f"<{n}q", data, _MARK.size), int(path.name), since))
         return found
 
     def _kill_overdue(self) -> dict[int, Status]:
-        """Kill the processes whose run is past its time, and say which runs those were."""
+        """Kill the processes that have shown no life for the time of a run, and say which runs were too long."""
         if self._timeout is None:
             return {}
-        late = [(i, pid) for i, pid, start in self._at_work() if time.monotonic() - start > self._timeout + _GRACE]
+        late = [(runs, pid) for runs, pid, since in self._at_work() if time.monotonic() - since > self._timeout + _GRACE]
         for _, pid in late:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        return {index: Status.TIMEOUT for index, _ in late}
+        return {runs[0]: Status.TIMEOUT for runs, _ in late if len(runs) == 1}  # which of several it was shows alone
 
     def _restart(self) -> None:
         self._stop()
@@ -199,8 +201,9 @@ def _mark_file(folder: str) -> int:
     return os.open(Path(folder) / str(os.getpid()), os.O_CREAT | os.O_WRONLY)
 
 
-def _mark(folder: str, index: int) -> None:
-    os.pwrite(_mark_file(folder), _MARK.pack(index, time.monotonic()), 0)
+def _mark(folder: str, runs: Sequence[int]) -> None:
+    """Note which runs this worker is at, and that it is alive."""
+    os.pwrite(_mark_file(folder), _MARK.pack(time.monotonic(), len(runs)) + struct.pack(f"<{len(runs)}q", *runs), 0)
 
 
 @cache
@@ -220,18 +223,13 @@ def _prepare(spec: ScenarioSpec, folder: str, workers: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
     _end_with(os.getppid())
     spec.resolve().prepare()
-    _mark(folder, _IDLE)
+    gc.freeze()  # what is loaded by now stays: the collector need not look through it again and again
+    _mark(folder, ())
     deadline = time.monotonic() + 20.0
     while len(os.listdir(folder)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
         time.sleep(0.005)
 
 
 def _run_chunk(spec: ScenarioSpec, jobs: list[Job], folder: str, timeout: float | None) -> list[Outcome]:
-    """Run jobs one after the other in a worker, noting which one is at work."""
-    scenario = spec.resolve().limited(timeout)
-    outcomes = []
-    for job in jobs:
-        _mark(folder, job.index)
-        outcomes.append(run_job(scenario, job))
-    _mark(folder, _IDLE)
-    return outcomes
+    """Run jobs in a worker, noting which are at work."""
+    return run_jobs(spec.resolve().limited(timeout), jobs, partial(_mark, folder))

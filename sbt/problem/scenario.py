@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
-__all__ = ["Configurable", "LogicalScenario", "Metric", "Pool", "Simulate"]
+__all__ = ["Batched", "Configurable", "LogicalScenario", "Metric", "Pool", "Simulate"]
 
 
 class Simulate(Protocol):
@@ -25,6 +25,25 @@ class Simulate(Protocol):
 
     def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
         """Return the trace; raise `RunError` where the run cannot give one."""
+        ...
+
+
+@runtime_checkable
+class Batched(Protocol):
+    """A `Simulate` that can run several concrete scenarios at once."""
+
+    @property
+    def batched(self) -> bool:
+        """Whether it does, as it is configured."""
+        ...
+
+    def simulate_many(
+        self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = ...
+    ) -> list[Trace | Exception]:
+        """Return the trace, or the error, of each of these values and seeds: the same as one by one.
+
+        `at_work` is told, again and again, which of them are being run.
+        """
         ...
 
 

@@ -76,7 +76,14 @@ SCENARIO = LogicalScenario(
             Parameter("d_t", 0.1, 10.0, "s", description="time gap from ego's front to co's rear at ego's speed"),
         )
     ),
-    simulate=SumoSimulation(net="straight", scene=scene, duration=DURATION, step_length=0.05, lane_change_duration=LANE_CHANGE),
+    simulate=SumoSimulation(
+        net="straight",
+        scene=scene,
+        duration=DURATION,
+        step_length=0.05,
+        lane_change_duration=LANE_CHANGE,
+        isolations=("fresh", "reuse", "replicas"),
+    ),
     metrics=(
         ttc_min(margin=MARGIN),
         d_min(margin=MARGIN),

@@ -70,7 +70,13 @@ SCENARIO = LogicalScenario(
             Parameter("v_ego", 80.0, 150.0, "km/h", description="speed of ego at the start, also its set speed"),
         )
     ),
-    simulate=SumoSimulation(net="straight", scene=scene, duration=DURATION, step_length=0.05),
+    simulate=SumoSimulation(
+        net="straight",
+        scene=scene,
+        duration=DURATION,
+        step_length=0.05,
+        isolations=("fresh", "reuse", "replicas"),
+    ),
     metrics=(ttc_min(), d_min(), collision(), impact_speed(), thw_min(), drac_max()),
     requirement=Requirement("ttc_min", CriticalInterval(high=0.1)),
 )

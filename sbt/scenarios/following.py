@@ -86,7 +86,13 @@ SCENARIO = LogicalScenario(
             Parameter("v_delay", 0.02, 0.3, "s", description="dead time of ego's longitudinal dynamics"),
         )
     ),
-    simulate=SumoSimulation(net="straight", scene=scene, duration=DURATION, step_length=0.05),
+    simulate=SumoSimulation(
+        net="straight",
+        scene=scene,
+        duration=DURATION,
+        step_length=0.05,
+        isolations=("fresh", "reuse", "replicas"),
+    ),
     metrics=(ttc_min(), d_min(), collision(), impact_speed(), thw_min(), drac_max()),
     requirement=Requirement("ttc_min", CriticalInterval(high=0.1)),
 )

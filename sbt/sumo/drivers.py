@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from sbt.sumo.dynamics import DeadTime, FirstOrderLag, Gust
 from sbt.sumo.sensors import RangeSensor, Target
 
 __all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stand", "Walk"]
+
+_as_action = partial(tuple.__new__, Action)
+"""An `Action` of its four parts, without the default values that take most of the time to make one."""
 
 
 class AccAeb:
@@ -69,13 +73,12 @@ class AccAeb:
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the acceleration over the next step: the mean of the lag's output at its ends."""
         demand = self._delay(t, self._demand(own.speed, self._sensor(t, own, others)))
-        before = self._reached
-        after = self._lag(demand, t - self._last)
+        before, dt = self._reached, t - self._last
+        after = self._lag(demand, dt)
         if self._lag_2 is not None:
-            after = self._lag_2(after, t - self._last)
-        self._reached = after
-        self._last = t
-        return Action(0.5 * (before + after))
+            after = self._lag_2(after, dt)
+        self._reached, self._last = after, t
+        return _as_action((0.5 * (before + after), None, None, None))
 
     def _demand(self, speed: float, target: Target | None) -> float:
         """Return the acceleration that ACC and AEB ask for; AEB brakes on until nothing closes in."""
@@ -86,21 +89,19 @@ class AccAeb:
             gap, closing = target
             if closing <= 0:
                 self._braking = False
-            elif gap < self._aeb_distance or gap < self._last_moment(closing):
+            elif gap < self._aeb_distance or (
+                self._aeb_reserve is not None  # the gap from which it can only just stop, and the reserve
+                and gap < closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
+            ):
                 self._braking = True
             if self._braking:
                 return -self._aeb_braking
             follow = 0.1 * (gap - self._distance_min - self._time_gap * speed) - 0.6 * closing
-            demand = min(demand, follow)
+            if follow < demand:
+                demand = follow
         if demand < -self._acc_braking:
             return -self._acc_braking
         return demand if demand < self._acc_accel else self._acc_accel
-
-    def _last_moment(self, closing: float) -> float:
-        """Return the gap at which AEB brakes because of the closing speed (m)."""
-        if self._aeb_reserve is None:
-            return 0.0
-        return closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
 
 
 class LaneChange:

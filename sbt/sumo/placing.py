@@ -9,7 +9,7 @@ from typing import Any
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
-from sbt.sumo.actors import Actor, Obstacle, Pose, Scene
+from sbt.sumo.actors import Actor, Pose, Scene
 from sbt.sumo.session import ABSENT, direct, session
 
 __all__ = ["insert", "mover", "type_name", "verify"]
@@ -27,37 +27,45 @@ def type_name(actor: Actor) -> str:
     return f"type_{actor.type.length!r}_{actor.type.width!r}_{extra:x}"
 
 
-def insert(sumo: Any, scene: Scene) -> None:
-    """Ask SUMO to put every actor on the road in the next step, with its own checks off."""
+def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
+    """Ask SUMO to put every actor on the road in the next step, with its own checks off.
+
+    Args:
+        sumo: libsumo.
+        scene: what to insert.
+        prefix: of the network's copy that it goes to; of names and edges.
+    """
     here = session()
     for actor in scene.actors:
+        name = prefix + actor.name
         if actor.person:
-            sumo.person.add(actor.name, actor.route[0], actor.position, typeID=type_name(actor))
-            here.inserted(actor.name, "person")
-            sumo.person.appendWaitingStage(actor.name, _FOREVER)
+            sumo.person.add(name, prefix + actor.route[0], actor.position, typeID=type_name(actor))
+            here.inserted(name, "person")
+            sumo.person.appendWaitingStage(name, _FOREVER)
         else:
             sumo.vehicle.add(
-                actor.name, here.route(actor.route), typeID=type_name(actor), depart="now",
+                name, here.route(tuple(prefix + edge for edge in actor.route)), typeID=type_name(actor), depart="now",
                 departLane=str(actor.lane), departPos=repr(actor.position), departSpeed=repr(actor.speed),
             )  # fmt: skip
-            here.inserted(actor.name)
+            here.inserted(name)
             if actor.driver is not None:
-                sumo.vehicle.setSpeedMode(actor.name, 32)
-                sumo.vehicle.setLaneChangeMode(actor.name, 0)
-                sumo.vehicle.setSpeed(actor.name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
+                sumo.vehicle.setSpeedMode(name, 32)
+                sumo.vehicle.setLaneChangeMode(name, 0)
+                sumo.vehicle.setSpeed(name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
         if actor.pose is not None:
-            mover(sumo, actor)(actor.pose)
+            mover(sumo, actor, prefix)(actor.pose)
     for obstacle in scene.obstacles:
-        _show(sumo, obstacle)
+        sumo.polygon.add(prefix + obstacle.name, list(obstacle.corners), _COLOR, True, "obstacle")
+        here.inserted(prefix + obstacle.name, "polygon")
 
 
-def mover(sumo: Any, actor: Actor) -> Callable[[Pose], None]:
+def mover(sumo: Any, actor: Actor, prefix: str = "") -> Callable[[Pose], None]:
     """Return what puts the centre of an actor on a pose, off the lanes too, in SUMO's next step.
 
     Raises:
         RunError: (the returned function) the pose is not finite.
     """
-    name, half = actor.name, _front(actor)
+    name, half = prefix + actor.name, _front(actor)
     move = direct(sumo, "person" if actor.person else "vehicle", "moveToXY")
     lane = () if actor.person else (-1,)
 
@@ -65,23 +73,23 @@ def mover(sumo: Any, actor: Actor) -> Callable[[Pose], None]:
         x, y, heading = pose
         front_x, front_y = x + half * math.cos(heading), y + half * math.sin(heading)
         if not (math.isfinite(front_x) and math.isfinite(front_y)):
-            raise RunError(Status.FAILED, f"the controller of {name} must give finite numbers, but gave pose {pose}")
+            raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave pose {pose}")
         move(name, "", *lane, front_x, front_y, (90.0 - math.degrees(heading)) % 360.0, _FREE)
 
     return place
 
 
-def verify(sumo: Any, scene: Scene) -> None:
+def verify(sumo: Any, scene: Scene, prefix: str = "") -> None:
     """Compare what SUMO realised with what was asked for.
 
     Raises:
         RunError: an actor is not on the road, or not as asked.
     """
     for actor in scene.actors:
-        domain = sumo.person if actor.person else sumo.vehicle
-        if actor.person and actor.name not in domain.getIDList():
+        name, domain = prefix + actor.name, sumo.person if actor.person else sumo.vehicle
+        if actor.person and name not in domain.getIDList():
             raise RunError(Status.INVALID, f"{actor.name} must be there at the start, but SUMO did not insert it")
-        position = domain.getPosition(actor.name) if actor.pose is not None else domain.getLanePosition(actor.name)
+        position = domain.getPosition(name) if actor.pose is not None else domain.getLanePosition(name)
         if ABSENT in (position, position[0] if isinstance(position, tuple) else position):
             raise RunError(Status.INVALID, f"{actor.name} must be on the road at the start, but SUMO did not insert it")
         if actor.pose is not None:
@@ -94,8 +102,8 @@ def verify(sumo: Any, scene: Scene) -> None:
         else:
             realised = {
                 "position": (actor.position, position, "m"),
-                "speed": (actor.speed, domain.getSpeed(actor.name), "m/s"),
-                "lane": (actor.lane, domain.getLaneIndex(actor.name), ""),
+                "speed": (actor.speed, domain.getSpeed(name), "m/s"),
+                "lane": (actor.lane, domain.getLaneIndex(name), ""),
             }
         for what, (asked, got, unit) in realised.items():
             if abs(asked - got) > _TOLERANCE:
@@ -108,8 +116,3 @@ def _front(actor: Actor) -> float:
     """Return how far ahead of the centre SUMO's position of the actor is: a vehicle's is its front bumper."""
     return 0.0 if actor.person else 0.5 * actor.type.length
 
-
-def _show(sumo: Any, obstacle: Obstacle) -> None:
-    """Draw an obstacle as a polygon."""
-    sumo.polygon.add(obstacle.name, list(obstacle.corners), _COLOR, True, "obstacle")
-    session().inserted(obstacle.name, "polygon")

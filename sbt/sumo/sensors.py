@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from sbt.sumo.actors import State
@@ -11,14 +9,8 @@ from sbt.sumo.actors import State
 __all__ = ["RangeSensor", "Target"]
 
 
-class Target(NamedTuple):
-    """The nearest road user ahead in the path, as measured."""
-
-    gap: float
-    """bumper to bumper (m)"""
-    closing: float
-    """rate at which the gap shrinks (m/s)"""
-
+Target = tuple[float, float]
+"""The nearest road user ahead in the path, as measured: gap from bumper to bumper (m), rate at which it shrinks (m/s)."""
 
 _BLOCK = 128
 
@@ -52,26 +44,25 @@ class RangeSensor:
     def __call__(self, t: float, own: State, others: tuple[State, ...]) -> Target | None:
         """Return the latest measurement at time t; None where nothing is in the path."""
         tick = int(t / self._period + 1e-6)
-        if tick >= self._next:
-            self._next = tick + 1
-            self._held = self._measure(tick, own, others)
-        return self._held
-
-    def _measure(self, tick: int, own: State, others: tuple[State, ...]) -> Target | None:
-        x, y, cos, sin = own.x, own.y, own.cos, own.sin
+        if tick < self._next:
+            return self._held
+        self._next = tick + 1
+        x, y, cos, sin, length, width = own.x, own.y, own.cos, own.sin, own.length, own.width
         nearest: State | None = None
         smallest = self._reach
         for other in others:
             dx, dy = other.x - x, other.y - y
-            gap = dx * cos + dy * sin - 0.5 * (own.length + other.length)
-            if 0.0 <= gap < smallest and abs(dy * cos - dx * sin) - 0.5 * (own.width + other.width) < self._margin:
+            gap = dx * cos + dy * sin - 0.5 * (length + other.length)
+            if 0.0 <= gap < smallest and abs(dy * cos - dx * sin) - 0.5 * (width + other.width) < self._margin:
                 nearest, smallest = other, gap
         if nearest is None:
+            self._held = None
             return None
         noise = self._buffer[tick] if tick < len(self._buffer) else self._draw(tick)
         closing = own.speed - nearest.speed * (nearest.cos * cos + nearest.sin * sin) + noise[1]
         gap = smallest + noise[0]
-        return Target(gap if gap > 0.0 else 0.0, closing)
+        self._held = held = (gap if gap > 0.0 else 0.0, closing)
+        return held
 
     def _draw(self, tick: int) -> tuple[float, float]:
         """Return the noise of one tick: the same whatever was in the path before."""

@@ -1,11 +1,12 @@
 """The one SUMO simulation of this process, guarded: every error leaves as a plain `RunError`.
 
 libsumo holds one simulation a process, its exceptions cannot be pickled, and the reason of an error
-is often only on file descriptor 2. All of that stays in here. Two isolation levels:
+is often only on file descriptor 2. All of that stays in here. Three isolation levels:
 
 - `fresh`: SUMO is loaded anew for every run; always right.
 - `reuse`: one simulation lives on, actors are removed and inserted again; bit-identical to `fresh`
   where SUMO draws no random numbers and nothing else needs a reset.
+- `replicas`: as `reuse`, of a simulation with several copies of the network, a run in each.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from xml.sax.saxutils import quoteattr
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import VehicleType
+from sbt.sumo.copies import copied
 
 __all__ = ["ABSENT", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
 
@@ -54,8 +56,13 @@ def direct(sumo: Any, domain: str, name: str) -> Any:
 
     Of a module that has no such function (traci), the public one.
     """
-    binary = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
-    return getattr(binary, f"{domain}_{name}", None) or getattr(getattr(sumo, domain), name)
+    return _binary(domain, name) if sumo is libsumo() else getattr(getattr(sumo, domain), name)
+
+
+@cache
+def _binary(domain: str, name: str) -> Any:
+    module = libsumo()
+    return getattr(module.libsumo._libsumo, f"{domain}_{name}", None) or getattr(getattr(module, domain), name)
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,7 @@ class Setup:
         step_length: of SUMO (s).
         lane_change_duration: time of a continuous lane change (s), 0: at once.
         options: further SUMO options, as on its command line.
+        copies: of the network, each with ids of its own; 1: the network as it is.
     """
 
     net: str
@@ -75,11 +83,13 @@ class Setup:
     step_length: float
     lane_change_duration: float = 0.0
     options: tuple[str, ...] = ()
+    copies: int = 1
 
     def command(self, seed: int) -> list[str]:
         """Return SUMO's arguments without the program's name."""
+        net = self.net if self.copies == 1 else _copies_file(self.net, self.copies)
         return [
-            "--net-file", self.net, "--additional-files", _types_file(self.types),
+            "--net-file", net, "--additional-files", _types_file(self.types),
             "--step-length", repr(self.step_length), "--lanechange.duration", repr(self.lane_change_duration),
             "--seed", str(seed), *_OPTIONS, *self.options,
         ]  # fmt: skip
@@ -104,6 +114,14 @@ def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
     return str(path)
 
 
+@cache
+def _copies_file(net: str, copies: int) -> str:
+    """Write the copies of a network once a process and return the file's name."""
+    path = Path(_scratch().name) / f"{copies}-{hashlib.blake2b(net.encode(), digest_size=8).hexdigest()}.net.xml"
+    path.write_text(copied(Path(net), copies))
+    return str(path)
+
+
 class Session:
     """The process's simulation; use the one that `session()` returns."""
 
@@ -116,7 +134,7 @@ class Session:
 
     @contextlib.contextmanager
     def run(self, setup: Setup, seed: int, isolation: str) -> Iterator[Any]:
-        """Give libsumo with an empty simulation of this setup at hand, for one run.
+        """Give libsumo with an empty simulation of this setup at hand, for one run, or for one in each copy.
 
         Raises:
             RunError: SUMO raised; the reason carries what it wrote to file descriptor 2.
@@ -125,7 +143,8 @@ class Session:
             try:
                 self._load(setup, seed, isolation)
                 yield self._sumo
-                self._clear()
+                if self._setup is not None:
+                    self.remove()
             except BaseException as error:
                 self._setup = None
                 if isinstance(error, (self._sumo.TraCIException, self._sumo.FatalTraCIError)):
@@ -145,28 +164,29 @@ class Session:
         """Remember a vehicle, person or polygon that the end of the run has to remove."""
         self._inside.append((domain, name))
 
+    def remove(self, prefix: str = "") -> None:
+        """Take out what was inserted, all of it or what has names with this prefix."""
+        for domain, name in [entry for entry in self._inside if entry[1].startswith(prefix)]:
+            getattr(self._sumo, domain).remove(name)
+        self._inside = [entry for entry in self._inside if not entry[1].startswith(prefix)]
+
     def _load(self, setup: Setup, seed: int, isolation: str) -> None:
-        if isolation == "reuse" and setup == self._setup:
+        kept = isolation != "fresh"
+        if kept and setup == self._setup:
             return
-        command = setup.command(0 if isolation == "reuse" else seed)
+        command = setup.command(0 if kept else seed)
         self._routes.clear()
         self._inside.clear()
         if self._sumo.isLoaded():
             self._sumo.load(command)
         else:
             self._sumo.start(["sumo", *command])
-        self._setup = setup if isolation == "reuse" else None
+        self._setup = setup if kept else None
 
     def _flush(self) -> None:
         """Step once: SUMO keeps pointers to actors that were moved since the last step, which the next load deletes."""
         with contextlib.suppress(self._sumo.TraCIException, self._sumo.FatalTraCIError):
             self._sumo.simulationStep()
-
-    def _clear(self) -> None:
-        if self._setup is not None:
-            for domain, name in self._inside:
-                getattr(self._sumo, domain).remove(name)
-        self._inside.clear()
 
     @contextlib.contextmanager
     def _captured(self) -> Iterator[None]:
