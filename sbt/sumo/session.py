@@ -20,14 +20,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from xml.sax.saxutils import quoteattr
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import VehicleType
 
-__all__ = ["ABSENT", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
+__all__ = ["ABSENT", "Loadable", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
 
 ABSENT = -1073741824.0
 """What SUMO answers for an actor that is not on the road (it does not raise)."""
@@ -56,6 +56,14 @@ def direct(sumo: Any, domain: str, name: str) -> Any:
     """
     binary = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
     return getattr(binary, f"{domain}_{name}", None) or getattr(getattr(sumo, domain), name)
+
+
+class Loadable(Protocol):
+    """What a simulation is loaded with."""
+
+    def command(self, seed: int) -> list[str]:
+        """Return SUMO's arguments without the program's name."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -109,13 +117,13 @@ class Session:
 
     def __init__(self) -> None:
         self._sumo = libsumo()
-        self._setup: Setup | None = None
+        self._setup: Loadable | None = None
         self._routes: set[tuple[str, ...]] = set()
         self._inside: list[tuple[str, str]] = []
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
 
     @contextlib.contextmanager
-    def run(self, setup: Setup, seed: int, isolation: str) -> Iterator[Any]:
+    def run(self, setup: Loadable, seed: int, isolation: str) -> Iterator[Any]:
         """Give libsumo with an empty simulation of this setup at hand, for one run.
 
         Raises:
@@ -145,7 +153,7 @@ class Session:
         """Remember a vehicle, person or polygon that the end of the run has to remove."""
         self._inside.append((domain, name))
 
-    def _load(self, setup: Setup, seed: int, isolation: str) -> None:
+    def _load(self, setup: Loadable, seed: int, isolation: str) -> None:
         if isolation == "reuse" and setup == self._setup:
             return
         command = setup.command(0 if isolation == "reuse" else seed)
