@@ -7,6 +7,8 @@ import time
 import traceback
 from collections.abc import Mapping
 
+import numpy as np
+
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
@@ -44,9 +46,13 @@ def _measured(scenario: LogicalScenario, inputs: Mapping[str, float], seed: int)
 
 
 def _check_trace(trace: Trace) -> None:
+    """Refuse states that are not finite; NaN in all of them says that an actor is not there, which the first one must be."""
     for name in ("x", "y", "heading", "speed"):
-        total = float(getattr(trace, name).sum())
-        if not math.isfinite(total):
+        values = getattr(trace, name)
+        if math.isfinite(float(values.sum())):
+            continue
+        wrong = ~np.isfinite(values) & trace.present
+        if wrong.any() or not trace.present[:, 0].all():
             raise RunError(Status.FAILED, f"every state must be finite, but trace.{name} is not")
 
 

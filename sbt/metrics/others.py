@@ -40,7 +40,7 @@ def stretches(trace: Trace, ego: str, other: str) -> tuple[tuple[slice, Trace], 
 
 def _stretches(trace: Trace, ego: str, other: str) -> Iterator[tuple[slice, Trace]]:
     at = [trace.actors.index(name) for name in (ego, other)]
-    there = np.isfinite(trace.x[:, at]).all(axis=1)
+    there = trace.present[:, at].all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
     for first, last in edges.reshape(-1, 2).tolist():
         if last - first > 1 or len(trace.time) == 1:

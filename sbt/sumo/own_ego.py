@@ -22,6 +22,8 @@ _KEPT = ("Length", "Width", "Height", "VehicleClass", "MaxSpeed", "MinGap", "Acc
          "Imperfection", "SpeedFactor", "SpeedDeviation", "Color", "MaxSpeedLat", "MinGapLat", "LateralAlignment")  # fmt: skip
 _ATTRIBUTE = {"Imperfection": "sigma", "VehicleClass": "vClass", "SpeedDeviation": "speedDev", "LateralAlignment": "latAlignment"}
 _FASTEST = 1e4
+_FOR_THE_ROUTE = 513
+"""SUMO's lane-change mode in which only the route is a reason, and others are respected."""
 
 Pilot = Callable[[float, State, tuple[State, ...]], None]
 
@@ -35,7 +37,7 @@ class OwnEgo:
         driver: a controller, or (`kind: sumo`) another car-following model; None: as the files have it.
         set_speed: what a controller would keep (m/s); None: the speed allowed where it departs.
         speed_mode: SUMO's speed mode while a controller drives: 32 obeys it in everything, 24 stops at red
-            lights and gives way all the same.
+            lights and gives way all the same. Lanes are changed as the route needs it, or the controller says.
         may_leave: reaching the end of its route before the duration is no failure.
     """
 
@@ -72,6 +74,7 @@ class OwnEgo:
         if controller is None:
             raise InputError(f"ego.kind must name a controller, but got '{self.driver.kind}'")
         sumo.vehicle.setSpeedMode(self.id, self.speed_mode)
+        sumo.vehicle.setLaneChangeMode(self.id, _FOR_THE_ROUTE)
         act = controller.act
 
         def pilot(t: float, own: State, others: tuple[State, ...]) -> None:

@@ -147,7 +147,8 @@ class OwnSimulation:
                 handed = Handed(self, values, seed, lambda launch: stack.enter_context(opened(launch)))
                 if self.files is not None:
                     handed.begin(self.files)
-                return handed.watch.trace(handed.drive())
+                ended = handed.drive()
+                return handed.watch.trace(ended)
         except RunError as error:
             raise RunError(error.status, f"{error.reason}{handed.line if handed is not None else ''}") from None
 
