@@ -41,7 +41,7 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
 
     Args:
         kind: one of `KINDS`.
-        name: an installed name, or `file.py:NAME`.
+        name: an installed name, or `file.py:NAME`; of scenarios also `folder/scenario.yaml`.
         folder: where a relative file is looked up; default the working directory.
 
     Raises:
@@ -50,6 +50,8 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
     if ".py:" in name:
         path, _, attribute = name.rpartition(":")
         return _from_file(str((folder or Path.cwd()) / Path(path).expanduser()), attribute)
+    if kind == "scenarios" and name.endswith((".yaml", ".yml")):
+        return load("sources", "yaml")(name, folder or Path.cwd())
     source, _, rest = name.partition(":")
     if kind == "scenarios" and rest and source in _entries("sources"):
         return load("sources", source)(rest, folder or Path.cwd())

@@ -9,6 +9,7 @@ import typer
 from sbt import __version__
 from sbt.cli import campaign, inform, metrics, scenario
 from sbt.cli.console import verb
+from sbt.cli.new import new
 from sbt.cli.replay import replay
 
 __all__ = ["app", "main"]
@@ -30,6 +31,7 @@ for _verb in (
 ):
     app.command()(verb(_verb))
 app.command()(verb(metrics.metrics))
+app.command()(verb(new))
 app.command("list")(verb(inform.list_))
 app.command()(verb(inform.schema))
 app.command()(verb(inform.doctor))

@@ -24,7 +24,7 @@ Isolation = Annotated[str, typer.Option(metavar="auto|fresh|reuse|replicas", hel
 
 
 def simulate(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name, or file.py:NAME.")],
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name, scenario.yaml, or file.py:NAME.")],
     inputs: Annotated[
         list[str] | None,
         typer.Argument(metavar="[NAME=VALUE]...", help="Inputs; the others are at their centre."),
@@ -119,7 +119,7 @@ def _write_trace(path: Path, states: Trace) -> None:
 
 
 def check(
-    target: Annotated[str, typer.Argument(metavar="TARGET", help="CONFIG.yaml, a scenario's name, or file.py:NAME.")],
+    target: Annotated[str, typer.Argument(metavar="TARGET", help="CONFIG.yaml, scenario.yaml, a scenario's name, or file.py:NAME.")],
     *,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the runs.")] = 0,
     isolation: Isolation = "auto",
@@ -142,13 +142,20 @@ def _target(target: str, isolation: str) -> tuple[ScenarioSpec, LogicalScenario 
     """Return the scenario of a configuration file (with its ranges), or the one with this name."""
     from sbt.execution.spec import ScenarioSpec
 
-    if Path(target).suffix not in (".yaml", ".yml"):
+    if Path(target).suffix not in (".yaml", ".yml") or _is_scenario(Path(target)):
         return ScenarioSpec(target, str(Path.cwd()), isolation=isolation), None
     from sbt.config.assemble import assemble
     from sbt.config.load import load
 
     assembly = assemble(load(target))
     return assembly.spec, assembly.scenario
+
+
+def _is_scenario(path: Path) -> bool:
+    """Return whether a YAML file describes a scenario, not a campaign."""
+    from sbt.config.scenario_file import is_scenario
+
+    return is_scenario(path)
 
 
 def _pairs(what: str, texts: list[str]) -> dict[str, Any]:

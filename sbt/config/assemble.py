@@ -97,7 +97,7 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     config = loaded.config
     ego = None if config.ego is None else _plain_ego(config.ego, loaded.folder)
     folder = str(loaded.folder.resolve())
-    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, config.simulation.step_length)
+    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, config.simulation.step_length, config.requirement.stl)
 
 
 def _plain_ego(ego: Choice, folder: Path) -> dict[str, Any]:
@@ -113,8 +113,9 @@ def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
         raise problems.error()
     scenario = base
     steps: tuple[tuple[Key, ScenarioSpec], ...] = (
-        (("ego",), replace(spec, step_length=None, isolation="auto")),
-        (("simulation", "step_length"), replace(spec, ego=None, isolation="auto")),
+        (("ego",), replace(spec, step_length=None, isolation="auto", formula=None)),
+        (("simulation", "step_length"), replace(spec, ego=None, isolation="auto", formula=None)),
+        (("requirement", "stl"), replace(spec, ego=None, step_length=None, isolation="auto")),
         (("executor", "isolation"), spec),
     )
     before = len(problems.found)
@@ -129,6 +130,8 @@ def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
 def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) -> Requirement:
     """Return the scenario's requirement with the configured metric and interval."""
     change, own = loaded.config.requirement, scenario.requirement
+    if change.stl is not None:
+        return own if change.critical is None else Requirement(own.metric, CriticalInterval(*change.critical))
     metric = own.metric if change.metric is None else change.metric
     if metric not in scenario.measured:
         problems.add(("requirement", "metric"), must_be_one_of("a metric", metric, scenario.measured))

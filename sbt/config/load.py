@@ -25,7 +25,7 @@ from pydantic import BaseModel, ValidationError
 from sbt.config.model import Configuration
 from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
 
-__all__ = ["ConfigError", "Loaded", "dump", "fingerprint", "load", "parse", "resolve", "resumed", "schema"]
+__all__ = ["ConfigError", "Loaded", "dump", "fingerprint", "load", "located", "parse", "read", "resolve", "resumed", "schema"]
 
 _NOT_IDENTITY = ("executor", "store", "budget")
 _RULES = {
@@ -63,15 +63,36 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Loaded:
         ConfigError: the file cannot be read, or anything in it breaks a rule; all at once.
     """
     path = Path(path)
+    return parse(read(path), overrides, name=str(path), folder=path.resolve().parent)
+
+
+def read(path: Path) -> str:
+    """Return the text of a YAML file.
+
+    Raises:
+        ConfigError: it cannot be read, or is no text.
+    """
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        return path.read_bytes().decode("utf-8-sig")
     except IsADirectoryError:
         raise ConfigError([f"{path}: a configuration must be a YAML file, but this is a folder"]) from None
     except OSError as error:
         raise ConfigError([f"{path}: a configuration must be a readable file, but: {error.strerror}"]) from None
     except UnicodeDecodeError as error:
         raise ConfigError([f"{path}: a configuration must be UTF-8 text, but byte {error.start} is not"]) from None
-    return parse(text, overrides, name=str(path), folder=path.resolve().parent)
+
+
+def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wrong: Sequence[str] = ()) -> ConfigError:
+    """Return what pydantic found as messages with places, after those that are known already.
+
+    Args:
+        source: where the keys stand.
+        error: of the model's validation.
+        kind: the model, whose keys near misses are compared with.
+        wrong: messages known already.
+    """
+    found = [_problem(e, kind) for e in error.errors() if e["type"] != "default_factory_not_called"]
+    return ConfigError([*wrong, *source.sorted(found)])
 
 
 def parse(text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None) -> Loaded:
@@ -86,7 +107,7 @@ def parse(text: str, overrides: Sequence[str] = (), *, name: str = "<text>", fol
     try:
         config = Configuration.model_validate(data)
     except ValidationError as error:
-        wrong += source.sorted([_problem(e) for e in error.errors() if e["type"] != "default_factory_not_called"])
+        wrong = list(located(source, error, Configuration, wrong).errors)
     if wrong:
         raise ConfigError(wrong)
     return Loaded(config, source, folder or Path.cwd())
@@ -164,12 +185,12 @@ def _with(data: Any, path: tuple[str, ...], value: Any) -> dict[str, Any]:
     return {**(data or {}), head: _with(inner, rest, value) if rest else value}
 
 
-def _problem(error: Any) -> tuple[Key, str, bool]:
+def _problem(error: Any, root: type[BaseModel]) -> tuple[Key, str, bool]:
     """Return path, message and whether the key is at fault, of one of pydantic's errors."""
     path: Key = tuple(part for part in error["loc"] if part != "[key]")
     kind = error["type"]
     if kind == "extra_forbidden":
-        return path, _unknown_key(path), True
+        return path, _unknown_key(path, root), True
     if kind == "missing":
         return path, _RULES[kind], True
     if kind == "value_error":  # a rule of ours: the message has the value already, or names it
@@ -178,15 +199,15 @@ def _problem(error: Any) -> tuple[Key, str, bool]:
     return path, f"{rule}, but got {_shown(error['input'])}", kind == "invalid_key"
 
 
-def _unknown_key(path: Key) -> str:
-    known = _keys_at(path[:-1])
+def _unknown_key(path: Key, root: type[BaseModel]) -> str:
+    known = _keys_at(path[:-1], root)
     near = get_close_matches(str(path[-1]), known, 1)
     return f"unknown key (did you mean '{near[0]}'?)" if near else f"unknown key; the keys here are {', '.join(known)}"
 
 
-def _keys_at(path: Key) -> list[str]:
+def _keys_at(path: Key, root: type[BaseModel]) -> list[str]:
     """Return the keys of the model at a path."""
-    kind: Any = Configuration
+    kind: Any = root
     for part in path:
         kind = _inner(kind.model_fields[part].annotation) if _is_model(kind) else _inner(get_args(kind)[-1])
         if get_origin(kind) is tuple:

@@ -146,12 +146,23 @@ class RequirementChange(_Strict):
         default=None,
         description="Critical values [low, high], closed; ends may be -.inf or .inf; null: the own.",
     )
+    stl: Name | None = Field(
+        default=None, description="A formula such as G[0,20](gap > 2 and ttc > 1.5) instead of a metric; its robustness is "
+        "the metric stl, critical in [-.inf, 0].",
+    )  # fmt: skip
 
     @field_validator("critical")
     @classmethod
     def _proper(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
         if value is not None:
             CriticalInterval(*value)
+        return value
+
+    @field_validator("stl")
+    @classmethod
+    def _instead_of_a_metric(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is not None and info.data.get("metric") is not None:
+            raise ValueError(f"a requirement has a metric or a formula (stl), not both, but got metric {info.data['metric']}")
         return value
 
 
@@ -252,6 +263,7 @@ def _tenth(data: dict[str, Any]) -> int:
 
 def _store(data: dict[str, Any]) -> str:
     path = Path(data["scenario"].removesuffix(":SCENARIO"))
+    path = path.parent if path.name in ("scenario.yaml", "scenario.yml") and path.parent.name else path
     name = re.sub(r"[^\w-]+", "_", path.stem if path.suffix in (".py", ".yaml") else path.name)
     return f"runs/{data['campaign']}_{name}"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,10 +17,20 @@ from sbt.problem.expression import Expression
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["configured_space"]
+__all__ = ["SpaceChanges", "configured_space", "law_of"]
 
 
-def configured_space(config: Configuration, space: ParameterSpace, problems: Problems) -> ParameterSpace:
+@dataclass(frozen=True)
+class SpaceChanges:
+    """The part of a configuration that changes a parameter space."""
+
+    inputs: Mapping[str, InputChange]
+    correlation: tuple[CorrelationEntry, ...] = ()
+    constraints: tuple[str, ...] = ()
+    features: Mapping[str, str] = field(default_factory=dict)
+
+
+def configured_space(config: Configuration | SpaceChanges, space: ParameterSpace, problems: Problems) -> ParameterSpace:
     """Return the space with the configured changes; what is wrong with them is added to `problems`."""
     changed = {p.name: p for p in space.parameters}
     for name, change in config.inputs.items():
@@ -61,7 +71,7 @@ def _parameter(old: Parameter, change: InputChange, problems: Problems) -> Param
     distribution = old.distribution
     if change.distribution is not None:
         law = change.distribution
-        distribution = problems.attempt((*path, "distribution"), lambda: _law(law))
+        distribution = problems.attempt((*path, "distribution"), lambda: law_of(law))
         if distribution is None:
             return old
     low = old.low if change.min is None else change.min
@@ -69,7 +79,12 @@ def _parameter(old: Parameter, change: InputChange, problems: Problems) -> Param
     return problems.attempt(path, lambda: replace(old, low=low, high=high, distribution=distribution)) or old
 
 
-def _law(choice: Choice) -> Distribution:
+def law_of(choice: Choice) -> Distribution:
+    """Return the law that a configuration describes.
+
+    Raises:
+        InputError: there is no such law, or not with these parameters.
+    """
     for name, value in choice.settings.items():
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise InputError(f"a distribution's parameters must be numbers, but got {name}: {value!r}")

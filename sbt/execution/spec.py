@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sbt.errors import PluginError
+from sbt.errors import InputError, PluginError
 from sbt.plugins import load
+from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario
 
 __all__ = ["ScenarioSpec"]
@@ -29,6 +30,7 @@ class ScenarioSpec:
         ego: the AV under test; None: the scenario's own.
         isolation: auto, fresh, reuse or replicas; scenarios without SUMO ignore it.
         step_length: simulation step (s); None: the scenario's own.
+        formula: of signal temporal logic, measured as the metric `stl` and required; None: the scenario's own requirement.
     """
 
     name: str
@@ -36,6 +38,7 @@ class ScenarioSpec:
     ego: Mapping[str, Any] | None = None
     isolation: str = "auto"
     step_length: float | None = None
+    formula: str | None = None
 
     def resolve(self) -> LogicalScenario:
         """Return the scenario; loaded once per process and specification.
@@ -45,13 +48,30 @@ class ScenarioSpec:
             InputError: the scenario does not offer one of the choices.
         """
         ego = None if self.ego is None else json.dumps(dict(self.ego), sort_keys=True)
-        return _resolve(self.name, str(Path(self.folder).resolve()), ego, self.isolation, self.step_length)
+        return _resolve(self.name, str(Path(self.folder).resolve()), ego, self.isolation, self.step_length, self.formula)
 
 
 @cache
-def _resolve(name: str, folder: str, ego: str | None, isolation: str, step_length: float | None) -> LogicalScenario:
+def _resolve(
+    name: str, folder: str, ego: str | None, isolation: str, step_length: float | None, formula: str | None
+) -> LogicalScenario:
     scenario = load("scenarios", name, Path(folder))
     if not isinstance(scenario, LogicalScenario):
-        raise PluginError(f"a scenario must be a LogicalScenario, but '{name}' is a {type(scenario).__name__}")
+        hint = "; a TraCI loop goes into a scenario.yaml: simulate: file.py:NAME" if callable(scenario) else ""
+        raise PluginError(f"a scenario must be a LogicalScenario, but '{name}' is a {type(scenario).__name__}{hint}")
+    if formula is not None:
+        scenario = _requiring(scenario, formula)
     chosen = scenario.configured(None if ego is None else json.loads(ego), None, step_length)
     return chosen.configured(isolation=isolation)  # afterwards: what is allowed may depend on the ego
+
+
+def _requiring(scenario: LogicalScenario, formula: str) -> LogicalScenario:
+    """Return the scenario with the robustness of a formula as a further metric, and <= 0 critical."""
+    from sbt.metrics.stl import stl
+
+    if scenario.simulate is None:
+        raise InputError(f"a formula needs the trace of a run, but scenario {scenario.name} gives its metrics directly")
+    roles = scenario.roles
+    metric = stl(formula, "stl", roles.ego, roles.other, roles.margin)
+    others = tuple(m for m in scenario.metrics if m.name != metric.name)
+    return replace(scenario, metrics=(*others, metric), requirement=Requirement(metric.name, CriticalInterval(high=0.0)))

@@ -8,6 +8,8 @@ import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import numpy as np
+
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
@@ -80,9 +82,13 @@ def _measured(scenario: LogicalScenario, trace: Trace | Exception) -> tuple[dict
 
 
 def _check_trace(trace: Trace) -> None:
+    """Refuse states that are not finite; NaN in all of them says that an actor is not there, which the first one must be."""
     for name in ("x", "y", "heading", "speed"):
-        total = float(getattr(trace, name).sum())
-        if not math.isfinite(total):
+        values = getattr(trace, name)
+        if math.isfinite(float(values.sum())):
+            continue
+        wrong = ~np.isfinite(values) & trace.present
+        if wrong.any() or not trace.present[:, 0].all():
             raise RunError(Status.FAILED, f"every state must be finite, but trace.{name} is not")
 
 

@@ -28,7 +28,7 @@ def jerk_max(ego: str = "ego") -> Metric:
     def function(trace: Trace) -> float:
         return float(np.abs(jerk(trace.actor(ego), trace.time)).max())
 
-    return Metric("jerk_max", function, "m/s^3", "high", 0.0, "largest absolute rate of the ego's acceleration")
+    return Metric("jerk_max", function, "m/s^3", "high", 0.0, "largest absolute rate of the ego's acceleration", alone=True)
 
 
 def deceleration_max(ego: str = "ego") -> Metric:
@@ -37,7 +37,7 @@ def deceleration_max(ego: str = "ego") -> Metric:
     def function(trace: Trace) -> float:
         return float(max(0.0, -trace.actor(ego).acceleration.min()))
 
-    return Metric("deceleration_max", function, "m/s^2", "high", 0.0, "strongest deceleration of the ego")
+    return Metric("deceleration_max", function, "m/s^2", "high", 0.0, "strongest deceleration of the ego", alone=True)
 
 
 JERK_MAX = jerk_max()

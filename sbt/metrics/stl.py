@@ -32,8 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.arrays import Vector
+from sbt.errors import RunError
+from sbt.metrics.others import worst_signal
 from sbt.metrics.signals import check_signal, signal
 from sbt.metrics.stl_grammar import Binary, Number, Signal, Term, Unary, parse
+from sbt.problem.outcome import Status
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
@@ -50,14 +53,14 @@ _POINTWISE: dict[str, Callable[[Vector, Vector], Vector]] = {
 }  # fmt: skip
 
 
-def stl(text: str, name: str = "stl", ego: str = "ego", other: str = "co", margin: float = 0.0) -> Metric:
+def stl(text: str, name: str = "stl", ego: str = "ego", other: str | None = "co", margin: float = 0.0) -> Metric:
     """Return the robustness of a formula at the start of the trace as a metric; < 0 violates it.
 
     Args:
         text: the formula.
         name: of the metric.
         ego: the road user under test.
-        other: the one that bare signals of two road users speak of.
+        other: the one that bare signals of two road users speak of; None: all others, the worst at every instant.
         margin: lateral clearance below which the other is in ego's path (m).
 
     Raises:
@@ -66,7 +69,13 @@ def stl(text: str, name: str = "stl", ego: str = "ego", other: str = "co", margi
     formula = parse(text, check_signal)
 
     def function(trace: Trace) -> float:
-        return float(robustness(formula, lambda what: signal(trace, what, ego, other, margin), trace.time)[0])
+        def read(what: str) -> Vector:
+            values = worst_signal(trace, what, ego, margin) if other is None else signal(trace, what, ego, other, margin)
+            if np.isnan(values).any():
+                raise RunError(Status.FAILED, f"{what} must be there at every instant, but its road user is not")
+            return values
+
+        return float(robustness(formula, read, trace.time)[0])
 
     return Metric(
         name, function, "", "low", description=f"robustness of {text}",

@@ -17,7 +17,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
-__all__ = ["Batched", "Configurable", "LogicalScenario", "Metric", "Pool", "Simulate"]
+__all__ = ["Batched", "Configurable", "LogicalScenario", "Metric", "Pool", "Roles", "Simulate"]
 
 
 class Simulate(Protocol):
@@ -81,6 +81,7 @@ class Metric:
         without: the value where there was no interaction to measure.
         description: one sentence.
         source: reference of the definition.
+        alone: it measures the ego alone, whoever else is there.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Metric:
     without: float = math.inf
     description: str = ""
     source: str = ""
+    alone: bool = False
 
     def __call__(self, trace: Trace) -> float:
         """Return the metric of a trace.
@@ -126,6 +128,21 @@ class Pool:
 
 
 @dataclass(frozen=True)
+class Roles:
+    """Whom the bare signals of a formula speak of (`sbt.metrics.stl`).
+
+    Args:
+        ego: the road user under test.
+        other: the other one; None: all others, the worst at every instant.
+        margin: lateral clearance below which the other is in ego's path (m).
+    """
+
+    ego: str = "ego"
+    other: str | None = "co"
+    margin: float = 0.0
+
+
+@dataclass(frozen=True)
 class LogicalScenario:
     """A parametrized traffic situation and its requirement.
 
@@ -140,6 +157,7 @@ class LogicalScenario:
             of `simulate`: there is no trace to look at.
         metric_names: the metrics that `evaluate` gives.
         pool: recorded outcomes; campaigns then choose among these rows only.
+        roles: of the actors, for formulas as requirements.
 
     Raises:
         InputError: neither or both of simulate and evaluate, or a requirement on an absent metric.
@@ -154,6 +172,7 @@ class LogicalScenario:
     evaluate: Callable[[Mapping[str, float], int], Mapping[str, float]] | None = None
     metric_names: tuple[str, ...] = ()
     pool: Pool | None = None
+    roles: Roles = Roles()
 
     def __post_init__(self) -> None:
         if (self.simulate is None) == (self.evaluate is None):

@@ -51,6 +51,8 @@ class Trace:
         reported: SUMO's own collision list ("collider>victim@time"), a cross-check only.
         signals: name to (t,) numbers recorded beside the states, such as what the ego perceived.
 
+    In traffic road users come and go: where one is not there, all its states are NaN (`present`).
+
     Two traces are the same where `identical` says so; as keys they count by identity.
 
     Raises:
@@ -78,6 +80,12 @@ class Trace:
         for name, values in self.signals.items():
             if values.shape != shape[:1]:
                 raise ValueError(f"trace.signals['{name}'] must have shape {shape[:1]}, but got {values.shape}")
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """(t, m) whether the actor is there: not all of its states are NaN."""
+        gone = [np.isnan(getattr(self, name)) for name in ("x", "y", "heading", "speed")]
+        return ~np.logical_and.reduce(gone)
 
     def actor(self, name: str) -> ActorTrace:
         """Return the columns of one actor.
@@ -108,13 +116,14 @@ class Trace:
     def identical(self, other: Trace) -> bool:
         """Return whether two traces agree to the last bit, signals and SUMO's collision list included."""
         arrays = ("time", "x", "y", "heading", "speed", "acceleration", "length", "width")
-        same = all(np.array_equal(getattr(self, name), getattr(other, name)) for name in arrays)
+        same = all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in arrays)
         same = same and list(self.signals) == list(other.signals)
         same = same and all(np.array_equal(values, other.signals[name]) for name, values in self.signals.items())
         return same and (self.actors, self.ended, self.reported) == (other.actors, other.ended, other.reported)
 
     def rows(self) -> list[dict[str, float | str]]:
-        """Return one dictionary a time and actor, for a CSV file."""
+        """Return one dictionary a time and actor that is there, for a CSV file."""
+        present = self.present
         columns = ("x", "y", "heading", "speed", "acceleration")
         return [
             {
@@ -123,4 +132,5 @@ class Trace:
             }
             for i, t in enumerate(self.time)
             for k, name in enumerate(self.actors)
+            if present[i, k]
         ]  # fmt: skip

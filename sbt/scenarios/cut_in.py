@@ -14,7 +14,7 @@ import numpy as np
 from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State, Until, VehicleType
 from sbt.sumo.drivers import LaneChange
@@ -93,4 +93,5 @@ SCENARIO = LogicalScenario(
         drac_max(margin=MARGIN),
     ),
     requirement=Requirement("ttc_min", CriticalInterval(-5.0, 0.5)),
+    roles=Roles(margin=MARGIN),
 )

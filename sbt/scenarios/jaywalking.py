@@ -16,7 +16,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario, Roles, Metric
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import Actor, Obstacle, Scene, State, Until, VehicleType
@@ -216,5 +216,6 @@ SCENARIO = LogicalScenario(
         ego=Ego("pedestrian_braking"),
     ),
     metrics=(MIN_DIST, COLLISION, IMPACT_SPEED),
+    roles=Roles(other="child"),
     requirement=Requirement("min_dist", CriticalInterval(high=-1e-6)),
 )

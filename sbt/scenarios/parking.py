@@ -16,7 +16,7 @@ from sbt.errors import InputError
 from sbt.metrics.geometry import contact_index, rectangle_distance, swept_contact
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario, Roles, Metric
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import Actor, Pose, Scene, State, Until, VehicleType
@@ -158,5 +158,6 @@ SCENARIO = LogicalScenario(
         net="parking_lot", scene=scene, duration=DURATION, step_length=0.05, ego=Ego("emergency_stop"),
     ),
     metrics=(CRITERION, D_MIN, COLLISION, V_EGO, V_CO),
+    roles=Roles(other="co_1"),
     requirement=Requirement("criterion", CriticalInterval(high=-10.0)),
 )  # fmt: skip

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from xml.sax.saxutils import quoteattr
 
 from sbt.errors import RunError
@@ -29,7 +29,7 @@ from sbt.problem.outcome import Status
 from sbt.sumo.actors import VehicleType
 from sbt.sumo.copies import copied
 
-__all__ = ["ABSENT", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
+__all__ = ["ABSENT", "Loadable", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
 
 ABSENT = -1073741824.0
 """What SUMO answers for an actor that is not on the road (it does not raise)."""
@@ -63,6 +63,14 @@ def direct(sumo: Any, domain: str, name: str) -> Any:
 def _binary(domain: str, name: str) -> Any:
     module = libsumo()
     return getattr(module.libsumo._libsumo, f"{domain}_{name}", None) or getattr(getattr(module, domain), name)
+
+
+class Loadable(Protocol):
+    """What a simulation is loaded with."""
+
+    def command(self, seed: int) -> list[str]:
+        """Return SUMO's arguments without the program's name."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -127,13 +135,13 @@ class Session:
 
     def __init__(self) -> None:
         self._sumo = libsumo()
-        self._setup: Setup | None = None
+        self._setup: Loadable | None = None
         self._routes: set[tuple[str, ...]] = set()
         self._inside: list[tuple[str, str]] = []
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
 
     @contextlib.contextmanager
-    def run(self, setup: Setup, seed: int, isolation: str) -> Iterator[Any]:
+    def run(self, setup: Loadable, seed: int, isolation: str) -> Iterator[Any]:
         """Give libsumo with an empty simulation of this setup at hand, for one run, or for one in each copy.
 
         Raises:
@@ -170,7 +178,7 @@ class Session:
             getattr(self._sumo, domain).remove(name)
         self._inside = [entry for entry in self._inside if not entry[1].startswith(prefix)]
 
-    def _load(self, setup: Setup, seed: int, isolation: str) -> None:
+    def _load(self, setup: Loadable, seed: int, isolation: str) -> None:
         kept = isolation != "fresh"
         if kept and setup == self._setup:
             return

@@ -1,0 +1,204 @@
+"""`scenario.yaml` to a logical scenario: every mistake at once, each with file, line and column."""
+
+from __future__ import annotations
+
+import math
+from difflib import get_close_matches
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from sbt.config.load import located, read
+from sbt.config.own_metrics import actors_of, metric_of
+from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
+from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
+from sbt.config.space import SpaceChanges, configured_space, law_of
+from sbt.errors import InputError
+from sbt.plugins import load
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario, Metric, Roles
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.ego import Ego
+from sbt.sumo.files import SumoFiles, options_of_config
+from sbt.sumo.own_ego import OwnEgo
+from sbt.sumo.script import Loop, OwnSimulation, just_step
+from sbt.sumo.watch import Watching
+
+__all__ = ["from_file", "is_scenario"]
+
+
+def is_scenario(path: Path) -> bool:
+    """Return whether a YAML file describes a scenario, not a campaign."""
+    data = read_yaml(read(path), str(path))[0]
+    return isinstance(data, dict) and "campaign" not in data and bool({"sumo", "simulate", "ego"} & set(data))
+
+
+def from_file(name: str, folder: Path) -> LogicalScenario:
+    """Return the scenario of a `scenario.yaml`.
+
+    Args:
+        name: the file; what it names is relative to it.
+        folder: where a relative `name` is looked up.
+
+    Raises:
+        ConfigError: everything that is wrong with it and with the files it names.
+    """
+    path = (folder / Path(name).expanduser()).resolve()
+    data, source, wrong = read_yaml(read(path), name)
+    problems = Problems(source)
+    try:
+        model = ScenarioModel.model_validate(data)
+    except ValidationError as error:
+        raise located(source, error, ScenarioModel, wrong) from None
+    if wrong:
+        raise ConfigError(wrong)
+    return _Builder(model, path.parent, problems).scenario(path)
+
+
+class _Builder:
+    """Makes the parts, collecting what is wrong with each."""
+
+    def __init__(self, model: ScenarioModel, folder: Path, problems: Problems):
+        self._model, self._folder, self._problems = model, folder, problems
+
+    def scenario(self, path: Path) -> LogicalScenario:
+        model, problems = self._model, self._problems
+        space = self._space()
+        files, loop = self._files(), self._loop()
+        ego = self._ego(model.ego, files)
+        metrics = self._metrics()
+        requirement = self._requirement(metrics)
+        if files is not None:
+            self._check_inputs(files)
+        if model.sumo is None and model.simulate is None:
+            problems.add(("inputs",), "a scenario needs files (sumo) or a loop (simulate), but has neither")
+        problems.check()
+        named = tuple(dict.fromkeys((*model.others.named, *(n for m in model.metrics for n in actors_of(m)))))
+        named = tuple(n for n in named if n != model.ego.id)
+        simulation = problems.attempt(("step_length",), lambda: OwnSimulation(
+            Watching(ego or OwnEgo(model.ego.id), model.duration, model.others.within, named, model.wait),
+            files, loop, self._folder, model.step_length,
+        ))  # fmt: skip
+        problems.check()
+        name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
+        return LogicalScenario(
+            name, space or ParameterSpace(()), requirement or Requirement("", CriticalInterval(high=0.0)), simulation, metrics,
+            model.description, roles=Roles(model.ego.id, None),
+        )  # fmt: skip
+
+    def _space(self) -> ParameterSpace | None:
+        """Return the inputs with their correlation, constraints and features."""
+        parameters = []
+        for name, entry in self._model.inputs.items():
+            law = None
+            if entry.distribution is not None:
+                choice = entry.distribution
+                law = self._problems.attempt(("inputs", name, "distribution"), lambda choice=choice: law_of(choice))
+            made = self._problems.attempt(("inputs", name), lambda name=name, entry=entry, law=law: Parameter(
+                name, entry.min, entry.max, entry.unit, law, entry.kind, entry.description,
+            ))  # fmt: skip
+            if made is not None:
+                parameters.append(made)
+        if len(parameters) < len(self._model.inputs):
+            return None
+        model = self._model
+        changes = SpaceChanges({}, model.correlation, model.constraints, model.features)
+        return configured_space(changes, ParameterSpace(tuple(parameters)), self._problems)
+
+    def _files(self) -> SumoFiles | None:
+        if self._model.sumo is None:
+            return None
+        entry = self._model.sumo
+        files = self._problems.attempt(("sumo",), lambda: SumoFiles.of(self._options(entry), self._folder, "sumo"))
+        if files is None:
+            return None
+        found = files
+        return files if self._problems.attempt(("sumo",), lambda: found.templates) is not None else None
+
+    def _options(self, entry: SumoEntry) -> dict[str, str]:
+        """Return the options of the configuration with what the scenario file says on top."""
+        options = {} if entry.config is None else options_of_config(self._folder / entry.config)
+        for name, value in (("net-file", entry.net), ("route-files", ",".join(entry.routes)),
+                            ("additional-files", ",".join(entry.additional))):  # fmt: skip
+            if value:
+                options[name] = value
+        written = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in entry.options.items()}
+        return {**options, **written}
+
+    def _loop(self) -> Loop:
+        name = self._model.simulate
+        if name is None:
+            return just_step
+        found = self._problems.attempt(("simulate",), lambda: load("scenarios", name, self._folder))
+        if found is not None and not callable(found):
+            self._problems.add(("simulate",), f"a loop must be a function simulate(sumo, values, rng), but '{name}' is not")
+        loop: Loop = found if found is not None else just_step
+        return loop
+
+    def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> OwnEgo | None:
+        if files is not None and self._model.simulate is None and files.vehicle(entry.id) is None:
+            names = files.names()
+            near = get_close_matches(entry.id, names, 1)
+            hint = f" (did you mean '{near[0]}'?)" if near else ""
+            known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
+            self._problems.add(("ego",), f"the ego must be a vehicle, trip or flow of the files ({known}), but got '{entry.id}'{hint}")
+        kind = entry.kind
+        if kind is None:
+            if entry.settings:
+                self._problems.add(("ego",), f"settings need a kind (a controller, or sumo), but got {', '.join(entry.settings)}")
+            return OwnEgo(entry.id, None, entry.set_speed, entry.speed_mode, entry.may_leave)
+        if ".py:" in kind:
+            kind = str(self._folder / Path(kind).expanduser())
+        driver = self._problems.attempt(("ego",), lambda: Ego.of(kind, **entry.settings))
+        return OwnEgo(entry.id, driver, entry.set_speed, entry.speed_mode, entry.may_leave)
+
+    def _metrics(self) -> tuple[Metric, ...]:
+        made: dict[str, Metric] = {}
+        formula = self._model.requirement.stl
+        entries = [*self._model.metrics, *([] if formula is None else [MetricEntry(stl=formula)])]
+        if not entries:
+            self._problems.add(("metrics",), "a scenario needs at least one metric, but has none")
+        for k, entry in enumerate(entries):
+            path = ("metrics", k) if k < len(self._model.metrics) else ("requirement", "stl")
+            metric = self._problems.attempt(path, lambda entry=entry: metric_of(entry, self._folder, self._model.ego.id))
+            if metric is not None and metric.name in made:
+                self._problems.add(path, f"metrics need different names (name: ...), but got '{metric.name}' twice")
+            elif metric is not None:
+                made[metric.name] = metric
+        return tuple(made.values())
+
+    def _requirement(self, metrics: tuple[Metric, ...]) -> Requirement | None:
+        """Return the requirement, on a metric or on a formula that is one of them."""
+        wanted, problems = self._model.requirement, self._problems
+        names = [m.name for m in metrics]
+        if wanted.stl is not None:
+            return Requirement("stl", CriticalInterval(*(wanted.critical or (-math.inf, 0.0))))
+        if wanted.metric is None or wanted.critical is None:
+            problems.add(("requirement",), "a requirement must have a metric and critical: [low, high]")
+            return None
+        if wanted.metric not in names and len(names) == len(self._model.metrics):
+            problems.add(("requirement", "metric"), must_be_one_of("a metric", wanted.metric, names))
+        return Requirement(wanted.metric, CriticalInterval(*wanted.critical))
+
+    def _check_inputs(self, files: SumoFiles) -> None:
+        """Compare placeholders and inputs."""
+        known, used = list(self._model.inputs), set()
+        try:
+            holes = list(files.holes())
+        except InputError as error:
+            self._problems.add(("sumo",), str(error))
+            return
+        for hole in holes:
+            for name in hole.formula.names():
+                used.add(name)
+                if name not in known:
+                    rule = must_be_one_of(f"${{{hole.formula.text}}}: a placeholder", name, known)
+                    self._problems.add(("inputs",), f"{hole.place}: {rule}")
+        for name in known:
+            if name not in used and self._model.simulate is None:
+                files_read = ", ".join(t.path.name for t in files.templates)
+                self._problems.add(
+                    ("inputs", name), f"an input must stand as a placeholder ${{{name}}} in the files ({files_read}), but does not",
+                    at_key=True,
+                )  # fmt: skip

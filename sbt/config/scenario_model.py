@@ -1,0 +1,124 @@
+"""The keys of a `scenario.yaml`: the user's own SUMO files or TraCI loop as a logical scenario."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, ValidationInfo, field_validator
+
+from sbt.config.model import Choice, Condition, CorrelationEntry, Formula, Name, RequirementChange
+
+__all__ = ["EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ScenarioModel", "SumoEntry"]
+
+
+def _under(key: str) -> BeforeValidator:
+    """Return what reads a bare text as the mapping `{key: text}`."""
+    return BeforeValidator(lambda value: {key: value} if isinstance(value, str) else value)
+
+
+class _Strict(BaseModel):
+    """Frozen; unknown keys are errors; a string is no number and a boolean no integer."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class _Open(_Strict):
+    """The same, but further keys are settings."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, JsonValue]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The keys beside the declared ones."""
+        return dict(self.__pydantic_extra__)
+
+
+Names = Annotated[tuple[Name, ...], BeforeValidator(lambda value: [value] if isinstance(value, str) else value), Field(strict=False)]
+
+
+class SumoEntry(_Strict):
+    """The user's files, relative to the scenario file."""
+
+    config: Name | None = Field(default=None, description="A .sumocfg.")
+    net: Name | None = Field(default=None, description="The network (.net.xml, .net.xml.gz); default: the configuration's.")
+    routes: Names = Field(default=(), description="Route files; default: the configuration's.")
+    additional: Names = Field(default=(), description="Additional files; default: the configuration's.")
+    options: dict[str, str | float | int | bool] = Field(default={}, description="Further SUMO options, name: value.")
+
+
+class InputEntry(_Strict):
+    """One input: its range, unit and law."""
+
+    min: float = Field(description="Lower end of the range.")
+    max: float = Field(description="Upper end of the range.")
+    unit: str = Field(default="", description="As printed.")
+    distribution: Choice | None = Field(default=None, description="Law on the range, such as {kind: normal, mean: 4, std: 1}.")
+    kind: Literal["continuous", "integer"] = Field(default="continuous", description="integer: whole numbers only.")
+    description: str = Field(default="", description="One line for reports.")
+
+
+class EgoEntry(_Open):
+    """The vehicle under test; further keys are settings of its driver."""
+
+    id: Name = Field(description="Its id in SUMO.")
+    kind: Name | None = Field(
+        default=None, description="A controller (file.py:NAME for one's own), or sumo with model: IDM; null: as the files have it."
+    )
+    set_speed: float | None = Field(default=None, gt=0, description="What a controller keeps (m/s); null: the allowed speed.")
+    speed_mode: int = Field(default=32, ge=0, description="SUMO's speed mode under a controller; 24 stops at red lights.")
+    may_leave: bool = Field(default=False, description="Arriving before the duration is over is no failure.")
+
+
+class OthersEntry(_Strict):
+    """Who is recorded beside the ego."""
+
+    within: float = Field(default=100.0, gt=0, description="Radius around the ego (m).")
+    named: Names = Field(default=(), description="Ids recorded wherever they are.")
+
+
+class MetricEntry(_Open):
+    """One metric; further keys are its settings, such as margin."""
+
+    kind: Name | None = Field(default=None, description="An installed metric, or file.py:NAME.")
+    stl: Name | None = Field(default=None, description="A formula instead; its robustness is the metric.")
+    name: Name | None = Field(default=None, description="As written in the requirement and the store; default: the kind.")
+    other: Name | None = Field(default=None, description="Id of the one that counts; null: all others, the worst.")
+
+    @field_validator("stl")
+    @classmethod
+    def _one_of_two(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is not None and info.data.get("kind") is not None:
+            raise ValueError(f"a metric has a kind or a formula (stl), not both, but got kind {info.data['kind']}")
+        return value
+
+
+class ScenarioModel(_Strict):
+    """A logical scenario of the user's own files or loop."""
+
+    name: Name | None = Field(default=None, description="Default: the folder's name.")
+    description: str = Field(default="", description="The first line is a title.")
+    sumo: Annotated[SumoEntry, _under("config")] | None = Field(default=None, description="The files, or just a .sumocfg.")
+    simulate: Name | None = Field(default=None, description="file.py:NAME of a loop simulate(sumo, values, rng).")
+    inputs: dict[str, InputEntry] = Field(min_length=1, description="By name; ${name} in the files.")
+    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False)] = Field(default=(), description="Correlated pairs.")
+    constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = Field(default=(), description="Conditions on inputs.")
+    features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel.")
+    ego: Annotated[EgoEntry, _under("id")] = Field(description="The vehicle under test, or just its id.")
+    others: OthersEntry = Field(default=OthersEntry(), description="Who is recorded.")
+    duration: float = Field(gt=0, allow_inf_nan=False, description="From the ego's departure on (s).")
+    wait: float = Field(default=3600.0, gt=0, allow_inf_nan=False, description="Longest time until the ego departs (s).")
+    step_length: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="SUMO's step (s); null: the files', or 0.1."
+    )
+    metrics: Annotated[tuple[Annotated[MetricEntry, _under("kind")], ...], Field(strict=False)] = Field(
+        default=(), description="What is measured."
+    )
+    requirement: RequirementChange = Field(description="{metric, critical} or {stl}.")
+
+    @field_validator("simulate")
+    @classmethod
+    def _something_to_run(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is not None and ".py:" not in value:
+            raise ValueError(f"a loop must be file.py:NAME, but got '{value}'")
+        return value

@@ -1,0 +1,130 @@
+"""Whether SUMO put a vehicle of the user's files where the files ask for it, and in words why not.
+
+SUMO delays a vehicle that its insertion checks find too close, silently: the concrete scenario that
+runs is then another one. Compared are departure, position, speed and lane, as far as they are numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sbt.errors import RunError
+from sbt.problem.outcome import Status
+from sbt.sumo.files import SumoFiles
+from sbt.sumo.template import fill
+
+__all__ = ["Asked", "Insertions", "asked_of"]
+
+_TOLERANCE = 1e-3
+_HINT = 'set insertionChecks="none" on the vehicle, or the option insertion-checks: none'
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the files ask of one vehicle's start; None where that is SUMO's to choose.
+
+    Attributes:
+        place: `file:line:column` of the vehicle.
+        depart: time (s).
+        position: of the front bumper on its lane (m), from its end where negative.
+        speed: m/s.
+        lane: index.
+    """
+
+    place: str
+    depart: float | None
+    position: float | None
+    speed: float | None
+    lane: float | None
+
+
+def asked_of(files: SumoFiles, values: Mapping[str, float], ego: str) -> dict[str, Asked]:
+    """Return what is asked of the ego and of every vehicle that has a placeholder."""
+    found: dict[str, Asked] = {}
+    for one in files.templates:
+        for name, written in one.vehicles.items():
+            if written[""] not in ("vehicle", "trip") or (name != ego and not any("${" in v for v in written.values())):
+                continue
+
+            def read(key: str, written: Mapping[str, str] = written, place: str = one.lines[name]) -> float | None:
+                try:
+                    return float(fill(written[key], values, place))
+                except (KeyError, ValueError):
+                    return None
+
+            found[name] = Asked(one.lines[name], read("depart"), read("departPos"), read("departSpeed"), read("departLane"))
+    return found
+
+
+class Insertions:
+    """Follows the vehicles until they have departed, and compares."""
+
+    def __init__(self, sumo: Any, asked: Mapping[str, Asked]):
+        self._sumo = sumo
+        self._asked = dict(asked)
+        self._meant: dict[str, str] = {}
+
+    def after_step(self, departed: frozenset[str]) -> None:
+        """Compare who departed in this step with what was asked.
+
+        Raises:
+            RunError: another start than the one asked for.
+        """
+        if not self._asked:
+            return
+        now, dt = self._sumo.simulation.getTime(), self._sumo.simulation.getDeltaT()
+        for name in [name for name in self._asked if name in departed]:
+            self._compare(name, self._asked.pop(name), dt)
+        for name, asked in self._asked.items():
+            if asked.depart is not None and asked.depart <= now - dt and name not in self._meant:
+                self._meant[name] = self._behind(name, asked)
+
+    def waiting(self, name: str) -> str:
+        """Return in words why a vehicle is not there yet."""
+        if name in self._sumo.simulation.getPendingVehicles():
+            meant = self._meant.get(name, "")
+            return f"SUMO holds it back since its departure{f', asked for {meant}' if meant else ''}: {_HINT}"
+        return "SUMO has not loaded it: is its depart later, or the route file not sorted by depart (SUMO drops what comes late)?"
+
+    def _compare(self, name: str, asked: Asked, dt: float) -> None:
+        vehicle = self._sumo.vehicle
+        departure = vehicle.getDeparture(name)
+        if asked.depart is not None and departure - asked.depart > dt + _TOLERANCE:
+            meant, got = self._meant.get(name, ""), self._behind(name, None)
+            raise RunError(
+                Status.INVALID, f"{asked.place}: you asked for '{name}' at t = {asked.depart:g} s{f', {meant}' if meant else ''}; "
+                f"SUMO inserted it at t = {departure:g} s{f', {got}' if got else ''}: {_HINT}",
+            )  # fmt: skip
+        position = asked.position
+        if position is not None and position < 0:
+            position += self._sumo.lane.getLength(vehicle.getLaneID(name))
+        realised = (
+            ("departPos", position, vehicle.getLanePosition(name), " m"),
+            ("departSpeed", asked.speed, vehicle.getSpeed(name), " m/s"),
+            ("departLane", asked.lane, vehicle.getLaneIndex(name), ""),
+        )
+        for what, wanted, got, unit in realised:
+            if wanted is not None and abs(wanted - got) > _TOLERANCE:
+                raise RunError(
+                    Status.INVALID, f"{asked.place}: you asked for '{name}' with {what} {wanted:g}{unit}, SUMO inserted it with "
+                    f"{got:g}{unit}: {_HINT}",
+                )  # fmt: skip
+
+    def _behind(self, name: str, asked: Asked | None) -> str:
+        """Return the gap to the one ahead on its lane in words: as asked, or (None) as it is; "" where there is none."""
+        vehicle = self._sumo.vehicle
+        if asked is None:
+            lane, position = vehicle.getLaneID(name), vehicle.getLanePosition(name)
+        else:
+            if asked.position is None:
+                return ""
+            lane, position = f"{vehicle.getRoute(name)[0]}_{int(asked.lane or 0)}", asked.position
+            position += self._sumo.lane.getLength(lane) if position < 0 else 0.0
+        ahead = [
+            (vehicle.getLanePosition(other) - vehicle.getLength(other) - position, other)
+            for other in self._sumo.lane.getLastStepVehicleIDs(lane)
+            if other != name and vehicle.getLanePosition(other) > position
+        ]
+        return "{:.3g} m behind '{}'".format(*min(ahead)) if ahead else ""

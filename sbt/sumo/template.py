@@ -1,0 +1,228 @@
+"""The user's own SUMO files with `${...}` in their attributes, filled with numbers and nothing else.
+
+What stands between the braces is a formula over inputs (`${gap}`, `${100 + gap}`, `${v / 3.6}`). Every
+other byte stays as it is. A file without placeholders, also in what it includes, is used where it lies;
+of the others a filled copy is written. Document types and entities are refused: a file must not make
+SUMO read another one behind the user's back.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import re
+import xml.parsers.expat
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+
+from sbt.errors import InputError, RunError
+from sbt.problem.expression import Expression
+from sbt.problem.outcome import Status
+
+__all__ = ["Hole", "Template", "fill", "holes", "template"]
+
+_HOLE = re.compile(r"\$\{([^{}]*)\}")
+_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
+_REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
+_REFERRING = ("include", "variableSpeedSign", "rerouter")
+"""Elements whose `href` or `file` SUMO reads, relative to the file they stand in."""
+_VEHICLES = ("vehicle", "trip", "flow", "person", "personFlow")
+
+
+@dataclass(frozen=True)
+class Hole:
+    """One placeholder: its formula, and where it stands (`file:line:column`)."""
+
+    formula: Expression
+    place: str
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A stretch of a file that is not copied as it is: a placeholder, or the name of another file."""
+
+    start: int
+    end: int
+    hole: Hole | None = None
+    target: Path | None = None
+    included: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """One XML file of the user.
+
+    Attributes:
+        path: absolute.
+        root: name and attributes of its outermost element.
+        parts: what is replaced in a copy, in order.
+        vehicles: attributes of the vehicles, trips, flows and persons by id, as they are written.
+        lines: where each of them stands (`file:line:column`).
+        data: its bytes, kept only where there are parts to replace.
+    """
+
+    path: Path
+    root: tuple[str, Mapping[str, str]]
+    parts: tuple[_Part, ...]
+    vehicles: Mapping[str, Mapping[str, str]]
+    lines: Mapping[str, str]
+    data: bytes = b""
+
+    @cached_property
+    def includes(self) -> tuple[Template, ...]:
+        """The files it includes, as templates."""
+        return tuple(template(p.target) for p in self.parts if p.included and p.target is not None)
+
+    def tree(self, above: tuple[Path, ...] = ()) -> Iterator[Template]:
+        """Yield the file and all that it includes.
+
+        Raises:
+            InputError: a file includes itself, or one of them is no proper file.
+        """
+        if self.path in above:
+            raise InputError(f"a SUMO file must not include itself, but {self.path} does")
+        yield self
+        for inner in self.includes:
+            yield from inner.tree((*above, self.path))
+
+    @cached_property
+    def holes(self) -> tuple[Hole, ...]:
+        """All placeholders, those of included files too."""
+        return tuple(p.hole for t in self.tree() for p in t.parts if p.hole is not None)
+
+    def write(self, values: Mapping[str, float], folder: Path) -> Path:
+        """Return the file with the placeholders filled: a copy in `folder`, or the file itself where it has none.
+
+        Raises:
+            RunError: a formula is not finite for these values.
+        """
+        if not self.holes:
+            return self.path
+        copied, at = [], 0
+        for part in self.parts:
+            copied += [self.data[at : part.start], self._replaced(part, values, folder)]
+            at = part.end
+        name = self.path.name.removesuffix(".gz")
+        target = folder / f"{abs(hash(self.path)):x}-{name}"
+        target.unlink(missing_ok=True)  # a simulation that ends may still hold the old one open
+        target.write_bytes(b"".join([*copied, self.data[at:]]))
+        return target
+
+    def _replaced(self, part: _Part, values: Mapping[str, float], folder: Path) -> bytes:
+        if part.hole is not None:
+            return number(part.hole, values).encode()
+        if part.target is None:
+            raise InputError(f"a part of {self.path} must have a value or a file")
+        target = template(part.target).write(values, folder) if part.included else part.target
+        return b'"' + str(target).encode() + b'"'
+
+
+def holes(text: str, place: str) -> tuple[Hole, ...]:
+    """Return the placeholders of one value.
+
+    Raises:
+        InputError: one is no formula; the message begins with the place.
+    """
+    return tuple(_hole(match.group(1), place) for match in _HOLE.finditer(text))
+
+
+def fill(text: str, values: Mapping[str, float], place: str = "") -> str:
+    """Return a value with its placeholders filled."""
+    return _HOLE.sub(lambda match: number(_hole(match.group(1), place), values), text)
+
+
+def number(hole: Hole, values: Mapping[str, float]) -> str:
+    """Return the value of a placeholder as SUMO reads it; whole numbers without a point, for lanes and counts.
+
+    Raises:
+        RunError: it is not finite.
+    """
+    value = float(hole.formula(values))
+    if not math.isfinite(value):
+        raise RunError(Status.INVALID, f"{hole.place}: ${{{hole.formula.text}}} must be finite, but got {value}")
+    return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
+
+
+def _hole(text: str, place: str) -> Hole:
+    try:
+        formula = Expression(text)
+    except InputError as error:
+        raise InputError(f"{place}: ${{{text}}} must be a formula over inputs, but {error}") from None
+    if not formula.names():
+        raise InputError(f"{place}: ${{{text}}} must use at least one input, but it uses none")
+    return Hole(formula, place)
+
+
+def _read(path: Path) -> bytes:
+    """Return the bytes of a file, unpacked."""
+    try:
+        data = path.read_bytes()
+        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+    except (OSError, EOFError) as error:
+        raise InputError(f"a SUMO file must be readable, but {path} is not: {error}") from None
+
+
+@cache
+def template(path: Path) -> Template:
+    """Return one file of the user; read once a process.
+
+    Raises:
+        InputError: it cannot be read, is no well-formed XML, declares a document type or entities, or has a
+            placeholder that is no formula; the message begins with file, line and column.
+    """
+    data = _read(path)
+    if b"\0" in data[:64]:
+        raise InputError(f"{path}: a SUMO file must be encoded byte by byte (UTF-8), but it has zero bytes")
+    parser = xml.parsers.expat.ParserCreate()
+    roots: list[tuple[str, Mapping[str, str]]] = []
+    parts: list[_Part] = []
+    vehicles: dict[str, Mapping[str, str]] = {}
+    lines: dict[str, str] = {}
+    every = b"${" in data or b"<include" in data
+
+    def place() -> str:
+        return f"{path}:{parser.CurrentLineNumber}:{parser.CurrentColumnNumber + 1}"
+
+    def refuse(*_: object) -> None:
+        raise InputError(f"{place()}: a SUMO file must not declare a document type or entities, but it does")
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if not roots:
+            roots.append((tag, attributes))
+            if tag == "net" and not every:  # large, and only its root matters
+                parser.StartElementHandler = None
+        if tag in _VEHICLES and "id" in attributes:
+            vehicles[attributes["id"]], lines[attributes["id"]] = {"": tag, **attributes}, place()
+        if every:
+            parts.extend(_parts(path, data, parser.CurrentByteIndex, tag, place()))
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = start
+    try:
+        parser.Parse(data, True)
+    except xml.parsers.expat.ExpatError as error:
+        raise InputError(f"{path}:{error.lineno}:{error.offset + 1}: a SUMO file must be well-formed XML, but: {error}") from None
+    return Template(path, roots[0], tuple(parts), vehicles, lines, data if parts else b"")
+
+
+def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_Part]:
+    """Yield the placeholders and file names of the tag that begins at a byte."""
+    found = _TAG.match(data, at)
+    if found is None:
+        return
+    text = found.group()
+    taken: list[_Part] = []
+    if tag in _REFERRING:
+        for match in _REFERENCE.finditer(text):
+            name = match.group(2)[1:-1].decode()
+            target = (path.parent / name).resolve()
+            if tag == "include" and not target.is_file():
+                raise InputError(f"{place}: an included file must exist, but got '{name}'")
+            if target.is_file():
+                taken.append(_Part(at + match.start(2), at + match.end(2), target=target, included=tag == "include"))
+    for match in re.finditer(_HOLE.pattern.encode(), text):
+        taken.append(_Part(at + match.start(), at + match.end(), hole=_hole(match.group(1).decode(), place)))
+    yield from sorted(taken, key=lambda part: part.start)
