@@ -19,6 +19,8 @@ _FREE = 2
 """keepRoute of moveToXY that keeps a pose to the last bit, off the lanes too."""
 _COLOR = (90, 90, 90, 255)
 _FOREVER = 1e6
+_END = -1.0
+"""Position that is the end of the last edge."""
 
 
 def type_name(actor: Actor) -> str:
@@ -34,7 +36,10 @@ def insert(sumo: Any, scene: Scene) -> None:
         if actor.person:
             sumo.person.add(actor.name, actor.route[0], actor.position, typeID=type_name(actor))
             here.inserted(actor.name, "person")
-            sumo.person.appendWaitingStage(actor.name, _FOREVER)
+            if actor.pose is None:
+                sumo.person.appendWalkingStage(actor.name, list(actor.route), _END, speed=actor.speed)
+            else:
+                sumo.person.appendWaitingStage(actor.name, _FOREVER)
         else:
             sumo.vehicle.add(
                 actor.name, here.route(actor.route), typeID=type_name(actor), depart="now",
@@ -43,7 +48,8 @@ def insert(sumo: Any, scene: Scene) -> None:
             here.inserted(actor.name)
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(actor.name, 32)
-                sumo.vehicle.setLaneChangeMode(actor.name, 0)
+                if not actor.lane_changes:
+                    sumo.vehicle.setLaneChangeMode(actor.name, 0)
                 sumo.vehicle.setSpeed(actor.name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
         if actor.pose is not None:
             mover(sumo, actor)(actor.pose)
@@ -84,24 +90,29 @@ def verify(sumo: Any, scene: Scene) -> None:
         position = domain.getPosition(actor.name) if actor.pose is not None else domain.getLanePosition(actor.name)
         if ABSENT in (position, position[0] if isinstance(position, tuple) else position):
             raise RunError(Status.INVALID, f"{actor.name} must be on the road at the start, but SUMO did not insert it")
-        if actor.pose is not None:
-            x, y, heading = actor.pose
-            half = _front(actor)
-            realised = {
-                "x": (x + half * math.cos(heading), position[0], "m"),
-                "y": (y + half * math.sin(heading), position[1], "m"),
-            }
-        else:
-            realised = {
-                "position": (actor.position, position, "m"),
-                "speed": (actor.speed, domain.getSpeed(actor.name), "m/s"),
-                "lane": (actor.lane, domain.getLaneIndex(actor.name), ""),
-            }
-        for what, (asked, got, unit) in realised.items():
+        for what, (asked, got, unit) in _realised(domain, actor, position).items():
             if abs(asked - got) > _TOLERANCE:
                 raise RunError(
                     Status.INVALID, f"{actor.name} must start with {what} {asked:.6g} {unit}, but SUMO gave {got:.6g} {unit}"
                 )
+
+
+def _realised(domain: Any, actor: Actor, position: Any) -> dict[str, tuple[float, float, str]]:
+    """Return what was asked of an actor, what SUMO made of it, and the unit."""
+    if actor.pose is not None:
+        x, y, heading = actor.pose
+        half = _front(actor)
+        return {
+            "x": (x + half * math.cos(heading), position[0], "m"),
+            "y": (y + half * math.sin(heading), position[1], "m"),
+        }
+    if actor.person:  # SUMO chooses the pavement and lets it walk in the step that inserts it
+        return {"position": (actor.position, position, "m")}
+    return {
+        "position": (actor.position, position, "m"),
+        "speed": (actor.speed, domain.getSpeed(actor.name), "m/s"),
+        "lane": (actor.lane, domain.getLaneIndex(actor.name), ""),
+    }
 
 
 def _front(actor: Actor) -> float:

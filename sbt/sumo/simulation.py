@@ -13,6 +13,7 @@ import numpy as np
 from sbt.errors import InputError, RunError
 from sbt.metrics.geometry import contact_index
 from sbt.problem.outcome import Status
+from sbt.problem.parameter import Parameter
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.seeds import stream
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
@@ -81,6 +82,11 @@ class SumoSimulation:
             step_length=self.step_length if step_length is None else step_length,
         )  # fmt: skip
 
+    @property
+    def inputs(self) -> tuple[Parameter, ...]:
+        """Inputs that come with the AV under test; the scenario's space has them beside its own."""
+        return self.ego.inputs
+
     def prepare(self) -> None:
         """Import libsumo and find the network.
 
@@ -101,7 +107,7 @@ class SumoSimulation:
             RunError: SUMO fails, an actor vanishes, a controller asks for the impossible, the start is
                 not the one asked for, or it takes too long.
         """
-        scene = self.scene(values, self.ego, stream(seed, "scene"))
+        scene = self.scene(values, self.ego.bound(values), stream(seed, "scene"))
         types = tuple(sorted({type_name(a): a.type for a in scene.actors}.items()))
         setup = Setup(str(net_file(self.net)), types, self.step_length, self.lane_change_duration, self.options)
         level = self.isolation or self.isolations[-1]
