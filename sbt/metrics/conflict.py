@@ -103,24 +103,46 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
     return HORIZON
 
 
-def time_behind(trace: Trace, ego: str = "ego", other: str = "co", horizon: float = HORIZON) -> float:
+def time_behind(
+    trace: Trace, ego: str = "ego", other: str = "co", horizon: float = HORIZON, zone: tuple[float, float, float] | None = None
+) -> float:
     """Return how soon the other comes where ego has been: the PET with ego first (s), at most `horizon`; 0 for a collision.
 
     As `post_encroachment_time`, but waiting until someone has passed and driving right behind counts
     nothing: only who takes a spot before another does leaves that other a time.
+
+    Args:
+        trace: the run.
+        ego: who is first.
+        other: who comes after.
+        horizon: the value where the other comes there no sooner (s).
+        zone: x, y and radius of a circle (m); only where ego's centre was in it counts. None: everywhere.
     """
     a, b = trace.actor(ego), trace.actor(other)
-    n = len(trace.time)
     if first_contact(trace, ego, other) is not None:
         return 0.0
-    if n < 2 or not _paths_near(a, b):
+    inside = np.arange(len(a.x)) if zone is None else np.flatnonzero(np.hypot(a.x - zone[0], a.y - zone[1]) <= zone[2])
+    if inside.size < 2 or not _paths_near(a, b):
         return horizon
-    step = float(trace.time[-1] - trace.time[0]) / (n - 1)
-    last = min(n - 1, int(horizon / step))
-    for k in range(_smallest_shift(a, b), last + 1):
-        if _meet(*_shifted(a, b, k)):
-            return min(horizon, step * _halved(a, b, 1, k))
+    first, n = int(inside[0]), int(inside[-1]) + 1 - int(inside[0])
+    a, b = part(a, first, first + n), part(b, first, len(b.x))
+    step = float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
+    for k in range(_smallest_shift(a, b), min(len(b.x) - 1, int(horizon / step)) + 1):
+        if _meet(*_behind(a, b, k)):
+            apart, touching = k - 1.0, float(k)
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (apart + touching)
+                apart, touching = (apart, middle) if _meet(*_behind(a, b, middle)) else (middle, touching)
+            return min(horizon, step * touching)
     return horizon
+
+
+def _behind(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:
+    """Return the first n instants of a, and b so many steps later, as far as it is recorded."""
+    padded = part(b, 0, min(len(b.x), len(a.x) + int(shift) + 1))
+    _, there = _shifted(padded, padded, shift)
+    n = min(len(a.x), len(there.x))
+    return part(a, 0, n), part(there, 0, n)
 
 
 def _smallest_shift(a: ActorTrace, b: ActorTrace) -> int:

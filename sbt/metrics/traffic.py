@@ -47,15 +47,16 @@ def nearest_distance(ego: str = "ego") -> Metric:
     )  # fmt: skip
 
 
-def time_left(ego: str = "ego", horizon: float = HORIZON) -> Metric:
+def time_left(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float, float, float] | None = None) -> Metric:
     """Return the smallest time after which anyone comes where ego has been (s): 0 for a collision.
 
     Args:
         ego: whose conflicts.
         horizon: the value where nobody comes there by then (s); run so long after the last conflict.
+        zone: x, y and radius of a circle (m): only where ego was in it counts; None: everywhere.
     """
     return Metric(
-        "pet_ego_first", _over_all(lambda t, a, b: time_behind(t, a, b, horizon), ego, min, horizon), "s", "low", horizon,
+        "pet_ego_first", _over_all(lambda t, a, b: time_behind(t, a, b, horizon, zone), ego, min, horizon), "s", "low", horizon,
         "smallest time between ego leaving a spot and anyone else reaching it",
         "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions",
     )  # fmt: skip

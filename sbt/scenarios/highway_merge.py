@@ -66,8 +66,8 @@ SCENARIO = LogicalScenario(
     space=ParameterSpace(
         (
             Parameter("flow_co", 1000.0, 2000.0, "1/h", description="cars an hour and lane"),
-            Parameter("v_co", 60.0, 110.0, "km/h", description="mean desired speed in the right lane"),
-            Parameter("v_ego", 50.0, 100.0, "km/h", description="speed of ego on the ramp at the start"),
+            Parameter("v_co", 60.0, 130.0, "km/h", description="mean desired speed in the right lane"),
+            Parameter("v_ego", 40.0, 100.0, "km/h", description="speed of ego on the ramp at the start"),
             *EGO.inputs,
         )
     ),
@@ -75,6 +75,6 @@ SCENARIO = LogicalScenario(
         net="on_ramp", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",),
         lane_change_duration=LANE_CHANGE,
     ),  # fmt: skip
-    metrics=(time_left(horizon=HORIZON), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
-    requirement=Requirement("pet_ego_first", CriticalInterval(high=0.4)),
+    metrics=(nearest_ttc(), time_left(horizon=HORIZON), nearest_distance(), struck(), struck_speed(), others_braking()),
+    requirement=Requirement("ttc_path_min", CriticalInterval(high=2.0)),
 )

@@ -32,6 +32,8 @@ NEAREST, FARTHEST = 560.0, 60.0
 """Fronts of the circulating cars at the start, on the western arm (m)."""
 CLEAR = 35.0
 """y at which ego has left the roundabout behind (m)."""
+ENTRY = (0.0, -18.0, 12.0)
+"""Circle around the point where ego enters the ring (m): what follows is car following, not giving way."""
 HORIZON = 5.0
 """A car that comes later to where ego has been was not bothered (s)."""
 DURATION = 30.0
@@ -53,7 +55,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     )
     leaves = rng.random(len(cars)) < values["p_leave"]
     cars = tuple(replace(car, route=LEAVING) if out else car for car, out in zip(cars, leaves, strict=True))
-    car = Actor("ego", ("in_south", *RING), 0, ARM - DISTANCE, speed, driver, automated(ego, speed, LIMIT))
+    car = Actor("ego", ("in_south", *RING), 0, ARM - DISTANCE, speed, driver, automated(ego, LIMIT, LIMIT))
     return Scene((car, *cars), until_over)
 
 
@@ -75,13 +77,13 @@ SCENARIO = LogicalScenario(
             Parameter("v_co", 20.0, 40.0, "km/h", description="mean desired speed of these cars in the ring"),
             Parameter("p_leave", 0.0, 0.6, "", description="share of these cars that leaves at the exit before ego's entry"),
             Parameter("tau_co", 0.4, 1.4, "s", description="time gap that these cars keep"),
-            Parameter("v_ego", 20.0, 50.0, "km/h", description="speed of ego at the start and desired on the arm"),
+            Parameter("v_ego", 20.0, 50.0, "km/h", description="speed of ego at the start"),
             *EGO.inputs,
         )
     ),
     simulate=SumoSimulation(
         net="roundabout", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)
     ),
-    metrics=(time_left(horizon=HORIZON), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
-    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.0)),
+    metrics=(time_left(horizon=HORIZON, zone=ENTRY), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
+    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
 )
