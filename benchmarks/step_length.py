@@ -78,7 +78,8 @@ def main() -> None:
         u[::2, 1] *= 0.35
     x = scenario.space.from_unit(u)
     if args.traffic:
-        return traffic(args, x)
+        traffic(args, x)
+        return
     y = {step: metric_at(args.scenario, step, x, args.seeds) for step in (0.1, 0.05, 0.025, 0.005)}
     own = y[0.05]
     moving = (own > 0).all(axis=1) & (own < 9.9).all(axis=1)

@@ -57,7 +57,8 @@ def contact_share(a: ActorTrace, b: ActorTrace, dx: Vector, dy: Vector) -> Vecto
     Args:
         a: at the end of each step, its heading that of the whole step.
         b: likewise.
-        dx, dy: (t,) from a's centre to b's at the start of each step (m).
+        dx: (t,) from a's centre to b's at the start of each step (m).
+        dy: likewise.
     """
     cos, sin = _axes(a, b)
     reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from sbt.metrics.conflict import distance, time_behind
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
 from sbt.metrics.paths import HORIZON as CONFLICT

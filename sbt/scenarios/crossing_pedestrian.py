@@ -89,7 +89,7 @@ SCENARIO = LogicalScenario(
         (
             Parameter("v_ego", 30.0, 60.0, "km/h", description="speed of ego at the start and desired"),
             Parameter("v_ped", 0.8, 3.0, "m/s", description="speed of the pedestrian, from slow walking to running"),
-            Parameter("t_ped", -4.0, 2.0, "s", description="from ego's arrival at constant speed to the pedestrian's at the kerb"),
+            Parameter("t_ped", -4.0, 2.0, "s", description="the pedestrian at the kerb after ego, at constant speed, there"),
             Parameter("flow_co", 100.0, 600.0, "1/h", description="oncoming cars an hour"),
             *EGO.inputs,
         )

@@ -84,6 +84,8 @@ SCENARIO = LogicalScenario(
     simulate=SumoSimulation(
         net="roundabout", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)
     ),
-    metrics=(time_left(horizon=HORIZON, zone=ENTRY), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
+    metrics=(
+        time_left(horizon=HORIZON, zone=ENTRY), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking(),
+    ),
     requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
 )

@@ -59,6 +59,12 @@ class Ego:
         return self.kind != SUMO
 
     @property
+    def lane_change(self) -> str:
+        """SUMO's lane-change model that the settings choose, "" for a controller."""
+        settings = dict(self.settings)
+        return str(settings.get("lane_change", settings.get("laneChangeModel", "LC2013"))) if self.kind == SUMO else ""
+
+    @property
     def inputs(self) -> tuple[Parameter, ...]:
         """The settings that are inputs of the scenario."""
         return tuple(value for _, value in self.settings if isinstance(value, Parameter))

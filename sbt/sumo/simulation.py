@@ -18,6 +18,7 @@ from sbt.problem.trace import ActorTrace, Trace
 from sbt.seeds import stream
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
 from sbt.sumo.ego import Ego
+from sbt.sumo.models import SUBLANE
 from sbt.sumo.nets import net_file
 from sbt.sumo.placing import insert, mover, type_name, verify
 from sbt.sumo.session import ABSENT, Setup, check_options, direct, session
@@ -75,6 +76,8 @@ class SumoSimulation:
     ) -> SumoSimulation:
         """Return a copy with another ego, isolation level or step length."""
         chosen = self.ego if ego is None else Ego.of(**ego)
+        if chosen.lane_change == SUBLANE and "--lateral-resolution" not in self.options:
+            raise InputError(f"ego.lane_change {SUBLANE} needs SUMO's option --lateral-resolution, which this scenario has not")
         levels = self.isolations if chosen.deterministic else ("fresh",)
         level = self.isolation if isolation is None and self.isolation in levels else isolation
         return replace(
