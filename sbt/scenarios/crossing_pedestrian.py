@@ -94,7 +94,7 @@ SCENARIO = LogicalScenario(
             *EGO.inputs,
         )
     ),
-    simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
+    simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",)),
     metrics=(nearest_ttc(), nearest_distance(), struck(), struck_speed()),
     requirement=Requirement("ttc_path_min", CriticalInterval(high=0.5)),
 )

@@ -20,6 +20,8 @@ __all__ = ["SCENARIO"]
 
 LIMIT = 120 / 3.6
 """Speed limit (m/s)."""
+DESIRED = 100 / 3.6
+"""Speed that ego wants to drive (m/s)."""
 RAMP = 250.0
 """Length of the ramp (m); its last 150 m are parallel to the motorway."""
 DISTANCE = 100.0
@@ -46,7 +48,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
         lane.draw(rng, flow, values["v_co"] / 3.6 * factor, NEAREST, FARTHEST)
         for lane, factor in zip(LANES, (1.0, 1.1), strict=True)
     )
-    kind = automated(ego, 100 / 3.6, LIMIT)
+    kind = automated(ego, DESIRED, LIMIT)
     car = Actor("ego", ("ramp", "merge", "after"), 0, RAMP - DISTANCE, speed, driver, kind, lane_changes=True)
     return Scene((car, *right, *left), until_over)
 
@@ -67,7 +69,7 @@ SCENARIO = LogicalScenario(
         (
             Parameter("flow_co", 1000.0, 2000.0, "1/h", description="cars an hour and lane"),
             Parameter("v_co", 60.0, 130.0, "km/h", description="mean desired speed in the right lane"),
-            Parameter("v_ego", 40.0, 100.0, "km/h", description="speed of ego on the ramp at the start"),
+            Parameter("v_ego", 40.0, 100.0, "km/h", description="speed of ego on the ramp at the start; it wants 100 km/h"),
             *EGO.inputs,
         )
     ),
