@@ -34,17 +34,52 @@ def metric_at(name: str, step: float, x: np.ndarray, seeds: int) -> np.ndarray:
     return y.reshape(len(x), seeds)
 
 
+def traffic(args: argparse.Namespace, x: np.ndarray) -> None:
+    """Print how far the mean over seeds moves as the own step is halved, beside the spread and what it alone explains.
+
+    With random drivers another step means other random numbers too: even without any effect of the step the
+    means differ, by the spread times sqrt(2 / seeds).
+    """
+    scenario = ScenarioSpec(args.scenario).resolve()
+    own = scenario.simulate.step_length
+    y = {step: metric_at(args.scenario, step, x, args.seeds) for step in (own, own / 2, own / 4)}
+    spread = y[own].std(axis=1, ddof=1)
+    critical = scenario.requirement.critical
+    print(f"{args.scenario}: {args.points} Sobol points x {args.seeds} seeds; spread over seeds: median {np.median(spread):.3f}, "
+          f"mean {spread.mean():.3f}\n")
+    print("| step (s) | mean metric | critical share | change to the step above: bias | mean change of a point "
+          "| explained by the spread | points below their spread |\n|---|---|---|---|---|---|---|")
+    above = None
+    for step, values in y.items():
+        share = float(critical.contains(values.ravel()).mean())
+        row = f"| {step:g} | {values.mean():.3f} | {100 * share:.2f} % |"
+        if above is None:
+            print(row + " | | | |")
+        else:
+            change = values.mean(axis=1) - above.mean(axis=1)
+            moves = spread > 0
+            noise = np.sqrt(2 / args.seeds) * np.sqrt(2 / np.pi) * spread.mean()
+            below = float((np.abs(change)[moves] < spread[moves]).mean())
+            print(row + f" {change.mean():+.3f} +- {change.std(ddof=1) / np.sqrt(len(x)):.3f} | {np.abs(change).mean():.3f} "
+                  f"| {noise:.3f} | {100 * below:.0f} % |")
+        above = values
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="cut_in")
     parser.add_argument("--points", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--traffic", action="store_true", help="random traffic: halve the own step twice, spread over seeds")
     args = parser.parse_args()
     scenario = ScenarioSpec(args.scenario).resolve()
     u = qmc.Sobol(scenario.space.dimension, rng=3).random(args.points)
     if args.scenario == "cut_in":  # most of the plane is uneventful: half of the points where it is not
         u[::2, 1] *= 0.35
     x = scenario.space.from_unit(u)
+    if args.traffic:
+        traffic(args, x)
+        return
     y = {step: metric_at(args.scenario, step, x, args.seeds) for step in (0.1, 0.05, 0.025, 0.005)}
     own = y[0.05]
     moving = (own > 0).all(axis=1) & (own < 9.9).all(axis=1)

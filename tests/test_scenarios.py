@@ -18,7 +18,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.scenarios import jaywalking, lane_keeping
 from sbt.sumo.actors import Action, Actor, Obstacle, State
-from sbt.sumo.drivers import ArcExit, SpeedProfile
+from sbt.sumo.drivers import ArcExit, SpeedProfile, Stand
 from sbt.sumo.dynamics import Gust, JerkLimitedStop, SingleTrack
 from sbt.sumo.lane_keeping import MarkingSensor
 from sbt.sumo.sight import Boxes, outline
@@ -340,7 +340,7 @@ def test_actors_by_pose_need_a_controller() -> None:
     with pytest.raises(InputError, match="needs a controller"):
         Actor("a", ("road",), 0, 0.0, 0.0, None, pose=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="must have a pose"):
-        Actor("a", ("road",), 0, 0.0, 0.0, None, person=True)
+        Actor("a", ("road",), 0, 0.0, 0.0, Stand(), person=True)
 
 
 @pytest.mark.sumo

@@ -15,7 +15,10 @@ from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["distance", "distance_min", "pet", "post_encroachment_time", "severity", "ttc_2d", "ttc_2d_min"]
+__all__ = [
+    "distance", "distance_min", "pet", "post_encroachment_time", "severity", "time_behind", "ttc_2d",
+    "ttc_2d_min",
+]  # fmt: skip
 
 _HALVINGS = 10
 """The PET is exact to the step of the trace divided by 2 to this power."""
@@ -98,6 +101,59 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
         if found:
             return min(HORIZON, step * min(_halved(a, b, sign, k) for sign in found))
     return HORIZON
+
+
+def time_behind(
+    trace: Trace, ego: str = "ego", other: str = "co", horizon: float = HORIZON, zone: tuple[float, float, float] | None = None
+) -> float:
+    """Return how soon the other comes where ego has been: the PET with ego first (s), at most `horizon`; 0 for a collision.
+
+    As `post_encroachment_time`, but waiting until someone has passed and driving right behind counts
+    nothing: only who takes a spot before another does leaves that other a time.
+
+    Args:
+        trace: the run.
+        ego: who is first.
+        other: who comes after.
+        horizon: the value where the other comes there no sooner (s).
+        zone: x, y and radius of a circle (m); only where ego's centre was in it counts. None: everywhere.
+    """
+    a, b = trace.actor(ego), trace.actor(other)
+    if first_contact(trace, ego, other) is not None:
+        return 0.0
+    inside = np.arange(len(a.x)) if zone is None else np.flatnonzero(np.hypot(a.x - zone[0], a.y - zone[1]) <= zone[2])
+    if inside.size < 2 or not _paths_near(a, b):
+        return horizon
+    first, n = int(inside[0]), int(inside[-1]) + 1 - int(inside[0])
+    a, b = part(a, first, first + n), part(b, first, len(b.x))
+    step = float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
+    for k in range(_smallest_shift(a, b), min(len(b.x) - 1, int(horizon / step)) + 1):
+        if _meet(*_behind(a, b, k)):
+            apart, touching = k - 1.0, float(k)
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (apart + touching)
+                apart, touching = (apart, middle) if _meet(*_behind(a, b, middle)) else (middle, touching)
+            return min(horizon, step * touching)
+    return horizon
+
+
+def _behind(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:
+    """Return the first n instants of a, and b so many steps later, as far as it is recorded."""
+    padded = part(b, 0, min(len(b.x), len(a.x) + int(shift) + 1))
+    _, there = _shifted(padded, padded, shift)
+    n = min(len(a.x), len(there.x))
+    return part(a, 0, n), part(there, 0, n)
+
+
+def _smallest_shift(a: ActorTrace, b: ActorTrace) -> int:
+    """Return a number of steps below which b cannot come where a was: by circles around both, and how far they move."""
+    moved = sum(float(np.hypot(np.diff(c.x), np.diff(c.y)).max(initial=0.0)) for c in (a, b))
+    reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + moved
+    near = (b.x[None, :] - a.x[:, None]) ** 2 + (b.y[None, :] - a.y[:, None]) ** 2 <= reach**2  # (t, t)
+    first, second = np.nonzero(near)
+    shifts = second - first
+    shifts = shifts[shifts >= 0]
+    return max(int(shifts.min()) - 1, 1) if shifts.size else len(a.x)
 
 
 def _halved(a: ActorTrace, b: ActorTrace, sign: int, k: int) -> float:

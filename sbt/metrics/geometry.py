@@ -9,7 +9,9 @@ import numpy as np
 from sbt.arrays import Vector
 from sbt.problem.trace import ActorTrace
 
-__all__ = ["contact_index", "corners", "part", "rectangle_distance", "swept_contact", "time_to_contact"]
+__all__ = [
+    "contact_index", "contact_share", "corners", "part", "rectangle_distance", "swept_contact", "time_to_contact",
+]  # fmt: skip
 
 
 def corners(actor: ActorTrace) -> np.ndarray:
@@ -45,11 +47,23 @@ def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
     Source:
         separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
     """
+    dx, dy = b.x - a.x, b.y - a.y
+    return contact_share(a, b, np.concatenate([dx[:1], dx[:-1]]), np.concatenate([dy[:1], dy[:-1]]))
+
+
+def contact_share(a: ActorTrace, b: ActorTrace, dx: Vector, dy: Vector) -> Vector:
+    """Return (t,) the share of a step after which the rectangles touch, each step by itself; inf: they do not.
+
+    Args:
+        a: at the end of each step, its heading that of the whole step.
+        b: likewise.
+        dx: (t,) from a's centre to b's at the start of each step (m).
+        dy: likewise.
+    """
     cos, sin = _axes(a, b)
     reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)
-    dx, dy = b.x - a.x, b.y - a.y
-    end = dx[:, None] * cos + dy[:, None] * sin  # (t, 4) centre distance along each axis
-    start = np.concatenate([dx[:1], dx[:-1]])[:, None] * cos + np.concatenate([dy[:1], dy[:-1]])[:, None] * sin
+    end = (b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin  # (t, 4) centre distance along each axis
+    start = dx[:, None] * cos + dy[:, None] * sin
     enter, leave = _overlap_span(start, end - start, reach)
     hit = (enter <= leave) & (leave >= 0) & (enter <= 1)
     return np.where(hit, np.maximum(enter, 0.0), np.inf)

@@ -13,6 +13,7 @@ import numpy as np
 from sbt.arrays import Mask, Points, Vector
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
+from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -204,7 +205,16 @@ class LogicalScenario:
             return self
         if not isinstance(self.simulate, Configurable):
             raise InputError(f"scenario {self.name} offers no choice of ego or step length")
-        return replace(self, simulate=self.simulate.configured(ego, isolation, step_length))
+        simulate = self.simulate.configured(ego, isolation, step_length)
+        return replace(self, simulate=simulate, space=self._space_with(getattr(simulate, "inputs", ())))
+
+    def _space_with(self, inputs: tuple[Parameter, ...]) -> ParameterSpace:
+        """Return the space with these inputs of an AV under test in place of those of the present one."""
+        present = {p.name for p in getattr(self.simulate, "inputs", ())}
+        kept = tuple(p for p in self.space.parameters if p.name not in present)
+        if not present and not inputs:
+            return self.space
+        return replace(self.space, parameters=(*kept, *inputs))
 
     def limited(self, timeout: float | None) -> LogicalScenario:
         """Return a copy whose runs look at the clock, where the scenario can."""

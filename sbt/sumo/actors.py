@@ -110,10 +110,12 @@ class Actor:
         type: its SUMO type.
         pose: where it starts instead, on or off the lanes; its controller then gives a pose at every
             step, and `lane` and `position` only say where SUMO lets it in.
-        person: a SUMO person; it needs a pose and is round, `type.width` wide.
+        person: a SUMO person, round, `type.width` wide. With a pose its controller moves it; without one it
+            walks along `route` at `speed` by SUMO's model, on the pavements and crossings of the network.
+        lane_changes: SUMO changes its lanes (for its route, and safely) although a controller drives.
 
     Raises:
-        InputError: numbers that are not finite, a person without a pose, a pose without a controller.
+        InputError: numbers that are not finite, a pose without a controller, a controller of a person without one.
     """
 
     name: str
@@ -125,6 +127,7 @@ class Actor:
     type: VehicleType = field(default_factory=VehicleType)
     pose: Pose | None = None
     person: bool = False
+    lane_changes: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.position) and math.isfinite(self.speed) and self.speed >= 0):
@@ -133,8 +136,8 @@ class Actor:
             )
         if self.pose is not None and not all(math.isfinite(v) for v in self.pose):
             raise InputError(f"actor {self.name}: a pose must be finite, but got {self.pose}")
-        if self.person and self.pose is None:
-            raise InputError(f"actor {self.name}: a person must have a pose, but got none")
+        if self.person and self.pose is None and self.driver is not None:
+            raise InputError(f"actor {self.name}: a person with a controller must have a pose, but got none")
         if self.pose is not None and self.driver is None:
             raise InputError(f"actor {self.name}: a pose needs a controller that goes on from it, but SUMO would drive")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,23 +10,29 @@ import numpy as np
 
 from sbt import plugins
 from sbt.errors import InputError
+from sbt.problem.parameter import Parameter
 from sbt.seeds import stream
 from sbt.sumo.actors import Controller, VehicleType
+from sbt.sumo.models import checked, unit_of
 
 __all__ = ["SUMO", "Ego"]
 
 SUMO = "sumo"
 """The kind of ego that one of SUMO's own models drives."""
+_DEFAULTS = {"decel": "4.5", "emergencyDecel": "9", "accel": "2.6", "minGap": "2.5"}
+_RANGE = ({"min", "max"}, {"min", "max", "unit"})
 
 
 @dataclass(frozen=True)
 class Ego:
     """Kind and settings of the AV under test.
 
+    A setting that is a range, `{min: 0.5, max: 2.0}`, is an input of the scenario: `ego_` and its name.
+
     Args:
         kind: a controller by name or `file.py:NAME`, called as `NAME(rng, set_speed, **settings)`
             once a run; or `sumo`, driven by the car-following model `model` with vType attributes.
-        settings: (name, value) pairs.
+        settings: (name, value) pairs; a `Parameter` as value is such an input.
 
     Raises:
         InputError: unknown kind or settings (`Ego.of`).
@@ -36,20 +43,38 @@ class Ego:
 
     @classmethod
     def of(cls, kind: str = "acc_aeb", **settings: Any) -> Ego:
-        """Return the ego of this kind, its settings tried out once."""
-        ego = cls(kind, tuple(sorted(settings.items())))
-        if kind != SUMO:
-            driver = ego.driver(stream(0, "ego"), 1.0)
-            if not callable(getattr(driver, "act", None)):
-                raise InputError(f"ego.kind must name a controller with act(t, own, others), but '{kind}' has none")
-        elif not all(isinstance(value, (str, int, float)) for value in settings.values()):
-            raise InputError(f"ego settings of kind sumo must be vType attributes, but got {settings}")
+        """Return the ego of this kind, its settings tried out once, ranges at their centre."""
+        given = ((name, _input(name, value) if isinstance(value, Mapping) else value) for name, value in sorted(settings.items()))
+        ego = cls(kind, tuple(given))
+        trial = ego.bound({p.name: p.centre for p in ego.inputs})
+        if kind == SUMO:
+            checked(dict(trial.settings))
+        elif not callable(getattr(trial.driver(stream(0, "ego"), 1.0), "act", None)):
+            raise InputError(f"ego.kind must name a controller with act(t, own, others), but '{kind}' has none")
         return ego
 
     @property
     def deterministic(self) -> bool:
         """Whether SUMO draws no random numbers for this ego."""
         return self.kind != SUMO
+
+    @property
+    def lane_change(self) -> str:
+        """SUMO's lane-change model that the settings choose, "" for a controller."""
+        settings = dict(self.settings)
+        return str(settings.get("lane_change", settings.get("laneChangeModel", "LC2013"))) if self.kind == SUMO else ""
+
+    @property
+    def inputs(self) -> tuple[Parameter, ...]:
+        """The settings that are inputs of the scenario."""
+        return tuple(value for _, value in self.settings if isinstance(value, Parameter))
+
+    def bound(self, values: Mapping[str, float]) -> Ego:
+        """Return the ego of one run: every setting that is an input has its value."""
+        if not self.inputs:
+            return self
+        bound = ((name, values[value.name] if isinstance(value, Parameter) else value) for name, value in self.settings)
+        return replace(self, settings=tuple(bound))
 
     def driver(self, rng: np.random.Generator, set_speed: float, **overrides: Any) -> Controller | None:
         """Return the controller of one run, None where SUMO drives.
@@ -70,9 +95,19 @@ class Ego:
         return built
 
     def vehicle_type(self, base: VehicleType, set_speed: float) -> VehicleType:
-        """Return the SUMO type of the ego: `base`, with SUMO's model where that drives."""
+        """Return the SUMO type of the ego: `base`, with SUMO's models where they drive."""
         if self.kind != SUMO:
             return base
-        given = {("carFollowModel" if k == "model" else k): str(v) for k, v in self.settings}
-        wanted = {"maxSpeed": repr(set_speed), "decel": "4.5", "emergencyDecel": "9", "accel": "2.6", "minGap": "2.5"}
-        return replace(base, attributes=tuple(sorted({**wanted, **dict(base.attributes), **given}.items())))
+        given = checked(dict(self.settings))
+        length, width = float(given.pop("length", base.length)), float(given.pop("width", base.width))
+        attributes = {"maxSpeed": repr(set_speed), **_DEFAULTS, **dict(base.attributes), **given}
+        return replace(base, length=length, width=width, attributes=tuple(sorted(attributes.items())))
+
+
+def _input(name: str, value: Mapping[str, Any]) -> Parameter:
+    """Return the input that a range given as an ego setting is."""
+    numbers = all(isinstance(value.get(key), (int, float)) and not isinstance(value.get(key), bool) for key in ("min", "max"))
+    if set(value) not in _RANGE or not numbers:
+        raise InputError(f"ego.{name} must be a value or a range such as {{min: 0.5, max: 2.0}}, but got {dict(value)}")
+    unit = str(value.get("unit", unit_of(name)))
+    return Parameter(f"ego_{name}", float(value["min"]), float(value["max"]), unit, description=f"setting {name} of the ego")

@@ -19,6 +19,8 @@ _FREE = 2
 """keepRoute of moveToXY that keeps a pose to the last bit, off the lanes too."""
 _COLOR = (90, 90, 90, 255)
 _FOREVER = 1e6
+_END = -1.0
+"""Position that is the end of the last edge."""
 
 
 def type_name(actor: Actor) -> str:
@@ -41,7 +43,10 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
         if actor.person:
             sumo.person.add(name, prefix + actor.route[0], actor.position, typeID=type_name(actor))
             here.inserted(name, "person")
-            sumo.person.appendWaitingStage(name, _FOREVER)
+            if actor.pose is None:
+                sumo.person.appendWalkingStage(name, [prefix + edge for edge in actor.route], _END, speed=actor.speed)
+            else:
+                sumo.person.appendWaitingStage(name, _FOREVER)
         else:
             sumo.vehicle.add(
                 name, here.route(tuple(prefix + edge for edge in actor.route)), typeID=type_name(actor), depart="now",
@@ -50,7 +55,8 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
             here.inserted(name)
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(name, 32)
-                sumo.vehicle.setLaneChangeMode(name, 0)
+                if not actor.lane_changes:
+                    sumo.vehicle.setLaneChangeMode(name, 0)
                 sumo.vehicle.setSpeed(name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
         if actor.pose is not None:
             mover(sumo, actor, prefix)(actor.pose)
@@ -92,24 +98,29 @@ def verify(sumo: Any, scene: Scene, prefix: str = "") -> None:
         position = domain.getPosition(name) if actor.pose is not None else domain.getLanePosition(name)
         if ABSENT in (position, position[0] if isinstance(position, tuple) else position):
             raise RunError(Status.INVALID, f"{actor.name} must be on the road at the start, but SUMO did not insert it")
-        if actor.pose is not None:
-            x, y, heading = actor.pose
-            half = _front(actor)
-            realised = {
-                "x": (x + half * math.cos(heading), position[0], "m"),
-                "y": (y + half * math.sin(heading), position[1], "m"),
-            }
-        else:
-            realised = {
-                "position": (actor.position, position, "m"),
-                "speed": (actor.speed, domain.getSpeed(name), "m/s"),
-                "lane": (actor.lane, domain.getLaneIndex(name), ""),
-            }
-        for what, (asked, got, unit) in realised.items():
+        for what, (asked, got, unit) in _realised(domain, actor, name, position).items():
             if abs(asked - got) > _TOLERANCE:
                 raise RunError(
                     Status.INVALID, f"{actor.name} must start with {what} {asked:.6g} {unit}, but SUMO gave {got:.6g} {unit}"
                 )
+
+
+def _realised(domain: Any, actor: Actor, name: str, position: Any) -> dict[str, tuple[float, float, str]]:
+    """Return what was asked of an actor, what SUMO made of it, and the unit."""
+    if actor.pose is not None:
+        x, y, heading = actor.pose
+        half = _front(actor)
+        return {
+            "x": (x + half * math.cos(heading), position[0], "m"),
+            "y": (y + half * math.sin(heading), position[1], "m"),
+        }
+    if actor.person:  # SUMO chooses the pavement and lets it walk in the step that inserts it
+        return {"position": (actor.position, position, "m")}
+    return {
+        "position": (actor.position, position, "m"),
+        "speed": (actor.speed, domain.getSpeed(name), "m/s"),
+        "lane": (actor.lane, domain.getLaneIndex(name), ""),
+    }
 
 
 def _front(actor: Actor) -> float:

@@ -12,7 +12,6 @@ is often only on file descriptor 2. All of that stays in here. Three isolation l
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import os
 import sys
@@ -109,16 +108,14 @@ def _scratch() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="sbt-")
 
 
-@cache
 def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
-    """Write the vehicle types once a process and return the file's name."""
+    """Write the vehicle types of the next load and return the file's name; SUMO reads it while it loads, never again."""
     lines = []
     for name, kind in types:
         attributes = {**_DEFAULTS, "length": repr(kind.length), "width": repr(kind.width), **dict(kind.attributes)}
         lines.append(f"<vType id={quoteattr(name)} " + " ".join(f"{k}={quoteattr(v)}" for k, v in attributes.items()) + "/>")
-    text = "<additional>\n" + "\n".join(lines) + "\n</additional>\n"
-    path = Path(_scratch().name) / f"types-{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.add.xml"
-    path.write_text(text)
+    path = Path(_scratch().name) / "types.add.xml"
+    path.write_text("<additional>\n" + "\n".join(lines) + "\n</additional>\n")
     return str(path)
 
 

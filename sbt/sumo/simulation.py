@@ -12,12 +12,14 @@ import numpy as np
 
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
+from sbt.problem.parameter import Parameter
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
 from sbt.sumo.actors import Scene
 from sbt.sumo.batch import simulate_many
 from sbt.sumo.driving import Drive
 from sbt.sumo.ego import Ego
+from sbt.sumo.models import SUBLANE
 from sbt.sumo.nets import net_file
 from sbt.sumo.placing import insert, type_name, verify
 from sbt.sumo.session import Setup, check_options, direct, session
@@ -75,12 +77,19 @@ class SumoSimulation:
     ) -> SumoSimulation:
         """Return a copy with another ego, isolation level or step length."""
         chosen = self.ego if ego is None else Ego.of(**ego)
+        if chosen.lane_change == SUBLANE and "--lateral-resolution" not in self.options:
+            raise InputError(f"ego.lane_change {SUBLANE} needs SUMO's option --lateral-resolution, which this scenario has not")
         levels = self.isolations if chosen.deterministic else ("fresh",)
         level = self.isolation if isolation is None and self.isolation in levels else isolation
         return replace(
             self, ego=chosen, isolations=levels, isolation=None if level == "auto" else level,
             step_length=self.step_length if step_length is None else step_length,
         )  # fmt: skip
+
+    @property
+    def inputs(self) -> tuple[Parameter, ...]:
+        """Inputs that come with the AV under test; the scenario's space has them beside its own."""
+        return self.ego.inputs
 
     def prepare(self) -> None:
         """Import libsumo and find the network.
@@ -151,7 +160,7 @@ class SumoSimulation:
 
     def built(self, values: Mapping[str, float], seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
-        return self.scene(values, self.ego, stream(seed, "scene"))
+        return self.scene(values, self.ego.bound(values), stream(seed, "scene"))
 
     def setup(self, scene: Scene, copies: int = 1) -> Setup:
         """Return what SUMO is loaded with for a scene."""

@@ -1,0 +1,100 @@
+"""Crossing pedestrian: someone walks over a zebra crossing of a real town as ego comes, among other walkers and cars.
+
+The streets are those around Wagner-Regeny-Strasse in Berlin-Adlershof, imported from OpenStreetMap data (c) OpenStreetMap
+contributors, ODbL (`sumo_nets/town`); the zebra crossing is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.actors import Actor, Scene, State, VehicleType
+from sbt.sumo.ego import Ego
+from sbt.sumo.simulation import SumoSimulation
+from sbt.sumo.traffic import Column, automated
+
+__all__ = ["SCENARIO"]
+
+LIMIT = 50 / 3.6
+"""Speed limit of the street (m/s)."""
+BEFORE, GAP, BLOCK = 167.58, 14.4, 60.96
+"""Lengths of ego's street before the junction, across it, and from it to the crossing (m), of `town`."""
+DISTANCE = 90.0
+"""From ego's front to the crossing at the start (m)."""
+STREET = ("15", "14#0", "14#1", "13")
+BACK = ("-13", "-14#1", "-14#0", "-15")
+OVER = ("14#0", "-14#0", "-15")
+"""Where the pedestrian walks: along ego's side, over the crossing, and back along the other."""
+WALKER = VehicleType(0.5, 0.5, (("vClass", "pedestrian"), ("minGap", "0.25")))
+ONCOMING = Column("oncoming", BACK, 1, LIMIT)
+NEAREST = 90.0
+"""Foremost start of an oncoming car, on the 95 m before the junction behind the crossing (m)."""
+PAVEMENTS = (("14#1", "13"), ("-14#0", "-15"))
+WALKERS = 3.0
+"""Mean number of other walkers."""
+PASSED = 10.0
+"""How far behind the crossing ego has passed it (m)."""
+CROSSING = (297.46, 285.96)
+"""Middle of the crossing (m)."""
+DURATION = 25.0
+"""Longest time that is looked at (s)."""
+EGO = Ego.of("sumo", jmCrossingGap={"min": 0.0, "max": 10.0}, decel={"min": 2.5, "max": 5.0})
+
+
+def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
+    """Return ego, the pedestrian who reaches the kerb `t_ped` after ego would reach the crossing, and the others."""
+    speed, walk = values["v_ego"] / 3.6, values["v_ped"]
+    driver = ego.driver(rng, speed)
+    start = BEFORE + GAP + BLOCK - DISTANCE
+    way = walk * (DISTANCE / speed + values["t_ped"])
+    cars = ONCOMING.draw(rng, values["flow_co"], LIMIT, NEAREST, 0.0)
+    actors = (
+        Actor("ego", STREET, 1, start, speed, driver, automated(ego, speed, LIMIT)),
+        Actor("ped", OVER, 0, BLOCK - way, walk, type=WALKER, person=True),
+    )
+    return Scene((*actors, *cars, *walkers(rng)), until_over)
+
+
+def walkers(rng: np.random.Generator) -> tuple[Actor, ...]:
+    """Return the other walkers of a run, who stay on the pavements of the block."""
+    return tuple(
+        Actor(f"walker_{k}", PAVEMENTS[int(rng.integers(2))], 0, float(rng.uniform(1.0, 30.0)), float(rng.uniform(0.8, 1.6)),
+              type=WALKER, person=True)
+        for k in range(int(rng.poisson(WALKERS)))
+    )  # fmt: skip
+
+
+def until_over(t: float, states: Mapping[str, State]) -> str | None:
+    """End the run once ego has passed the crossing."""
+    ego = states["ego"]
+    ahead = (CROSSING[0] - ego.x) * ego.cos + (CROSSING[1] - ego.y) * ego.sin
+    return "passed" if ahead < -PASSED else None
+
+
+SCENARIO = LogicalScenario(
+    name="crossing_pedestrian",
+    description=(
+        "Pedestrian on a zebra crossing of a real town.\n"
+        "A street in Berlin-Adlershof at 50 km/h, from OpenStreetMap data. Ego comes at v_ego; a pedestrian walks along the "
+        "pavement at v_ped, turns onto the zebra crossing t_ped after ego would reach it, and trusts in the right of way."
+    ),
+    space=ParameterSpace(
+        (
+            Parameter("v_ego", 30.0, 60.0, "km/h", description="speed of ego at the start and desired"),
+            Parameter("v_ped", 0.8, 3.0, "m/s", description="speed of the pedestrian, from slow walking to running"),
+            Parameter("t_ped", -4.0, 2.0, "s", description="the pedestrian at the kerb after ego, at constant speed, there"),
+            Parameter("flow_co", 100.0, 600.0, "1/h", description="oncoming cars an hour"),
+            *EGO.inputs,
+        )
+    ),
+    simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",)),
+    metrics=(nearest_ttc(), nearest_distance(), struck(), struck_speed()),
+    requirement=Requirement("ttc_path_min", CriticalInterval(high=0.5)),
+)

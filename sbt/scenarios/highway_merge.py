@@ -1,0 +1,82 @@
+"""Highway merge: ego comes from an on-ramp and has to find its place in dense traffic before the acceleration lane ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.actors import Actor, Scene, State
+from sbt.sumo.ego import Ego
+from sbt.sumo.simulation import SumoSimulation
+from sbt.sumo.traffic import Column, automated
+
+__all__ = ["SCENARIO"]
+
+LIMIT = 120 / 3.6
+"""Speed limit (m/s)."""
+DESIRED = 100 / 3.6
+"""Speed that ego wants to drive (m/s)."""
+RAMP = 250.0
+"""Length of the ramp (m); its last 150 m are parallel to the motorway."""
+DISTANCE = 100.0
+"""From ego's front to the nose at the start (m)."""
+NEAREST, FARTHEST = 890.0, 250.0
+"""Fronts of the cars on the motorway at the start; the nose is at 900 m (m)."""
+LANE_CHANGE = 3.0
+"""Duration of a lane change (s)."""
+MERGED = 400.0
+"""x at which ego has left the acceleration lane well behind (m); it ends at 250 m."""
+HORIZON = 5.0
+"""A car that comes later to where ego has been was not bothered (s)."""
+DURATION = 30.0
+"""Longest time that is looked at (s)."""
+EGO = Ego.of("sumo", tau={"min": 0.4, "max": 1.6}, lcAssertive={"min": 1.0, "max": 5.0}, accel={"min": 1.5, "max": 3.5})
+LANES = tuple(Column(name, ("main", "merge", "after"), lane, LIMIT) for lane, name in enumerate(("right", "left")))
+
+
+def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
+    """Return ego on the ramp and two columns of cars on the motorway, the left one 10 % faster."""
+    speed, flow = values["v_ego"] / 3.6, values["flow_co"]
+    driver = ego.driver(rng, speed)
+    right, left = (
+        lane.draw(rng, flow, values["v_co"] / 3.6 * factor, NEAREST, FARTHEST)
+        for lane, factor in zip(LANES, (1.0, 1.1), strict=True)
+    )
+    kind = automated(ego, DESIRED, LIMIT)
+    car = Actor("ego", ("ramp", "merge", "after"), 0, RAMP - DISTANCE, speed, driver, kind, lane_changes=True)
+    return Scene((car, *right, *left), until_over)
+
+
+def until_over(t: float, states: Mapping[str, State]) -> str | None:
+    """End the run once ego is well past the acceleration lane."""
+    return "merged" if states["ego"].x > MERGED else None
+
+
+SCENARIO = LogicalScenario(
+    name="highway_merge",
+    description=(
+        "Merging from an on-ramp into dense motorway traffic.\n"
+        "Motorway with two lanes, an on-ramp and an acceleration lane of 250 m. Ego comes at v_ego and changes into the right "
+        "lane, which carries flow_co cars an hour at v_co; the left lane carries as many, 10 % faster."
+    ),
+    space=ParameterSpace(
+        (
+            Parameter("flow_co", 1000.0, 2000.0, "1/h", description="cars an hour and lane"),
+            Parameter("v_co", 60.0, 130.0, "km/h", description="mean desired speed in the right lane"),
+            Parameter("v_ego", 40.0, 100.0, "km/h", description="speed of ego on the ramp at the start; it wants 100 km/h"),
+            *EGO.inputs,
+        )
+    ),
+    simulate=SumoSimulation(
+        net="on_ramp", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",),
+        lane_change_duration=LANE_CHANGE,
+    ),
+    metrics=(nearest_ttc(), time_left(horizon=HORIZON), nearest_distance(), struck(), struck_speed(), others_braking()),
+    requirement=Requirement("ttc_path_min", CriticalInterval(high=2.0)),
+)

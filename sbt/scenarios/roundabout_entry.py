@@ -1,0 +1,91 @@
+"""Roundabout entry: ego gives way to circulating traffic, some of which leaves just before it.
+
+A one-lane compact roundabout, 18 m to the middle of the lane (an inscribed circle of some 40 m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.actors import Actor, Scene, State
+from sbt.sumo.ego import Ego
+from sbt.sumo.simulation import SumoSimulation
+from sbt.sumo.traffic import Column, automated
+
+__all__ = ["SCENARIO"]
+
+LIMIT, RING_LIMIT = 50 / 3.6, 30 / 3.6
+"""Speed limits of the arms and of the ring (m/s)."""
+ARM = 600.0
+"""From the middle of the roundabout to the end of an arm (m)."""
+DISTANCE = 80.0
+"""From ego's front to the middle of the roundabout at the start (m)."""
+NEAREST, FARTHEST = 560.0, 60.0
+"""Fronts of the circulating cars at the start, on the western arm (m)."""
+CLEAR = 35.0
+"""y at which ego has left the roundabout behind (m)."""
+ENTRY = (0.0, -18.0, 12.0)
+"""Circle around the point where ego enters the ring (m): what follows is car following, not giving way."""
+HORIZON = 5.0
+"""A car that comes later to where ego has been was not bothered (s)."""
+DURATION = 30.0
+"""Longest time that is looked at (s)."""
+EGO = Ego.of(
+    "sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5}
+)
+RING = ("ring_south_east", "ring_east_north", "out_north")
+PASSING = Column("co", ("in_west", "ring_west_south", *RING), 0, RING_LIMIT)
+LEAVING = ("in_west", "ring_west_south", "out_south")
+
+
+def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
+    """Return ego on the southern arm and cars from the western one, which pass ego's entry or leave before it."""
+    speed = values["v_ego"] / 3.6
+    driver = ego.driver(rng, speed)
+    cars = PASSING.driven(tau=values["tau_co"]).draw(
+        rng, values["flow_co"], values["v_co"] / 3.6, NEAREST, FARTHEST, start=values["v_co"] / 3.6 * LIMIT / RING_LIMIT
+    )
+    leaves = rng.random(len(cars)) < values["p_leave"]
+    cars = tuple(replace(car, route=LEAVING) if out else car for car, out in zip(cars, leaves, strict=True))
+    car = Actor("ego", ("in_south", *RING), 0, ARM - DISTANCE, speed, driver, automated(ego, LIMIT, LIMIT))
+    return Scene((car, *cars), until_over)
+
+
+def until_over(t: float, states: Mapping[str, State]) -> str | None:
+    """End the run once ego is on the northern arm: whom it bothered at its entry has come there."""
+    return "passed" if states["ego"].y > CLEAR else None
+
+
+SCENARIO = LogicalScenario(
+    name="roundabout_entry",
+    description=(
+        "Entry into a roundabout with circulating traffic.\n"
+        "One-lane roundabout, 30 km/h. Ego comes from the south at v_ego and enters as soon as its driver model accepts a gap "
+        "between the cars from the west, flow_co an hour at v_co in the ring; a share p_leave of them leaves just before ego."
+    ),
+    space=ParameterSpace(
+        (
+            Parameter("flow_co", 200.0, 1000.0, "1/h", description="cars an hour that come from the west"),
+            Parameter("v_co", 20.0, 40.0, "km/h", description="mean desired speed of these cars in the ring"),
+            Parameter("p_leave", 0.0, 0.6, "", description="share of these cars that leaves at the exit before ego's entry"),
+            Parameter("tau_co", 0.4, 1.4, "s", description="time gap that these cars keep"),
+            Parameter("v_ego", 20.0, 50.0, "km/h", description="speed of ego at the start"),
+            *EGO.inputs,
+        )
+    ),
+    simulate=SumoSimulation(
+        net="roundabout", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)
+    ),
+    metrics=(
+        time_left(horizon=HORIZON, zone=ENTRY), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking(),
+    ),
+    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
+)

@@ -1,0 +1,86 @@
+"""Unprotected left turn: ego crosses the oncoming traffic of a main road where nothing but the right of way protects it.
+
+Gap acceptance at a permissive left turn is the pre-crash scenario "left turn across path, opposite direction"
+(Najm, Smith and Yanagisawa 2007, Pre-Crash Scenario Typology for Crash Avoidance Research, DOT HS 810 767).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.actors import Actor, Scene, State, Until
+from sbt.sumo.ego import Ego
+from sbt.sumo.simulation import SumoSimulation
+from sbt.sumo.traffic import Column, automated
+
+__all__ = ["SCENARIO"]
+
+LIMIT = 50 / 3.6
+"""Speed limit of all roads (m/s)."""
+ARM = 1000.0
+"""Length of the western arm up to the middle of the junction (m), of the network `left_turn`."""
+DISTANCE = 80.0
+"""From ego's front to the middle of the junction at the start (m)."""
+NEAREST, FARTHEST = 880.0, 100.0
+"""Fronts of the oncoming cars at the start, on the 900 m from the east to the junction (m)."""
+CLEAR = 15.0
+"""y beyond which ego has left the junction (m)."""
+HORIZON = 5.0
+"""A car that comes later to where ego has been was not bothered (s)."""
+DURATION = 40.0
+"""Longest time that is looked at (s)."""
+EGO = Ego.of(
+    "sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5}
+)
+ONCOMING = Column("oncoming", ("in_east", "out_west"), 0, LIMIT)
+
+
+def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
+    """Return ego ahead of the junction, about to turn left, and a column of cars that comes the other way."""
+    speed = values["v_ego"] / 3.6
+    driver = ego.driver(rng, speed)
+    cars = ONCOMING.draw(rng, values["flow_co"], values["v_co"] / 3.6, NEAREST, FARTHEST)
+    car = Actor("ego", ("in_west", "out_north"), 0, ARM - DISTANCE, speed, driver, automated(ego, speed, LIMIT))
+    return Scene((car, *cars), until_over())
+
+
+def until_over() -> Until:
+    """Return the rule that ends the run: ego left the junction `HORIZON` ago."""
+    left: list[float] = []
+
+    def over(t: float, states: Mapping[str, State]) -> str | None:
+        if not left and states["ego"].y > CLEAR:
+            left.append(t)
+        return "passed" if left and t >= left[0] + HORIZON else None
+
+    return over
+
+
+SCENARIO = LogicalScenario(
+    name="unprotected_left_turn",
+    description=(
+        "Unprotected left turn across oncoming traffic.\n"
+        "Urban main road at 50 km/h, one lane each way, a side road to the north, no signals. Ego approaches at v_ego and "
+        "turns left as soon as its driver model accepts a gap in the oncoming traffic, flow_co cars an hour at v_co."
+    ),
+    space=ParameterSpace(
+        (
+            Parameter("flow_co", 200.0, 1000.0, "1/h", description="oncoming cars an hour"),
+            Parameter("v_co", 40.0, 80.0, "km/h", description="mean desired speed of the oncoming cars"),
+            Parameter("v_ego", 20.0, 50.0, "km/h", description="speed of ego at the start and desired"),
+            *EGO.inputs,
+        )
+    ),
+    simulate=SumoSimulation(
+        net="left_turn", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)
+    ),
+    metrics=(time_left(horizon=HORIZON), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
+    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
+)

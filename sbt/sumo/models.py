@@ -1,0 +1,124 @@
+"""SUMO's car-following and lane-change models and the vType attributes each takes: what an ego may be made of.
+
+SUMO ignores an attribute that a model does not have, silently; this table is what misspelt or misplaced ones
+are told by. Source: SUMO's documentation, "Definition of Vehicles, Vehicle Types, and Routes" and "Car-Following Models".
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sbt.errors import InputError
+
+__all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "attributes_of", "checked", "unit_of"]
+
+SUBLANE = "SL2015"
+"""The lane-change model that needs SUMO's option --lateral-resolution; without it, it never changes lanes."""
+_COMMON = {
+    "minGap": "m", "accel": "m/s^2", "decel": "m/s^2", "emergencyDecel": "m/s^2", "apparentDecel": "m/s^2", "tau": "s",
+    "maxSpeed": "m/s", "speedFactor": "", "speedDev": "", "actionStepLength": "s", "impatience": "", "startupDelay": "s",
+    "length": "m", "width": "m",
+    "jmCrossingGap": "m", "jmIgnoreKeepClearTime": "s", "jmDriveAfterYellowTime": "s", "jmDriveAfterRedTime": "s",
+    "jmDriveRedSpeed": "m/s", "jmIgnoreFoeSpeed": "m/s", "jmIgnoreFoeProb": "", "jmIgnoreJunctionFoeProb": "",
+    "jmSigmaMinor": "", "jmTimegapMinor": "s", "jmStoplineGap": "m", "jmExtraGap": "m",
+}  # fmt: skip
+_SIGMA = {"sigma": "", "sigmaStep": "s"}
+_IDM = {"delta": "", "stepping": "s"}
+CAR_FOLLOWING: Mapping[str, Mapping[str, str]] = {
+    "Krauss": _SIGMA, "KraussOrig1": _SIGMA, "KraussPS": _SIGMA, "SmartSK": {"sigma": ""},
+    "Daniel1": {"sigma": ""}, "PWagner2009": {"sigma": "", "tauLast": "s", "apProb": ""}, "BKerner": {"k": "", "phi": ""},
+    "IDM": _IDM, "IDMM": _IDM | {"adaptFactor": "", "adaptTime": "s"},
+    "EIDM": _IDM | {
+        "tpreview": "s", "tPersDrive": "s", "treaction": "s", "tPersEstimate": "s", "ccoolness": "", "sigmaleader": "",
+        "sigmagap": "", "sigmaerror": "", "jerkmax": "m/s^3", "epsilonacc": "m/s^2", "taccmax": "s", "Mflatness": "",
+        "Mbegin": "", "maxvehpreview": "", "vehdynamics": "",
+    },
+    "Wiedemann": {"security": "", "estimation": ""},
+    "W99": {"cc1": "s", "cc2": "m", "cc3": "s", "cc4": "m/s", "cc5": "m/s", "cc6": "1e-4 rad/s", "cc7": "m/s^2",
+            "cc8": "m/s^2", "cc9": "m/s^2"},
+    "ACC": dict.fromkeys((
+        "speedControlGain", "gapClosingControlGainSpeed", "gapClosingControlGainSpace", "gapControlGainSpeed",
+        "gapControlGainSpace", "collisionAvoidanceGainSpace", "collisionAvoidanceGainSpeed"), ""),
+    "CACC": dict.fromkeys((
+        "speedControlGainCACC", "gapClosingControlGainGap", "gapClosingControlGainGapDot", "gapControlGainGap",
+        "gapControlGainGapDot", "collisionAvoidanceGainGap", "collisionAvoidanceGainGapDot"), ""),
+}  # fmt: skip
+"""Car-following model to its own attributes and their units; all take the common ones beside. KraussAB and Rail, which
+the documentation names too, are left out: SUMO 1.28 does not know the one, and the other takes no ballistic steps."""
+_LC_COMMON = dict.fromkeys((
+    "lcStrategic", "lcCooperative", "lcSpeedGain", "lcKeepRight", "lcOvertakeRight", "lcLookaheadLeft", "lcSpeedGainRight",
+    "lcSpeedGainLookahead", "lcCooperativeRoundabout", "lcCooperativeSpeed", "lcAssertive", "lcSigma",
+    "lcKeepRightAcceptanceTime", "lcOvertakeDeltaSpeedFactor"), "")  # fmt: skip
+LANE_CHANGE: Mapping[str, Mapping[str, str]] = {
+    "LC2013": _LC_COMMON,
+    "SL2015": _LC_COMMON | {
+        "lcSublane": "", "lcPushy": "", "lcPushyGap": "m", "lcImpatience": "", "lcTimeToImpatience": "s", "lcAccelLat": "m/s^2",
+        "lcTurnAlignmentDistance": "m", "lcMaxSpeedLatStanding": "m/s", "lcMaxSpeedLatFactor": "", "lcLaneDiscipline": "",
+    },
+    "DK2008": {},
+}  # fmt: skip
+"""Lane-change model to its attributes and their units. SL2015 needs SUMO's option --lateral-resolution."""
+
+
+def attributes_of(model: str, lane_change: str) -> dict[str, str]:
+    """Return the attributes that a vehicle of these two models takes, with their units.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    return {**_COMMON, **_of("model", CAR_FOLLOWING, model), **_of("lane_change", LANE_CHANGE, lane_change)}
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of an attribute, "" for a pure number or where it is unknown."""
+    tables = (_COMMON, *CAR_FOLLOWING.values(), *LANE_CHANGE.values())
+    return next((table[name] for table in tables if name in table), "")
+
+
+def checked(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return the vType attributes that settings of an ego of kind `sumo` mean, after a check of names and numbers.
+
+    `model` and `lane_change` choose the models (SUMO's `carFollowModel` and `laneChangeModel`; Krauss and LC2013).
+
+    Raises:
+        InputError: an unknown model, an attribute that these models do not have, or one that is no finite number.
+
+    >>> checked({"model": "IDM", "tau": 1.2})
+    {'carFollowModel': 'IDM', 'laneChangeModel': 'LC2013', 'tau': '1.2'}
+    """
+    aliases = {"carFollowModel": "model", "laneChangeModel": "lane_change"}
+    given = {aliases.get(name, name): value for name, value in settings.items()}
+    model, lane_change = str(given.pop("model", "Krauss")), str(given.pop("lane_change", "LC2013"))
+    known = attributes_of(model, lane_change)
+    for name, value in given.items():
+        if name not in known:
+            hint = _hint(name, known)
+            owners = [m for m, own in {**CAR_FOLLOWING, **LANE_CHANGE}.items() if name in own]
+            of = f"; it belongs to {', '.join(owners)}" if owners else hint
+            rule = f"ego settings of kind sumo must be vType attributes of {model} or {lane_change}"
+            raise InputError(f"{rule}, but got '{name}'{of}")
+        if not _finite(value):
+            raise InputError(f"ego.{name} must be a finite number, but got {value!r}")
+    return {"carFollowModel": model, "laneChangeModel": lane_change} | {name: str(value) for name, value in given.items()}
+
+
+def _of(key: str, table: Mapping[str, Mapping[str, str]], name: str) -> Mapping[str, str]:
+    if name not in table:
+        raise InputError(f"ego.{key} must be one of SUMO's {', '.join(table)}, but got '{name}'{_hint(name, table)}")
+    return table[name]
+
+
+def _hint(name: str, known: Iterable[str]) -> str:
+    lower = {k.lower(): k for k in known}
+    near = difflib.get_close_matches(name.lower(), lower, 1)
+    return f" (did you mean '{lower[near[0]]}'?)" if near else ""
+
+
+def _finite(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and math.isfinite(float(value))
+    except (TypeError, ValueError):
+        return False
