@@ -33,7 +33,7 @@ _INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a belie
 _THOMPSON = 0.53  # share of the guided picks: 45 of 85 %
 _GLOBAL, _LOCAL = 1500, 350  # candidates
 _FEWEST_FREE = 0.05  # of the cube that deflation must leave
-_CLEAR = 0.1  # picks of one batch repel each other within this part of the cube's diagonal
+_CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
 
 
 @dataclass(frozen=True)
@@ -150,10 +150,12 @@ class Region:
     Args:
         centre: (d,) the run.
         side: of the box.
+        failures: batches in it since the last improvement.
     """
 
     centre: Vector
     side: float
+    failures: int = 0
 
     @cached_property
     def dimension(self) -> int:
@@ -182,19 +184,19 @@ def regions(u: Points, margin: Vector, batch: Vector) -> list[Region]:
         batch: (n,) number of the batch of each run, increasing.
     """
     found: list[Region] = []
-    left = np.ones(len(u), dtype=bool)
+    left = margin < np.median(margin)  # on a plateau no run is better than the others
     while left.any() and len(found) < _MOST_REGIONS:
         best = int(np.flatnonzero(left)[np.argmin(margin[left])])
         near = np.abs(u - u[best]).max(axis=1) <= _APART
-        side = _side(u[near], margin[near], batch[near])
+        side, failures = _side(u[near], margin[near], batch[near])
         if side >= _SHORTEST:
-            found.append(Region(u[best], side))
+            found.append(Region(u[best], side, failures))
         left &= ~near
     return found
 
 
-def _side(u: Points, margin: Vector, batch: Vector) -> float:
-    """Return the side of a trust region from the runs of its neighbourhood, in order."""
+def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
+    """Return side and failures of a trust region from the runs of its neighbourhood, in order."""
     side, best, failures, successes = _LONGEST, -1, 0, 0
     for number in np.unique(batch):
         mine = np.flatnonzero(batch == number)
@@ -204,13 +206,11 @@ def _side(u: Points, margin: Vector, batch: Vector) -> float:
             continue
         if margin[leader] < margin[best]:
             best, successes, failures = leader, successes + 1, 0
+            side = min(2 * side, _LONGEST) if successes >= 2 else side
         elif (np.abs(u[mine] - u[best]).max(axis=1) <= 0.5 * side).any():
             failures, successes = failures + 1, 0
-        if failures >= _PATIENCE:
-            side, failures = side / 2, 0
-        elif successes >= 2:
-            side, successes = min(2 * side, _LONGEST), 0
-    return side
+            side = side / 2 if failures % _PATIENCE == 0 else side
+    return side, failures
 
 
 def propose(
@@ -276,7 +276,8 @@ def _hopeful(
     for region in found:
         candidates = region.candidates(_LOCAL, rng)
         candidates = candidates[admissible(candidates)]
-        if len(candidates) and belief.log_probability(candidates, _INFLATION).max() > np.log(_HOPELESS):
+        tried = region.failures >= _PATIENCE
+        if len(candidates) and not (tried and belief.log_probability(candidates, _INFLATION).max() < np.log(_HOPELESS)):
             kept.append((region, candidates))
     return kept
 
@@ -315,16 +316,15 @@ def _globally(
         moved = rng.random(around.shape) < max(0.3, 1.0 / d)
         around = np.clip(around + scale * rng.standard_normal(around.shape) * moved, 0.0, 1.0)
         candidates = np.vstack([candidates, around[admissible(around)]])
-    score = belief.log_probability(candidates, _INFLATION)
+    scores = [np.maximum(belief.log_probability(candidates, wide), np.log(_HOPELESS)) for wide in (1.0, _INFLATION)]
+    away = _repelled(candidates, u, 0.2 * _CLEAR * np.sqrt(d))
     chosen = picks.reshape(-1, d)
-    size = np.sqrt(d)
-    score = score + _repelled(candidates, u, 0.2 * _CLEAR * size)
     for point in chosen:
-        score = score + _repelled(candidates, point[None], _CLEAR * size)
-    while len(chosen) < n:
-        at = int(np.argmax(score))
+        away += _repelled(candidates, point[None], _CLEAR * np.sqrt(d))
+    for k in range(n - len(chosen)):
+        at = int(np.argmax(scores[k % 2] + away))
         chosen = np.vstack([chosen, candidates[at]])
-        score = score + _repelled(candidates, candidates[at][None], _CLEAR * size)
+        away += _repelled(candidates, candidates[at][None], _CLEAR * np.sqrt(d))
     return chosen
 
 
