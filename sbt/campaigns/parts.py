@@ -25,7 +25,9 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store import PlannedRun
 
-__all__ = ["Acquisition", "BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of"]
+__all__ = [
+    "Acquisition", "BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of", "held_out_runs", "named_inputs",
+]  # fmt: skip
 
 Acquisition = Callable[[Prediction, CriticalInterval, Vector], Vector]
 
@@ -103,8 +105,8 @@ class BatchStage:
         belief = s.learner.fit(log.history) if s.learner is not None and not first else None
         draw = self._draw(belief, log, size - held_out)
         stage = "initial" if first else self.name
-        chosen = [PlannedRun(stage, _inputs(s.scenario, row)) for row in self._values(draw, log)]
-        random = self._held_out(log.iteration, held_out + (s.reference if first else 0))
+        chosen = [PlannedRun(stage, named_inputs(s.scenario, row)) for row in self._values(draw, log)]
+        random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         how = {
             "method": draw.method, "candidates": draw.candidates, "acceptance": draw.acceptance,
             _POSITION: draw.next_position, "held_out": len(random),
@@ -147,12 +149,13 @@ class BatchStage:
             return scenario.space.from_unit(draw.u)
         return scenario.pool.x[pool.rows[draw.positions]]
 
-    def _held_out(self, iteration: int, n: int) -> list[PlannedRun]:
-        """Return n uniform random runs of the box, with their log density."""
-        space = self.settings.scenario.space
-        rng = stream(self.settings.seed, VALIDATION, iteration)
-        u, log_q = _uniform(space, n, rng)
-        return [PlannedRun(VALIDATION, _inputs(self.settings.scenario, row), log_q) for row in space.from_unit(u)]
+
+def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun]:
+    """Return n uniform random runs of the box, with their log density, for the batch of this iteration."""
+    space = settings.scenario.space
+    rng = stream(settings.seed, VALIDATION, iteration)
+    u, log_q = _uniform(space, n, rng)
+    return [PlannedRun(VALIDATION, named_inputs(settings.scenario, row), log_q) for row in space.from_unit(u)]
 
 
 def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[Points, float | None]:
@@ -174,7 +177,8 @@ def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[P
     return np.vstack(kept), -float(sum(math.log(b - a + w) for (a, b), w in zip(ends, whole, strict=True)))
 
 
-def _inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
+def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
+    """Return the (d,) values of a concrete scenario by name."""
     return {name: float(value) for name, value in zip(scenario.space.names, row, strict=True)}
 
 

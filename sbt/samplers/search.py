@@ -161,7 +161,7 @@ def known(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.ra
         batch: (m,) number of the batch that each run came with; None: each run by itself.
         rng: the only source of randomness.
     """
-    number = np.arange(len(u)) if batch is None else np.asarray(batch)
+    number = np.arange(len(u), dtype=np.float64) if batch is None else np.asarray(batch, dtype=np.float64)
     ok = np.isfinite(y)
     hit = ok & search.critical.contains(y)
     free = deflated(search, u[hit], rng, u.shape[1])
