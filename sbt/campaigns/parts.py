@@ -22,7 +22,9 @@ from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store import PlannedRun
 
-__all__ = ["BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of"]
+__all__ = [
+    "BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of", "held_out_runs", "named_inputs",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,16 +77,17 @@ class BatchStage:
         belief = s.learner.fit(log.history) if s.learner is not None and not first else None
         found = (evenly if first else self.choose)(s, belief, log, size - held_out)
         stage = "initial" if first else self.name
-        chosen = [PlannedRun(stage, _inputs(s.scenario, row)) for row in found.x]
-        random = self._held_out(log.iteration, held_out + (s.reference if first else 0))
+        chosen = [PlannedRun(stage, named_inputs(s.scenario, row)) for row in found.x]
+        random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         return Batch((*chosen, *random), {**found.how, "held_out": len(random)}, fit_of(belief))
 
-    def _held_out(self, iteration: int, n: int) -> list[PlannedRun]:
-        """Return n uniform random runs of the box, with their log density."""
-        space = self.settings.scenario.space
-        rng = stream(self.settings.seed, VALIDATION, iteration)
-        u, log_q = _uniform(space, n, rng)
-        return [PlannedRun(VALIDATION, _inputs(self.settings.scenario, row), log_q) for row in space.from_unit(u)]
+
+def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun]:
+    """Return n uniform random runs of the box, with their log density, for the batch of this iteration."""
+    space = settings.scenario.space
+    rng = stream(settings.seed, VALIDATION, iteration)
+    u, log_q = _uniform(space, n, rng)
+    return [PlannedRun(VALIDATION, named_inputs(settings.scenario, row), log_q) for row in space.from_unit(u)]
 
 
 def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[Points, float | None]:
@@ -106,7 +109,8 @@ def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[P
     return np.vstack(kept), -float(sum(math.log(b - a + w) for (a, b), w in zip(ends, whole, strict=True)))
 
 
-def _inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
+def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
+    """Return the (d,) values of a concrete scenario by name."""
     return {name: float(value) for name, value in zip(scenario.space.names, row, strict=True)}
 
 

@@ -47,6 +47,9 @@ class CampaignKind:
         adaptive: it needs a metamodel.
         methods: values of `acquisition.kind` that are the campaign's own ways to choose a batch, beside
             the installed acquisition functions.
+        metamodel: the default one with its settings.
+        most_initial: the most runs that the default of `initial` takes.
+        batch: default runs per iteration; None: as many as initial.
     """
 
     description: str
@@ -54,6 +57,9 @@ class CampaignKind:
     stop: Mapping[str, float | int | None] = field(default_factory=dict)
     adaptive: bool = True
     methods: tuple[str, ...] = ()
+    metamodel: Mapping[str, Any] = field(default_factory=lambda: {"kind": "gp"})
+    most_initial: int | None = None
+    batch: int | None = None
 
 
 CAMPAIGNS: Mapping[str, CampaignKind] = {
@@ -63,7 +69,11 @@ CAMPAIGNS: Mapping[str, CampaignKind] = {
     ),
     "falsification": CampaignKind(
         "find critical concrete scenarios, and distinct failure modes", "portfolio",
-        stop={"failures": None, "modes": None}, methods=("portfolio",),
+        stop={"failures": None, "modes": None},
+        methods=(
+            "portfolio", "log_expected_improvement", "probability_of_violation", "lower_confidence_bound", "thompson", "cma_es",
+        ),
+        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, most_initial=20, batch=10,
     ),
     "estimation": CampaignKind(
         "probability of a critical scenario under the inputs' distribution", "difference",
@@ -258,7 +268,12 @@ class ExecutorChoice(_Strict):
 
 
 def _tenth(data: dict[str, Any]) -> int:
-    return int(min(max(10, data["budget"] // 10), data["budget"]))
+    most = CAMPAIGNS[data["campaign"]].most_initial or data["budget"]
+    return int(min(max(10, data["budget"] // 10), data["budget"], most))
+
+
+def _batch(data: dict[str, Any]) -> int:
+    return CAMPAIGNS[data["campaign"]].batch or int(data["initial"])
 
 
 def _store(data: dict[str, Any]) -> str:
@@ -269,7 +284,8 @@ def _store(data: dict[str, Any]) -> str:
 
 
 def _metamodel(data: dict[str, Any]) -> MetamodelChoice | None:
-    return MetamodelChoice.model_validate({"kind": "gp"}) if CAMPAIGNS[data["campaign"]].adaptive else None
+    kind = CAMPAIGNS[data["campaign"]]
+    return MetamodelChoice.model_validate(dict(kind.metamodel)) if kind.adaptive else None
 
 
 def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
@@ -299,12 +315,12 @@ class Configuration(_Strict):
     budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
     initial: int = Field(
         default_factory=_tenth, ge=1,
-        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10.",
+        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10, in a falsification at most 20.",
     )  # fmt: skip
     batch: int = Field(
-        default_factory=lambda data: data["initial"],
+        default_factory=_batch,
         ge=1,
-        description="Runs per iteration; default: as many as initial.",
+        description="Runs per iteration; default: as many as initial, in a falsification 10.",
     )
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(

@@ -35,7 +35,7 @@ _CLOCK = 64
 """The wall clock is looked at once in so many steps."""
 
 
-class Over(BaseException):  # noqa: N818  (no error: `except Exception` in a user's loop must not hold it)
+class Over(BaseException):
     """Ends the user's loop because the run is over; `ended` says why."""
 
     def __init__(self, ended: str):

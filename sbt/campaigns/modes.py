@@ -1,0 +1,124 @@
+"""Failure modes: critical runs that the metamodel's critical region connects, and what is said of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from sbt.arrays import Points, Vector
+from sbt.history import History
+from sbt.problem.scenario import LogicalScenario
+from sbt.samplers.search import Belief
+
+__all__ = ["Mode", "connected", "described", "modes_of"]
+
+_PROBES = 9  # on the segment between two runs
+_MOST = 200  # critical runs that are compared with each other; further ones join the nearest
+_CHUNK = 100  # segments asked for at once
+_NOT_WITHIN = 1e-9
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A failure mode.
+
+    Args:
+        rows: of its critical runs in the history.
+        representative: the row deepest in the critical interval.
+        most_likely: the row of largest p(x).
+        safe: the uncritical row nearest to the representative in the unit cube; None: there is none.
+    """
+
+    rows: tuple[int, ...]
+    representative: int
+    most_likely: int
+    safe: int | None
+
+
+def connected(belief: Belief, u: Points) -> Vector:
+    """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
+
+    Args:
+        belief: of the metamodel.
+        u: (n, d) critical runs in the unit cube.
+    """
+    n = len(u)
+    group = np.arange(n)
+    distance = cdist(u, u)
+    first, second = np.triu_indices(n, 1)
+    order = np.argsort(distance[first, second], kind="stable")
+    first, second = first[order], second[order]
+    steps = np.linspace(0.0, 1.0, _PROBES + 2)[1:-1, None]
+    while len(first):
+        apart = group[first] != group[second]
+        first, second = first[apart], second[apart]
+        a, b = first[:_CHUNK], second[:_CHUNK]
+        first, second = first[_CHUNK:], second[_CHUNK:]
+        if len(a) == 0:
+            break
+        probes = u[a][:, None, :] * (1.0 - steps) + u[b][:, None, :] * steps  # (pairs, 9, d)
+        inside = (belief.probability(probes.reshape(-1, u.shape[1])) > 0.5).reshape(len(a), _PROBES).all(axis=1)
+        for i, j in zip(a[inside], b[inside], strict=True):
+            group[group == group[j]] = group[i]
+    return group
+
+
+def modes_of(belief: Belief, history: History, scenario: LogicalScenario) -> list[Mode]:
+    """Return the failure modes, the one with the deepest run first.
+
+    Args:
+        belief: learned from these runs.
+        history: runs; only finished ones count.
+        scenario: with the campaign's space and requirement.
+    """
+    critical = scenario.requirement.critical
+    y = history.y(scenario.requirement.metric)
+    hits = np.flatnonzero(critical.contains(y))
+    if len(hits) == 0:
+        return []
+    u = scenario.space.to_unit(history.x)
+    depth = critical.margin(y)
+    chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
+    group = connected(belief, u[chosen])
+    nearest = cdist(u[hits], u[chosen]).argmin(axis=1)
+    label = group[nearest]
+    log_p = scenario.space.log_density(history.x[hits])
+    uncritical = np.flatnonzero(np.isfinite(y) & ~critical.contains(y))
+    found = []
+    for name in np.unique(label):
+        rows = hits[label == name]
+        representative = int(rows[np.argmin(depth[rows])])
+        likely = int(rows[np.argmax(log_p[label == name])])
+        safe = int(uncritical[cdist(u[[representative]], u[uncritical])[0].argmin()]) if len(uncritical) else None
+        found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
+    return sorted(found, key=lambda mode: (depth[mode.representative], mode.representative))
+
+
+def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed: Vector) -> dict[str, Any]:
+    """Return a mode as JSON.
+
+    Args:
+        mode: rows of the history.
+        history: the runs.
+        scenario: with the campaign's space and requirement.
+        confirmed: (k,) metric of the representative's runs with fresh seeds, NaN where one failed.
+    """
+    metric, critical = scenario.requirement.metric, scenario.requirement.critical
+    record = history.records[mode.representative]
+    likely = history.records[mode.most_likely]
+    told = {
+        "representative": record.index, "inputs": dict(record.inputs), "metric": record.metrics[metric], "size": len(mode.rows),
+        "confirmed": float(critical.contains(confirmed).mean()) if len(confirmed) else None, "confirmation_runs": len(confirmed),
+        "most_likely": {"run": likely.index, "inputs": dict(likely.inputs), "metric": likely.metrics[metric]},
+        "nearest_safe": None,
+    }  # fmt: skip
+    if mode.safe is not None:
+        safe = history.records[mode.safe]
+        change = {k: safe.inputs[k] - v for k, v in record.inputs.items() if abs(safe.inputs[k] - v) > _NOT_WITHIN * abs(v)}
+        told["nearest_safe"] = {
+            "run": safe.index, "inputs": dict(safe.inputs), "metric": safe.metrics[metric], "change": change,
+        }  # fmt: skip
+    return told

@@ -1,0 +1,115 @@
+"""Batches by one criterion alone: parts of the portfolio, and what others use, to compare with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from scipy.special import erfcx, log_ndtr
+
+from sbt.arrays import Points, Vector
+from sbt.samplers.search import Belief, Picks, Search, believe, fill, known, refined, repelled
+
+__all__ = ["CRITERIA", "Criterion", "log_expected_improvement", "lower_confidence_bound", "probability_of_violation", "propose_by"]
+
+Criterion = Callable[[Belief, Points, float], Vector]
+"""(belief, points (n, d), margin of the best run in warped units) -> (n,) scores, larger is better."""
+
+_KAPPA = 2.0  # standard deviations below the mean
+_CLEAR = 0.05  # as in the portfolio
+_DRAWN = 600  # candidates at which functions are drawn
+_SQRT_HALF_PI, _LOG_SQRT_2PI = np.sqrt(0.5 * np.pi), 0.5 * np.log(2.0 * np.pi)
+
+
+def probability_of_violation(belief: Belief, u: Points, best: float) -> Vector:
+    """Return (n,) log P(critical).
+
+    Source:
+        Kushner (1964), probability of improvement, with the edge of the critical interval as the level.
+    """
+    del best
+    return belief.log_probability(u)
+
+
+def lower_confidence_bound(belief: Belief, u: Points, best: float) -> Vector:
+    """Return (n,) minus the margin two standard deviations towards the critical interval.
+
+    Source:
+        Cox and John (1992); kappa = 2.
+    """
+    del best
+    p = belief(u)
+    return _KAPPA * p.sigma - belief.critical.margin(p.mu)
+
+
+def log_expected_improvement(belief: Belief, u: Points, best: float) -> Vector:
+    """Return (n,) log E[max(best - margin, 0)], the margin measured from the end on which the mean lies.
+
+    Source:
+        Ament et al. (2023), arXiv 2310.20708, eq. (9): stable far below the incumbent.
+    """
+    p = belief(u)
+    return np.asarray(np.log(p.sigma) + _log_h((best - belief.critical.margin(p.mu)) / p.sigma))
+
+
+def _log_h(z: Vector) -> Vector:
+    """Return log(phi(z) + z Phi(z)), finite for z down to -1e6."""
+    out = np.empty_like(z)
+    high = z > -1.0
+    phi = np.exp(-0.5 * z[high] ** 2 - _LOG_SQRT_2PI)
+    out[high] = np.log(phi + z[high] * np.exp(log_ndtr(z[high])))
+    low = z[~high]
+    mills = _SQRT_HALF_PI * erfcx(-low * np.sqrt(0.5))  # Phi(z) / phi(z)
+    rest = np.where(low > -1e3, np.log1p(np.maximum(low * mills, -1.0 + 1e-300)), -2.0 * np.log(-low))
+    out[~high] = -0.5 * low**2 - _LOG_SQRT_2PI + rest
+    return out
+
+
+CRITERIA: Mapping[str, Criterion | None] = {
+    "log_expected_improvement": log_expected_improvement,
+    "probability_of_violation": probability_of_violation,
+    "lower_confidence_bound": lower_confidence_bound,
+    "thompson": None,
+}
+"""By name, as in `acquisition.kind`; Thompson sampling draws functions and has no score."""
+
+
+def propose_by(
+    name: str, search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None
+) -> Picks:
+    """Return n points by the criterion `name` alone; deflation and arguments as in `portfolio.propose`.
+
+    The points of one batch repel each other, or are each the best of a function drawn (`thompson`).
+
+    Raises:
+        KeyError: there is no such criterion.
+    """
+    criterion = CRITERIA[name]
+    seen, d = known(search, u, y, batch, rng), u.shape[1]
+    if len(seen.u) < 2:
+        return Picks(fill(seen.admissible, n, d, rng), (name,) * n)
+    belief = believe(search, seen.u, seen.y, rng)
+    margin = belief.critical.margin(belief.warp.values(seen.y))
+    start = seen.u[np.argsort(margin, kind="stable")[:30]]
+    best = float(margin.min())
+    score = probability_of_violation if criterion is None else criterion
+    candidates, values = refined(lambda v: score(belief, v, best), start, seen.admissible, rng)
+    if criterion is None:
+        return Picks(_thompson(belief, candidates[np.argsort(-values, kind="stable")[:_DRAWN]], n, rng), (name,) * n)
+    values = values + repelled(candidates, u, 0.2 * _CLEAR * np.sqrt(d))
+    picks = np.empty((n, d))
+    for k in range(n):
+        picks[k] = candidates[int(np.argmax(values))]
+        values += repelled(candidates, picks[k][None], _CLEAR * np.sqrt(d))
+    return Picks(picks, (name,) * n)
+
+
+def _thompson(belief: Belief, candidates: Points, n: int, rng: np.random.Generator) -> Points:
+    """Return n points, each the best of a function drawn over the candidates; no point twice."""
+    drawn = belief.critical.margin(belief.draws(candidates, n, rng))
+    chosen = np.empty((n, candidates.shape[1]))
+    for k in range(n):
+        at = int(np.argmin(drawn[k]))
+        chosen[k] = candidates[at]
+        drawn[:, at] = np.inf
+    return chosen
