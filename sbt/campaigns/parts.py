@@ -47,6 +47,8 @@ class Settings:
         acquisition: log score of candidates; None where the campaign chooses by a method of its own.
         method: name of the acquisition or method, as configured.
         stop: rules by name, None where one is off.
+        gate: `probability` and `confidence` of the verdict of an estimation; None: no verdict.
+        earlier: runs of another campaign to learn from, never to count.
     """
 
     scenario: LogicalScenario
@@ -60,6 +62,8 @@ class Settings:
     acquisition: Acquisition | None
     method: str = ""
     stop: Mapping[str, Any] = field(default_factory=dict)
+    gate: Mapping[str, float] | None = None
+    earlier: History | None = None
 
 
 @dataclass(frozen=True)

@@ -6,41 +6,45 @@ one. Up to a stopping time the draws only teach; from then on they count, with w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
-from sbt.arrays import Points, Vector
+from sbt.arrays import Mask, Points, Vector
 from sbt.campaign import Batch, Log
+from sbt.campaigns.counting import DRAWN, counted_batches
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
-from sbt.estimators.hunt import BASIN, greedy, outside
 from sbt.estimators.importance import BLIND, SHARES, Plan, chosen, planned
-from sbt.estimators.intervals import Combined, Counted, combined
+from sbt.estimators.intervals import combined
 from sbt.estimators.mixture import Mixture, fitted, log_normal, particles, wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability, learned
 from sbt.history import History
-from sbt.problem.space import ParameterSpace
+from sbt.metamodels.base import Metamodel
+from sbt.samplers import portfolio
+from sbt.samplers.search import DEFLATION, Free, Search
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store import PlannedRun
 
-__all__ = ["DRAWN", "SequentialStage", "counted_batches"]
+__all__ = ["FEWEST_BATCHES", "SequentialStage"]
 
-DRAWN = "estimation"
-"""Stage of runs that were drawn with a known density."""
 _HUNT = "hunt"
 _POOL = 10_000
 _PARTICLES = 800
 _CANDIDATES = 6_000
-_PHASE_0 = (0.25, 0.4)
-_LEARN = 0.6
+_PHASE_0 = 0.4
+_EVEN_SHARE = 0.1
+_COMMON = 0.02
+_STALLED = 1.5
+_LEARN = 0.5
 _HUNTED_SHARE = 0.2
-_FEWEST_BATCHES = 4
+FEWEST_BATCHES = 4
+"""Batches that must count before a target is believed to be met."""
 _TARGET = 0.02
 
 
@@ -70,7 +74,7 @@ class SequentialStage:
             return "budget"
         target = s.stop.get("cov")
         counted = counted_batches(log, s)
-        if target is not None and len(counted) >= _FEWEST_BATCHES:
+        if target is not None and len(counted) >= FEWEST_BATCHES:
             found = combined(counted)
             hits = sum(float(b.critical.sum()) for b in counted)
             if hits >= 10 and found.value > 0 and found.std_error <= target * found.value:
@@ -114,27 +118,41 @@ class SequentialStage:
         )
 
     def _hunting(self, log: Log, known: _Known) -> bool:
-        """Return whether phase 0 goes on: to 40 % of the budget, no longer than two batches without a new mode."""
+        """Return whether phase 0 goes on: to 40 % of the budget, no longer than two batches without a new mode.
+
+        It ends as well where failures are common: draws from the law meet every region that counts.
+        """
         spent = len(log.history)
-        if spent >= _PHASE_0[1] * self.settings.budget or any(i.get("phase") != "hunt" for i in log.iterations[1:]):
+        if spent >= _PHASE_0 * self.settings.budget or any(i.get("phase") != "hunt" for i in log.iterations[1:]):
             return False
         modes = [i["modes"] for i in log.iterations[1:]] + [known.modes]
-        return not (len(modes) >= 3 and modes[-1] == modes[-3] and known.modes > 0)
+        if known.modes > 0 and len(modes) >= 3 and modes[-1] == modes[-3]:
+            return False
+        return not (known.modes > 0 and self._common(known, log.iteration))
+
+    def _common(self, known: _Known, iteration: int) -> bool:
+        """Return whether the metamodel takes more than 1 in 50 draws from the law to be critical."""
+        belief = known.learn(stream(self.settings.seed, "common fit", iteration))
+        z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
+        return belief is not None and float(np.exp(belief(z)[0]).mean()) > _COMMON
 
     def _hunt(self, known: _Known, iteration: int, n: int) -> Points:
-        """Return n hunting picks (n, d)."""
-        s, rng = self.settings, stream(self.settings.seed, "hunt", iteration)
-        if n == 0:
-            return np.empty((0, s.scenario.space.dimension))
-        z = self._feasible(rng.standard_normal((4000, len(self._wide))) * self._wide, iteration)
-        u = self._coordinates(z)
-        free = outside(u, known.u[known.critical])
-        if free.sum() < 10 * n:
-            free[:] = True
-        z, u = z[free], u[free]
-        belief = known.learn(stream(s.seed, "hunt fit", iteration), deflated=True)
-        score = (lambda _: np.zeros(len(z))) if belief is None else (lambda _: belief(z)[0])
-        return z[greedy(u, score, known.u, n, even=max(n // 3, 1) if n > 1 else 0)]
+        """Return n hunting picks (n, d): the falsification portfolio in the cube of the wide law, some spread evenly."""
+        s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", iteration)
+        even = round(_EVEN_SHARE * n)
+        spread = rng.random((even, space.dimension))
+        if n > even:
+            search = Search(
+                s.scenario.requirement.critical, metamodel_of(s), lambda v: self._coordinates(self._scores(v)),
+                lambda v: space.feasible(space.from_normal(self._scores(v))),
+            )  # fmt: skip
+            picks = portfolio.propose(search, known.cube(self._wide), known.y, n - even, rng, known.batch)
+            spread = np.vstack([picks.u, spread])
+        return self._feasible(self._scores(spread), iteration)
+
+    def _scores(self, v: Points) -> Points:
+        """Return normal scores of points of the cube in which the wide law is uniform."""
+        return ndtri(np.clip(v, 1e-9, 1.0 - 1e-9)) * self._wide
 
     def _drawn(self, log: Log, known: _Known, size: int) -> Batch:
         """Return draws from a fresh pool, and hunting picks."""
@@ -152,7 +170,7 @@ class SequentialStage:
         log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
         plan = planned(log_pi, log_not, log_w, log_wide, stratum, BLIND if known.one_sided else SHARES)
         n = size - hunted
-        draws = chosen(plan, n, rng.permutation(len(z)).astype(float), rng)
+        draws = chosen(plan, n, log_pi - log_not, rng)
         log_q = s.scenario.space.log_density(x[draws.rows]) - np.log(draws.coefficient)
         counts = self._counts(log, plan, size)
         how = {
@@ -168,25 +186,17 @@ class SequentialStage:
         """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
         if belief is None or not known.critical.any():
             return Mixture(self._wide)
-        start = Mixture(self._wide, None)
-        z, _ = start.sample(_CANDIDATES, rng)
-        hits = known.z[known.critical]
-        near = hits[rng.integers(len(hits), size=_CANDIDATES // 3)]
-        near = near + 0.3 * rng.standard_normal(near.shape)
-        z = np.concatenate([z, near])
-        from scipy.special import logsumexp
-        d = z.shape[1]
-        kernel = -0.5 * ((z[:, None] - hits[None]) ** 2).sum(axis=2) / 0.09 - 0.5 * d * np.log(2 * np.pi * 0.09)
-        kernel = logsumexp(kernel, axis=1) - np.log(len(hits))
-        log_start = np.logaddexp(start.log_density(z) + np.log(0.75), kernel + np.log(0.25))
-        clouds = []
-        for doubtful in (False, True):
-            def target(points: Points, doubtful: bool = doubtful) -> Vector:
-                log_pi, log_not = belief(points)
-                return log_normal(points) + (0.5 * (log_pi + log_not) if doubtful else log_pi)
+        z, log_q = Mixture(self._wide).sample_near(_CANDIDATES, known.z[known.critical], rng)
 
-            clouds.append(particles(target, z, log_start, _PARTICLES, rng))
-        return fitted(tuple(clouds), self._wide, rng)
+        def mass(points: Points) -> Vector:
+            return log_normal(points) + belief(points)[0]
+
+        def doubt(points: Points) -> Vector:
+            log_pi, log_not = belief(points)
+            return log_normal(points) + 0.5 * (log_pi + log_not)
+
+        clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, doubt))
+        return fitted(clouds, self._wide, rng)
 
     def _counts(self, log: Log, plan: Plan, size: int) -> bool:
         """Return whether this batch counts: from the stopping time on, which looks only at what is past."""
@@ -196,6 +206,8 @@ class SequentialStage:
         s, spent = self.settings, len(log.history)
         if spent + size > _LEARN * s.budget:
             return True
+        if len(drawn) >= 2 and _relative(drawn[-1]) < _STALLED * plan.anticipated / max(plan.prior, 1e-300) ** 2:
+            return True  # learning no longer pays
         left = (1.0 - _HUNTED_SHARE) * (s.budget - spent)
         base = max(plan.prior, 1e-300)
         target = s.stop.get("cov")
@@ -203,24 +215,35 @@ class SequentialStage:
         return len(drawn) >= 1 and (plan.anticipated / left) ** 0.5 <= target * base
 
 
+def _relative(how: Mapping[str, Any]) -> float:
+    """Return the anticipated squared coefficient of variation of a draw of an earlier batch."""
+    return float(how["anticipated"]) / max(float(how["prior"]), 1e-300) ** 2
+
+
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """Runs to learn from: normal scores z, coordinates u, metric y, and what is critical."""
+    """Runs to learn from: normal scores z, coordinates u, metric y, what is critical, the batch of each."""
 
     z: Points
     u: Points
     y: Vector
-    critical: Any
+    critical: Mask
+    batch: Vector
     coordinates: Coordinates
     settings: Settings
 
     @classmethod
     def of(cls, history: History, coordinates: Coordinates, settings: Settings) -> _Known:
-        runs = history.training
-        z = settings.scenario.space.to_normal(runs.x) if len(runs) else np.empty((0, settings.scenario.space.dimension))
+        """Return what the history teaches, and what an earlier campaign does."""
+        runs, space = history.training, settings.scenario.space
         requirement = settings.scenario.requirement
-        y = runs.y(requirement.metric)
-        return cls(z, coordinates(z), y, requirement.critical.contains(y), coordinates, settings)
+        x, y, batch = runs.x, runs.y(requirement.metric), runs.iteration
+        if settings.earlier is not None:
+            first = settings.earlier.training
+            x, y = np.vstack([first.x, x]), np.concatenate([first.y(requirement.metric), y])
+            batch = np.concatenate([np.full(len(first), -1), batch])
+        z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
+        return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings)
 
     @property
     def one_sided(self) -> bool:
@@ -232,45 +255,28 @@ class _Known:
         """Number of basins that the critical runs fill, in their order."""
         centres: list[Vector] = []
         for u in self.u[self.critical]:
-            if not centres or outside(u[None], np.array(centres), BASIN)[0]:
+            if not centres or Free(np.array(centres), DEFLATION)(u[None])[0]:
                 centres.append(u)
         return len(centres)
 
-    def learn(self, rng: np.random.Generator, *, deflated: bool = False) -> LogProbability | None:
-        """Return the belief; `deflated` leaves out what lies around critical runs. None with too few runs."""
-        keep = np.ones(len(self.y), dtype=bool)
-        if deflated and self.critical.any():
-            rest = outside(self.u, self.u[self.critical])
-            keep = rest if rest.sum() >= 5 else keep
-        learner = self.settings.learner
-        if learner is None:
-            raise InputError("the difference estimator needs a metamodel, but got none")
-        if keep.sum() < 2:
+    def cube(self, wide: Vector) -> Points:
+        """Return the runs in the cube in which the wide law is uniform."""
+        return np.asarray(ndtr(self.z / wide))
+
+    def learn(self, rng: np.random.Generator) -> LogProbability | None:
+        """Return the belief; None with too few runs."""
+        if len(self.y) < 2:
             return None
         interval = self.settings.scenario.requirement.critical
-        return learned(learner.metamodel, self.coordinates, interval, self.z[keep], self.y[keep], rng)
+        return learned(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng)
 
 
-def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = False) -> list[Counted]:
-    """Return the batches that count, with their outcomes; failed runs count as stated.
+def metamodel_of(settings: Settings) -> Metamodel:
+    """Return the metamodel of a campaign that cannot do without.
 
     Raises:
-        InputError: a counted run has no proposal density.
+        InputError: there is none.
     """
-    found, requirement = [], settings.scenario.requirement
-    critical = requirement.critical.contains(log.history.y(requirement.metric))
-    critical = critical | (failed_critical & ~log.history.ok)
-    drawn = log.history.stage == DRAWN
-    for how in log.iterations:
-        if how.get("phase") != "count":
-            continue
-        rows = np.flatnonzero(drawn & (log.history.iteration == how["iteration"]))
-        if len(rows) < how["draws"]:
-            continue  # a batch counts only when it is complete
-        if any(log.history.records[k].log_q is None for k in rows):
-            raise InputError("an estimate needs runs with a known proposal density, but a counted run has none")
-        found.append(Counted(
-            how["prior"], how["anticipated"], how["pool_variance"], np.array(how["coefficient"]), np.array(how["believed"]),
-            critical[rows].astype(np.float64),
-        ))  # fmt: skip
-    return found
+    if settings.learner is None:
+        raise InputError("the sequential estimator needs a metamodel, but got none")
+    return settings.learner.metamodel

@@ -67,7 +67,8 @@ def planned(
     """Return the plan of smaller anticipated variance, the difference form or Meta-IS.
 
     Args:
-        log_pi, log_not: (N,) log P(critical) and log P(uncritical) of the metamodel.
+        log_pi: (N,) log P(critical) of the metamodel.
+        log_not: (N,) log P(uncritical) of the metamodel.
         log_w: (N,) log p/h; -inf where the nominal law has no mass.
         log_wide: (N,) log of the wide law over h.
         stratum: (N,) component of h that gave each point: their counts are fixed.

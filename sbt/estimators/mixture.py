@@ -46,6 +46,10 @@ def wide_scales(bounded: Vector) -> Vector:
     return np.where(bounded == 0, s, 1.0)
 
 
+_NEAR, _NEAR_SHARE = 0.3, 0.25
+"""Spread of candidates about known critical points, and their share."""
+
+
 @dataclass(frozen=True, eq=False)
 class Normals:
     """k normal components: weight (k,), mean (k, d), lower Cholesky factors (k, d, d)."""
@@ -110,10 +114,17 @@ class Mixture:
                 parts.append(mean + rng.standard_normal((count, d)) @ factor.T)
         return np.concatenate(parts), np.repeat(np.arange(len(counts)), counts).astype(np.float64)
 
+    def sample_near(self, n: int, centres: Points, rng: np.random.Generator) -> tuple[Points, Vector]:
+        """Return n candidates from this mixture and from around `centres` (k, d), with (n,) log density."""
+        near = round(_NEAR_SHARE * n)
+        around = centres[rng.integers(len(centres), size=near)] + _NEAR * rng.standard_normal((near, centres.shape[1]))
+        z = np.concatenate([self.sample(n - near, rng)[0], around])
+        kernel = np.array([log_normal(z - centre, _NEAR) for centre in centres])  # (k, n)
+        log_near = logsumexp(kernel, axis=0) - math.log(len(centres))
+        return z, np.logaddexp(self.log_density(z) + math.log(1.0 - _NEAR_SHARE), log_near + math.log(_NEAR_SHARE))
 
-def particles(
-    target: LogTarget, start: Points, log_start: Vector, n: int, rng: np.random.Generator, moves: int = 8
-) -> Points:
+
+def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: np.random.Generator, moves: int = 8) -> Points:
     """Return (n, d) particles that follow exp(target) about: resampled, then moved by Metropolis steps.
 
     Args:
@@ -210,7 +221,7 @@ def _em_of(z: Points, k: int, rng: np.random.Generator) -> tuple[Normals, float]
 
 def _maximised(z: Points, share: Points, total: Points) -> Normals:
     """Return the normals of largest likelihood given how much of each particle belongs to them."""
-    n, d = z.shape
+    d = z.shape[1]
     mass = share.sum(axis=1)
     keep = mass > 1.0
     share, mass = share[keep], mass[keep]

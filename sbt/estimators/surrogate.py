@@ -7,7 +7,6 @@ without trend keeps it from being sure where it only extrapolates.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,10 +14,12 @@ import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.metamodels.base import Metamodel
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["Coordinates", "LogProbability", "Warp", "learned"]
+__all__ = ["Coordinates", "LogProbability", "learned"]
 
 LogProbability = Callable[[Points], tuple[Vector, Vector]]
 """(n, d) normal scores to (n,) log P(critical) and (n,) log P(uncritical)."""
@@ -53,37 +54,12 @@ class Coordinates:
         return np.ascontiguousarray(np.column_stack([own, derived]))
 
 
-@dataclass(frozen=True)
-class Warp:
-    """asinh((y - edge) / scale): monotone, linear near the edge, logarithmic far from it."""
-
-    edge: float
-    scale: float
-
-    @classmethod
-    def of(cls, y: Vector, critical: CriticalInterval) -> Warp:
-        """Return the warp for these metrics: about the end of the interval that is nearer to most of them."""
-        ends = [end for end in (critical.low, critical.high) if math.isfinite(end)]
-        edge = min(ends, key=lambda end: float(np.median(np.abs(y - end))))
-        scale = float(np.median(np.abs(y - edge)))
-        return cls(edge, scale if scale > 0 else max(float(np.abs(y - edge).max()), 1.0))
-
-    def __call__(self, y: Vector) -> Vector:
-        """Return the warped metrics."""
-        return np.arcsinh((y - self.edge) / self.scale)
-
-    def interval(self, critical: CriticalInterval) -> CriticalInterval:
-        """Return the critical interval in warped units."""
-        low, high = (float(self(np.array([end]))[0]) for end in (critical.low, critical.high))
-        return CriticalInterval(low, high)
-
-
 def learned(
     metamodel: Metamodel, coordinates: Coordinates, critical: CriticalInterval, z: Points, y: Vector, rng: np.random.Generator
 ) -> LogProbability:
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,)."""
-    u, warp = coordinates(z), Warp.of(y, critical)
-    t, inside = warp(y), warp.interval(critical)
+    u, warp = coordinates(z), Warp.about(y, critical)
+    t, inside = warp.values(y), warp.interval(critical)
     plain = metamodel.fit(u, t, rng)
     trend = _trend(u, t)
     if trend is None:
@@ -101,8 +77,6 @@ def learned(
 
 
 def _shifted(mu: Vector, sigma: Vector, trend: Vector, inside: CriticalInterval) -> tuple[Vector, Vector]:
-    from sbt.metamodels.prediction import Prediction
-
     return Prediction.gaussian(mu + trend, sigma).log_probability(inside)
 
 

@@ -153,6 +153,20 @@ class GaussianProcessPredictor:
             noise=common * (self.scale * np.sqrt(noise)),
         )
 
+    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m.
+
+        Source:
+            Rasmussen & Williams (2006), eq. (2.24) and appendix A.2.
+        """
+        with single_threaded():
+            cross = self.hyper.covariance(self.u, u)  # (rows, m)
+            mean = self.centre + self.alpha @ cross
+            half = solve_triangular(self.factor, cross, lower=True, overwrite_b=True, check_finite=False)
+            latent = self.hyper.covariance(u, u) - half.T @ half
+            root = _factor(latent, np.full(len(u), 1e-8 * self.hyper.outputscale))
+            return self.shift + self.scale * (mean + rng.standard_normal((n, len(u))) @ root.T)
+
     def _moments(self, u: Points) -> tuple[Vector, Vector]:
         """Return (m,) mean and (m,) variance without noise, standardised."""
         cross = self.hyper.covariance(self.u, u)  # (n, m)

@@ -1,0 +1,184 @@
+"""Where to look for the next failure: several trust regions, global picks of P(critical), deflation.
+
+Everything is a function of the runs so far: what a trust region has become is read from them each
+time, nothing is remembered between batches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.arrays import Mask, Points, Vector
+from sbt.samplers.search import Belief, Picks, Search, believe, fill, known, refined, repelled
+
+__all__ = ["Region", "propose", "regions"]
+
+_APART = 0.25  # of the best runs of two trust regions, Chebyshev distance
+_MOST_REGIONS = 3
+_LONGEST, _SHORTEST = 0.8, 2.0**-6  # side of a trust region
+_PATIENCE = 3  # batches without an improvement before a trust region is halved
+_HOPELESS = 1e-4  # largest inflated P(critical) in a region that is given up
+_INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a belief from few runs is too sure
+_THOMPSON = 0.7  # share of the picks; measured against 0.53, see docs/falsification.md
+_LOCAL = 350  # candidates of a trust region
+_CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
+
+
+def propose(
+    search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None
+) -> Picks:
+    """Return n points where the next failure may be, away from the failures that are known.
+
+    About 70 % are Thompson draws in up to three trust regions, the others are global picks of
+    P(critical) that repel each other; where nothing promises anything, they fill the space. The caller
+    adds a share of space-filling runs (about 10 %).
+
+    Args:
+        search: what is searched.
+        u: (m, d) finished runs in the unit cube, in order.
+        y: (m,) their metric; NaN where a run failed.
+        n: points wanted >= 1.
+        rng: the only source of randomness.
+        batch: (m,) number of the batch that each run came with; None: each run by itself.
+
+    Returns:
+        The picks; random ones (`global`) where there are fewer than two runs to learn from.
+
+    Source:
+        Trust regions and Thompson draws: Eriksson et al. (2019), TuRBO, arXiv 1910.01739; the mixture
+        and the deflation were measured, see docs/falsification.md.
+    """
+    seen, d = known(search, u, y, batch, rng), u.shape[1]
+    if len(seen.u) < 2:
+        return Picks(fill(seen.admissible, n, d, rng), ("global",) * n)
+    belief = believe(search, seen.u, seen.y, rng)
+    found = regions(seen.u, search.critical.margin(seen.y), seen.batch)
+    niches = _hopeful(belief, found, seen.admissible, rng)
+    drawn = _thompson(belief, niches, round(_THOMPSON * n), d, rng)
+    picks = _globally(belief, drawn, n, u, niches, seen.admissible, rng)
+    why = ("thompson",) * len(drawn) + ("global",) * (n - len(drawn))
+    order = np.argsort(-belief.log_probability(picks), kind="stable")
+    return Picks(picks[order], tuple(why[k] for k in order))
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A trust region: a box about the best run of its neighbourhood.
+
+    Args:
+        centre: (d,) the run.
+        side: of the box.
+        failures: batches in it since the last improvement.
+    """
+
+    centre: Vector
+    side: float
+    failures: int = 0
+
+    def candidates(self, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, d) points of the box, of the cube too; at most about 20 coordinates are moved."""
+        d = len(self.centre)
+        moved = rng.random((n, d)) < min(1.0, 20.0 / d)
+        moved[np.arange(n), rng.integers(0, d, n)] = True
+        reach = 0.5 * self.side * 2.0 ** (-3.0 * rng.random((n, 1)))
+        step = reach * rng.uniform(-1.0, 1.0, (n, d))
+        return np.clip(self.centre + np.where(moved, step, 0.0), 0.0, 1.0)
+
+
+def regions(u: Points, margin: Vector, batch: Vector) -> list[Region]:
+    """Return the trust regions about the best runs, at least 0.25 apart, the best first.
+
+    The side is replayed from the runs near the centre: halved after three batches without an
+    improvement, doubled after two with one; a side below 2^-6 retires the region.
+
+    Args:
+        u: (n, d) runs, none of them critical.
+        margin: (n,) distance of the metric to the critical interval.
+        batch: (n,) number of the batch of each run, increasing.
+    """
+    found: list[Region] = []
+    left = margin < np.median(margin)  # on a plateau no run is better than the others
+    while left.any() and len(found) < _MOST_REGIONS:
+        best = int(np.flatnonzero(left)[np.argmin(margin[left])])
+        near = np.abs(u - u[best]).max(axis=1) <= _APART
+        side, failures = _side(u[near], margin[near], batch[near])
+        if side >= _SHORTEST:
+            found.append(Region(u[best], side, failures))
+        left &= ~near
+    return found
+
+
+def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
+    """Return side and failures of a trust region from the runs of its neighbourhood, in order."""
+    side, best, failures, successes = _LONGEST, -1, 0, 0
+    for number in np.unique(batch):
+        mine = np.flatnonzero(batch == number)
+        leader = int(mine[np.argmin(margin[mine])])
+        if best < 0:
+            best = leader
+            continue
+        if margin[leader] < margin[best]:
+            best, successes, failures = leader, successes + 1, 0
+            side = min(2 * side, _LONGEST) if successes >= 2 else side
+        elif (np.abs(u[mine] - u[best]).max(axis=1) <= 0.5 * side).any():
+            failures, successes = failures + 1, 0
+            side = side / 2 if failures % _PATIENCE == 0 else side
+    return side, failures
+
+
+def _hopeful(
+    belief: Belief, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator
+) -> list[tuple[Region, Points]]:
+    """Return the regions in which a critical run may be, each with its candidates."""
+    kept = []
+    for region in found:
+        points = region.candidates(_LOCAL, rng)
+        points = points[admissible(points)]
+        if len(points) == 0:
+            continue
+        tried = region.failures >= _PATIENCE
+        if not tried or belief.log_probability(points, _INFLATION).max() >= np.log(_HOPELESS):
+            kept.append((region, points))
+    return kept
+
+
+def _thompson(belief: Belief, niches: list[tuple[Region, Points]], n: int, d: int, rng: np.random.Generator) -> Points:
+    """Return n points, each the best of a function drawn over the candidates of a region; none without regions.
+
+    Every second one is from the region whose draw is best, the others from each region in turn.
+    """
+    if not niches:
+        return np.empty((0, d))
+    drawn = [belief.critical.margin(belief.draws(points, n, rng)) for _, points in niches]
+    picks = np.empty((n, d))
+    for k in range(n):
+        which = (k // 2) % len(niches) if k % 2 else int(np.argmin([values[k].min() for values in drawn]))
+        at = int(np.argmin(drawn[which][k]))
+        picks[k] = niches[which][1][at]
+        drawn[which][:, at] = np.inf  # no point twice
+    return picks
+
+
+def _globally(
+    belief: Belief, picks: Points, n: int, u: Points, niches: list[tuple[Region, Points]],
+    admissible: Callable[[Points], Mask], rng: np.random.Generator,
+) -> Points:  # fmt: skip
+    """Return the picks and further ones, n in all: the largest P(critical), every second time inflated.
+
+    Below `_HOPELESS` all candidates are alike, and what repels them alone decides.
+    """
+    d = u.shape[1]
+    start = np.vstack([np.empty((0, d)), *(points for _, points in niches)])
+    candidates, wide = refined(lambda v: belief.log_probability(v, _INFLATION), start, admissible, rng)
+    scores = [np.maximum(values, np.log(_HOPELESS)) for values in (belief.log_probability(candidates), wide)]
+    away = repelled(candidates, u, 0.2 * _CLEAR * np.sqrt(d))
+    for point in picks:
+        away += repelled(candidates, point[None], _CLEAR * np.sqrt(d))
+    for k in range(n - len(picks)):
+        at = int(np.argmax(scores[k % 2] + away))
+        picks = np.vstack([picks, candidates[at]])
+        away += repelled(candidates, candidates[at][None], _CLEAR * np.sqrt(d))
+    return picks

@@ -1,0 +1,206 @@
+"""What every search for failures stands on: its belief, deflation, candidates.
+
+The belief is about the warped metric, not about the distance to the critical interval, which has a
+kink. After a hit its basin is deflated: left out of the runs to learn from and of the candidates, so
+that the next failure is a different one, and so that runs piled up in one basin do not decide which
+inputs seem to matter elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from sbt.arrays import Mask, Points, Vector
+from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.warp import Warp
+from sbt.problem.requirement import CriticalInterval
+
+__all__ = ["DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled"]
+
+DEFLATION = 0.22
+"""Half the side of the box about a critical run that the search leaves alone (unit cube)."""
+_FEWEST_FREE = 0.05  # of the space that deflation must leave
+_CANDIDATES = 1500
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is searched, and with what belief.
+
+    Args:
+        critical: M_c, in the unit of y.
+        metamodel: learns the warped y.
+        columns: (n, d) unit-cube points to the metamodel's inputs (derived features).
+        feasible: (n, d) unit-cube points to (n,) booleans.
+        deflation: see `DEFLATION`.
+    """
+
+    critical: CriticalInterval
+    metamodel: Metamodel
+    columns: Callable[[Points], Points] = lambda u: u
+    feasible: Callable[[Points], Mask] = lambda u: np.ones(len(u), dtype=bool)
+    deflation: float = DEFLATION
+
+
+@dataclass(frozen=True)
+class Picks:
+    """Points that were chosen.
+
+    Args:
+        u: (n, d) in the unit cube, the one of largest P(critical) first.
+        why: (n,) `thompson` or `global`.
+    """
+
+    u: Points
+    why: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A metamodel of the warped metric."""
+
+    predictor: Predictor
+    columns: Callable[[Points], Points]
+    warp: Warp
+    critical: CriticalInterval  # warped
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the belief about the warped metric at u (n, d)."""
+        return self.predictor(self.columns(u))
+
+    def log_probability(self, u: Points, inflation: float = 1.0) -> Vector:
+        """Return (n,) log P(critical) at u, sigma multiplied by `inflation`."""
+        p = self(u)
+        wide = Prediction(p.mean, inflation * p.std, p.weight, p.noise)
+        return wide.log_probability(self.critical)[0]
+
+    def probability(self, u: Points) -> Vector:
+        """Return (n,) P(critical) at u."""
+        return np.exp(self.log_probability(u))
+
+    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, m) draws of the warped metric as a function, at u (m, d).
+
+        A process draws functions; of a mixture one component stands for a function; a single Gaussian a
+        point is drawn point by point.
+        """
+        joint: Any = getattr(self.predictor, "draws", None)
+        if joint is not None:
+            return joint(self.columns(u), n, rng)
+        p = self(u)
+        component = rng.choice(len(p.weight), n, p=p.weight)
+        if len(p.weight) >= 5:
+            return p.mean[component]
+        return p.mean[component] + p.std[component] * rng.standard_normal((n, len(u)))
+
+
+def believe(search: Search, u: Points, y: Vector, rng: np.random.Generator) -> Belief:
+    """Return the belief learned from u (n, d) and finite y (n,), n >= 2."""
+    warp = Warp.about(y, search.critical)
+    predictor = search.metamodel.fit(search.columns(u), warp.values(y), rng)
+    return Belief(predictor, search.columns, warp, warp.interval(search.critical))
+
+
+@dataclass(frozen=True, eq=False)
+class Free:
+    """The part of the cube that is not deflated.
+
+    Args:
+        hits: (k, d) critical runs.
+        radius: half the side of the box that each takes away.
+    """
+
+    hits: Points
+    radius: float
+
+    def __call__(self, u: Points) -> Mask:
+        """Return (n,) booleans: u is in no box."""
+        if len(self.hits) == 0:
+            return np.ones(len(u), dtype=bool)
+        return np.asarray(cdist(u, self.hits, "chebyshev").min(axis=1) > self.radius)
+
+
+def deflated(search: Search, hits: Points, rng: np.random.Generator, dimension: int) -> Free:
+    """Return what deflation leaves; the radius is halved until that is at least 5 % of the space."""
+    probe = rng.random((512, dimension))
+    probe = probe[search.feasible(probe)] if search.feasible(probe).any() else probe
+    radius = search.deflation
+    while radius > 1e-6 and Free(hits, radius)(probe).mean() < _FEWEST_FREE:
+        radius /= 2
+    return Free(hits, radius)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is left to learn from, and where to look.
+
+    Args:
+        u, y, batch: (m, d), (m,), (m,) runs that neither failed nor lie in a deflated basin.
+        admissible: (n, d) points to (n,) booleans: feasible and not deflated.
+    """
+
+    u: Points
+    y: Vector
+    batch: Vector
+    admissible: Callable[[Points], Mask]
+
+
+def known(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.random.Generator) -> Known:
+    """Return the runs and the space that deflation leaves.
+
+    Args:
+        search: what is searched.
+        u: (m, d) finished runs in the unit cube, in order.
+        y: (m,) their metric; NaN where a run failed.
+        batch: (m,) number of the batch that each run came with; None: each run by itself.
+        rng: the only source of randomness.
+    """
+    number = np.arange(len(u)) if batch is None else np.asarray(batch)
+    ok = np.isfinite(y)
+    hit = ok & search.critical.contains(y)
+    free = deflated(search, u[hit], rng, u.shape[1])
+    left = ok & ~hit & free(u)
+    return Known(u[left], y[left], number[left], lambda points: search.feasible(points) & free(points))
+
+
+def fill(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:
+    """Return (n, d) uniform admissible points; what 10,000 tries do not find is uniform in the cube."""
+    kept = np.empty((0, d))
+    for _ in range(100):
+        u = rng.random((max(100, n), d))
+        kept = np.vstack([kept, u[admissible(u)]])
+        if len(kept) >= n:
+            break
+    missing = n - len(kept)
+    return np.vstack([kept, rng.random((missing, d))]) if missing > 0 else kept[:n]
+
+
+def refined(
+    score: Callable[[Points], Vector], start: Points, admissible: Callable[[Points], Mask], rng: np.random.Generator
+) -> tuple[Points, Vector]:
+    """Return (m, d) candidates and (m,) scores: uniform ones, those of `start` (k, d), and steps from the best of them."""
+    d = start.shape[1]
+    candidates = np.vstack([fill(admissible, _CANDIDATES, d, rng), start])
+    values = score(candidates)
+    for scale in (0.1, 0.03):
+        best = candidates[np.argsort(-values, kind="stable")[:30]]
+        around = np.repeat(best, 10, axis=0)
+        moved = rng.random(around.shape) < max(0.3, 1.0 / d)
+        around = np.clip(around + scale * rng.standard_normal(around.shape) * moved, 0.0, 1.0)
+        around = around[admissible(around)]
+        if len(around):
+            candidates, values = np.vstack([candidates, around]), np.concatenate([values, score(around)])
+    return candidates, values
+
+
+def repelled(u: Points, others: Points, radius: float) -> Vector:
+    """Return (n,) log factors: 0 far from the others, -inf on one of them."""
+    square = cdist(u, others, "sqeuclidean").min(axis=1)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(-np.expm1(-0.5 * square / radius**2)))
