@@ -6,12 +6,13 @@ one. Up to a stopping time the draws only teach; from then on they count, with w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr, ndtri
 
 from sbt.arrays import Mask, Points, Vector
@@ -26,7 +27,7 @@ from sbt.estimators.surrogate import Coordinates, LogProbability, learned
 from sbt.history import History
 from sbt.metamodels.base import Metamodel
 from sbt.samplers import portfolio
-from sbt.samplers.search import DEFLATION, Free, Search
+from sbt.samplers.search import Search
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store import PlannedRun
@@ -39,10 +40,11 @@ _PARTICLES = 800
 _CANDIDATES = 6_000
 _PHASE_0 = 0.4
 _EVEN_SHARE = 0.1
+_PROBES = 9
 _COMMON = 0.02
 _STALLED = 1.5
-_LEARN = 0.5
-_HUNTED_SHARE = 0.2
+_LEARN = 0.6
+_HUNTED_SHARE = (0.2, 0.1)
 FEWEST_BATCHES = 4
 """Batches that must count before a target is believed to be met."""
 _TARGET = 0.02
@@ -84,14 +86,16 @@ class SequentialStage:
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
         s = self.settings
-        if log.iteration == 0:
+        if log.iteration == 0 and (s.earlier is None or len(s.earlier.training) < 2):
             return self._initial(min(s.initial, s.budget))
         size = min(s.batch, s.budget - len(log.history))
         known = _Known.of(log.history, self._coordinates, s)
-        if self._hunting(log, known):
+        belief = known.learn(stream(s.seed, "fit", log.iteration))
+        modes = self._hunting(log, known, belief)
+        if modes is not None:
             rows = self._hunt(known, log.iteration, size)
-            return Batch(self._runs(rows, _HUNT), {"method": "hunt", "phase": "hunt", "modes": known.modes})
-        return self._drawn(log, known, size)
+            return Batch(self._runs(rows, _HUNT), {"method": "hunt", "phase": "hunt", "modes": modes})
+        return self._drawn(log, known, belief, size)
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide law."""
@@ -117,22 +121,22 @@ class SequentialStage:
             for row, density in zip(rows, densities, strict=True)
         )
 
-    def _hunting(self, log: Log, known: _Known) -> bool:
-        """Return whether phase 0 goes on: to 40 % of the budget, no longer than two batches without a new mode.
+    def _hunting(self, log: Log, known: _Known, belief: LogProbability | None) -> int | None:
+        """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
-        It ends as well where failures are common: draws from the law meet every region that counts.
+        It ends with 40 % of the budget, after two batches without a new mode, and where failures are common:
+        draws from the law meet every region that counts.
         """
-        spent = len(log.history)
-        if spent >= _PHASE_0 * self.settings.budget or any(i.get("phase") != "hunt" for i in log.iterations[1:]):
-            return False
-        modes = [i["modes"] for i in log.iterations[1:]] + [known.modes]
-        if known.modes > 0 and len(modes) >= 3 and modes[-1] == modes[-3]:
-            return False
-        return not (known.modes > 0 and self._common(known, log.iteration))
+        phases = [i.get("phase") for i in log.iterations]
+        if len(log.history) >= _PHASE_0 * self.settings.budget or {"learn", "count"} & set(phases):
+            return None
+        modes = [int(i["modes"]) for i in log.iterations if i.get("phase") == "hunt"] + [known.modes(belief)]
+        if modes[-1] > 0 and len(modes) >= 3 and modes[-1] <= modes[-3]:
+            return None
+        return None if modes[-1] > 0 and self._common(belief, log.iteration) else modes[-1]
 
-    def _common(self, known: _Known, iteration: int) -> bool:
+    def _common(self, belief: LogProbability | None, iteration: int) -> bool:
         """Return whether the metamodel takes more than 1 in 50 draws from the law to be critical."""
-        belief = known.learn(stream(self.settings.seed, "common fit", iteration))
         z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
         return belief is not None and float(np.exp(belief(z)[0]).mean()) > _COMMON
 
@@ -154,11 +158,9 @@ class SequentialStage:
         """Return normal scores of points of the cube in which the wide law is uniform."""
         return ndtri(np.clip(v, 1e-9, 1.0 - 1e-9)) * self._wide
 
-    def _drawn(self, log: Log, known: _Known, size: int) -> Batch:
+    def _drawn(self, log: Log, known: _Known, belief: LogProbability | None, size: int) -> Batch:
         """Return draws from a fresh pool, and hunting picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
-        hunted = min(round(_HUNTED_SHARE * size), size - 1)
-        belief = known.learn(stream(s.seed, "fit", log.iteration))
         mixture = self._mixture(belief, known, rng)
         z, stratum = mixture.sample(_POOL, rng)
         x = s.scenario.space.from_normal(z)
@@ -169,15 +171,16 @@ class SequentialStage:
         unsure = np.full(len(z), np.log(0.5))
         log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
         plan = planned(log_pi, log_not, log_w, log_wide, stratum, BLIND if known.one_sided else SHARES)
+        counts = self._counts(log, plan, size)
+        hunted = min(round(_HUNTED_SHARE[counts] * size), size - 1)
         n = size - hunted
         draws = chosen(plan, n, log_pi - log_not, rng)
         log_q = s.scenario.space.log_density(x[draws.rows]) - np.log(draws.coefficient)
-        counts = self._counts(log, plan, size)
         how = {
             "method": plan.form, "phase": "count" if counts else "learn", "pool": _POOL, "draws": n,
             "prior": plan.prior, "anticipated": plan.anticipated, "pool_variance": plan.pool_variance,
             "nominal": plan.nominal, "coefficient": draws.coefficient.tolist(), "believed": draws.believed.tolist(),
-            "pi": np.exp(log_pi[draws.rows]).tolist(), "components": len(mixture.shares), "modes": known.modes,
+            "pi": np.exp(log_pi[draws.rows]).tolist(), "components": len(mixture.shares),
         }  # fmt: skip
         picks = self._runs(self._hunt(known, log.iteration, hunted), _HUNT)
         return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), how)
@@ -206,18 +209,21 @@ class SequentialStage:
         s, spent = self.settings, len(log.history)
         if spent + size > _LEARN * s.budget:
             return True
-        if len(drawn) >= 2 and _relative(drawn[-1]) < _STALLED * plan.anticipated / max(plan.prior, 1e-300) ** 2:
+        doubts = [
+            _relative(i["anticipated"], i["prior"]) for i in (*drawn[-2:], {"anticipated": plan.anticipated, "prior": plan.prior})
+        ]
+        if len(doubts) == 3 and max(doubts) < _STALLED * min(doubts):
             return True  # learning no longer pays
-        left = (1.0 - _HUNTED_SHARE) * (s.budget - spent)
+        left = (1.0 - _HUNTED_SHARE[True]) * (s.budget - spent)
         base = max(plan.prior, 1e-300)
         target = s.stop.get("cov")
         target = _TARGET if target is None else target
-        return len(drawn) >= 1 and (plan.anticipated / left) ** 0.5 <= target * base
+        return len(drawn) >= 1 and math.sqrt(plan.anticipated / left) <= target * base
 
 
-def _relative(how: Mapping[str, Any]) -> float:
-    """Return the anticipated squared coefficient of variation of a draw of an earlier batch."""
-    return float(how["anticipated"]) / max(float(how["prior"]), 1e-300) ** 2
+def _relative(anticipated: float, prior: float) -> float:
+    """Return the anticipated coefficient of variation of one draw."""
+    return math.sqrt(anticipated) / max(prior, 1e-300)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,14 +256,18 @@ class _Known:
         """Whether all runs are critical, or none is."""
         return not self.critical.any() or bool(self.critical.all())
 
-    @cached_property
-    def modes(self) -> int:
-        """Number of basins that the critical runs fill, in their order."""
-        centres: list[Vector] = []
-        for u in self.u[self.critical]:
-            if not centres or Free(np.array(centres), DEFLATION)(u[None])[0]:
-                centres.append(u)
-        return len(centres)
+    def modes(self, belief: LogProbability | None) -> int:
+        """Return the number of groups of critical runs that the metamodel's critical region does not connect."""
+        hits = self.z[self.critical]
+        if belief is None or len(hits) < 2:
+            return len(hits)
+        i, j = np.triu_indices(len(hits), 1)
+        along = np.linspace(0.1, 0.9, _PROBES)[:, None, None]
+        probes = hits[i] * along + hits[j] * (1.0 - along)  # (probes, pairs, d)
+        inside = belief(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
+        joined = inside.all(axis=0)
+        graph = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(hits), len(hits)))
+        return int(connected_components(graph, directed=False)[0])
 
     def cube(self, wide: Vector) -> Points:
         """Return the runs in the cube in which the wide law is uniform."""

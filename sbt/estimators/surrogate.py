@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr
 
 from sbt.arrays import Points, Vector
 from sbt.metamodels.base import Metamodel
@@ -45,13 +46,13 @@ class Coordinates:
 
     def __call__(self, z: Points) -> Points:
         """Return (n, d + f) coordinates of normal scores z (n, d)."""
-        x = self.space.from_normal(z)
-        u = self.space.to_unit(x)
         correlation = self.space.correlation
         scores = z if correlation is None else z @ np.linalg.cholesky(np.asarray(correlation)).T
-        own = np.where(self.bounded == 1, u, 0.5 + scores / (2.0 * _REACH))
-        derived = self.space.metamodel_inputs(u)[:, self.space.dimension :]
-        return np.ascontiguousarray(np.column_stack([own, derived]))
+        own = np.where(self.bounded == 1, ndtr(scores), 0.5 + scores / (2.0 * _REACH))
+        if not self.space.features:
+            return np.ascontiguousarray(own)
+        u = self.space.to_unit(self.space.from_normal(z))
+        return np.column_stack([own, self.space.metamodel_inputs(u)[:, self.space.dimension :]])
 
 
 def learned(
