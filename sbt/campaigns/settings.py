@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sbt.arrays import Vector
+from sbt.history import History
 from sbt.learner import Learner
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
@@ -32,6 +33,8 @@ class Settings:
         acquisition: log score of candidates; None where the campaign chooses by a method of its own.
         method: name of the acquisition or method, as configured.
         stop: rules by name, None where one is off.
+        gate: `probability` and `confidence` of the verdict of an estimation; None: no verdict.
+        earlier: runs of another campaign to learn from, never to count.
     """
 
     scenario: LogicalScenario
@@ -45,3 +48,5 @@ class Settings:
     acquisition: Acquisition | None
     method: str = ""
     stop: Mapping[str, Any] = field(default_factory=dict)
+    gate: Mapping[str, float] | None = None
+    earlier: History | None = None

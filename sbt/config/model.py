@@ -77,7 +77,7 @@ CAMPAIGNS: Mapping[str, CampaignKind] = {
     ),
     "estimation": CampaignKind(
         "probability of a critical scenario under the inputs' distribution", "difference",
-        stop={"cov": 0.1}, methods=("difference",),
+        stop={"cov": 0.1}, methods=("difference", "monte_carlo", "subset"),
     ),
     "coverage": CampaignKind("evenly distributed points: the baseline, and data sets", "even", adaptive=False),
 }

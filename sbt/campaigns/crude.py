@@ -1,0 +1,122 @@
+"""Stages that need no metamodel: draws from the law itself, and subset simulation in repeats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+from sbt.campaign import Batch, Log
+from sbt.campaigns.parts import Settings
+from sbt.estimators.monte_carlo import Share
+from sbt.estimators.subset import Repeat
+from sbt.problem.space import ParameterSpace
+from sbt.seeds import stream
+from sbt.store import PlannedRun
+
+__all__ = ["MonteCarloStage", "SubsetStage", "law_share", "repeats_of"]
+
+_LAW = "monte_carlo"
+_REPEATS = 5
+_FEWEST_HITS = 10
+_FEWEST_BATCHES = 4
+
+
+@dataclass(frozen=True)
+class MonteCarloStage:
+    """Independent draws from the law of the inputs."""
+
+    settings: Settings
+    name: str = _LAW
+
+    def stop(self, log: Log) -> str | None:
+        """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
+        if log.iterations and len(log.history) >= self.settings.budget:
+            return "budget"
+        target = self.settings.stop.get("cov")
+        if target is not None and log.iteration >= _FEWEST_BATCHES:
+            share = law_share(log, self.settings)
+            if share.hits >= _FEWEST_HITS and share.cov is not None and share.cov <= target:
+                return "cov"
+        return None
+
+    def propose(self, log: Log) -> Batch:
+        """Return the next draws."""
+        s, space = self.settings, self.settings.scenario.space
+        size = min(s.batch if log.iterations else s.initial, s.budget - len(log.history))
+        x = space.sample(size, stream(s.seed, "monte_carlo", log.iteration))
+        return Batch(_runs(space, x, _LAW, space.log_density(x)), {"method": "monte_carlo", "phase": "count"})
+
+
+@dataclass(frozen=True)
+class SubsetStage:
+    """Subset simulation on the simulator: a batch is one step of every chain of every repeat."""
+
+    settings: Settings
+    name: str = "subset"
+
+    def stop(self, log: Log) -> str | None:
+        """Return `converged` where every repeat has finished, `budget` where the next step does not fit in it."""
+        if not log.iterations:
+            return None
+        repeats = repeats_of(log, self.settings)
+        if all(r.finished for r in repeats):
+            return "converged"
+        size = sum(_width(r) for r in repeats if not r.finished)
+        return "budget" if len(log.history) + size > self.settings.budget else None
+
+    def propose(self, log: Log) -> Batch:
+        """Return one step of every chain that is not finished."""
+        s, space = self.settings, self.settings.scenario.space
+        runs: list[PlannedRun] = []
+        for k, repeat in enumerate(repeats_of(log, s)):
+            if not repeat.finished:
+                z = repeat.asked(stream(s.seed, "subset", k, log.iteration))
+                stage = "subset level 0" if repeat.levels == 0 else "subset"
+                x = space.from_normal(z)
+                log_q = space.log_density(x) if repeat.levels == 0 and not space.constraints else None
+                runs += _runs(space, x, stage, log_q)
+        return Batch(tuple(runs), {"method": "subset", "phase": "subset"})
+
+
+def repeats_of(log: Log, settings: Settings) -> list[Repeat]:
+    """Return where the repeats stand, replayed from the log: their draws belong to the seed, the metrics are there."""
+    requirement, space = settings.scenario.requirement, settings.scenario.space
+    level = max(settings.budget // (4 * _REPEATS) // 10, 2) * 10
+    if settings.budget < _REPEATS * level:
+        level = max(settings.budget // _REPEATS, 1)
+    repeats = [Repeat(level, space.dimension) for _ in range(_REPEATS)]
+    margin = requirement.critical.margin(log.history.y(requirement.metric))
+    for how in log.iterations:
+        rows, start = np.flatnonzero(log.history.iteration == how["iteration"]), 0
+        for k, repeat in enumerate(repeats):
+            if not repeat.finished:
+                z = repeat.asked(stream(settings.seed, "subset", k, how["iteration"]))
+                told = _outcomes(margin[rows[start : start + len(z)]], z, space)
+                repeats[k], start = repeat.told(z, told), start + len(z)
+    return repeats
+
+
+def _outcomes(margin: Vector, z: Points, space: ParameterSpace) -> Vector:
+    return np.where(space.feasible(space.from_normal(z)), margin, np.inf) if space.constraints else margin
+
+
+def _width(repeat: Repeat) -> int:
+    return repeat.n if repeat.levels == 0 else len(repeat.front)
+
+
+def _runs(space: ParameterSpace, x: Points, stage: str, log_q: Vector | None) -> tuple[PlannedRun, ...]:
+    names = space.names
+    return tuple(
+        PlannedRun(stage, {n: float(v) for n, v in zip(names, row, strict=True)}, None if log_q is None else float(log_q[k]))
+        for k, row in enumerate(x)
+    )
+
+
+def law_share(log: Log, settings: Settings, stage: str = _LAW) -> Share:
+    """Return the hits among the runs of a stage that were drawn from the law."""
+    requirement = settings.scenario.requirement
+    runs = log.history.where(log.history.stage == stage)
+    hits = int(requirement.critical.contains(runs.y(requirement.metric)).sum())
+    return Share(len(runs), hits, int((~runs.ok).sum()))

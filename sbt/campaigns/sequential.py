@@ -1,0 +1,292 @@
+"""The sequential estimator as a stage: hunt, learn, then count, every batch a function of the log.
+
+A batch of the estimation has draws from a fresh pool, with known density, and hunting picks without
+one. Up to a stopping time the draws only teach; from then on they count, with weights fixed in advance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.special import ndtr, ndtri
+
+from sbt.arrays import Mask, Points, Vector
+from sbt.campaign import Batch, Log
+from sbt.campaigns.counting import DRAWN, counted_batches
+from sbt.campaigns.parts import Settings
+from sbt.errors import InputError
+from sbt.estimators.importance import BLIND, SHARES, Plan, chosen, planned
+from sbt.estimators.intervals import combined
+from sbt.estimators.mixture import Mixture, fitted, log_normal, particles, wide_scales
+from sbt.estimators.surrogate import Coordinates, LogProbability, learned
+from sbt.history import History
+from sbt.metamodels.base import Metamodel
+from sbt.samplers import portfolio
+from sbt.samplers.search import Search
+from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import stream
+from sbt.store import PlannedRun
+
+__all__ = ["FEWEST_BATCHES", "SequentialStage"]
+
+_HUNT = "hunt"
+_POOL = 10_000
+_PARTICLES = 800
+_CANDIDATES = 6_000
+_PHASE_0 = 0.4
+_EVEN_SHARE = 0.1
+_PROBES = 9
+_COMMON = 0.02
+_STALLED = 1.5
+_LEARN = 0.6
+_HUNTED_SHARE = (0.2, 0.1)
+FEWEST_BATCHES = 4
+"""Batches that must count before a target is believed to be met."""
+_TARGET = 0.02
+
+
+@dataclass(frozen=True)
+class SequentialStage:
+    """Hunts critical regions, learns them, then draws runs that count.
+
+    Source:
+        the difference form, its defence, weights and interval: `sbt.estimators`.
+    """
+
+    settings: Settings
+    name: str = DRAWN
+
+    @cached_property
+    def _coordinates(self) -> Coordinates:
+        return Coordinates(self.settings.scenario.space)
+
+    @cached_property
+    def _wide(self) -> Vector:
+        return wide_scales(self._coordinates.bounded)
+
+    def stop(self, log: Log) -> str | None:
+        """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
+        s = self.settings
+        if log.iterations and len(log.history) >= s.budget:
+            return "budget"
+        target = s.stop.get("cov")
+        counted = counted_batches(log, s)
+        if target is not None and len(counted) >= FEWEST_BATCHES:
+            found = combined(counted)
+            hits = sum(float(b.critical.sum()) for b in counted)
+            if hits >= 10 and found.value > 0 and found.std_error <= target * found.value:
+                return "cov"
+        return None
+
+    def propose(self, log: Log) -> Batch:
+        """Return the next batch."""
+        s = self.settings
+        if log.iteration == 0 and (s.earlier is None or len(s.earlier.training) < 2):
+            return self._initial(min(s.initial, s.budget))
+        size = min(s.batch, s.budget - len(log.history))
+        known = _Known.of(log.history, self._coordinates, s)
+        belief = known.learn(stream(s.seed, "fit", log.iteration))
+        modes = self._hunting(log, known, belief)
+        if modes is not None:
+            rows = self._hunt(known, log.iteration, size)
+            return Batch(self._runs(rows, _HUNT), {"method": "hunt", "phase": "hunt", "modes": modes})
+        return self._drawn(log, known, belief, size)
+
+    def _initial(self, n: int) -> Batch:
+        """Return an even design over the wide law."""
+        sobol = SobolSequence(self.settings.scenario.space.dimension, self.settings.seed)
+        z = ndtri(sobol.points(0, n)) * self._wide
+        return Batch(self._runs(self._feasible(z, 0), "initial"), {"method": "sobol", "phase": "initial"})
+
+    def _feasible(self, z: Points, iteration: int) -> Points:
+        """Return the points with those outside of the constraints replaced by draws of the law."""
+        space = self.settings.scenario.space
+        bad = ~space.feasible(space.from_normal(z))
+        if bad.any():
+            z = z.copy()
+            z[bad] = space.to_normal(space.sample(int(bad.sum()), stream(self.settings.seed, "feasible", iteration)))
+        return z
+
+    def _runs(self, z: Points, stage: str, log_q: Vector | None = None) -> tuple[PlannedRun, ...]:
+        space = self.settings.scenario.space
+        rows = space.from_normal(z)
+        densities = [None] * len(rows) if log_q is None else [float(q) for q in log_q]
+        return tuple(
+            PlannedRun(stage, {name: float(v) for name, v in zip(space.names, row, strict=True)}, density)
+            for row, density in zip(rows, densities, strict=True)
+        )
+
+    def _hunting(self, log: Log, known: _Known, belief: LogProbability | None) -> int | None:
+        """Return the number of modes known so far while phase 0 goes on, None once it is over.
+
+        It ends with 40 % of the budget, after two batches without a new mode, and where failures are common:
+        draws from the law meet every region that counts.
+        """
+        phases = [i.get("phase") for i in log.iterations]
+        if len(log.history) >= _PHASE_0 * self.settings.budget or {"learn", "count"} & set(phases):
+            return None
+        modes = [int(i["modes"]) for i in log.iterations if i.get("phase") == "hunt"] + [known.modes(belief)]
+        if modes[-1] > 0 and len(modes) >= 3 and modes[-1] <= modes[-3]:
+            return None
+        return None if modes[-1] > 0 and self._common(belief, log.iteration) else modes[-1]
+
+    def _common(self, belief: LogProbability | None, iteration: int) -> bool:
+        """Return whether the metamodel takes more than 1 in 50 draws from the law to be critical."""
+        z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
+        return belief is not None and float(np.exp(belief(z)[0]).mean()) > _COMMON
+
+    def _hunt(self, known: _Known, iteration: int, n: int) -> Points:
+        """Return n hunting picks (n, d): the falsification portfolio in the cube of the wide law, some spread evenly."""
+        s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", iteration)
+        even = round(_EVEN_SHARE * n)
+        spread = rng.random((even, space.dimension))
+        if n > even:
+            search = Search(
+                s.scenario.requirement.critical, metamodel_of(s), lambda v: self._coordinates(self._scores(v)),
+                lambda v: space.feasible(space.from_normal(self._scores(v))),
+            )  # fmt: skip
+            picks = portfolio.propose(search, known.cube(self._wide), known.y, n - even, rng, known.batch)
+            spread = np.vstack([picks.u, spread])
+        return self._feasible(self._scores(spread), iteration)
+
+    def _scores(self, v: Points) -> Points:
+        """Return normal scores of points of the cube in which the wide law is uniform."""
+        return ndtri(np.clip(v, 1e-9, 1.0 - 1e-9)) * self._wide
+
+    def _drawn(self, log: Log, known: _Known, belief: LogProbability | None, size: int) -> Batch:
+        """Return draws from a fresh pool, and hunting picks."""
+        s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
+        mixture = self._mixture(belief, known, rng)
+        z, stratum = mixture.sample(_POOL, rng)
+        x = s.scenario.space.from_normal(z)
+        log_w = log_normal(z) - mixture.log_density(z)
+        if s.scenario.space.constraints:
+            log_w = np.where(s.scenario.space.feasible(x), log_w - np.log(s.scenario.space.feasible_mass), -np.inf)
+        log_wide = log_normal(z, self._wide) - mixture.log_density(z)
+        unsure = np.full(len(z), np.log(0.5))
+        log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
+        plan = planned(log_pi, log_not, log_w, log_wide, stratum, BLIND if known.one_sided else SHARES)
+        counts = self._counts(log, plan, size)
+        hunted = min(round(_HUNTED_SHARE[counts] * size), size - 1)
+        n = size - hunted
+        draws = chosen(plan, n, log_pi - log_not, rng)
+        log_q = s.scenario.space.log_density(x[draws.rows]) - np.log(draws.coefficient)
+        how = {
+            "method": plan.form, "phase": "count" if counts else "learn", "pool": _POOL, "draws": n,
+            "prior": plan.prior, "anticipated": plan.anticipated, "pool_variance": plan.pool_variance,
+            "nominal": plan.nominal, "coefficient": draws.coefficient.tolist(), "believed": draws.believed.tolist(),
+            "pi": np.exp(log_pi[draws.rows]).tolist(), "components": len(mixture.shares),
+        }  # fmt: skip
+        picks = self._runs(self._hunt(known, log.iteration, hunted), _HUNT)
+        return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), how)
+
+    def _mixture(self, belief: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
+        """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
+        if belief is None or not known.critical.any():
+            return Mixture(self._wide)
+        z, log_q = Mixture(self._wide).sample_near(_CANDIDATES, known.z[known.critical], rng)
+
+        def mass(points: Points) -> Vector:
+            return log_normal(points) + belief(points)[0]
+
+        def doubt(points: Points) -> Vector:
+            log_pi, log_not = belief(points)
+            return log_normal(points) + 0.5 * (log_pi + log_not)
+
+        clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, doubt))
+        return fitted(clouds, self._wide, rng)
+
+    def _counts(self, log: Log, plan: Plan, size: int) -> bool:
+        """Return whether this batch counts: from the stopping time on, which looks only at what is past."""
+        drawn = [i for i in log.iterations if i.get("phase") in ("learn", "count")]
+        if any(i["phase"] == "count" for i in drawn):
+            return True
+        s, spent = self.settings, len(log.history)
+        if spent + size > _LEARN * s.budget:
+            return True
+        doubts = [
+            _relative(i["anticipated"], i["prior"]) for i in (*drawn[-2:], {"anticipated": plan.anticipated, "prior": plan.prior})
+        ]
+        if len(doubts) == 3 and max(doubts) < _STALLED * min(doubts):
+            return True  # learning no longer pays
+        left = (1.0 - _HUNTED_SHARE[True]) * (s.budget - spent)
+        base = max(plan.prior, 1e-300)
+        target = s.stop.get("cov")
+        target = _TARGET if target is None else target
+        return len(drawn) >= 1 and math.sqrt(plan.anticipated / left) <= target * base
+
+
+def _relative(anticipated: float, prior: float) -> float:
+    """Return the anticipated coefficient of variation of one draw."""
+    return math.sqrt(anticipated) / max(prior, 1e-300)
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """Runs to learn from: normal scores z, coordinates u, metric y, what is critical, the batch of each."""
+
+    z: Points
+    u: Points
+    y: Vector
+    critical: Mask
+    batch: Vector
+    coordinates: Coordinates
+    settings: Settings
+
+    @classmethod
+    def of(cls, history: History, coordinates: Coordinates, settings: Settings) -> _Known:
+        """Return what the history teaches, and what an earlier campaign does."""
+        runs, space = history.training, settings.scenario.space
+        requirement = settings.scenario.requirement
+        x, y, batch = runs.x, runs.y(requirement.metric), runs.iteration
+        if settings.earlier is not None:
+            first = settings.earlier.training
+            x, y = np.vstack([first.x, x]), np.concatenate([first.y(requirement.metric), y])
+            batch = np.concatenate([np.full(len(first), -1), batch])
+        z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
+        return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings)
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether all runs are critical, or none is."""
+        return not self.critical.any() or bool(self.critical.all())
+
+    def modes(self, belief: LogProbability | None) -> int:
+        """Return the number of groups of critical runs that the metamodel's critical region does not connect."""
+        hits = self.z[self.critical]
+        if belief is None or len(hits) < 2:
+            return len(hits)
+        i, j = np.triu_indices(len(hits), 1)
+        along = np.linspace(0.1, 0.9, _PROBES)[:, None, None]
+        probes = hits[i] * along + hits[j] * (1.0 - along)  # (probes, pairs, d)
+        inside = belief(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
+        joined = inside.all(axis=0)
+        graph = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(hits), len(hits)))
+        return int(connected_components(graph, directed=False)[0])
+
+    def cube(self, wide: Vector) -> Points:
+        """Return the runs in the cube in which the wide law is uniform."""
+        return np.asarray(ndtr(self.z / wide))
+
+    def learn(self, rng: np.random.Generator) -> LogProbability | None:
+        """Return the belief; None with too few runs."""
+        if len(self.y) < 2:
+            return None
+        interval = self.settings.scenario.requirement.critical
+        return learned(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng)
+
+
+def metamodel_of(settings: Settings) -> Metamodel:
+    """Return the metamodel of a campaign that cannot do without.
+
+    Raises:
+        InputError: there is none.
+    """
+    if settings.learner is None:
+        raise InputError("the sequential estimator needs a metamodel, but got none")
+    return settings.learner.metamodel

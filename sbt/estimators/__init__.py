@@ -1,0 +1,1 @@
+"""Estimators of a failure probability, and what they can and cannot say."""

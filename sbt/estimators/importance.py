@@ -1,0 +1,136 @@
+"""Draws for a probability from a pool: how many, where, with which weight, and what they are worth.
+
+    P_t = (1/N) sum_i w_i pi_i + (1/n) sum_j w_j (1_j - pi_j) / (N r_j)
+
+over a fresh pool of N points with weights w = p/h and beliefs pi, and n draws from the pool with
+probabilities r. Unbiased for any belief that knows only earlier runs: the first sum is what the
+metamodel thinks, the second corrects it by true runs. With pi = 0 there it is Meta-IS.
+
+Source:
+    Dubourg, Sudret, Deheeger (2013), Meta-IS, Probabilistic Engineering Mechanics 33; the difference
+    form is that of survey sampling: Cassel, Saerndal, Wretman (1976), Biometrika 63.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+
+__all__ = ["SHARES", "Draws", "Plan", "chosen", "planned"]
+
+SHARES = (0.78, 0.05, 0.05, 0.12)
+"""Of the draws: in proportion to doubt, to the nominal law, to the pool, to the wide law."""
+BLIND = (0.0, 0.5, 0.1, 0.4)
+"""The same while the metamodel knows only one side: nothing to doubt, everything to be found."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """How a batch will draw from its pool.
+
+    Attributes:
+        form: "difference" or "meta" (Meta-IS).
+        probability: (N,) r, the probability of each pool point, sum 1.
+        believed: (N,) pi as the correction uses it: 0 for Meta-IS.
+        weight: (N,) w / N.
+        prior: the first sum: what the metamodel thinks; 0 for Meta-IS.
+        anticipated: variance of one draw if the metamodel is right.
+        pool_variance: of P_t through the pool, in total.
+        nominal: share of the draws in proportion to the nominal law.
+    """
+
+    form: str
+    probability: Vector
+    believed: Vector
+    weight: Vector
+    prior: float
+    anticipated: float
+    pool_variance: float
+    nominal: float
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """n draws: (n,) rows of the pool, (n,) coefficients w / (N r), (n,) beliefs that the correction subtracts."""
+
+    rows: Vector
+    coefficient: Vector
+    believed: Vector
+
+
+def planned(
+    log_pi: Vector, log_not: Vector, log_w: Vector, log_wide: Vector, stratum: Vector, shares: tuple[float, ...] = SHARES
+) -> Plan:
+    """Return the plan of smaller anticipated variance, the difference form or Meta-IS.
+
+    Args:
+        log_pi: (N,) log P(critical) of the metamodel.
+        log_not: (N,) log P(uncritical) of the metamodel.
+        log_w: (N,) log p/h; -inf where the nominal law has no mass.
+        log_wide: (N,) log of the wide law over h.
+        stratum: (N,) component of h that gave each point: their counts are fixed.
+        shares: of the draws, as `SHARES`.
+    """
+    n = len(log_w)
+    w, pi = np.exp(log_w) / n, np.exp(log_pi)
+    alive = np.isfinite(log_w)
+    doubt = {"difference": 0.5 * (log_pi + log_not), "meta": 0.5 * log_pi}
+    plans = []
+    for form, log_doubt in doubt.items():
+        r = shares[1] * w / w.sum() + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
+        r += shares[0] * _normalised(log_doubt + log_w, alive)
+        r /= r.sum()
+        mean = float((w * pi).sum())
+        second = float((w**2 * pi / np.where(alive, r, 1.0)).sum())
+        if form == "difference":
+            variance = float((w**2 * pi * np.exp(log_not) / np.where(alive, r, 1.0)).sum())
+        else:
+            variance = second - mean**2
+        spread = _stratified_variance(n * w * pi, stratum)
+        plans.append(Plan(
+            form, r, pi if form == "difference" else np.zeros(n), w, mean if form == "difference" else 0.0,
+            max(variance, 0.0), spread, shares[1],
+        ))  # fmt: skip
+    return min(plans, key=lambda plan: plan.anticipated)
+
+
+def _normalised(log_value: Vector, alive: Vector) -> Vector:
+    """Return values that sum to 1 over the points that are alive; even there where all vanish."""
+    log_value = np.where(alive, log_value, -np.inf)
+    top = float(log_value.max())
+    if not np.isfinite(top):
+        return np.asarray(alive / alive.sum())
+    value = np.exp(log_value - top)
+    return np.asarray(value / value.sum())
+
+
+def _stratified_variance(values: Vector, stratum: Vector) -> float:
+    """Return the variance of the mean of values whose numbers in each stratum were fixed."""
+    n, total = len(values), 0.0
+    for s in np.unique(stratum):
+        inside = values[stratum == s]
+        if len(inside) > 1:
+            total += len(inside) * float(inside.var(ddof=1))
+    return total / n**2
+
+
+def chosen(plan: Plan, n: int, order: Points, rng: np.random.Generator) -> Draws:
+    """Return n draws, systematic with probabilities r along an order of the pool.
+
+    Every pool point is expected n r times, exactly; neighbours in the order are not drawn together more
+    often than needed, so that the variance is at most about that of independent draws.
+
+    Args:
+        plan: probabilities and beliefs.
+        n: number of draws.
+        order: (N,) a number by which the pool is ordered.
+        rng: the only source of randomness.
+    """
+    rows = np.argsort(order, kind="stable")
+    edges = np.cumsum(plan.probability[rows])
+    at = (np.arange(n) + rng.random()) / n * edges[-1]
+    drawn = rows[np.minimum(np.searchsorted(edges, at, side="right"), len(rows) - 1)]
+    return Draws(drawn, plan.weight[drawn] / plan.probability[drawn], plan.believed[drawn])

@@ -1,0 +1,159 @@
+"""What the batches of an estimation say together: value, interval, and the bounds beside it.
+
+Weights of the batches are fixed before their results are known: weights by inverse variance would
+prefer batches that met no surprise, and are biased for it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import betaincinv, stdtrit
+
+from sbt.arrays import Vector
+from sbt.errors import InputError
+
+__all__ = ["Combined", "Counted", "binomial_upper", "combined", "few_hits_bound", "undetected_mass"]
+
+FEWEST_HITS = 10
+"""Critical runs below which there is a one-sided bound instead of an interval."""
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """A batch that counts, with its outcomes.
+
+    Args:
+        prior: what the metamodel thought: mean of w pi over the pool.
+        anticipated: variance of one draw if the metamodel is right.
+        pool_variance: of the batch through its pool.
+        coefficient: (n,) w / (N r) of the draws.
+        believed: (n,) pi of the draws, as the correction subtracts it.
+        critical: (n,) 1 where the run was critical, else 0.
+    """
+
+    prior: float
+    anticipated: float
+    pool_variance: float
+    coefficient: Vector
+    believed: Vector
+    critical: Vector
+
+    @property
+    def value(self) -> float:
+        """Estimate of this batch alone; may be negative."""
+        return self.prior + float((self.coefficient * (self.critical - self.believed)).mean())
+
+    @property
+    def variance(self) -> float:
+        """The larger of realised and anticipated variance, plus the pool's."""
+        n, terms = len(self.critical), self.coefficient * (self.critical - self.believed)
+        realised = float(terms.var(ddof=1)) / n if n > 1 else math.inf
+        return max(realised, self.anticipated / n) + self.pool_variance
+
+
+@dataclass(frozen=True)
+class Combined:
+    """An estimate from all counted batches.
+
+    Attributes:
+        value: unbiased, may be negative.
+        std_error: from the larger of the batches' own and the between-batch variance.
+        freedom: degrees of freedom of its t quantile.
+        effective_sample_size: of the weights of the draws.
+        largest_share: of the sum of weights, by one draw.
+    """
+
+    value: float
+    std_error: float
+    freedom: float
+    effective_sample_size: float
+    largest_share: float
+
+    def limit(self, confidence: float, *, side: float) -> float:
+        """Return the one-sided limit at this confidence, side -1 below or +1 above, clipped to [0, 1]."""
+        reach = float(stdtrit(self.freedom, confidence)) * self.std_error
+        return min(max(self.value + side * reach, 0.0), 1.0)
+
+
+def combined(batches: Sequence[Counted]) -> Combined:
+    """Return the estimate with weights sqrt(t) n_t, t = 1 for the first batch that counts.
+
+    Source:
+        Owen and Zhou (2019), arXiv 1901.02976: weights of adaptive importance sampling fixed in advance.
+
+    Raises:
+        InputError: no batch.
+    """
+    if not batches:
+        raise InputError("an estimate needs at least one counted batch, but got none")
+    c = np.array([math.sqrt(t + 1.0) * len(b.critical) for t, b in enumerate(batches)])
+    c /= c.sum()
+    values = np.array([b.value for b in batches])
+    value = float(c @ values)
+    own = float((c**2) @ np.array([b.variance for b in batches]))
+    share = float((c**2).sum())
+    between = float((c**2) @ (values - value) ** 2) / (1.0 - share) if len(batches) > 1 else 0.0
+    weights = np.concatenate([ct / len(b.critical) * b.coefficient for ct, b in zip(c, batches, strict=True)])
+    total = float(weights.sum())
+    return Combined(
+        value, math.sqrt(max(own, between)), max(1.0 / share - 1.0, 1.0),
+        total**2 / float((weights**2).sum()) if total > 0 else 0.0, float(weights.max()) / total if total > 0 else 1.0,
+    )  # fmt: skip
+
+
+def binomial_upper(hits: int, n: int, confidence: float) -> float:
+    """Return the exact one-sided upper limit of a share after `hits` of n.
+
+    Source:
+        Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    """
+    return 1.0 if hits >= n else float(betaincinv(hits + 1, n - hits, confidence))
+
+
+def few_hits_bound(hits: int, nominal: Vector, confidence: float) -> float:
+    """Return the exact upper limit of a probability after few hits, from the defensive share of the draws.
+
+    Every draw meets a region of probability P with probability at least s P, s the share that is drawn
+    in proportion to the nominal law, whatever the metamodel thinks. The limit is the P at which `hits`
+    or fewer are only just credible.
+
+    Args:
+        hits: critical draws.
+        nominal: (n,) s of each draw.
+        confidence: of the limit.
+    """
+    if len(nominal) == 0 or hits >= len(nominal):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        p = 0.5 * (low + high)
+        low, high = (p, high) if _at_most(hits, nominal * p) > 1.0 - confidence else (low, p)
+    return high
+
+
+def _at_most(hits: int, chances: Vector) -> float:
+    """Return the probability of at most `hits` successes in independent trials with these chances."""
+    mass = np.zeros(hits + 1)
+    mass[0] = 1.0
+    for chance in chances:
+        mass[1:] = mass[1:] * (1.0 - chance) + mass[:-1] * chance
+        mass[0] *= 1.0 - chance
+    return float(mass.sum())
+
+
+def undetected_mass(nominal: Vector, surprises: int, confidence: float = 0.95) -> float:
+    """Return the most that a region which the metamodel denies may hold.
+
+    3 / n_p at 95 %, n_p the number of draws in proportion to the nominal law, while none of them was a
+    surprise (a critical run that the metamodel thought impossible).
+
+    Args:
+        nominal: (n,) share of each draw that is in proportion to the nominal law.
+        surprises: critical runs that the metamodel had denied.
+        confidence: of the bound.
+    """
+    return few_hits_bound(surprises, nominal, confidence)

@@ -1,0 +1,236 @@
+"""Gaussian mixtures in the standard-normal space: proposals with an exact density.
+
+A mixture is fitted to particles from the regions that matter; the nominal law and a wide one are
+always components of it, so that no point of the space has a density of (nearly) zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.special import gammainccinv, logsumexp
+
+from sbt.arrays import Points, Vector
+
+__all__ = ["Mixture", "Normals", "fitted", "log_normal", "particles", "wide_scales"]
+
+LogTarget = Callable[[Points], Vector]
+_TAIL = 1e-4
+_COMPONENTS = (1, 2, 4, 7)
+_STEPS = 25
+
+
+def log_normal(z: Points, scale: Vector | float = 1.0) -> Vector:
+    """Return (n,) log density of independent centred normals with standard deviations `scale`, at z (n, d)."""
+    d = z.shape[1]
+    scales = np.broadcast_to(np.asarray(scale, dtype=np.float64), (d,))
+    squares: Vector = ((z / scales) ** 2).sum(axis=1)
+    return -0.5 * squares - float(np.log(scales).sum()) - 0.5 * d * math.log(2.0 * math.pi)
+
+
+def wide_scales(bounded: Vector) -> Vector:
+    """Return (d,) standard deviations of the wide component: s on normal scores with a tail, 1 on bounded inputs.
+
+    s^2 d' is the 1 - 1e-4 quantile of chi^2 with d' degrees of freedom, d' the number of inputs with a
+    tail. The normal score of a uniform input is left alone: its nominal law covers the range evenly.
+
+    Args:
+        bounded: (d,) 1 where the input is uniform on its range, else 0.
+    """
+    free = int((bounded == 0).sum())
+    s = math.sqrt(2.0 * float(gammainccinv(0.5 * free, _TAIL)) / free) if free else 1.0
+    return np.where(bounded == 0, s, 1.0)
+
+
+_NEAR, _NEAR_SHARE = 0.3, 0.25
+"""Spread of candidates about known critical points, and their share."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normals:
+    """k normal components: weight (k,), mean (k, d), lower Cholesky factors (k, d, d)."""
+
+    weight: Vector
+    mean: Points
+    factor: Points
+
+    def log_terms(self, z: Points) -> Points:
+        """Return (k, n) log density of each component at z (n, d), weights included."""
+        d, terms = z.shape[1], []
+        for weight, mean, factor in zip(self.weight, self.mean, self.factor, strict=True):
+            white = solve_triangular(factor, (z - mean).T, lower=True, check_finite=False)  # (d, n)
+            norm = math.log(weight) - float(np.log(np.diag(factor)).sum()) - 0.5 * d * math.log(2.0 * math.pi)
+            terms.append(norm - 0.5 * (white**2).sum(axis=0))
+        return np.array(terms).reshape(len(self.weight), len(z))
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """The proposal h: the nominal law, the wide law and fitted normals, with exact density.
+
+    Args:
+        wide: (d,) standard deviations of the wide component.
+        normals: fitted components; None: there was nothing to fit.
+        defence: shares of the nominal and of the wide component where there are fitted ones.
+    """
+
+    wide: Vector
+    normals: Normals | None = None
+    defence: tuple[float, float] = (0.1, 0.1)
+
+    @property
+    def shares(self) -> Vector:
+        """(2 + k,) shares of the nominal, the wide and the fitted components."""
+        if self.normals is None:
+            return np.array([0.5, 0.5])
+        rest = 1.0 - sum(self.defence)
+        return np.concatenate([self.defence, rest * self.normals.weight])
+
+    def log_density(self, z: Points) -> Vector:
+        """Return (n,) log h(z), exact."""
+        shares = self.shares
+        terms = [math.log(shares[0]) + log_normal(z), math.log(shares[1]) + log_normal(z, self.wide)]
+        if self.normals is not None:
+            terms += list(math.log(1.0 - sum(self.defence)) + self.normals.log_terms(z))
+        return np.asarray(logsumexp(np.array(terms), axis=0))
+
+    def sample(self, n: int, rng: np.random.Generator) -> tuple[Points, Vector]:
+        """Return n points, stratified: each component gives its share of them, and (n,) their component.
+
+        The counts are rounded by one common uniform number, so that their expectation is exact.
+        """
+        shares = self.shares
+        edges = np.floor(n * np.concatenate([[0.0], np.cumsum(shares)]) + rng.random())
+        edges[-1] = edges[0] + n
+        counts = np.diff(edges).astype(int)
+        d = len(self.wide)
+        parts = [rng.standard_normal((counts[0], d)), rng.standard_normal((counts[1], d)) * self.wide]
+        if self.normals is not None:
+            for count, mean, factor in zip(counts[2:], self.normals.mean, self.normals.factor, strict=True):
+                parts.append(mean + rng.standard_normal((count, d)) @ factor.T)
+        return np.concatenate(parts), np.repeat(np.arange(len(counts)), counts).astype(np.float64)
+
+    def sample_near(self, n: int, centres: Points, rng: np.random.Generator) -> tuple[Points, Vector]:
+        """Return n candidates from this mixture and from around `centres` (k, d), with (n,) log density."""
+        near = round(_NEAR_SHARE * n)
+        around = centres[rng.integers(len(centres), size=near)] + _NEAR * rng.standard_normal((near, centres.shape[1]))
+        z = np.concatenate([self.sample(n - near, rng)[0], around])
+        kernel = np.array([log_normal(z - centre, _NEAR) for centre in centres])  # (k, n)
+        log_near = logsumexp(kernel, axis=0) - math.log(len(centres))
+        return z, np.logaddexp(self.log_density(z) + math.log(1.0 - _NEAR_SHARE), log_near + math.log(_NEAR_SHARE))
+
+
+def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: np.random.Generator, moves: int = 8) -> Points:
+    """Return (n, d) particles that follow exp(target) about: resampled, then moved by Metropolis steps.
+
+    Args:
+        target: (m, d) points to (m,) log density, not normalised; -inf is allowed.
+        start: (m, d) candidates from any density.
+        log_start: (m,) log density of the candidates.
+        n: particles.
+        rng: the only source of randomness.
+        moves: Metropolis steps of each particle.
+    """
+    value = target(start)
+    log_w = np.where(np.isfinite(value), value - log_start, -np.inf)
+    if not np.isfinite(log_w).any():
+        return np.empty((0, start.shape[1]))
+    for power in (0.5, 1.0):  # tempered: many distinct candidates before the particles are moved
+        weight = np.exp(power * (log_w - log_w.max()))
+        weight /= weight.sum()
+        if power == 0.5 and 1.0 / float((weight**2).sum()) < 2 * n:
+            continue
+        break
+    edges = np.cumsum(weight)
+    rows = np.minimum(np.searchsorted(edges, (np.arange(n) + rng.random()) / n * edges[-1]), len(start) - 1)
+    z, log_z = start[rows].copy(), value[rows].copy()
+    step = 0.6
+    for _ in range(moves):
+        spread = z.std(axis=0) + 0.1
+        a, b = rng.permutation(n), rng.permutation(n)
+        jump = np.where(rng.random((n, 1)) < 0.5, 0.5 * (z[a] - z[b]), spread * rng.standard_normal(z.shape))
+        new = z + step * jump * rng.random((n, 1)) * 2.0 / math.sqrt(z.shape[1])
+        log_new = target(new)
+        accept = np.log(rng.random(n)) < log_new - log_z
+        z[accept], log_z[accept] = new[accept], log_new[accept]
+        step *= 1.3 if accept.mean() > 0.3 else 0.7
+    return z
+
+
+def fitted(clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generator, inflate: float = 1.25) -> Mixture:
+    """Return the mixture whose normals are fitted to each cloud of particles, equal shares, by EM and BIC.
+
+    Args:
+        clouds: (n, d) particles each; those too small for a covariance are left out.
+        wide: (d,) standard deviations of the wide component.
+        rng: the only source of randomness.
+        inflate: factor on the covariances: the tails of h must not be thinner than the target's.
+    """
+    parts = [_em(cloud, rng) for cloud in clouds if len(cloud) >= 8 * cloud.shape[1]]
+    if not parts:
+        return Mixture(wide)
+    return Mixture(wide, Normals(
+        np.concatenate([p.weight for p in parts]) / len(parts), np.concatenate([p.mean for p in parts]),
+        math.sqrt(inflate) * np.concatenate([p.factor for p in parts]),
+    ))  # fmt: skip
+
+
+def _em(z: Points, rng: np.random.Generator) -> Normals:
+    """Return the normals of best BIC among a few numbers of components."""
+    n, d = z.shape
+    best, best_value = None, math.inf
+    for k in _COMPONENTS:
+        if k > 1 and n < 10 * k * d:
+            break
+        found, log_likelihood = _em_of(z, k, rng)
+        value = -2.0 * log_likelihood + len(found.weight) * (1 + d + d * (d + 1) / 2) * math.log(n)
+        if value < best_value:
+            best, best_value = found, value
+    assert best is not None  # noqa: S101
+    return best
+
+
+def _em_of(z: Points, k: int, rng: np.random.Generator) -> tuple[Normals, float]:
+    """Return k normals by expectation maximisation, started from far-apart particles, and their log likelihood."""
+    n, d = z.shape
+    total = np.cov(z.T).reshape(d, d) + 1e-6 * np.eye(d)
+    white = solve_triangular(np.linalg.cholesky(total), z.T, lower=True).T
+    centres = [int(rng.integers(n))]
+    nearest = np.full(n, np.inf)
+    for _ in range(k - 1):
+        nearest = np.minimum(nearest, ((white - white[centres[-1]]) ** 2).sum(axis=1))
+        centres.append(int(rng.choice(n, p=nearest / nearest.sum())) if nearest.sum() > 0 else int(rng.integers(n)))
+    label = np.argmin(((white[:, None] - white[centres]) ** 2).sum(axis=2), axis=1)
+    share = np.eye(k)[label].T * 0.9 + 0.1 / k  # (k, n)
+    value = -math.inf
+    for _ in range(_STEPS):
+        model = _maximised(z, share, total)
+        terms = model.log_terms(z)
+        together = logsumexp(terms, axis=0)
+        share = np.exp(terms - together)
+        if float(together.sum()) < value + 1e-3 * n:
+            value = max(value, float(together.sum()))
+            break
+        value = float(together.sum())
+    return model, value
+
+
+def _maximised(z: Points, share: Points, total: Points) -> Normals:
+    """Return the normals of largest likelihood given how much of each particle belongs to them."""
+    d = z.shape[1]
+    mass = share.sum(axis=1)
+    keep = mass > 1.0
+    share, mass = share[keep], mass[keep]
+    mean = share @ z / mass[:, None]
+    factors = []
+    for weights, centre, m in zip(share, mean, mass, strict=True):
+        off = z - centre
+        covariance = (weights * off.T) @ off / m
+        prior = d + 2.0
+        covariance = (m * covariance + prior * 0.05 * total) / (m + prior) + 1e-4 * np.eye(d)
+        factors.append(np.linalg.cholesky(covariance))
+    return Normals(mass / mass.sum(), mean, np.array(factors).reshape(len(mass), d, d))
