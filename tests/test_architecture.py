@@ -39,7 +39,7 @@ FLOORS = (
 NEIGHBOURS = {
     "execution": set(), "store": {"history"}, "campaign": {"learner"}, "samplers": {"acquisition"},
     "plugins": {"errors"}, "arrays": {"errors"}, "seeds": set(), "errors": set(), "sbt": set(),
-    "run": {"config", "replay"}, "replay": {"config", "run"}, "__main__": {"cli"}, "testing": {"report"},
+    "run": {"config", "replay"}, "replay": {"config", "run"}, "__main__": {"cli"}, "testing": {"report"}, "benchmark": {"report"},
 }  # fmt: skip
 LATE = {
     "metrics": {"sumo"},  # reading recorded FCD needs the networks' geometry

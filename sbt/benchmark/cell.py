@@ -219,7 +219,8 @@ def _keep_predictions(folder: Path, learner: _ReferenceLearner, belief: Belief, 
         columns.append(np.stack([part.mu, part.sigma, np.exp(log_p), log_p - log_not]))
     mu, sigma, p, odds = np.concatenate(columns, axis=1)
     temporary = folder / ("part." + PREDICTIONS)
+    ends = [critical.low, critical.high]
     np.savez_compressed(
-        temporary, y=y, mu=mu, sigma=sigma, p=p, odds=odds, critical=critical.contains(y), requirement=[critical.low, critical.high]
+        temporary, y=y, mu=mu, sigma=sigma, p=p, odds=odds, critical=critical.contains(y), requirement=ends
     )
     temporary.replace(folder / PREDICTIONS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +50,16 @@ def run_benchmark(
     """
     config, all_cells = loaded.config, list(loaded.cells())
     store, failed = Path(config.store), {}
-    made = [make_reference(each_, config.workers, listener.progress) for each_ in loaded.references()] if reference else []
-    if cells:
-        todo = [cell for cell in all_cells if not is_done(cell)]
-        listener.say(f"{len(all_cells)} cells, {len(all_cells) - len(todo)} are done")
-        for k, (cell, reason) in enumerate(each(run_cell, todo, config.workers), 1):
-            listener.say(f"{k}/{len(todo)} {cell.name}: {reason or 'done'}")
+    references, made = dict(loaded.references()), []
+    todo = [cell for cell in all_cells if not is_done(cell)] if cells else []
+    listener.say(f"{len(all_cells)} cells, {len(todo)} to do")
+    groups = groupby(todo, lambda cell: (cell.seed, cell.scenario)) if cells else ((("", name), ()) for name in references)
+    for (_, scenario), group in groups:
+        if reference and scenario in references:  # made when it is needed: early cells give early results
+            listener.say(f"{scenario}: reference runs")
+            made.append(make_reference(references.pop(scenario), config.workers, listener.progress))
+        for cell, reason in each(run_cell, list(group), config.workers):
+            listener.say(f"{cell.name}: {reason or 'done'}")
             if reason is not None:
                 failed[cell.name] = reason
     result: dict[str, Any] = {

@@ -11,7 +11,8 @@ from sbt.store import Store
 
 __all__ = ["opened"]
 
-_MAY_CHANGE = ("budget", "folder", "yaml", "initial", "batch")
+_IDENTITY = ("campaign", "scenario", "requirement", "inputs", "ego", "simulation", "seed", "batch", "metamodel", "acquisition")
+"""What must stay the same of a configuration; other keys may come and go with versions."""
 
 
 def opened(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: object) -> Store:
@@ -33,8 +34,7 @@ def opened(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: obje
     }  # fmt: skip
     store = Store.open(folder, kept)
     before = store.configuration
-    fixed = {key for key in {*kept, *before} if key not in _MAY_CHANGE} | set(more)
-    changed = sorted(key for key in fixed if kept.get(key) != before.get(key))
+    changed = sorted(key for key in (*_IDENTITY, *more) if kept.get(key) != before.get(key))
     if changed:
         store.close()
         told = "; ".join(f"{key}: {before.get(key)} there, {kept.get(key)} now" for key in changed)

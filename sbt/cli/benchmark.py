@@ -42,8 +42,9 @@ def benchmark(
             from sbt.benchmark.experiment import Listener, run_benchmark
 
             listener = Listener(lambda line: None if silent else print(line, file=sys.stderr, flush=True), show)
+            simulate = not (reference_only or figures_only)
             result = run_benchmark(
-                loaded, listener, reference=not figures_only, cells=not (reference_only or figures_only), figures=not reference_only
+                loaded, listener, reference=not figures_only, cells=simulate, figures=not reference_only
             )
     except KeyboardInterrupt:
         raise fail("interrupted, run again to go on", Exit.INTERRUPTED) from None

@@ -27,7 +27,7 @@ from sbt.config.source import ConfigError, Key, Place, SourceMap
 
 __all__ = ["ACQUISITIONS", "Benchmark", "Cell", "LoadedBenchmark", "load_benchmark"]
 
-ACQUISITIONS = ("even", "boundary")
+ACQUISITIONS: tuple[Literal["even", "boundary"], ...] = ("even", "boundary")
 _LABEL = r"^[\w.+ -]+$"
 
 
@@ -107,10 +107,11 @@ class Benchmark(_Strict):
 
     @model_validator(mode="after")
     def _distinct(self) -> Benchmark:
-        for what, values in (
-            ("scenarios", [s.label for s in self.scenarios]), ("metamodels", [m.label for m in self.metamodels]),
-            ("acquisitions", list(self.acquisitions)), ("seeds", list(self.seeds)),
-        ):  # fmt: skip
+        named: dict[str, list[Any]] = {
+            "scenarios": [s.label for s in self.scenarios], "metamodels": [m.label for m in self.metamodels],
+            "acquisitions": list(self.acquisitions), "seeds": list(self.seeds),
+        }  # fmt: skip
+        for what, values in named.items():
             twice = next((v for v in values if values.count(v) > 1), None)
             if twice is not None:
                 raise ValueError(f"{what} must be distinct (give them a name), but got '{twice}' twice")
@@ -164,11 +165,11 @@ class LoadedBenchmark:
     folder: Path
 
     def cells(self) -> Iterator[Cell]:
-        """Yield all cells: by seed, then metamodel, scenario, acquisition, so that early ones are comparable."""
+        """Yield all cells: by seed, then scenario, metamodel, acquisition, so that early results compare metamodels."""
         c = self.config
         for seed in c.seeds:
-            for j, metamodel in enumerate(c.metamodels):
-                for i, scenario in enumerate(c.scenarios):
+            for i, scenario in enumerate(c.scenarios):
+                for j, metamodel in enumerate(c.metamodels):
                     for acquisition in c.acquisitions:
                         batch, iterations = scenario.batch, scenario.iterations or c.iterations
                         folder = Path(c.store) / "cells" / "/".join(
@@ -186,14 +187,14 @@ class LoadedBenchmark:
                             iterations, c.max_candidates, folder, self.reference_of(scenario), scenario.reference or c.reference,
                         )  # fmt: skip
 
-    def references(self) -> Iterator[Loaded]:
-        """Yield the campaign of each scenario's reference runs, in its own folder."""
+    def references(self) -> Iterator[tuple[str, Loaded]]:
+        """Yield name of each scenario and the campaign of its reference runs, in its own folder."""
         c = self.config
         for i, scenario in enumerate(c.scenarios):
             n = scenario.reference or c.reference
             folder = str(self.reference_of(scenario))
-            data = {"campaign": "coverage", "seed": c.reference_seed, "budget": n, "initial": min(n, 1000), "store": folder}
-            yield self._loaded(scenario, data, [((), ("scenarios", i))])
+            data = {"campaign": "coverage", "seed": c.reference_seed, "budget": n, "initial": 2, "batch": 2, "store": folder}
+            yield scenario.label, self._loaded(scenario, data, [((), ("scenarios", i))])
 
     def reference_of(self, scenario: ScenarioEntry) -> Path:
         """Return the folder of the scenario's reference runs."""

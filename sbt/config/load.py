@@ -25,7 +25,9 @@ from pydantic import BaseModel, ValidationError
 from sbt.config.model import Configuration
 from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
 
-__all__ = ["ConfigError", "Loaded", "checked", "dump", "fingerprint", "load", "parse", "read_text", "resolve", "resumed", "schema"]
+__all__ = [
+    "ConfigError", "Loaded", "checked", "dump", "fingerprint", "load", "parse", "read_text", "resolve", "resumed", "schema",
+]  # fmt: skip
 
 M = TypeVar("M", bound=BaseModel)
 _NOT_IDENTITY = ("executor", "store", "budget")
