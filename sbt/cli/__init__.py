@@ -10,6 +10,7 @@ from sbt import __version__
 from sbt.cli import campaign, inform, metrics, scenario
 from sbt.cli.benchmark import benchmark
 from sbt.cli.console import verb
+from sbt.cli.predict import predict
 from sbt.cli.replay import replay
 
 __all__ = ["app", "main"]
@@ -27,6 +28,7 @@ for _verb in (
     campaign.status,
     campaign.report,
     campaign.export,
+    predict,
     replay,
 ):
     app.command()(verb(_verb))
