@@ -61,11 +61,7 @@ class Learner:
         if len(training) < 2:
             return None
         start = time.perf_counter()
-        space = self.scenario.space
-        y = training.y(self.scenario.requirement.metric)
-        u = space.metamodel_inputs(space.to_unit(training.x))
-        with self._named(len(training)):
-            predictor = self.metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
+        space, predictor = self.scenario.space, self.train(training)
         seconds = time.perf_counter() - start
 
         def predict(points: Points) -> Prediction:
@@ -74,6 +70,14 @@ class Learner:
                 return predictor(inputs)
 
         return Belief(predict, self._scores(predict, history), len(training), seconds)
+
+    def train(self, training: History) -> Predictor:
+        """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""
+        space = self.scenario.space
+        y = training.y(self.scenario.requirement.metric)
+        u = space.metamodel_inputs(space.to_unit(training.x))
+        with self._named(len(training)):
+            return self.metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
 
     def unseen(self, history: History) -> tuple[Points, Vector]:
         """Return x (n, d) and y (n,) that no metamodel learned from: held-out runs, or a table's rows not chosen."""

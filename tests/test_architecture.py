@@ -32,14 +32,14 @@ FLOORS = (
     ("learner", "campaign", "tables"),
     ("campaigns", "scenario_check"),
     ("config", "run", "replay"),
-    ("report", "benchmark", "export", "testing"),
+    ("report", "benchmark", "export", "testing", "predict"),
     ("cli", "__main__"),
 )
 """Rooms from the ground up; those on one floor do not know each other unless stated in NEIGHBOURS."""
 NEIGHBOURS = {
     "execution": set(), "store": {"history"}, "campaign": {"learner"}, "samplers": {"acquisition"},
     "plugins": {"errors"}, "arrays": {"errors"}, "seeds": set(), "errors": set(), "sbt": set(),
-    "run": {"config", "replay"}, "replay": {"config", "run"}, "__main__": {"cli"}, "testing": {"report"},
+    "run": {"config", "replay"}, "replay": {"config", "run"}, "__main__": {"cli"}, "testing": {"report"}, "benchmark": {"report"},
 }  # fmt: skip
 LATE = {
     "metrics": {"sumo"},  # reading recorded FCD needs the networks' geometry

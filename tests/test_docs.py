@@ -16,12 +16,14 @@ from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.config.assemble import assemble
+from sbt.config.benchmark import load_benchmark
 from sbt.config.load import load, parse
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+BENCHMARKS = sorted((ROOT / "configs").glob("benchmark_*.yaml"))
+CONFIGS = sorted(set((ROOT / "configs").glob("*.yaml")) - set(BENCHMARKS))
 EXAMPLES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for path in (ROOT / "sbt").rglob("*.py") if re.search(r"^\s*>>> ", path.read_text(), re.MULTILINE)
@@ -57,6 +59,12 @@ def test_configurations_run(config: Path, tmp_path: Path):
     assert (result["ok"], result["failed"]) == (result["runs"], 0)
     assert result["runs"] == 24 + min(20, load(config).config.validation.reference)
     assert (tmp_path / "s" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("config", BENCHMARKS, ids=lambda path: path.stem)
+def test_benchmarks_load(config: Path):
+    """The large ones take hours or weeks; the tiny one is run in test_benchmark.py."""
+    assert list(load_benchmark(config).cells())
 
 
 @pytest.mark.parametrize("module", EXAMPLES)

@@ -8,8 +8,10 @@ import typer
 
 from sbt import __version__
 from sbt.cli import campaign, inform, metrics, scenario
+from sbt.cli.benchmark import benchmark
 from sbt.cli.console import verb
 from sbt.cli.new import new
+from sbt.cli.predict import predict
 from sbt.cli.replay import replay
 
 __all__ = ["app", "main"]
@@ -27,11 +29,13 @@ for _verb in (
     campaign.status,
     campaign.report,
     campaign.export,
+    predict,
     replay,
 ):
     app.command()(verb(_verb))
 app.command()(verb(metrics.metrics))
 app.command()(verb(new))
+app.command()(verb(benchmark))
 app.command("list")(verb(inform.list_))
 app.command()(verb(inform.schema))
 app.command()(verb(inform.doctor))

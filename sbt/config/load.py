@@ -18,15 +18,19 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from sbt.config.model import Configuration
 from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
 
-__all__ = ["ConfigError", "Loaded", "dump", "fingerprint", "load", "located", "parse", "read", "resolve", "resumed", "schema"]
+__all__ = [
+    "ConfigError", "Loaded", "checked", "dump", "fingerprint", "load", "located", "parse", "read_text", "resolve", "resumed",
+    "schema",
+]  # fmt: skip
 
+M = TypeVar("M", bound=BaseModel)
 _NOT_IDENTITY = ("executor", "store", "budget")
 _RULES = {
     "missing": "is required",
@@ -62,18 +66,17 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Loaded:
     Raises:
         ConfigError: the file cannot be read, or anything in it breaks a rule; all at once.
     """
-    path = Path(path)
-    return parse(read(path), overrides, name=str(path), folder=path.resolve().parent)
+    return parse(read_text(path), overrides, name=str(path), folder=Path(path).resolve().parent)
 
 
-def read(path: Path) -> str:
-    """Return the text of a YAML file.
+def read_text(path: str | Path) -> str:
+    """Return the text of a configuration file.
 
     Raises:
-        ConfigError: it cannot be read, or is no text.
+        ConfigError: the file cannot be read.
     """
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return Path(path).read_bytes().decode("utf-8-sig")
     except IsADirectoryError:
         raise ConfigError([f"{path}: a configuration must be a YAML file, but this is a folder"]) from None
     except OSError as error:
@@ -97,20 +100,31 @@ def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wr
 
 def parse(text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None) -> Loaded:
     """Check a configuration given as text; like `load`."""
+    config, source = checked(Configuration, text, overrides, name)
+    return Loaded(config, source, folder or Path.cwd())
+
+
+def checked(model: type[M], text: str, overrides: Sequence[str], name: str) -> tuple[M, SourceMap]:
+    """Return YAML text as a checked model, and where its keys stand.
+
+    Raises:
+        ConfigError: anything in it breaks a rule; all at once.
+    """
     data, source, doubled = read_yaml(text, name)
     if data is None:
-        raise ConfigError([f"{name}:1:1: a configuration needs at least campaign and scenario, but it is empty"])
+        needed = " and ".join(key for key, field in model.model_fields.items() if field.is_required())
+        raise ConfigError([f"{name}:1:1: a configuration needs at least {needed}, but it is empty"])
     if not isinstance(data, dict):
         raise ConfigError([f"{name}:1:1: a configuration must be a mapping (key: value), but got {_shown(data)}"])
     data, source, wrong = _overridden(data, source, overrides)
     wrong = doubled + wrong
     try:
-        config = Configuration.model_validate(data)
+        config = model.model_validate(data)
     except ValidationError as error:
-        wrong = list(located(source, error, Configuration, wrong).errors)
+        wrong = list(located(source, error, model, wrong).errors)
     if wrong:
         raise ConfigError(wrong)
-    return Loaded(config, source, folder or Path.cwd())
+    return config, source
 
 
 def resolve(config: Configuration) -> dict[str, Any]:
@@ -185,12 +199,12 @@ def _with(data: Any, path: tuple[str, ...], value: Any) -> dict[str, Any]:
     return {**(data or {}), head: _with(inner, rest, value) if rest else value}
 
 
-def _problem(error: Any, root: type[BaseModel]) -> tuple[Key, str, bool]:
+def _problem(error: Any, model: type[BaseModel]) -> tuple[Key, str, bool]:
     """Return path, message and whether the key is at fault, of one of pydantic's errors."""
     path: Key = tuple(part for part in error["loc"] if part != "[key]")
     kind = error["type"]
     if kind == "extra_forbidden":
-        return path, _unknown_key(path, root), True
+        return path, _unknown_key(path, model), True
     if kind == "missing":
         return path, _RULES[kind], True
     if kind == "value_error":  # a rule of ours: the message has the value already, or names it
@@ -199,15 +213,15 @@ def _problem(error: Any, root: type[BaseModel]) -> tuple[Key, str, bool]:
     return path, f"{rule}, but got {_shown(error['input'])}", kind == "invalid_key"
 
 
-def _unknown_key(path: Key, root: type[BaseModel]) -> str:
-    known = _keys_at(path[:-1], root)
+def _unknown_key(path: Key, model: type[BaseModel]) -> str:
+    known = _keys_at(path[:-1], model)
     near = get_close_matches(str(path[-1]), known, 1)
     return f"unknown key (did you mean '{near[0]}'?)" if near else f"unknown key; the keys here are {', '.join(known)}"
 
 
-def _keys_at(path: Key, root: type[BaseModel]) -> list[str]:
+def _keys_at(path: Key, model: type[BaseModel]) -> list[str]:
     """Return the keys of the model at a path."""
-    kind: Any = root
+    kind: Any = model
     for part in path:
         kind = _inner(kind.model_fields[part].annotation) if _is_model(kind) else _inner(get_args(kind)[-1])
         if get_origin(kind) is tuple:

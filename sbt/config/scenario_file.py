@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sbt.config.load import located, read
+from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
@@ -30,7 +30,7 @@ __all__ = ["from_file", "is_scenario"]
 
 def is_scenario(path: Path) -> bool:
     """Return whether a YAML file describes a scenario, not a campaign."""
-    data = read_yaml(read(path), str(path))[0]
+    data = read_yaml(read_text(path), str(path))[0]
     return isinstance(data, dict) and "campaign" not in data and bool({"sumo", "simulate", "ego"} & set(data))
 
 
@@ -45,7 +45,7 @@ def from_file(name: str, folder: Path) -> LogicalScenario:
         ConfigError: everything that is wrong with it and with the files it names.
     """
     path = (folder / Path(name).expanduser()).resolve()
-    data, source, wrong = read_yaml(read(path), name)
+    data, source, wrong = read_yaml(read_text(path), name)
     problems = Problems(source)
     try:
         model = ScenarioModel.model_validate(data)

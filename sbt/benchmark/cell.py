@@ -1,0 +1,226 @@
+"""One cell of a benchmark: a campaign whose metamodel is scored on the reference runs after every batch."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sbt.acquisition import Acquisition
+from sbt.arrays import Points, Vector
+from sbt.benchmark.keeping import opened
+from sbt.benchmark.reference import reference_rows
+from sbt.campaign import Batch, Campaign, Fit, Log, Progress, run_stages
+from sbt.config.assemble import assemble
+from sbt.config.benchmark import Cell
+from sbt.errors import SbtError
+from sbt.execution.protocol import SerialExecutor
+from sbt.history import History
+from sbt.learner import Belief, Learner
+from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.scenario import LogicalScenario
+from sbt.samplers.pool import PoolSequence
+from sbt.samplers.roi import RoiDraw, rejection
+from sbt.samplers.sobol import SobolSequence
+from sbt.store import PlannedRun, Store
+
+__all__ = ["PREDICTIONS", "is_done", "run_cell"]
+
+PREDICTIONS = "predictions.npz"
+"""In the folder of a finished cell: y, mu, sigma and log odds of P(critical) at the reference runs."""
+_POSITION = "next_position"
+_CHUNK = 4096
+
+
+def is_done(cell: Cell) -> bool:
+    """Return whether a cell was run to its end."""
+    if not (cell.folder / PREDICTIONS).is_file():
+        return False
+    with Store.read(cell.folder) as store:
+        return store.conclusion is not None and store.configuration["reference"] == cell.reference_runs
+
+
+def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> None:
+    """Run one cell to its end, or go on where it was stopped.
+
+    Args:
+        cell: which one.
+        progress: called after every run.
+
+    Raises:
+        InputError: the reference runs are missing, or the store was made with other settings.
+        StoreError: it cannot be written.
+    """
+    parts, n = assemble(cell.loaded), cell.reference_runs
+    scenario, config = parts.scenario, cell.loaded.config
+    if parts.metamodel is None or parts.acquisition is None:
+        raise ValueError(f"a cell needs a metamodel and an acquisition, but {cell.name} has none")
+    rows = None if scenario.pool is not None else reference_rows(cell.reference, scenario, n)
+    learner = _ReferenceLearner(scenario, parts.metamodel, config.seed, rows)
+    acquisition = parts.acquisition if cell.acquisition != "even" else None
+    stage = _BenchmarkStage(scenario, learner, acquisition, config.seed, cell.iterations, cell.batch, cell.max_candidates)
+
+    def conclude(log: Log) -> tuple[dict[str, Any], Fit | None]:
+        belief = learner.fit(log.history)
+        if belief is None:
+            raise SbtError(f"{cell.name}: a metamodel needs two runs that went well, but got fewer")
+        _keep_predictions(cell.folder, learner, belief, log.history)
+        return {}, Fit(belief.scores, belief.seconds)
+
+    with opened(cell.folder, cell.loaded, scenario, reference=n, max_candidates=cell.max_candidates) as store:
+        limit = None if config.executor.timeout == float("inf") else config.executor.timeout
+        with _Recalling(SerialExecutor(parts.spec, limit), _known_runs(cell)) as executor:
+            stopped, conclusion, seconds = run_stages(
+                Campaign((stage,), conclude), store, executor, seed=config.seed, budget=config.budget,
+                requirement=scenario.requirement, versions="", listener=progress or (lambda _: None),
+            )  # fmt: skip
+        history = store.history()
+        critical = scenario.requirement.critical.contains(history.y(scenario.requirement.metric))
+        store.conclude({
+            "campaign": config.campaign, "scenario": config.scenario, "store": str(cell.folder), "runs": len(history),
+            "ok": int(history.ok.sum()), "failed": int((~history.ok).sum()), "critical": int(critical.sum()),
+            "iterations": len(store.iterations()), "stopped": stopped, "seconds": seconds, "conclusion": conclusion,
+        })  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _ReferenceLearner(Learner):
+    """Scores on the reference runs, on the rows that were not chosen for a recorded table."""
+
+    rows: tuple[Points, Vector] | None = None
+
+    def unseen(self, history: History) -> tuple[Points, Vector]:
+        """Return x (n, d) and y (n,) that score."""
+        return super().unseen(history) if self.rows is None else self.rows
+
+    def fit(self, history: History) -> Belief | None:
+        """Return the belief, the seconds of fit and of scoring among its scores."""
+        start = time.perf_counter()
+        belief = super().fit(history)
+        if belief is None:
+            return None
+        spent = {"fit_seconds": belief.seconds, "scoring_seconds": time.perf_counter() - start - belief.seconds}
+        return replace(belief, scores={**belief.scores, "learned": belief.runs, **spent})
+
+
+@dataclass(frozen=True)
+class _BenchmarkStage:
+    """Batches of equal size, the first one even; then from the acquisition, or even on and on.
+
+    Source:
+        Winkelmann et al. (2022), sections IV-B and V-A.
+    """
+
+    scenario: LogicalScenario
+    learner: _ReferenceLearner
+    acquisition: Acquisition | None
+    seed: int
+    iterations: int
+    batch: int
+    max_candidates: int
+    name: str = "benchmark"
+
+    def stop(self, log: Log) -> str | None:
+        """Return `iterations` when all batches were run."""
+        pool = self.scenario.pool
+        if pool is not None and len(log.history) >= len(pool.x):
+            return "no rows left"
+        return "iterations" if log.iteration >= self.iterations else None
+
+    def propose(self, log: Log) -> Batch:
+        """Return the next batch, and the scores of the metamodel that chose it."""
+        belief = self.learner.fit(log.history) if log.iteration > 0 else None
+        start = time.perf_counter()
+        draw, x = self._draw(belief, log)
+        names = self.scenario.space.names
+        runs = tuple(PlannedRun(self.name, dict(zip(names, map(float, row), strict=True))) for row in x)
+        how = {
+            "method": draw.method, "candidates": draw.candidates, "acceptance": draw.acceptance,
+            _POSITION: draw.next_position, "sampling_seconds": time.perf_counter() - start,
+        }  # fmt: skip
+        return Batch(runs, how, None if belief is None else Fit(belief.scores, belief.seconds))
+
+    def _draw(self, belief: Belief | None, log: Log) -> tuple[RoiDraw, Points]:
+        """Return the draw and its points in the inputs' units, exactly as recorded where they are."""
+        space, critical = self.scenario.space, self.scenario.requirement.critical
+        acquisition = self.acquisition
+
+        def score(u: Points) -> Vector:
+            if belief is None or acquisition is None:
+                return np.zeros(len(u))
+            return acquisition(belief.predict(u), critical, space.log_density(space.from_unit(u)))
+
+        admissible = (lambda u: space.feasible(space.from_unit(u))) if space.constraints else None
+        if self.scenario.pool is not None:
+            u = np.clip(space.to_unit(self.scenario.pool.x), 0.0, 1.0)
+            pool = PoolSequence(u, self.scenario.pool.taken(log.history.x), self.seed)
+            n = min(self.batch, len(pool))
+            draw = rejection(score, pool, n, start=0, seed=self.seed, label=log.iteration, max_candidates=len(pool))
+            return draw, self.scenario.pool.x[pool.rows[draw.positions]]
+        draw = rejection(
+            score, SobolSequence(space.dimension, self.seed), self.batch,
+            start=int(log.iterations[-1][_POSITION]) if log.iterations else 0, seed=self.seed, label=log.iteration,
+            max_candidates=max(self.max_candidates, self.batch), accept_filter=admissible,
+        )  # fmt: skip
+        return draw, space.from_unit(draw.u)
+
+
+class _Recalling:
+    """An executor that recalls runs which another cell has made: same scenario, inputs and seed, same outcome."""
+
+    def __init__(self, executor: SerialExecutor, known: Mapping[tuple[int, tuple[float, ...]], Outcome]):
+        self._executor, self._known = executor, known
+
+    def __enter__(self) -> _Recalling:
+        """Start the executor."""
+        self._executor.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Stop it."""
+        self._executor.__exit__(*error)
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Yield one outcome a job."""
+        new = []
+        for job in jobs:
+            known = self._known.get((job.seed, tuple(job.inputs.values())))
+            if known is None:
+                new.append(job)
+            else:
+                yield replace(known, index=job.index)
+        yield from self._executor.run(new)
+
+
+def _known_runs(cell: Cell) -> dict[tuple[int, tuple[float, ...]], Outcome]:
+    """Return the runs that went well in the even cells of this scenario and seed."""
+    known = {}
+    for folder in sorted(cell.folder.parents[2].glob(f"*/even/{cell.seed}")):
+        if folder != cell.folder and Store.begun(folder):
+            with Store.read(folder) as store:
+                for r in store.history().training.records:
+                    outcome = Outcome(r.index, Status(r.status), r.metrics, r.reason, r.seconds, r.collisions)
+                    known[r.seed, tuple(r.inputs.values())] = outcome
+    return known
+
+
+def _keep_predictions(folder: Path, learner: _ReferenceLearner, belief: Belief, history: History) -> None:
+    """Write what the last metamodel believes about the reference runs, for the figures."""
+    x, y = learner.unseen(history)
+    u, critical = learner.scenario.space.to_unit(x), learner.scenario.requirement.critical
+    columns = []
+    for k in range(0, len(u), _CHUNK):
+        part = belief.predict(u[k : k + _CHUNK])
+        log_p, log_not = part.log_probability(critical)
+        columns.append(np.stack([part.mu, part.sigma, np.exp(log_p), log_p - log_not]))
+    mu, sigma, p, odds = np.concatenate(columns, axis=1)
+    temporary = folder / ("part." + PREDICTIONS)
+    ends = [critical.low, critical.high]
+    np.savez_compressed(
+        temporary, y=y, mu=mu, sigma=sigma, p=p, odds=odds, critical=critical.contains(y), requirement=ends
+    )
+    temporary.replace(folder / PREDICTIONS)

@@ -1,0 +1,77 @@
+"""A whole benchmark: reference runs, then all cells that are not done, then the table and the figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from sbt.benchmark.cell import is_done, run_cell
+from sbt.benchmark.reference import make_reference
+from sbt.benchmark.table import write_table
+from sbt.campaign import Progress
+from sbt.config.benchmark import LoadedBenchmark
+from sbt.execution.tasks import each
+
+__all__ = ["TABLE", "Listener", "run_benchmark"]
+
+TABLE = "results.csv"
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Hears how far a benchmark is.
+
+    Args:
+        say: takes one line for people.
+        progress: called after every reference run.
+    """
+
+    say: Callable[[str], None]
+    progress: Callable[[Progress], None]
+
+
+def run_benchmark(
+    loaded: LoadedBenchmark, listener: Listener, *, reference: bool = True, cells: bool = True, figures: bool = True
+) -> dict[str, Any]:
+    """Run a benchmark, or go on where it was stopped; what is done is not done again.
+
+    Args:
+        loaded: a checked configuration.
+        listener: hears how far it is.
+        reference: make the reference runs that are missing.
+        cells: run the cells that are not done.
+        figures: write the table and the figures of what is done.
+
+    Returns:
+        What `benchmark --json` prints: store, references, cells, done, failed (name: reason), rows, table, figures.
+    """
+    config, all_cells = loaded.config, list(loaded.cells())
+    store, failed = Path(config.store), {}
+    references, made = dict(loaded.references()), []
+    todo = [cell for cell in all_cells if not is_done(cell)] if cells else []
+    listener.say(f"{len(all_cells)} cells, {len(todo)} to do")
+    groups = groupby(todo, lambda cell: (cell.seed, cell.scenario)) if cells else ((("", name), ()) for name in references)
+    for (_, scenario), group in groups:
+        if reference and scenario in references:  # made when it is needed: early cells give early results
+            listener.say(f"{scenario}: reference runs")
+            made.append(make_reference(references.pop(scenario), config.workers, listener.progress))
+        for cell, reason in each(run_cell, list(group), config.workers):
+            listener.say(f"{cell.name}: {reason or 'done'}")
+            if reason is not None:
+                failed[cell.name] = reason
+    result: dict[str, Any] = {
+        "store": str(store), "references": [str(folder) for folder in made if folder is not None], "cells": len(all_cells),
+        "done": sum(map(is_done, all_cells)), "failed": failed, "rows": 0, "table": None, "figures": [],
+    }  # fmt: skip
+    if figures:
+        from sbt.benchmark.figures import write_figures
+
+        store.mkdir(parents=True, exist_ok=True)
+        result["rows"] = write_table(store / TABLE, all_cells)
+        result["table"] = str(store / TABLE)
+        if result["rows"]:
+            result["figures"] = [str(path) for path in write_figures(loaded, store / TABLE, store / "figures")]
+    return result

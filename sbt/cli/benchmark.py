@@ -1,0 +1,57 @@
+"""The verb benchmark: the paper's experiment."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+
+__all__ = ["benchmark"]
+
+
+def benchmark(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.yaml", help="Configuration of the benchmark.")],
+    *,
+    store: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the results.")] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one key; repeatable.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Cells at the same time.")] = None,
+    reference_only: Annotated[bool, typer.Option("--reference-only", help="Only make the reference runs.")] = False,
+    figures_only: Annotated[bool, typer.Option("--figures-only", help="Only the table and figures of what is done.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
+) -> None:
+    """Compare metamodels on scenarios, with even and boundary samples, or go on where it was interrupted."""
+    overrides = list(changes or [])
+    if store is not None:
+        overrides.append(f"store={json.dumps(str(store))}")
+    if workers is not None:
+        overrides.append(f"workers={workers}")
+    silent = quiet or as_json
+    try:
+        with clean_stdout(), ProgressDisplay(silent=silent) as show:
+            from sbt.config.benchmark import load_benchmark
+
+            loaded = load_benchmark(config, overrides)
+            from sbt.benchmark.experiment import Listener, run_benchmark
+
+            listener = Listener(lambda line: None if silent else print(line, file=sys.stderr, flush=True), show)
+            simulate = not (reference_only or figures_only)
+            result = run_benchmark(
+                loaded, listener, reference=not figures_only, cells=simulate, figures=not reference_only
+            )
+    except KeyboardInterrupt:
+        raise fail("interrupted, run again to go on", Exit.INTERRUPTED) from None
+    if as_json:
+        print_json(result)
+    else:
+        print(f"{result['done']} of {result['cells']} cells done, {len(result['failed'])} failed")
+        print(f"table: {result['table']}, {len(result['figures'])} figures" if result["table"] else f"store: {result['store']}")
+    if result["failed"]:
+        raise fail("\n".join(f"{name}: {reason}" for name, reason in result["failed"].items()), Exit.INTERNAL)

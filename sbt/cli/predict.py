@@ -1,0 +1,58 @@
+"""The verb predict: what a campaign's metamodel believes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sbt.cli.campaign import Folder, _with_store
+from sbt.cli.console import clean_stdout, print_json
+from sbt.errors import InputError
+
+__all__ = ["predict"]
+
+
+def predict(
+    folder: Folder,
+    *,
+    inputs: Annotated[Path, typer.Option("--inputs", metavar="FILE.csv", help="A column for each input, a row each.")],
+    output: Annotated[Path | None, typer.Option("--output", metavar="FILE.csv", help="Write here; default: print.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Say what the campaign's metamodel believes about concrete scenarios: mean, sigma, P(critical)."""
+    with clean_stdout():
+        _with_store(folder)
+        from sbt.predict import predict_rows
+
+        table = predict_rows(folder, inputs)
+    rows = table.rows()
+    if table.ignored:
+        print(f"not inputs, ignored: {', '.join(table.ignored)}", file=sys.stderr)
+    if output is not None or not as_json:
+        text = io.StringIO()
+        writer = csv.DictWriter(text, [*table.inputs, *table.columns], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        _write(text.getvalue(), output)
+    if as_json:
+        print_json({
+            "store": str(folder), "metric": table.metric, "metamodel": table.metamodel, "learned": table.learned,
+            "source": table.source, "rows": rows,
+        })  # fmt: skip
+    else:
+        print(f"{table.metric} by {table.metamodel}, {table.source}, learned from {table.learned} runs", file=sys.stderr)
+
+
+def _write(text: str, output: Path | None) -> None:
+    if output is None:
+        print(text, end="", flush=True)
+        return
+    try:
+        output.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--output must be a file that can be written, but {output}: {error.strerror}") from None

@@ -1,0 +1,180 @@
+"""What the metamodel of a finished or running campaign believes about concrete scenarios that nobody ran.
+
+The fitted metamodel is kept beside the store, under a key of the runs that it learned from, so that
+asking again does not fit again.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+from sbt.history import History
+from sbt.learner import Learner
+from sbt.metamodels.base import Predictor
+from sbt.metamodels.persistence import load, read_info, save
+from sbt.problem.parameter import Parameter
+from sbt.problem.space import ParameterSpace
+from sbt.run import assembly_of, loaded_from, settings_of
+from sbt.store import Store
+
+__all__ = ["MODEL", "Table", "predict_rows", "read_inputs"]
+
+MODEL = "metamodel.sbtmodel"
+"""In the folder of a store: the metamodel that was fitted last by `predict`."""
+_CHUNK = 4096
+_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Table:
+    """Beliefs about rows of inputs.
+
+    Attributes:
+        inputs: names of the inputs.
+        x: (n, d) their values.
+        columns: (n,) mu, sigma, epistemic, noise (unit of the metric) and p_critical.
+        metric: the safety metric.
+        metamodel: kind, as configured.
+        learned: runs that it learned from.
+        source: "loaded", "fitted", or "fitted, not kept: ..." where it cannot be saved.
+        ignored: columns of the file that are no inputs.
+    """
+
+    inputs: tuple[str, ...]
+    x: Points
+    columns: Mapping[str, Vector]
+    metric: str
+    metamodel: str
+    learned: int
+    source: str
+    ignored: tuple[str, ...]
+
+    def rows(self) -> list[dict[str, float]]:
+        """Return one mapping a row: inputs, then beliefs."""
+        names = (*self.inputs, *self.columns)
+        values = np.column_stack([self.x, *self.columns.values()])
+        return [dict(zip(names, map(float, row), strict=True)) for row in values]
+
+
+def predict_rows(folder: Path, inputs: Path) -> Table:
+    """Return what a campaign's metamodel believes about the rows of a CSV file.
+
+    Args:
+        folder: of a store.
+        inputs: CSV with a column for each input, named as the input or as in exports (`x.<input>`).
+
+    Raises:
+        InputError: the campaign has no metamodel or fewer than two runs to learn from, or the file is
+            no such table: columns missing, values that are no numbers or outside of the range.
+        StoreError: the folder holds no campaign.
+    """
+    with Store.read(folder) as store:
+        loaded, history = loaded_from(store), store.history()
+    settings = settings_of(loaded, assembly_of(loaded))
+    learner, choice = settings.learner, loaded.config.metamodel
+    if learner is None or choice is None:
+        raise InputError(f"predict needs a campaign with a metamodel, but {folder} has none (add metamodel: {{kind: auto}})")
+    space, requirement = settings.scenario.space, settings.scenario.requirement
+    x, ignored = read_inputs(inputs, space)
+    training = history.training
+    if len(training) < 2:
+        raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
+    predictor, source = _predictor(folder, learner, training, json.dumps(choice.model_dump(mode="json"), sort_keys=True))
+    u = space.metamodel_inputs(space.to_unit(x))
+    parts = []
+    for k in range(0, len(u), _CHUNK):
+        belief = predictor(u[k : k + _CHUNK])
+        parts.append([belief.mu, belief.sigma, belief.epistemic, belief.noise, belief.probability(requirement.critical)])
+    names = ("mu", "sigma", "epistemic", "noise", "p_critical")
+    columns = dict(zip(names, np.concatenate(parts, axis=1), strict=True)) if parts else {n: np.empty(0) for n in names}
+    return Table(space.names, x, columns, requirement.metric, choice.kind, len(training), source, ignored)
+
+
+def _predictor(folder: Path, learner: Learner, training: History, settings: str) -> tuple[Predictor, str]:
+    """Return the fitted metamodel, from the file beside the store where that has learned from the same runs."""
+    path, key = folder / MODEL, _key(learner, training, settings)
+    if path.is_file():
+        try:
+            if read_info(path).get("key") == key:
+                return load(path), "loaded"
+        except InputError:  # damaged or of another version: it is only a copy, and is made again
+            pass
+    predictor = learner.train(training)
+    info: dict[str, Any] = {
+        "key": key, "inputs": list(training.names), "metric": learner.scenario.requirement.metric, "runs": len(training),
+    }  # fmt: skip
+    try:
+        save(predictor, path, info)
+    except (InputError, OSError) as error:  # somebody's own metamodel, or a folder that may only be read
+        return predictor, f"fitted, not kept: {error}"
+    return predictor, "fitted"
+
+
+def _key(learner: Learner, training: History, settings: str) -> str:
+    """Return a key of all that decides a fit: the rows, the settings, the seed, the space, the version."""
+    space = learner.scenario.space
+    told = (settings, learner.seed, repr(space.parameters), [name for name, _ in space.features], version("sumo-sbt"))
+    digest = hashlib.blake2b(json.dumps([str(part) for part in told]).encode(), digest_size=16)
+    digest.update(np.ascontiguousarray(training.x).tobytes())
+    digest.update(training.y(learner.scenario.requirement.metric).tobytes())
+    return digest.hexdigest()
+
+
+def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, ...]]:
+    """Return x (n, d) of a CSV file, and the names of its other columns.
+
+    Raises:
+        InputError: as `predict_rows`; the message has file and line.
+    """
+    try:
+        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"--inputs must be a readable CSV file, but {path}: {error}") from None
+    if not lines or not any(lines[0]):
+        raise InputError(f"{path}:1: the first line must name the columns, but it is empty")
+    head = [name.strip() for name in lines[0]]
+    short = [name.removeprefix("x.") for name in head]
+    doubled = next((name for name in space.names if short.count(name) > 1), None)
+    if doubled is not None:
+        raise InputError(f"{path}:1: a column must stand once, but '{doubled}' stands {short.count(doubled)} times")
+    missing = [name for name in space.names if name not in short]
+    if missing:
+        raise InputError(f"{path}:1: every input must be a column, but missing: {', '.join(_hinted(m, head) for m in missing)}")
+    where = [short.index(name) for name in space.names]
+    rows = [
+        [_value(path, number, line, column, p) for column, p in zip(where, space.parameters, strict=True)]
+        for number, line in enumerate(lines[1:], 2) if line
+    ]  # fmt: skip
+    others = tuple(name for k, name in enumerate(head) if k not in where)
+    return np.array(rows, dtype=np.float64).reshape(len(rows), space.dimension), others
+
+
+def _hinted(name: str, head: list[str]) -> str:
+    near = get_close_matches(name, head, 1)
+    return f"{name} (did you mean '{near[0]}'?)" if near else name
+
+
+def _value(path: Path, number: int, line: list[str], column: int, parameter: Parameter) -> float:
+    """Return one checked value of a line."""
+    text = line[column].strip() if column < len(line) else ""
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"{path}:{number}: {parameter.name} must be a number, but got '{text}'") from None
+    low, high = parameter.low, parameter.high
+    room = _TOLERANCE * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
+    if not low - room <= value <= high + room:  # also NaN
+        raise InputError(f"{path}:{number}: {parameter.name} must be in [{low:g}, {high:g}] {parameter.unit}, but got {text}")
+    return min(max(value, low), high)

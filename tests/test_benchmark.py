@@ -1,0 +1,202 @@
+"""Benchmarks: resumable, the same in parallel, scored on runs nobody learned from, mistakes where they stand."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sbt.benchmark import cell as cell_module
+from sbt.benchmark.cell import PREDICTIONS, is_done, run_cell
+from sbt.benchmark.panels import recall_curve
+from sbt.benchmark.reference import make_reference, reference_rows
+from sbt.benchmark.table import COLUMNS, read_table, rows_of, write_table
+from sbt.cli import app
+from sbt.config.benchmark import LoadedBenchmark, load_benchmark
+from sbt.config.source import ConfigError
+from sbt.store import Store
+
+ROOT = Path(__file__).resolve().parent.parent
+TINY = """
+scenarios:
+  - {scenario: analytic.py:SCENARIO, name: disc, batch: 12}
+metamodels:
+  - {kind: et, trees: 10}
+  - {kind: gp}
+seeds: [4]
+iterations: 3
+reference: 60
+max_candidates: 1024
+"""
+UNTIMED = [c for c in COLUMNS if not c.endswith("_seconds")]
+
+
+def written(folder: Path, text: str = TINY, **changes: object) -> LoadedBenchmark:
+    path = folder / "benchmark.yaml"
+    path.write_text(text)
+    return load_benchmark(path, [f"{k}={json.dumps(v)}" for k, v in {"store": str(folder / "b"), **changes}.items()])
+
+
+def table(loaded: LoadedBenchmark) -> list[tuple[object, ...]]:
+    return [tuple(row.get(key) for key in UNTIMED) for cell in loaded.cells() for row in rows_of(cell)]
+
+
+def invoked(folder: Path, *more: str) -> dict[str, object]:
+    done = CliRunner().invoke(app, ["benchmark", str(folder / "benchmark.yaml"), "--json", *more])
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def test_killed_and_run_again_ends_as_one_that_was_not(analytic, tmp_path, monkeypatch):
+    folder = analytic.parent
+    whole, other = written(folder, store=str(tmp_path / "a")), written(folder, store=str(tmp_path / "b"))
+    for loaded in (whole, other):
+        for _, reference in loaded.references():
+            make_reference(reference, 1)
+    for cell in whole.cells():
+        run_cell(cell)
+    kept = cell_module._ReferenceLearner.fit
+    calls = []
+
+    def killed(self, history):
+        calls.append(len(history))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return kept(self, history)
+
+    cells = list(other.cells())
+    monkeypatch.setattr(cell_module._ReferenceLearner, "fit", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(cells[1])
+    monkeypatch.undo()
+    assert not is_done(cells[1])
+    for cell in reversed(cells):  # another order: what is recalled from sibling cells changes nothing
+        run_cell(cell)
+    assert all(map(is_done, cells))
+    assert table(other) == table(whole)
+    assert len(table(whole)) == 2 * 2 * 3
+
+
+def test_the_command_runs_resumes_and_draws(analytic):
+    folder = analytic.parent
+    loaded = written(folder)
+    first = invoked(folder, "--store", str(folder / "b"), "--workers", "2")
+    assert (first["cells"], first["done"], first["failed"], first["rows"]) == (4, 4, {}, 12)
+    assert {Path(p).stem for p in first["figures"]} == {
+        "likelihood_even", "rmse_even", "likelihood_critical", "rmse_critical", "precision_recall", "reliability", "times",
+        "scatter_disc",
+    }  # fmt: skip
+    rows = read_table(Path(first["table"]))
+    assert tuple(rows[0]) == COLUMNS
+    assert all(row["n"] == 60 and 0 < row["base_rate"] < 1 for row in rows)
+    serial = written(folder, store=str(folder / "serial"))
+    make_reference(next(serial.references())[1], 1)
+    for cell in serial.cells():
+        run_cell(cell)
+    assert table(serial) == table(loaded)
+    before = {p: p.stat().st_mtime_ns for p in (folder / "b").rglob("*.npz")}
+    assert invoked(folder, "--store", str(folder / "b"))["done"] == 4
+    assert {p: p.stat().st_mtime_ns for p in (folder / "b").rglob("*.npz")} == before  # nothing was done again
+
+
+def test_scores_are_those_of_the_reference_runs_and_no_metamodel_learns_from_them(analytic):
+    loaded = written(analytic.parent)
+    (_, reference), cell = next(loaded.references()), next(loaded.cells())
+    folder = make_reference(reference, 1)
+    run_cell(cell)
+    scenario = cell_module.assemble(cell.loaded).scenario
+    x, y = reference_rows(folder, scenario, 60)
+    with np.load(cell.folder / PREDICTIONS) as kept:
+        np.testing.assert_array_equal(kept["y"], y)
+        density = -0.5 * ((kept["y"] - kept["mu"]) / kept["sigma"]) ** 2 - np.log(kept["sigma"] * np.sqrt(2 * np.pi))
+    *_, last = rows_of(cell)
+    assert last["log_likelihood"] == pytest.approx(density.mean())
+    assert (last["runs"], last["learned"], last["n"]) == (36, 36, 60)
+    with Store.read(cell.folder) as store:
+        learned = {tuple(row) for row in store.history().x}
+    assert learned.isdisjoint({tuple(row) for row in x})
+
+
+def test_reference_runs_grow_without_changing(analytic, tmp_path):
+    few, many = (written(analytic.parent, store=str(tmp_path / str(n)), reference=n) for n in (30, 90))
+    for loaded in (few, many, written(analytic.parent, store=str(tmp_path / "30"), reference=90)):
+        for _, reference in loaded.references():
+            make_reference(reference, 1)
+    frames = []
+    for n in (30, 90):
+        with Store.read(tmp_path / str(n) / "reference" / "disc") as store:
+            frames.append(store.history())
+    np.testing.assert_array_equal(frames[0].x, frames[1].x)
+    np.testing.assert_array_equal(frames[0].y("y"), frames[1].y("y"))
+
+
+def test_a_store_of_other_settings_is_refused(analytic):
+    loaded = written(analytic.parent)
+    make_reference(next(loaded.references())[1], 1)
+    run_cell(next(loaded.cells()))
+    with pytest.raises(ValueError, match=r"a cell belongs to one configuration, .*max_candidates: 1024 there, 2048 now"):
+        run_cell(next(written(analytic.parent, max_candidates=2048).cells()))
+
+
+def test_missing_reference_runs_are_said(analytic):
+    with pytest.raises(Exception, match="there is none in"):
+        run_cell(next(written(analytic.parent).cells()))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("iterations: 3", "iteration: 3", r"benchmark.yaml:8:1: iteration: unknown key \(did you mean 'iterations'\?\)"),
+        ("kind: gp}", "kind: gpp}", r"benchmark.yaml:6:\d+: metamodel.kind: .*did you mean 'gp'"),
+        ("trees: 10}", "tree: 10}", r"benchmark.yaml:5:\d+: metamodel: ExtraTrees takes a setting .*did you mean 'trees'"),
+        ("batch: 12", "batch: 1", r"benchmark.yaml:3:\d+: scenarios.0.batch: .*greater than or equal to 2, but got 1"),
+        ("seeds: [4]", "seeds: 0", r"benchmark.yaml:7:\d+: seeds: must be a number of seeds >= 1 or a list of seeds, but got 0"),
+        ("seeds: [4]", "seeds: [4, 4]", r"seeds must be distinct \(give them a name\), but got '4' twice"),
+        ("analytic.py:SCENARIO", "cut_inn", r"benchmark.yaml:3:\d+: scenario: .*did you mean 'cut_in'"),
+    ],
+)
+def test_mistakes_are_told_where_they_stand(analytic, old, new, message):
+    with pytest.raises(ConfigError, match=message):
+        written(analytic.parent, TINY.replace(old, new))
+
+
+def test_a_recorded_table_is_scored_on_the_rows_that_were_not_chosen(tmp_path):
+    rng = np.random.default_rng(0)
+    u = rng.random((150, 2))
+    folder = tmp_path / "rows"
+    folder.mkdir()
+    inputs = "".join(f"  {n}: {{type: continuous, unit: m, min: 0, max: 1}}\n" for n in "ab")
+    (folder / "config.yml").write_text(f"inputs:\n{inputs}outputs:\n  y: {{type: continuous, unit: m}}\n")
+    lines = [f"{float(a)!r},{float(b)!r},{float(np.hypot(a, b) - 0.6)!r}" for a, b in u]
+    (folder / "rows.csv").write_text("a,b,y\n" + "\n".join(lines) + "\n")
+    text = TINY.replace("analytic.py:SCENARIO, name: disc", "'table:rows'")
+    loaded = written(tmp_path, text)
+    assert make_reference(next(loaded.references())[1], 1) is None
+    cells = list(loaded.cells())
+    for cell in cells:
+        run_cell(cell)
+        assert [(r["runs"], r["n"]) for r in rows_of(cell)] == [(12, 138), (24, 126), (36, 114)]
+
+
+def test_expected_recall_is_the_observed_one_where_probabilities_are_true():
+    p = np.random.default_rng(3).random(200_000) ** 3
+    critical = np.random.default_rng(4).random(len(p)) < p
+    expected, observed = recall_curve(p, critical)
+    assert np.abs(expected - observed).max() < 0.01
+
+
+@pytest.mark.sumo
+def test_the_tiny_benchmark_runs(tmp_path):
+    done = CliRunner().invoke(app, ["benchmark", str(ROOT / "configs/benchmark_tiny.yaml"), "--store", str(tmp_path), "--json"])
+    assert done.exit_code == 0, done.output
+    result = json.loads(done.stdout)
+    assert (result["done"], result["failed"], result["rows"]) == (8, {}, 24)
+    even = [row for row in read_table(Path(result["table"])) if row["acquisition"] == "even"]
+    assert {row["method"] for row in even} == {"rejection", ""}
+    shutil.rmtree(tmp_path / "figures")
+    loaded = load_benchmark(ROOT / "configs/benchmark_tiny.yaml", [f"store={json.dumps(str(tmp_path))}"])
+    assert write_table(tmp_path / "results.csv", loaded.cells()) == 24

@@ -1,0 +1,102 @@
+"""`predict`: the campaign's own belief, kept under a key of its rows; a wrong table is refused with its line."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sbt.cli import app
+from sbt.predict import MODEL
+from sbt.run import assembly_of, loaded_from, settings_of
+from sbt.store import Store
+
+ROWS = "b,note,x.a\n0.5,middle,0.5\n0.1,corner,0.9\n"
+
+
+def invoke(*args: object):
+    return CliRunner().invoke(app, [str(a) for a in args])
+
+
+@pytest.fixture
+def store(configured, tmp_path):
+    config = configured(campaign="coverage", budget=40, initial=20, batch=20, metamodel={"kind": "gp"}, store=str(tmp_path / "s"))
+    assert invoke("run", config, "--quiet").exit_code == 0
+    (tmp_path / "rows.csv").write_text(ROWS)
+    return tmp_path / "s"
+
+
+def predicted(store) -> dict:
+    done = invoke("predict", store, "--inputs", store.parent / "rows.csv", "--json")
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def test_it_is_the_belief_of_the_campaign(store):
+    found = predicted(store)
+    with Store.read(store) as opened:
+        loaded, history = loaded_from(opened), opened.history()
+    settings = settings_of(loaded, assembly_of(loaded))
+    belief = settings.learner.fit(history).predict(np.array([[0.5, 0.5], [0.9, 0.1]]))
+    assert [(row["a"], row["b"]) for row in found["rows"]] == [(0.5, 0.5), (0.9, 0.1)]
+    for name, values in {
+        "mu": belief.mu, "sigma": belief.sigma, "epistemic": belief.epistemic, "noise": belief.noise,
+        "p_critical": belief.probability(settings.scenario.requirement.critical),
+    }.items():  # fmt: skip
+        assert [row[name] for row in found["rows"]] == values.tolist(), name
+    assert found["rows"][0]["p_critical"] > 0.9 > 0.1 > found["rows"][1]["p_critical"]
+
+
+def test_it_is_fitted_once_for_the_same_rows(store, configured):
+    first, second = predicted(store), predicted(store)
+    assert (first["source"], second["source"]) == ("fitted", "loaded")
+    assert first["rows"] == second["rows"]
+    config = configured(campaign="coverage", budget=60, metamodel={"kind": "gp"}, store=str(store))
+    assert invoke("run", config, "--quiet").exit_code == 0
+    third = predicted(store)
+    assert third["source"] == "fitted"
+    assert third["learned"] > first["learned"]
+    (store / MODEL).write_bytes(b"damaged")
+    again = predicted(store)
+    assert (again["source"], again["rows"]) == ("fitted", third["rows"])
+
+
+def test_text_goes_to_stdout_or_to_a_file(store, tmp_path):
+    done = invoke("predict", store, "--inputs", tmp_path / "rows.csv")
+    lines = list(csv.reader(done.stdout.splitlines()))
+    assert lines[0] == ["a", "b", "mu", "sigma", "epistemic", "noise", "p_critical"]
+    assert len(lines) == 3
+    assert "ignored: note" in done.stderr
+    assert invoke("predict", store, "--inputs", tmp_path / "rows.csv", "--output", tmp_path / "out.csv").stdout == ""
+    assert (tmp_path / "out.csv").read_text() == done.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,B\n1,1\n", r"rows.csv:1: every input must be a column, but missing: b"),
+        ("a,bb\n1,1\n", r"missing: b (did you mean 'bb'?)"),
+        ("a,b\n0.1,0.2\n0.1,x\n", r"rows.csv:3: b must be a number, but got 'x'"),
+        ("a,b\n0.1\n", r"rows.csv:2: b must be a number, but got ''"),
+        ("a,b\n1.5,0\n", r"rows.csv:2: a must be in [0, 1] , but got 1.5"),
+        ("a,b\nnan,0\n", r"rows.csv:2: a must be in [0, 1] , but got nan"),
+        ("a,b,x.a\n0,0,0\n", r"rows.csv:1: a column must stand once, but 'a' stands 2 times"),
+        ("", r"rows.csv:1: the first line must name the columns"),
+    ],
+)
+def test_a_wrong_table_is_refused(store, tmp_path, text, message):
+    (tmp_path / "rows.csv").write_text(text)
+    done = invoke("predict", store, "--inputs", tmp_path / "rows.csv")
+    assert (done.exit_code, message in done.stderr) == (2, True), done.stderr
+
+
+def test_a_campaign_without_metamodel_says_so(configured, tmp_path):
+    config = configured(campaign="coverage", budget=20, metamodel=None, store=str(tmp_path / "s"))
+    assert invoke("run", config, "--quiet").exit_code == 0
+    (tmp_path / "rows.csv").write_text(ROWS)
+    done = invoke("predict", tmp_path / "s", "--inputs", tmp_path / "rows.csv")
+    assert done.exit_code == 2
+    assert "predict needs a campaign with a metamodel" in done.stderr
