@@ -115,4 +115,3 @@ def verify(sumo: Any, scene: Scene, prefix: str = "") -> None:
 def _front(actor: Actor) -> float:
     """Return how far ahead of the centre SUMO's position of the actor is: a vehicle's is its front bumper."""
     return 0.0 if actor.person else 0.5 * actor.type.length
-
