@@ -105,7 +105,7 @@ def test_a_kept_simulation_is_a_fresh_one_whatever_ran_before():
     kept = [simulated(s, v, seed) for s, v, seed in work]
     for (scenario, values, seed), trace in zip(work, kept, strict=True):
         assert isinstance(scenario.simulate, SumoSimulation)
-        assert scenario.simulate.isolations == ("fresh", "reuse")
+        assert scenario.simulate.isolations == ("fresh", "reuse", "replicas")
         assert replace(scenario.simulate, isolation="fresh")(values, seed).identical(trace)
     assert len({(t.ended, len(t.time)) for t in kept}) > 8
 

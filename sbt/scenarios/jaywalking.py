@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -133,6 +134,7 @@ def until_over() -> Until:
     return over
 
 
+@lru_cache(maxsize=8)
 def distances(trace: Trace) -> tuple[float, float | None]:
     """Return the smallest distance of ego's rectangle and the child's circle, and ego's speed at the contact.
 

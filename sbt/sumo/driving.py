@@ -113,9 +113,7 @@ class Drive:
         )
 
 
-def _controls(
-    sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str
-) -> Callable[[float], None]:
+def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str) -> Callable[[float], None]:
     """Return what asks every controller and passes its action on to SUMO."""
     set_speed = direct(sumo, "vehicle", "setSpeed")
     movers = {prefix + a.name: mover(sumo, a, prefix) for a in actors}
@@ -172,8 +170,7 @@ def _observer(
         for person in {a.person for a in actors}
     }
     watched = [
-        (s, prefix + s.name, 0.0 if a.person else 0.5 * s.length, *getters[a.person])
-        for a, s in zip(actors, states, strict=True)
+        (s, prefix + s.name, 0.0 if a.person else 0.5 * s.length, *getters[a.person]) for a, s in zip(actors, states, strict=True)
     ]
     rate, size, write = 1.0 / dt, _ROW.size, _ROW.pack_into
 

@@ -45,8 +45,10 @@ class MarkingSensor:
     ):  # fmt: skip
         self._rng, self._reach, self._noise = rng, reach, noise
         self._points = np.concatenate([left, right])
+        self._x, self._y = np.ascontiguousarray(self._points.T)
         self._side = np.concatenate([np.full(len(left), 0.5 * lane), np.full(len(right), -0.5 * lane)])
-        self._boxes = Boxes((*o.pose, o.length, o.width) for o in obstacles)
+        self._obstacles = [(o, reach + math.hypot(0.5 * o.length, 0.5 * o.width)) for o in obstacles]
+        self._boxes: dict[tuple[Obstacle, ...], Boxes] = {}
         self._fit = np.zeros(4)
         self.seen = (0, 0)
 
@@ -54,14 +56,18 @@ class MarkingSensor:
         """Return the (4,) coefficients of the lane's middle in the vehicle's frame."""
         noise = self._noise * self._rng.standard_normal(len(self._points))
         eye = np.array([own.x, own.y])
-        offset = self._points - eye
-        ahead, left = (offset @ np.array([[own.cos, -own.sin], [own.sin, own.cos]])).T
-        near = np.flatnonzero((ahead > 0.0) & (ahead * ahead + left * left < self._reach**2))
-        near = near[~self._boxes.hides(eye, self._points[near])]
+        east, north = self._x - own.x, self._y - own.y
+        near = np.flatnonzero((east * east + north * north < self._reach**2) & (east * own.cos + north * own.sin > 0.0))
+        around = tuple([o for o, far in self._obstacles if math.hypot(o.pose[0] - own.x, o.pose[1] - own.y) < far])
+        if around:
+            if around not in self._boxes:
+                self._boxes[around] = Boxes((*o.pose, o.length, o.width) for o in around)
+            near = near[~self._boxes[around].hides(eye, self._points[near])]
         side = self._side[near]
         self.seen = (int(np.count_nonzero(side > 0)), int(np.count_nonzero(side < 0)))
-        x = ahead[near]
-        y = left[near] + noise[near]
+        east, north = east[near], north[near]
+        x = east * own.cos + north * own.sin
+        y = north * own.cos - east * own.sin + noise[near]
         _, c1, c2, c3 = self._fit
         turn = np.arctan(c1 + x * (2.0 * c2 + 3.0 * c3 * x))  # from a marking to the middle, across the lane as known
         x, y = x + side * np.sin(turn), y - side * np.cos(turn)

@@ -126,4 +126,3 @@ def _realised(domain: Any, actor: Actor, name: str, position: Any) -> dict[str, 
 def _front(actor: Actor) -> float:
     """Return how far ahead of the centre SUMO's position of the actor is: a vehicle's is its front bumper."""
     return 0.0 if actor.person else 0.5 * actor.type.length
-
