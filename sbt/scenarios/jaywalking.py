@@ -16,7 +16,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Roles, Metric
+from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import Actor, Obstacle, Scene, State, Until, VehicleType

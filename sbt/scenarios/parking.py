@@ -16,7 +16,7 @@ from sbt.errors import InputError
 from sbt.metrics.geometry import contact_index, rectangle_distance, swept_contact
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Roles, Metric
+from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import Actor, Pose, Scene, State, Until, VehicleType
