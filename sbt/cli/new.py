@@ -58,7 +58,9 @@ def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where scenario.yaml shall go.")],
     *,
     config: Annotated[Path, typer.Option("--from", metavar="MY.sumocfg", help="Your SUMO configuration.")],
-    ego: Annotated[str | None, typer.Option(metavar="ID", help="The vehicle under test; default: the first of the files.")] = None,
+    ego: Annotated[
+        str | None, typer.Option(metavar="ID", help="The vehicle under test; default: the first of the files.")
+    ] = None,
 ) -> None:
     """Write a commented scenario.yaml and campaign.yaml for your own SUMO files, which stay as they are."""
     with clean_stdout():
@@ -99,8 +101,9 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> list[P
     wait = 60 + (float(depart) if re.fullmatch(r"[\d.]+", depart) else 3540)
     step = "" if files.step_length() is not None else "step_length: 0.1            # SUMO's own default is 1 s\n"
     scenario = _SCENARIO.format(
-        folder=folder, config=_relative(config.resolve(), folder), routes=routes, ego=ego, duration=30, wait=f"{wait:g}", step=step,
-        first=next(iter(inputs)), inputs="".join(f"  {name}: {entry}\n" for name, entry in inputs.items()),
+        folder=folder, config=_relative(config.resolve(), folder), routes=routes, ego=ego, duration=30,
+        wait=f"{wait:g}", step=step, first=next(iter(inputs)),
+        inputs="".join(f"  {name}: {entry}\n" for name, entry in inputs.items()),
     )  # fmt: skip
     for name, text in (("scenario.yaml", scenario), ("campaign.yaml", _CAMPAIGN.format(folder=folder))):
         (folder / name).write_text(text)
@@ -126,7 +129,9 @@ def _copied(files: SumoFiles, ego: str, folder: Path) -> Path:
     """
     source = _file_of(files, ego)
     if source.path not in files.routes or source.path.suffix == ".gz":
-        raise InputError(f"the ego must stand in a route file that is named by the configuration, but '{ego}' is in {source.path}")
+        raise InputError(
+            f"the ego must stand in a route file that is named by the configuration, but '{ego}' is in {source.path}"
+        )
     target = folder / source.path.name
     if target.exists():
         raise InputError(f"FOLDER must not have a {source.path.name}, but '{folder}' has: choose another folder")

@@ -119,7 +119,7 @@ def _write_trace(path: Path, states: Trace) -> None:
 
 
 def check(
-    target: Annotated[str, typer.Argument(metavar="TARGET", help="CONFIG.yaml, scenario.yaml, a scenario's name, or file.py:NAME.")],
+    target: Annotated[str, typer.Argument(metavar="TARGET", help="CONFIG.yaml, scenario.yaml, a name, or file.py:NAME.")],
     *,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the runs.")] = 0,
     isolation: Isolation = "auto",

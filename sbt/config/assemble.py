@@ -97,7 +97,8 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     config = loaded.config
     ego = None if config.ego is None else _plain_ego(config.ego, loaded.folder)
     folder = str(loaded.folder.resolve())
-    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, config.simulation.step_length, config.requirement.stl)
+    step, formula = config.simulation.step_length, config.requirement.stl
+    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, step, formula)
 
 
 def _plain_ego(ego: Choice, folder: Path) -> dict[str, Any]:

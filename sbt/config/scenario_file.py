@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -91,13 +92,11 @@ class _Builder:
         """Return the inputs with their correlation, constraints and features."""
         parameters = []
         for name, entry in self._model.inputs.items():
-            law = None
-            if entry.distribution is not None:
-                choice = entry.distribution
-                law = self._problems.attempt(("inputs", name, "distribution"), lambda choice=choice: law_of(choice))
-            made = self._problems.attempt(("inputs", name), lambda name=name, entry=entry, law=law: Parameter(
-                name, entry.min, entry.max, entry.unit, law, entry.kind, entry.description,
-            ))  # fmt: skip
+            law, choice = None, entry.distribution
+            if choice is not None:
+                law = self._problems.attempt(("inputs", name, "distribution"), partial(law_of, choice))
+            make = partial(Parameter, name, entry.min, entry.max, entry.unit, law, entry.kind, entry.description)
+            made = self._problems.attempt(("inputs", name), make)
             if made is not None:
                 parameters.append(made)
         if len(parameters) < len(self._model.inputs):
@@ -142,7 +141,8 @@ class _Builder:
             near = get_close_matches(entry.id, names, 1)
             hint = f" (did you mean '{near[0]}'?)" if near else ""
             known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
-            self._problems.add(("ego",), f"the ego must be a vehicle, trip or flow of the files ({known}), but got '{entry.id}'{hint}")
+            rule = f"the ego must be a vehicle, trip or flow of the files ({known})"
+            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{hint}")
         kind = entry.kind
         if kind is None:
             if entry.settings:
@@ -156,12 +156,12 @@ class _Builder:
     def _metrics(self) -> tuple[Metric, ...]:
         made: dict[str, Metric] = {}
         formula = self._model.requirement.stl
-        entries = [*self._model.metrics, *([] if formula is None else [MetricEntry(stl=formula)])]
+        entries = [*self._model.metrics, *([] if formula is None else [MetricEntry.model_validate({"stl": formula})])]
         if not entries:
             self._problems.add(("metrics",), "a scenario needs at least one metric, but has none")
         for k, entry in enumerate(entries):
             path = ("metrics", k) if k < len(self._model.metrics) else ("requirement", "stl")
-            metric = self._problems.attempt(path, lambda entry=entry: metric_of(entry, self._folder, self._model.ego.id))
+            metric = self._problems.attempt(path, partial(metric_of, entry, self._folder, self._model.ego.id))
             if metric is not None and metric.name in made:
                 self._problems.add(path, f"metrics need different names (name: ...), but got '{metric.name}' twice")
             elif metric is not None:
@@ -197,8 +197,6 @@ class _Builder:
                     self._problems.add(("inputs",), f"{hole.place}: {rule}")
         for name in known:
             if name not in used and self._model.simulate is None:
-                files_read = ", ".join(t.path.name for t in files.templates)
-                self._problems.add(
-                    ("inputs", name), f"an input must stand as a placeholder ${{{name}}} in the files ({files_read}), but does not",
-                    at_key=True,
-                )  # fmt: skip
+                read_files = ", ".join(t.path.name for t in files.templates)
+                rule = f"an input must stand as a placeholder ${{{name}}} in the files ({read_files}), but does not"
+                self._problems.add(("inputs", name), rule, at_key=True)

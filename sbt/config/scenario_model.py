@@ -34,7 +34,9 @@ class _Open(_Strict):
         return dict(self.__pydantic_extra__)
 
 
-Names = Annotated[tuple[Name, ...], BeforeValidator(lambda value: [value] if isinstance(value, str) else value), Field(strict=False)]
+Names = Annotated[
+    tuple[Name, ...], BeforeValidator(lambda value: [value] if isinstance(value, str) else value), Field(strict=False)
+]
 
 
 class SumoEntry(_Strict):
@@ -63,7 +65,8 @@ class EgoEntry(_Open):
 
     id: Name = Field(description="Its id in SUMO.")
     kind: Name | None = Field(
-        default=None, description="A controller (file.py:NAME for one's own), or sumo with model: IDM; null: as the files have it."
+        default=None,
+        description="A controller (file.py:NAME for one's own), or sumo with model: IDM; null: the files' own.",
     )
     set_speed: float | None = Field(default=None, gt=0, description="What a controller keeps (m/s); null: the allowed speed.")
     speed_mode: int = Field(default=32, ge=0, description="SUMO's speed mode under a controller; 24 stops at red lights.")

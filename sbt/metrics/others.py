@@ -45,8 +45,15 @@ def _stretches(trace: Trace, ego: str, other: str) -> Iterator[tuple[slice, Trac
     for first, last in edges.reshape(-1, 2).tolist():
         if last - first > 1 or len(trace.time) == 1:
             i = slice(first, last)
-            columns = (getattr(trace, name)[i][:, at] for name in ("x", "y", "heading", "speed", "acceleration"))
-            yield i, Trace(trace.time[i], ("ego", "co"), *columns, trace.length[at], trace.width[at], trace.ended)
+            yield i, _part(trace, i, at)
+
+
+def _part(trace: Trace, i: slice, at: list[int]) -> Trace:
+    """Return some instants of one or two actors, called ego and co."""
+    return Trace(
+        trace.time[i], ("ego", "co")[: len(at)], trace.x[i][:, at], trace.y[i][:, at], trace.heading[i][:, at],
+        trace.speed[i][:, at], trace.acceleration[i][:, at], trace.length[at], trace.width[at], trace.ended,
+    )  # fmt: skip
 
 
 def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "") -> Metric:
@@ -64,9 +71,7 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
 
     def function(trace: Trace) -> float:
         if metric.alone:
-            k = trace.actors.index(ego)
-            columns = (getattr(trace, what)[:, [k]] for what in ("x", "y", "heading", "speed", "acceleration"))
-            return metric.function(Trace(trace.time, ("ego",), *columns, trace.length[[k]], trace.width[[k]], trace.ended))
+            return metric.function(_part(trace, slice(None), [trace.actors.index(ego)]))
         if other is not None:
             trace.actor(other)
         values = [

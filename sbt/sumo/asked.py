@@ -15,7 +15,7 @@ from sbt.problem.outcome import Status
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import fill
 
-__all__ = ["Asked", "Insertions", "asked_of"]
+__all__ = ["Asked", "Insertions", "asked_of", "number_or_none"]
 
 _TOLERANCE = 1e-3
 _HINT = 'set insertionChecks="none" on the vehicle, or the option insertion-checks: none'
@@ -26,7 +26,7 @@ class Asked:
     """What the files ask of one vehicle's start; None where that is SUMO's to choose.
 
     Attributes:
-        place: `file:line:column` of the vehicle.
+        place: `file:line:column: ` of the vehicle, "" where a loop adds it.
         depart: time (s).
         position: of the front bumper on its lane (m), from its end where negative.
         speed: m/s.
@@ -49,13 +49,20 @@ def asked_of(files: SumoFiles, values: Mapping[str, float], ego: str) -> dict[st
                 continue
 
             def read(key: str, written: Mapping[str, str] = written, place: str = one.lines[name]) -> float | None:
-                try:
-                    return float(fill(written[key], values, place))
-                except (KeyError, ValueError):
-                    return None
+                return number_or_none(fill(written.get(key, ""), values, place))
 
-            found[name] = Asked(one.lines[name], read("depart"), read("departPos"), read("departSpeed"), read("departLane"))
+            found[name] = Asked(
+                f"{one.lines[name]}: ", read("depart"), read("departPos"), read("departSpeed"), read("departLane")
+            )
     return found
+
+
+def number_or_none(value: Any) -> float | None:
+    """Return what SUMO would read as a number; None of words such as `max` or `best`."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return None
 
 
 class Insertions:
@@ -65,6 +72,14 @@ class Insertions:
         self._sumo = sumo
         self._asked = dict(asked)
         self._meant: dict[str, str] = {}
+
+    def expect(self, name: str, asked: Asked) -> None:
+        """Follow one more vehicle."""
+        self._asked[name] = asked
+
+    def forget(self, name: str) -> None:
+        """Follow a vehicle no more."""
+        self._asked.pop(name, None)
 
     def after_step(self, departed: frozenset[str]) -> None:
         """Compare who departed in this step with what was asked.
@@ -94,7 +109,7 @@ class Insertions:
         if asked.depart is not None and departure - asked.depart > dt + _TOLERANCE:
             meant, got = self._meant.get(name, ""), self._behind(name, None)
             raise RunError(
-                Status.INVALID, f"{asked.place}: you asked for '{name}' at t = {asked.depart:g} s{f', {meant}' if meant else ''}; "
+                Status.INVALID, f"{asked.place}you asked for '{name}' at t = {asked.depart:g} s{f', {meant}' if meant else ''}; "
                 f"SUMO inserted it at t = {departure:g} s{f', {got}' if got else ''}: {_HINT}",
             )  # fmt: skip
         position = asked.position
@@ -108,7 +123,7 @@ class Insertions:
         for what, wanted, got, unit in realised:
             if wanted is not None and abs(wanted - got) > _TOLERANCE:
                 raise RunError(
-                    Status.INVALID, f"{asked.place}: you asked for '{name}' with {what} {wanted:g}{unit}, SUMO inserted it with "
+                    Status.INVALID, f"{asked.place}you asked for '{name}' with {what} {wanted:g}{unit}, SUMO inserted it with "
                     f"{got:g}{unit}: {_HINT}",
                 )  # fmt: skip
 

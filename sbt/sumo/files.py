@@ -202,7 +202,9 @@ def _absolute(option: str, value: str, folder: Path) -> str:
     """Return the value with names of existing files absolute, where the option is about files."""
     if not option.endswith(("-file", "-files", "load-state")):
         return value
-    return ",".join(str((folder / name).resolve()) if (folder / name).exists() or option in _FILES else name for name in _split(value))
+    return ",".join(
+        str((folder / name).resolve()) if (folder / name).exists() or option in _FILES else name for name in _split(value)
+    )
 
 
 def _check_net(net: Template) -> None:

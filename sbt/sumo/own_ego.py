@@ -56,7 +56,7 @@ class OwnEgo:
         if self.driver is None or self.driver.kind != SUMO:
             return None
         settings = {("carFollowModel" if k == "model" else k): str(v) for k, v in self.driver.settings}
-        return "<vType id=\"{}\" {}/>".format(EGO_TYPE, " ".join(f'{k}="{v}"' for k, v in settings.items()))
+        return '<vType id="{}" {}/>'.format(EGO_TYPE, " ".join(f'{k}="{v}"' for k, v in settings.items()))
 
     def take_over(self, sumo: Any, rng: np.random.Generator) -> Pilot | None:
         """Give the ego its driver in the step in which it departs.

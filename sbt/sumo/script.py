@@ -20,7 +20,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
-from sbt.sumo.asked import asked_of
+from sbt.sumo.asked import Asked, asked_of, number_or_none
 from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
 from sbt.sumo.session import session
@@ -161,6 +161,7 @@ class Handed:
         self._module: Any = None
         self._watch: Watch | None = None
         self.simulation = _Simulation(self)
+        self.vehicle, self.person = _Commanded(self, "vehicle"), _Commanded(self, "person")
         self.line = ""
 
     def __getattr__(self, name: str) -> Any:
@@ -179,10 +180,12 @@ class Handed:
     def start(self, command: Sequence[str], *_: Any, **__: Any) -> tuple[int, str]:
         """Start SUMO as `traci.start` does; the program's name, ports and labels do not matter."""
         if self._module is not None:
-            raise RunError(Status.FAILED, "sumo.start must be called once, and not where the scenario gives files, but was called again")
+            raise RunError(
+                Status.FAILED, "sumo.start must be called once, by the loop or (files) by the scenario, but was called again"
+            )
         options = options_of_command(list(command)[1:], self._own.folder)
         self.begin(SumoFiles.of(options, self._own.folder, "sumo.start"))
-        version: tuple[int, str] = self._module.getVersion()
+        version: tuple[int, str] = self.__getattr__("getVersion")()
         return version
 
     def begin(self, files: SumoFiles) -> None:
@@ -225,6 +228,8 @@ class Handed:
             if isinstance(error, RunError) or "TraCI" in type(error).__name__:
                 raise
             raise RunError(Status.FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}") from error
+        if self._watch is not None and self._watch.over:  # the loop held it with a bare `except`
+            return self._watch.over
         if self._module is not None:
             self._module.simulationStep()  # SUMO keeps pointers to what was moved since the last step, which a load deletes
         return "loop"
@@ -249,6 +254,40 @@ class _Simulation:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._handed.__getattr__("simulation"), name)
+
+
+class _Commanded:
+    """The module's `vehicle` or `person`: commands must be finite, and what is added starts as asked or not at all."""
+
+    def __init__(self, handed: Handed, domain: str):
+        self._handed, self._domain = handed, domain
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._handed.__getattr__(self._domain), name)
+        if name.startswith("get"):
+            return function
+        return partial(self._command, name, function)
+
+    def _command(self, name: str, function: Any, *args: Any, **more: Any) -> Any:
+        for value in (*args, *more.values()):
+            if isinstance(value, float) and not math.isfinite(value):  # SUMO takes it and says nothing
+                shown = ", ".join(map(repr, (*args, *more.values())))
+                raise RunError(Status.FAILED, f"a loop must give finite numbers, but called sumo.{self._domain}.{name}({shown})")
+        done = function(*args, **more)
+        if self._domain == "vehicle" and name == "add":
+            self._expect(*args, **more)
+        elif self._domain == "vehicle" and name.startswith(("moveTo", "remove")) and args:
+            self._handed.watch.forget(str(args[0]))
+        return done
+
+    def _expect(
+        self, vehID: str, routeID: str = "", typeID: str = "", depart: Any = None, departLane: Any = "first",  # noqa: N803
+        departPos: Any = "base", departSpeed: Any = "0", *_: Any, **__: Any,  # noqa: N803
+    ) -> None:  # fmt: skip
+        """Note what `vehicle.add` asks for; the names are SUMO's."""
+        when = self._handed.simulation.getTime() if depart in (None, "now") else number_or_none(depart)
+        asked = Asked("", when, *map(number_or_none, (departPos, departSpeed, departLane)))
+        self._handed.watch.expect(vehID, asked)
 
 
 @contextlib.contextmanager

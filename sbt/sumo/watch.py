@@ -95,6 +95,19 @@ class Watch:
         self._timeout = timeout
         self._deadline = math.inf if timeout is None else time.monotonic() + timeout
 
+    @property
+    def over(self) -> str:
+        """Why the run is over, "" while it is not."""
+        return "" if self._over is None else self._over.ended
+
+    def expect(self, name: str, asked: Asked) -> None:
+        """Compare the start of a vehicle that the loop adds with what it asks for."""
+        self._insertions.expect(name, asked)
+
+    def forget(self, name: str) -> None:
+        """Do not compare the start of a vehicle that the loop moves."""
+        self._insertions.forget(name)
+
     def before_step(self) -> None:
         """Let the ego's controller act.
 
@@ -159,9 +172,8 @@ class Watch:
         nobody = simulation.getMinExpectedNumber() == 0
         if nobody or simulation.getTime() - self._first > self._watching.wait:
             why = "nobody is left to come" if nobody else self._insertions.waiting(self._ego)
-            raise RunError(
-                Status.INVALID, f"the ego '{self._ego}' must depart within {self._watching.wait:g} s, but had not at {self._at()}; {why}"
-            )
+            rule = f"the ego '{self._ego}' must depart within {self._watching.wait:g} s"
+            raise RunError(Status.INVALID, f"{rule}, but had not at {self._at()}; {why}")
 
     def _depart(self) -> None:
         """Begin to watch."""
@@ -174,10 +186,9 @@ class Watch:
     def _leave(self) -> None:
         if self._watching.ego.may_leave:
             self._end("left")
-        raise RunError(
-            Status.FAILED, f"the ego '{self._ego}' must stay for the duration of {self._watching.duration:g} s, but it left after "
-            f"{self._t + self._dt:g} s, at the end of its route: make the route longer or the duration shorter, or set may_leave: true",
-        )  # fmt: skip
+        rule = f"the ego '{self._ego}' must stay for the duration of {self._watching.duration:g} s"
+        advice = "make the route longer or the duration shorter, or set may_leave: true"
+        raise RunError(Status.FAILED, f"{rule}, but it left after {self._t + self._dt:g} s, at the end of its route: {advice}")
 
     def _observe(self) -> None:
         """Append the states of everybody who is there."""
@@ -237,7 +248,9 @@ class Watch:
             RunError: the ego never departed.
         """
         if not self._rows:
-            raise RunError(Status.INVALID, f"the ego '{self._ego}' must depart, but it had not when the loop ended at {self._at()}")
+            raise RunError(
+                Status.INVALID, f"the ego '{self._ego}' must depart, but had not when the loop ended at {self._at()}"
+            )
         names = tuple(self._states)
         column = {name: k for k, name in enumerate(names)}
         table = np.full((len(self._rows), len(names), 5), np.nan)
@@ -246,7 +259,7 @@ class Watch:
                 table[i, column[name]] = state
         x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
         return Trace(
-            np.arange(len(table)) * self._dt, names, x, y, heading, speed, acceleration,
+            np.arange(len(table), dtype=np.float64) * self._dt, names, x, y, heading, speed, acceleration,
             np.array([self._states[n].length for n in names]), np.array([self._states[n].width for n in names]),
             ended, tuple(self._reported),
         )  # fmt: skip

@@ -1,0 +1,106 @@
+"""Metrics where road users come and go: of every stretch, the worst, and nothing invented."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sbt.errors import InputError, RunError
+from sbt.execution.worker import run_job
+from sbt.metrics.comfort import deceleration_max
+from sbt.metrics.conflict import distance_min
+from sbt.metrics.longitudinal import FAR, HORIZON, collision, drac_max, ttc_min
+from sbt.metrics.others import in_traffic, stretches, worst_signal
+from sbt.metrics.stl import stl
+from sbt.problem.outcome import Job, Status
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.problem.trace import Trace
+
+N = 41
+TIME = np.arange(N) * 0.1
+
+
+def traffic(**others: tuple[float, float, float, slice]) -> Trace:
+    """An ego `v` at 20 m/s along x, and others: (x at 0, y, speed, when they are there)."""
+    names = ("v", *others)
+    x, y, speed = (np.full((N, len(names)), np.nan) for _ in range(3))
+    x[:, 0], y[:, 0], speed[:, 0] = 20.0 * TIME, 0.0, 20.0
+    for k, (start, side, v, when) in enumerate(others.values(), 1):
+        x[when, k], y[when, k], speed[when, k] = (start + v * TIME)[when], side, v
+    heading = np.where(np.isnan(x), np.nan, 0.0)
+    return Trace(TIME, names, x, y, heading, speed, heading.copy(), np.full(len(names), 5.0), np.full(len(names), 1.8))
+
+
+ALL = slice(None)
+
+
+def test_the_worst_of_all_others_counts_in_either_direction():
+    others = {"slow": (100.0, 0.0, 10.0, ALL), "fast": (30.0, 0.0, 30.0, ALL), "beside": (100.0, 8.0, 0.0, ALL)}
+    trace, alone = traffic(**others), {name: traffic(**{name: start}) for name, start in others.items()}
+    for metric, worst in ((ttc_min(passed=HORIZON), min), (distance_min(), min), (drac_max(), max), (collision(), max)):
+        single = [in_traffic(metric, "v", name)(one) for name, one in alone.items()]
+        assert in_traffic(metric, "v")(trace) == worst(single)
+        assert in_traffic(metric, "v", "fast")(trace) == single[1]
+
+
+def test_who_comes_and_goes_is_measured_while_there():
+    """Far away at first and at last; a car that jumps in from NaN sweeps over nobody."""
+    trace = traffic(one=(45.0, 0.0, 10.0, slice(10, 20)), two=(200.0, 0.0, 20.0, slice(0, 5)))
+    parts = stretches(trace, "v", "one")
+    assert [(i.start, i.stop, part.actors) for i, part in parts] == [(10, 20, ("ego", "co"))]
+    gap = 45.0 - 10.0 * TIME[19] - 5.0
+    assert in_traffic(ttc_min(passed=HORIZON), "v")(trace) == pytest.approx(gap / 10.0)
+    assert in_traffic(collision(), "v")(trace) == 0.0
+    twice = np.r_[5:10, 20:25]
+    assert len(stretches(traffic(one=(45.0, 0.0, 10.0, twice)), "v", "one")) == 2
+
+
+def test_without_anybody_the_metric_has_its_value_without():
+    for metric in (ttc_min(), distance_min(), drac_max(), collision()):
+        assert in_traffic(metric, "v")(traffic()) == metric.without
+    assert in_traffic(deceleration_max(), "v")(traffic()) == 0.0
+
+
+def test_an_actor_that_never_is_there_is_told():
+    with pytest.raises(RunError, match="no actor 'truck' in the trace, there are: v, one"):
+        in_traffic(ttc_min(), "v", "truck")(traffic(one=(50.0, 0.0, 10.0, ALL)))
+
+
+def test_signals_in_traffic_are_the_worst_at_every_instant():
+    trace = traffic(one=(45.0, 0.0, 10.0, slice(10, 20)), two=(60.0, 0.0, 20.0, ALL))
+    gap = worst_signal(trace, "gap", "v")
+    first = 45.0 - 10.0 * TIME - 5.0
+    assert gap[10:20] == pytest.approx(np.minimum(first, 55.0)[10:20])
+    assert gap[:10] == pytest.approx(55.0)
+    assert worst_signal(trace, "one.gap", "v")[:10] == pytest.approx(FAR)
+    assert worst_signal(trace, "two.speed", "v") == pytest.approx(20.0)
+    assert stl("G(gap > 20)", ego="v", other=None)(trace) == pytest.approx(first[19] - 20.0)
+    with pytest.raises(InputError, match=r"in traffic 'lateral' needs a road user, such as lead\.lateral"):
+        stl("G(lateral > 1)", ego="v", other=None)(trace)
+    with pytest.raises(RunError, match=r"one\.speed must be there at every instant"):
+        stl("G(one.speed > 1)", ego="v", other=None)(trace)
+
+
+def test_absent_is_nan_in_every_state_and_the_ego_never_is():
+    """What a worker lets through: NaN in all states of another one; neither infinity, nor a part, nor the ego."""
+    good = traffic(one=(45.0, 0.0, 10.0, slice(10, 20)))
+    half, gone, wild = good.x.copy(), good.x.copy(), good.x.copy()
+    half[12, 1], gone[3, 0], wild[12, 1] = np.nan, np.nan, np.inf
+    third = np.arange(N)[:, None] == 3
+    all_gone = {name: np.where(third, np.nan, getattr(good, name)) for name in ("x", "y", "heading", "speed")}
+    traces = (good, *(dataclasses.replace(good, x=x) for x in (half, gone, wild)), dataclasses.replace(good, **all_gone))
+    found = []
+    for trace in traces:
+        scenario = LogicalScenario(
+            "t", ParameterSpace((Parameter("a", 0, 1),)), Requirement("collision", CriticalInterval(low=1.0)),
+            lambda values, seed, trace=trace: trace, (in_traffic(collision(), "v"),),
+        )  # fmt: skip
+        found.append(run_job(scenario, Job(0, {"a": 0.5}, 1)).status)
+    assert found == [Status.OK] + [Status.FAILED] * 4
+    assert len(good.rows()) == N + 10
+    assert good.identical(dataclasses.replace(good, x=good.x.copy()))
