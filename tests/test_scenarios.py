@@ -161,7 +161,7 @@ def test_jaywalking_is_no_safer_in_rain_or_with_a_later_reaction() -> None:
 
 @pytest.mark.sumo
 def test_sumos_own_models_are_refused_where_they_see_nothing() -> None:
-    for name in ("jaywalking", "lane_keeping", "parking"):
+    for name in ("following", "jaywalking", "lane_keeping", "parking"):
         scenario = load("scenarios", name).configured(ego={"kind": "sumo", "model": "IDM"})
         with pytest.raises((InputError, RunError), match=r"ego\.kind"):
             scenario.run(centre(scenario), 0)

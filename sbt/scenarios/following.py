@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from sbt.errors import InputError
 from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
@@ -40,6 +41,8 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
         time_gap=values["f_safetyDistanceTimeGap"], distance_min=distance, aeb_distance=distance, aeb_reserve=None,
         lag=values["v_t_1"], lag_2=values["v_t_2"], reaction_time=values["v_delay"],
     )  # fmt: skip
+    if driver is None:
+        raise InputError("ego.kind must be a controller in following: eight inputs are its settings, SUMO's models have others")
     profile = SpeedProfile(values["a_co_1"], values["v_co_max"] / 3.6, values["t_v_co_max"], -values["a_co_2"])
     front = START + values["d_0"] + CAR.length
     return Scene(
