@@ -12,6 +12,7 @@ is often only on file descriptor 2. All of that stays in here. Three isolation l
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import os
 import sys
