@@ -37,7 +37,8 @@ Changed = Callable[..., Path]
 def files_of(page: str, folder: Path) -> None:
     text = (TUTORIALS / f"{page}.md").read_text()
     for name, content in re.findall(r"^```\w+ (\S+)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
-        (folder / name).write_text(content)
+        if not name.startswith("+"):
+            (folder / name).write_text(content)
 
 
 @pytest.fixture
@@ -145,6 +146,13 @@ def test_what_is_wrong_with_the_files_is_said_before_any_run(study, changes, sai
     done = CliRunner().invoke(app, ["run", str(path.parent / "campaign.yaml")])
     assert done.exit_code == 2
     assert not (path.parent / "results").exists()
+
+
+def test_a_scenario_is_no_campaign(study):
+    done = CliRunner().invoke(app, ["run", str(study())])
+    assert (done.exit_code, "this is a scenario" in done.output) == (2, True)
+    schema = json.loads(CliRunner().invoke(app, ["schema", "scenario"]).stdout)
+    assert {"sumo", "inputs", "ego", "duration", "requirement"} <= set(schema["properties"])
 
 
 def test_everything_wrong_is_told_at_once(study):
@@ -421,3 +429,35 @@ def test_a_city_with_traffic_lights(city):
     metrics = scenario.measure(trace)
     assert all(np.isfinite(list(metrics.values())))
     assert trace.identical(scenario.simulate({"flow": 900.0}, 2))
+
+
+def test_a_controller_sees_red_lights(tmp_path):
+    """It comes to the stop line only once the light is green; without eyes for lights it drives on."""
+    program = shutil.which("netgenerate")
+    if program is None:
+        pytest.skip("netgenerate is not installed (pip install 'sumo-sbt[tools]')")
+    environment = {k: v for k, v in os.environ.items() if k != "SUMO_HOME"}
+    command = [program, "--grid", "--grid.number", "5", "--grid.length", "200", "--tls.guess", "-L", "2", "-o", "grid.net.xml"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, env=environment)
+    (tmp_path / "one.rou.xml").write_text('<routes><trip id="ego" depart="${depart}" from="A2B2" to="D2E2" departSpeed="max"/></routes>')
+
+    def slowest(ego: str, depart: float) -> tuple[float, float]:
+        path = tmp_path / f"scenario{len(list(tmp_path.iterdir()))}.yaml"  # a scenario is loaded once a process
+        path.write_text(
+            "sumo: {net: grid.net.xml, routes: one.rou.xml}\ninputs: {depart: {min: 0, max: 90, unit: s}}\n"
+            f"ego: {{id: ego, may_leave: true{ego}}}\nduration: 40\nmetrics: [deceleration_max]\n"
+            "requirement: {metric: deceleration_max, critical: [9, .inf]}\n"
+        )
+        _, trace = simulated(path, depart=depart)
+        return float(trace.actor("ego").speed.min()), float(-trace.actor("ego").acceleration.min())
+
+    departs = (0.0, 20.0, 40.0, 60.0)
+    by_sumo = [slowest("", depart)[0] < 5.0 for depart in departs]
+    assert set(by_sumo) == {True, False}, "red for some, green for others"
+    for ego, expected in ((", kind: acc_aeb", by_sumo), (", kind: acc_aeb, lights: false", [False] * 4)):
+        found = []
+        for depart in departs:
+            speed, braking = slowest(ego, depart)
+            found.append(speed < 5.0)
+            assert braking < 4.0
+        assert found == expected

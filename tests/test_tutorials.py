@@ -18,10 +18,12 @@ PAGES = sorted((Path(__file__).resolve().parent.parent / "docs" / "tutorials").g
 
 
 def extract(page: Path, folder: Path) -> list[str]:
-    """Write the blocks with a file's name beside the language, and return the commands."""
+    """Write the blocks with a file's name beside the language (`+name` goes on with it), and return the commands."""
     text = page.read_text()
     for name, content in re.findall(r"^```\w+ (\S+)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
-        (folder / name).write_text(content)
+        path = folder / name.removeprefix("+")
+        before = path.read_text() + "\n\n" if name.startswith("+") else ""
+        path.write_text(before + content)
     return [line for block in re.findall(r"^```bash\n(.*?)^```", text, re.MULTILINE | re.DOTALL) for line in block.splitlines()]
 
 

@@ -64,8 +64,17 @@ def _summary(thing: Any) -> str:
     return (text.strip().splitlines() or [""])[0] + unit
 
 
-def schema() -> None:
-    """Print the JSON schema of configurations, for editors."""
+def schema(
+    kind: Annotated[str, typer.Argument(metavar="[campaign|scenario]", help="Of which file.")] = "campaign",
+) -> None:
+    """Print the JSON schema of configurations or of scenario.yaml, for editors."""
+    if kind not in ("campaign", "scenario"):
+        raise InputError(f"a schema must be campaign or scenario, but got '{kind}'")
+    if kind == "scenario":
+        from sbt.config.scenario_model import schema as scenario_schema
+
+        print(json.dumps(scenario_schema(), indent=2))
+        return
     from sbt.config.load import schema as configuration_schema
 
     print(json.dumps(configuration_schema(), indent=2))

@@ -116,6 +116,9 @@ def checked(model: type[M], text: str, overrides: Sequence[str], name: str) -> t
         raise ConfigError([f"{name}:1:1: a configuration needs at least {needed}, but it is empty"])
     if not isinstance(data, dict):
         raise ConfigError([f"{name}:1:1: a configuration must be a mapping (key: value), but got {_shown(data)}"])
+    if "campaign" not in data and {"sumo", "simulate"} & set(data):
+        rule = "a configuration must name a campaign, but this is a scenario"
+        raise ConfigError([f"{name}:1:1: {rule}; run one with scenario: {name}"])
     data, source, wrong = _overridden(data, source, overrides)
     wrong = doubled + wrong
     try:

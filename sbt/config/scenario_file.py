@@ -147,11 +147,11 @@ class _Builder:
         if kind is None:
             if entry.settings:
                 self._problems.add(("ego",), f"settings need a kind (a controller, or sumo), but got {', '.join(entry.settings)}")
-            return OwnEgo(entry.id, None, entry.set_speed, entry.speed_mode, entry.may_leave)
+            return OwnEgo(entry.id, None, entry.set_speed, entry.lights, entry.may_leave)
         if ".py:" in kind:
             kind = str(self._folder / Path(kind).expanduser())
         driver = self._problems.attempt(("ego",), lambda: Ego.of(kind, **entry.settings))
-        return OwnEgo(entry.id, driver, entry.set_speed, entry.speed_mode, entry.may_leave)
+        return OwnEgo(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave)
 
     def _metrics(self) -> tuple[Metric, ...]:
         made: dict[str, Metric] = {}

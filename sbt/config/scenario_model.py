@@ -8,7 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, V
 
 from sbt.config.model import Choice, Condition, CorrelationEntry, Formula, Name, RequirementChange
 
-__all__ = ["EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ScenarioModel", "SumoEntry"]
+__all__ = ["EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ScenarioModel", "SumoEntry", "schema"]
 
 
 def _under(key: str) -> BeforeValidator:
@@ -69,7 +69,7 @@ class EgoEntry(_Open):
         description="A controller (file.py:NAME for one's own), or sumo with model: IDM; null: the files' own.",
     )
     set_speed: float | None = Field(default=None, gt=0, description="What a controller keeps (m/s); null: the allowed speed.")
-    speed_mode: int = Field(default=32, ge=0, description="SUMO's speed mode under a controller; 24 stops at red lights.")
+    lights: bool = Field(default=True, description="To a controller a red light is an obstacle at its stop line.")
     may_leave: bool = Field(default=False, description="Arriving before the duration is over is no failure.")
 
 
@@ -125,3 +125,13 @@ class ScenarioModel(_Strict):
         if value is not None and ".py:" not in value:
             raise ValueError(f"a loop must be file.py:NAME, but got '{value}'")
         return value
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON schema of a `scenario.yaml`."""
+    found = {k: v for k, v in ScenarioModel.model_json_schema().items() if k != "title"}
+    for name in ("sumo", "ego"):  # a bare text stands for {config: text} and {id: text}
+        found["properties"][name] = {"anyOf": [{"type": "string"}, found["properties"][name]]}
+    items = found["properties"]["metrics"]
+    items["items"] = {"anyOf": [{"type": "string"}, items["items"]]}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "sumo-sbt scenario", **found}

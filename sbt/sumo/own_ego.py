@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -22,6 +23,13 @@ _KEPT = ("Length", "Width", "Height", "VehicleClass", "MaxSpeed", "MinGap", "Acc
          "Imperfection", "SpeedFactor", "SpeedDeviation", "Color", "MaxSpeedLat", "MinGapLat", "LateralAlignment")  # fmt: skip
 _ATTRIBUTE = {"Imperfection": "sigma", "VehicleClass": "vClass", "SpeedDeviation": "speedDev", "LateralAlignment": "latAlignment"}
 _FASTEST = 1e4
+_COMFORT = 3.0
+"""Deceleration with which one still stops at yellow (m/s^2)."""
+_LINE, _ACROSS = 0.1, 3.0
+"""Length and width of a stop line (m)."""
+_OBEDIENT = 32
+"""SUMO's speed mode in which a command is all that counts. (24, 28 and 30, which know lights, stop at a red one in a single
+step, with 78 m/s^2; 31 brakes for everything itself.)"""
 _FOR_THE_ROUTE = 513
 """SUMO's lane-change mode in which only the route is a reason, and others are respected."""
 
@@ -36,15 +44,15 @@ class OwnEgo:
         id: SUMO's id of it.
         driver: a controller, or (`kind: sumo`) another car-following model; None: as the files have it.
         set_speed: what a controller would keep (m/s); None: the speed allowed where it departs.
-        speed_mode: SUMO's speed mode while a controller drives: 32 obeys it in everything, 24 stops at red
-            lights and gives way all the same. Lanes are changed as the route needs it, or the controller says.
+        lights: a red traffic light is a standing obstacle at its stop line to a controller. It decides alone on
+            the speed (SUMO's speed mode 32); lanes are changed as the route needs it, or the controller says.
         may_leave: reaching the end of its route before the duration is no failure.
     """
 
     id: str
     driver: Ego | None = None
     set_speed: float | None = None
-    speed_mode: int = 32
+    lights: bool = True
     may_leave: bool = False
 
     def driven_by(self, driver: Ego) -> OwnEgo:
@@ -56,7 +64,7 @@ class OwnEgo:
         if self.driver is None or self.driver.kind != SUMO:
             return None
         settings = {("carFollowModel" if k == "model" else k): str(v) for k, v in self.driver.settings}
-        return '<vType id="{}" {}/>'.format(EGO_TYPE, " ".join(f'{k}="{v}"' for k, v in settings.items()))
+        return '<vType id="{}" {}/>'.format(EGO_TYPE, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
 
     def take_over(self, sumo: Any, rng: np.random.Generator) -> Pilot | None:
         """Give the ego its driver in the step in which it departs.
@@ -73,12 +81,13 @@ class OwnEgo:
         controller = self.driver.driver(rng, allowed if self.set_speed is None else self.set_speed)
         if controller is None:
             raise InputError(f"ego.kind must name a controller, but got '{self.driver.kind}'")
-        sumo.vehicle.setSpeedMode(self.id, self.speed_mode)
+        sumo.vehicle.setSpeedMode(self.id, _OBEDIENT)
         sumo.vehicle.setLaneChangeMode(self.id, _FOR_THE_ROUTE)
         act = controller.act
 
         def pilot(t: float, own: State, others: tuple[State, ...]) -> None:
-            action = act(t, own, others)
+            light = _red_light(sumo, own) if self.lights else None
+            action = act(t, own, others if light is None else (*others, light))
             if action.pose is not None:
                 raise RunError(Status.FAILED, f"a controller of '{self.id}' must give speeds, but gave the pose {action.pose}")
             speed = _speed_after(action.acceleration, action.speed, own)
@@ -101,6 +110,18 @@ class OwnEgo:
         factor = given.get("speedFactor", sumo.vehicle.getSpeedFactor(self.id))
         sumo.vehicle.setType(self.id, EGO_TYPE)
         sumo.vehicle.setSpeedFactor(self.id, float(factor))
+
+
+def _red_light(sumo: Any, own: State) -> State | None:
+    """Return the stop line of the next light, standing across the way, if it is red, or yellow and one can stop comfortably."""
+    for _, _, distance, color in sumo.vehicle.getNextTLS(own.name)[:1]:
+        if color in "ru" or (color == "y" and own.speed**2 < 2.0 * _COMFORT * distance):
+            line = State("red light", _LINE, _ACROSS, own.step)
+            line.turn(own.angle)
+            ahead = 0.5 * (own.length + _LINE) + distance
+            line.x, line.y = own.x + ahead * own.cos, own.y + ahead * own.sin
+            return line
+    return None
 
 
 def _speed_after(acceleration: float | None, speed: float | None, own: State) -> float | None:
