@@ -33,15 +33,27 @@ NAMES = ("crossing_pedestrian", "highway_merge", "roundabout_entry", "unprotecte
 CRITICAL = [
     (
         "crossing_pedestrian",
-        {"v_ego": 48.0612, "v_ped": 2.7839, "t_ped": 0.0093, "flow_co": 185.6115, "ego_decel": 3.8152,
-         "ego_jmCrossingGap": 3.6307},
-        1524365847,
+        {"v_ego": 50.9239, "v_ped": 2.892, "t_ped": 0.3784, "flow_co": 110.9939, "ego_decel": 3.2014,
+         "ego_jmCrossingGap": 1.1114},
+        1548870491,
+    ),
+    (
+        "highway_merge",
+        {"flow_co": 1135.702, "v_co": 80.5498, "v_ego": 76.8172, "ego_accel": 2.7407, "ego_lcAssertive": 1.7904,
+         "ego_tau": 0.4916},
+        401733047,
     ),
     (
         "roundabout_entry",
         {"flow_co": 981.6321, "v_co": 33.2299, "p_leave": 0.4287, "tau_co": 0.6421, "v_ego": 29.3729, "ego_accel": 2.9647,
          "ego_impatience": 0.5595, "ego_jmTimegapMinor": 0.3225},
         1242574842,
+    ),
+    (
+        "unprotected_left_turn",
+        {"flow_co": 774.4014, "v_co": 48.3519, "v_ego": 43.0047, "ego_accel": 2.1214, "ego_impatience": 0.7719,
+         "ego_jmTimegapMinor": 0.259},
+        880398003,
     ),
 ]  # fmt: skip
 """Critical runs of the coverage campaigns, rounded."""
