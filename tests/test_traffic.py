@@ -188,6 +188,15 @@ def test_a_python_controller_drives_along_the_route(tmp_path: Path) -> None:
 
 
 @pytest.mark.sumo
+@pytest.mark.parametrize("name", NAMES)
+def test_controllers_start_at_every_corner(name: str) -> None:
+    scenario = load("scenarios", name).configured(ego={"kind": "acc_aeb"})
+    for values in ({p.name: p.low for p in scenario.space.parameters}, {p.name: p.high for p in scenario.space.parameters}):
+        ego = scenario.simulate(values, 3).actor("ego")
+        assert ego.speed[0] == pytest.approx(values["v_ego"] / 3.6)
+
+
+@pytest.mark.sumo
 def test_types_of_many_runs_leave_one_file() -> None:
     scenario = load("scenarios", "unprotected_left_turn")
     for seed in range(3):

@@ -273,7 +273,7 @@ class Configuration(_Strict):
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel, name: formula.")
     ego: Choice | None = Field(
         default=None,
-        description="The AV under test: a controller or one of SUMO's models; a setting {min, max} is an input; null: the scenario's own.",
+        description="The AV: a controller or SUMO's models; a setting {min, max} is an input; null: the scenario's own.",
     )
     simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates; default: the scenario's.")
     seed: int = Field(default=0, ge=0, description="Seed of everything random in the campaign.")
