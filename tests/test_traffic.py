@@ -284,3 +284,19 @@ def test_metrics_among_many_take_the_worst_of_all() -> None:
     assert (struck()(crash), nearest_distance()(crash), nearest_ttc()(crash), time_left()(crash)) == (1.0, 0.0, 0.0, 0.0)
     assert struck_speed()(crash) == pytest.approx(4.0)
     assert struck()(trace(far)) == 0.0
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("name", NAMES)
+def test_nobody_leaves_the_road_while_ego_waits_for_ever(name: str, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "from sbt.sumo.actors import Action\n\n\nclass Stands:\n    def __init__(self, rng, set_speed):\n        pass\n\n"
+        "    def act(self, t, own, others):\n        return Action(acceleration=-9.0, speed=0.0)\n"
+    )
+    scenario = load("scenarios", name).configured(ego={"kind": f"{tmp_path}/own.py:Stands"})
+    fastest = {p.name: p.high for p in scenario.space.parameters} | {"flow_co": scenario.space.parameters[0].low}
+    if name == "crossing_pedestrian":
+        fastest["flow_co"] = 600.0
+    for seed in range(3):
+        trace_of_run = scenario.simulate(fastest, seed)
+        assert trace_of_run.ended == "duration"

@@ -35,9 +35,9 @@ OVER = ("14#0", "-14#0", "-15")
 PACE = 0.05
 """Standard deviation of the pedestrian's speed as a share of `v_ped`: nobody walks by the clock."""
 WALKER = VehicleType(0.5, 0.5, (("vClass", "pedestrian"), ("minGap", "0.25")))
-ONCOMING = Column("oncoming", BACK, 1, LIMIT)
-NEAREST = 90.0
-"""Foremost start of an oncoming car, on the 95 m before the junction behind the crossing (m)."""
+ONCOMING = Column("oncoming", BACK, 1, LIMIT, spread=0.05)
+NEAREST = 60.0
+"""Foremost start of an oncoming car, on the 95 m before the junction behind the crossing (m): none leaves the town in time."""
 PAVEMENTS = (("14#1", "13"), ("-14#0", "-15"))
 WALKERS = 3.0
 """Mean number of other walkers."""
@@ -45,7 +45,7 @@ PASSED = 10.0
 """How far behind the crossing ego has passed it (m)."""
 CROSSING = (297.46, 285.96)
 """Middle of the crossing (m)."""
-DURATION = 25.0
+DURATION = 23.0
 """Longest time that is looked at (s)."""
 EGO = Ego.of("sumo", jmCrossingGap={"min": 0.0, "max": 10.0}, decel={"min": 2.5, "max": 5.0})
 

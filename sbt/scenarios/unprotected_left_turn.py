@@ -34,8 +34,8 @@ CLEAR = 15.0
 """y beyond which ego has left the junction (m)."""
 HORIZON = 5.0
 """A car that comes later to where ego has been was not bothered (s)."""
-DURATION = 40.0
-"""Longest time that is looked at (s)."""
+DURATION = 38.0
+"""Longest time that is looked at (s); the fastest oncoming car is still there then."""
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
 ONCOMING = Column("oncoming", ("in_east", "out_west"), 0, LIMIT)
 
