@@ -309,7 +309,10 @@ class Configuration(_Strict):
         description="Conditions on inputs that every concrete scenario meets, such as 'v_ego - v_co < 30'.",
     )
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel, name: formula.")
-    ego: Choice | None = Field(default=None, description="The AV under test: a controller; null: the scenario's own.")
+    ego: Choice | None = Field(
+        default=None,
+        description="The AV: a controller or SUMO's models; a setting {min, max} is an input; null: the scenario's own.",
+    )
     simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates; default: the scenario's.")
     seed: int = Field(default=0, ge=0, description="Seed of everything random in the campaign.")
     budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")

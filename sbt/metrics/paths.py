@@ -48,9 +48,7 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str = "co") -> Vector:
         dx, dy = q.x - p.x, q.y - p.y  # (t, k)
         moved = np.hypot(np.diff(dx, axis=1), np.diff(dy, axis=1))
         rows, steps = np.nonzero(np.hypot(dx[:, 1:], dy[:, 1:]) <= reach + moved)  # circles: the exact test only there
-        share = contact_share(
-            _picked(a, p, rows, steps + 1), _picked(b, q, rows, steps + 1), dx[rows, steps], dy[rows, steps]
-        )
+        share = contact_share(_picked(a, p, rows, steps + 1), _picked(b, q, rows, steps + 1), dx[rows, steps], dy[rows, steps])
         np.minimum.at(times, near[rows], _STEP * (steps + share))
     contact = first_contact(trace, ego, other)
     if contact is not None:

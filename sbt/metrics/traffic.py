@@ -88,8 +88,6 @@ def others_braking(ego: str = "ego") -> Metric:
     )
 
 
-
-
 OTHERS_BRAKING_MAX = others_braking()
 PET_EGO_FIRST = time_left()
 TTC_PATH_MIN = nearest_ttc()

@@ -32,10 +32,12 @@ STREET = ("15", "14#0", "14#1", "13")
 BACK = ("-13", "-14#1", "-14#0", "-15")
 OVER = ("14#0", "-14#0", "-15")
 """Where the pedestrian walks: along ego's side, over the crossing, and back along the other."""
+PACE = 0.05
+"""Standard deviation of the pedestrian's speed as a share of `v_ped`: nobody walks by the clock."""
 WALKER = VehicleType(0.5, 0.5, (("vClass", "pedestrian"), ("minGap", "0.25")))
-ONCOMING = Column("oncoming", BACK, 1, LIMIT)
-NEAREST = 90.0
-"""Foremost start of an oncoming car, on the 95 m before the junction behind the crossing (m)."""
+ONCOMING = Column("oncoming", BACK, 1, LIMIT, spread=0.05)
+NEAREST = 60.0
+"""Foremost start of an oncoming car, on the 95 m before the junction behind the crossing (m): none leaves the town in time."""
 PAVEMENTS = (("14#1", "13"), ("-14#0", "-15"))
 WALKERS = 3.0
 """Mean number of other walkers."""
@@ -43,7 +45,7 @@ PASSED = 10.0
 """How far behind the crossing ego has passed it (m)."""
 CROSSING = (297.46, 285.96)
 """Middle of the crossing (m)."""
-DURATION = 25.0
+DURATION = 23.0
 """Longest time that is looked at (s)."""
 EGO = Ego.of("sumo", jmCrossingGap={"min": 0.0, "max": 10.0}, decel={"min": 2.5, "max": 5.0})
 
@@ -51,13 +53,14 @@ EGO = Ego.of("sumo", jmCrossingGap={"min": 0.0, "max": 10.0}, decel={"min": 2.5,
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
     """Return ego, the pedestrian who reaches the kerb `t_ped` after ego would reach the crossing, and the others."""
     speed, walk = values["v_ego"] / 3.6, values["v_ped"]
+    pace = walk * (1.0 + PACE * float(np.clip(rng.standard_normal(), -2.0, 2.0)))
     driver = ego.driver(rng, speed)
     start = BEFORE + GAP + BLOCK - DISTANCE
     way = walk * (DISTANCE / speed + values["t_ped"])
     cars = ONCOMING.draw(rng, values["flow_co"], LIMIT, NEAREST, 0.0)
     actors = (
         Actor("ego", STREET, 1, start, speed, driver, automated(ego, speed, LIMIT)),
-        Actor("ped", OVER, 0, BLOCK - way, walk, type=WALKER, person=True),
+        Actor("ped", OVER, 0, BLOCK - way, pace, type=WALKER, person=True),
     )
     return Scene((*actors, *cars, *walkers(rng)), until_over)
 
@@ -88,7 +91,7 @@ SCENARIO = LogicalScenario(
     space=ParameterSpace(
         (
             Parameter("v_ego", 30.0, 60.0, "km/h", description="speed of ego at the start and desired"),
-            Parameter("v_ped", 0.8, 3.0, "m/s", description="speed of the pedestrian, from slow walking to running"),
+            Parameter("v_ped", 0.8, 3.0, "m/s", description="mean speed of the pedestrian, from slow walking to running"),
             Parameter("t_ped", -4.0, 2.0, "s", description="the pedestrian at the kerb after ego, at constant speed, there"),
             Parameter("flow_co", 100.0, 600.0, "1/h", description="oncoming cars an hour"),
             *EGO.inputs,

@@ -74,7 +74,12 @@ SCENARIO = LogicalScenario(
         )
     ),
     simulate=SumoSimulation(
-        net="on_ramp", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",),
+        net="on_ramp",
+        scene=scene,
+        duration=DURATION,
+        step_length=0.1,
+        ego=EGO,
+        isolations=("fresh",),
         lane_change_duration=LANE_CHANGE,
     ),
     metrics=(nearest_ttc(), time_left(horizon=HORIZON), nearest_distance(), struck(), struck_speed(), others_braking()),

@@ -33,7 +33,7 @@ def automated(ego: Ego, speed: float, limit: float) -> VehicleType:
     margin = 1.0 + 1e-9  # SUMO refuses a start above the desired speed, which it computes as factor times limit
     attributes = dict(DRIVER) | {"sigma": "0", "speedFactor": repr(speed / limit * margin)}
     if ego.kind != SUMO:
-        return VehicleType()
+        return VehicleType(attributes=(("speedFactor", repr(max(speed / limit, 1.0) * margin)),))
     del attributes["carFollowModel"]
     return ego.vehicle_type(VehicleType(attributes=tuple(attributes.items())), speed * margin)
 
