@@ -318,4 +318,4 @@ def _statement(runs: History, hits: int, modes: list[dict[str, Any]], bound: dic
     plural = "s" if len(modes) != 1 else ""
     unsure = [m for m in modes if m["confirmed"] is not None and m["confirmed"] < 1.0]
     doubt = f" {len(unsure)} of them did not fail again with every fresh seed." if unsure else ""
-    return f"{hits} of {n} runs were critical, in {len(modes)} failure mode{plural}.{doubt}{hidden}"
+    return f"{hits} of {n} runs of the search were critical, in {len(modes)} failure mode{plural}.{doubt}{hidden}"

@@ -111,6 +111,7 @@ def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed
     likely = history.records[mode.most_likely]
     told = {
         "representative": record.index, "inputs": dict(record.inputs), "metric": record.metrics[metric], "size": len(mode.rows),
+        "runs": [history.records[k].index for k in mode.rows],
         "confirmed": float(critical.contains(confirmed).mean()) if len(confirmed) else None, "confirmation_runs": len(confirmed),
         "most_likely": {"run": likely.index, "inputs": dict(likely.inputs), "metric": likely.metrics[metric]},
         "nearest_safe": None,
