@@ -68,7 +68,8 @@ EVERYTHING = analytic(lambda x: -1.0 - x[:, 0], inputs=BOX, critical=LOW, name="
 BEYOND = analytic(lambda x: np.hypot(x[:, 0], x[:, 1]), inputs=BOX, critical=(5.0, 6.0), name="out of reach")
 PLATEAU = analytic(lambda x: np.where((x[:, 0] > 0.9) & (x[:, 1] > 0.8), -1.0, 10.0), inputs=BOX, critical=LOW, name="plateau")
 FLAT = analytic(lambda x: np.full(len(x), 3.0), inputs=BOX, critical=LOW, name="flat")
-IDLE = analytic(lambda x: np.abs(x[:, 0] - 0.62) - 0.01, inputs={**BOX, "c": (0.0, 1.0), "d": (0.0, 1.0)}, critical=LOW, name="idle")
+MORE = {**BOX, "c": (0.0, 1.0), "d": (0.0, 1.0)}
+IDLE = analytic(lambda x: np.abs(x[:, 0] - 0.62) - 0.01, inputs=MORE, critical=LOW, name="idle")
 HALF = own("half fails", half)
 COIN = own("coin", coin)
 '''

@@ -134,9 +134,7 @@ def _own(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
             history = kept.history()
     runs = history.where(history.stage != CONFIRM)
     scenario = assembly_of(loaded).scenario
-    return scenario.space.to_unit(runs.x), np.asarray(
-        scenario.requirement.critical.margin(runs.y(scenario.requirement.metric))
-    )
+    return scenario.space.to_unit(runs.x), np.asarray(scenario.requirement.critical.margin(runs.y(scenario.requirement.metric)))
 
 
 def _outside(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
@@ -175,7 +173,10 @@ def _distinct(u: Points) -> int:
 
 def table(cells: Sequence[Cell]) -> str:
     """Return the cells as a Markdown table: a row a sampler; a run that never came counts as infinite."""
-    lines = ["| sampler | seeds | found | median runs to the first | 90th percentile | distinct failures | seconds |", "|" + "---|" * 7]
+    lines = [
+        "| sampler | seeds | found | median runs to the first | 90th percentile | distinct failures | seconds |",
+        "|" + "---|" * 7,
+    ]
     for name in dict.fromkeys(cell.sampler for cell in cells):
         mine = [cell for cell in cells if cell.sampler == name]
         budget = mine[0].budget

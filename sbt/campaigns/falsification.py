@@ -307,11 +307,11 @@ def _statement(runs: History, hits: int, modes: list[dict[str, Any]], bound: dic
         return f"All {n} runs failed: nothing was tested."
     if bound is not None:
         sobol = bound["space_filling_runs"] - bound["random_runs"]
-        how = f" ({sobol} of them scrambled Sobol points, for which the bound, that of random ones, is approximate)" if sobol else ""
+        how = f" ({sobol} of them scrambled Sobol points, for which this bound of random ones is approximate)" if sobol else ""
         share = bound["box_fraction_failed_as_critical"]
         return (
-            f"No critical run in {n}. This proves nothing about the guided runs; from the {bound['space_filling_runs']} space-filling"
-            f" ones alone{how}, at most {100 * share:.3g} % of the box is critical (95 %).{hidden}"
+            f"No critical run in {n}. The guided runs bound nothing; from the {bound['space_filling_runs']} space-filling ones"
+            f" alone{how}, at most {100 * share:.3g} % of the box is critical (95 %).{hidden}"
         )
     if hits == n - failed:
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"

@@ -70,7 +70,7 @@ CAMPAIGNS: Mapping[str, CampaignKind] = {
         methods=(
             "portfolio", "log_expected_improvement", "probability_of_violation", "lower_confidence_bound", "thompson", "cma_es",
         ),
-        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, most_initial=20, batch=10,
+        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, most_initial=10, batch=10,
     ),
     "estimation": CampaignKind(
         "probability of a critical scenario under the inputs' distribution", "difference",
@@ -187,8 +187,10 @@ class MetamodelChoice(Choice):
 class AcquisitionChoice(_Strict):
     """The acquisition: how much a candidate is worth."""
 
-    kind: Name = Field(description="even, boundary, importance, another installed name, or file.py:NAME; falsification: portfolio, "
-        "log_expected_improvement, probability_of_violation, lower_confidence_bound, thompson, cma_es.")
+    kind: Name = Field(
+        description="even, boundary, importance, another installed name, or file.py:NAME; falsification: portfolio, "
+        "log_expected_improvement, probability_of_violation, lower_confidence_bound, thompson, cma_es.",
+    )  # fmt: skip
 
 
 class InputChange(_Strict):
@@ -294,12 +296,12 @@ class Configuration(_Strict):
     budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
     initial: int = Field(
         default_factory=_tenth, ge=1,
-        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10, in a falsification at most 20.",
+        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10, falsification: at most 10.",
     )  # fmt: skip
     batch: int = Field(
         default_factory=_batch,
         ge=1,
-        description="Runs per iteration; default: as many as initial, in a falsification 10.",
+        description="Runs per iteration; default: as many as initial, falsification: 10.",
     )
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(

@@ -35,7 +35,8 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
             *(Cell.of(mode["inputs"][name]) for name in space.names), Cell(_change(mode, space)),
             Cell.of(mode["most_likely"]["run"]),
         ))  # fmt: skip
-    columns = ("mode", "representative", found.requirement.metric, "runs", "confirmed", *space.names, "what makes it safe", "most likely")
+    metric = found.requirement.metric
+    columns = ("mode", "representative", metric, "runs", "confirmed", *space.names, "what makes it safe", "most likely")
     return Table(columns, tuple(rows), _NOTE if rows else "")
 
 
@@ -67,7 +68,8 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
     vertical = y if up is None else history.x[:, up]
     figure = new_figure(5.4, 4.4)
     ax = figure.subplots()
-    ax.scatter(history.x[history.ok, across], vertical[history.ok], s=9, color="#c3c9cf", linewidths=0, label="other runs", zorder=1)
+    ok = history.ok
+    ax.scatter(history.x[ok, across], vertical[ok], s=9, color="#c3c9cf", linewidths=0, label="other runs", zorder=1)
     where = {int(index): row for row, index in enumerate(history.index)}
     for k, mode in enumerate(modes[:_MOST_COLOURS]):
         rows = [where[run] for run in mode["runs"] if run in where]

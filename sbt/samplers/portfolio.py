@@ -27,9 +27,7 @@ _LOCAL = 350  # candidates of a trust region
 _CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
 
 
-def propose(
-    search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None
-) -> Picks:
+def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None) -> Picks:
     """Return n points where the next failure may be, away from the failures that are known.
 
     About 60 % are Thompson draws in up to three trust regions, the others are global picks of

@@ -21,7 +21,9 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled"]
+__all__ = [
+    "DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled",
+]  # fmt: skip
 
 DEFLATION = 0.22
 """Half the side of the box about a critical run that the search leaves alone (unit cube)."""
