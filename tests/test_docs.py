@@ -57,7 +57,8 @@ def test_configurations_run(config: Path, tmp_path: Path):
     result = json.loads(done.stdout)
     assert done.stdout.count("\n") == 1
     assert (result["ok"], result["failed"]) == (result["runs"], 0)
-    assert result["runs"] == 24 + min(20, load(config).config.validation.reference)
+    repeated = sum(mode["confirmation_runs"] for mode in result["conclusion"].get("failure_modes", []))
+    assert result["runs"] == 24 + repeated + min(20, load(config).config.validation.reference)
     assert (tmp_path / "s" / "report.html").is_file()
 
 

@@ -1,1 +1,1 @@
-"""The paper's experiment: metamodels x acquisitions x scenarios x seeds, scored on random reference runs."""
+"""The paper's experiment (metamodels x acquisitions x scenarios x seeds), and other samplers on the same budget."""

@@ -153,7 +153,7 @@ class SearchStage:
     def propose(self, log: Log) -> Batch:
         """Return the next batch, the run of largest P(critical) first."""
         s, first, runs = self.hunt.settings, not log.iterations, sought(log.history)
-        spent = len(runs) - (0 if first else s.reference)
+        spent, number = len(runs) - (0 if first else s.reference), self._number(log)
         size = min(s.initial if first else s.batch, s.budget - spent)
         start = int(log.iterations[-1][_POSITION]) if log.iterations else 0
         if first:
@@ -162,11 +162,15 @@ class SearchStage:
             return Batch((*chosen, *held_out_runs(s, 0, s.reference)), {"method": "even", _POSITION: at})
         held_out = 0 if s.scenario.pool is not None else min(_share_of(s.share, spent, size), size - 1)
         filling = min(_share_of(max(_FILL_SHARE - s.share, 0.0), spent, size), size - 1 - held_out)
-        picks, why = self._guided(log, runs, size - held_out - filling, start)
+        picks, why = self._guided(log, runs, size - held_out - filling)
         even, at = self._even(filling, start)
         chosen = self._snapped([(_SEARCH, picks), (_EVEN, even)], runs)
         how = {"method": s.method, **why, "even": filling, "held_out": held_out, _POSITION: at}
-        return Batch((*chosen, *held_out_runs(s, log.iteration, held_out)), how)
+        return Batch((*chosen, *held_out_runs(s, number, held_out)), how)
+
+    def _number(self, log: Log) -> int:
+        """Return the number of the next batch of the search; confirmations in between do not count."""
+        return sum(batch["stage"] == self.name for batch in log.iterations)
 
     def _even(self, n: int, start: int) -> tuple[Points, int]:
         """Return the next n points of the campaign's Sobol sequence, and the position after them."""
@@ -178,12 +182,12 @@ class SearchStage:
         )
         return draw.u, draw.next_position
 
-    def _guided(self, log: Log, runs: History, n: int, start: int) -> tuple[Points, dict[str, Any]]:
+    def _guided(self, log: Log, runs: History, n: int) -> tuple[Points, dict[str, Any]]:
         """Return n points by the configured method, and what the log keeps of how."""
         s, search = self.hunt.settings, self.hunt.search
         space, requirement = s.scenario.space, s.scenario.requirement
         u, y = np.clip(space.to_unit(runs.x), 0.0, 1.0), runs.y(requirement.metric)
-        rng = stream(s.seed, "search", log.iteration)
+        rng = stream(s.seed, "search", self._number(log))
         if s.acquisition is not None:
             return self._scored(log, n), {}
         if s.method == "cma_es":
@@ -303,15 +307,15 @@ def _statement(runs: History, hits: int, modes: list[dict[str, Any]], bound: dic
         return f"All {n} runs failed: nothing was tested."
     if bound is not None:
         sobol = bound["space_filling_runs"] - bound["random_runs"]
-        how = f" ({sobol} of them scrambled Sobol points, for which the bound, that of random ones, is approximate)" if sobol else ""
+        how = f" ({sobol} of them scrambled Sobol points, for which this bound of random ones is approximate)" if sobol else ""
         share = bound["box_fraction_failed_as_critical"]
         return (
-            f"No critical run in {n}. This proves nothing about the guided runs; from the {bound['space_filling_runs']} space-filling"
-            f" ones alone{how}, at most {100 * share:.3g} % of the box is critical (95 %).{hidden}"
+            f"No critical run in {n}. The guided runs bound nothing; from the {bound['space_filling_runs']} space-filling ones"
+            f" alone{how}, at most {100 * share:.3g} % of the box is critical (95 %).{hidden}"
         )
     if hits == n - failed:
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
     plural = "s" if len(modes) != 1 else ""
     unsure = [m for m in modes if m["confirmed"] is not None and m["confirmed"] < 1.0]
     doubt = f" {len(unsure)} of them did not fail again with every fresh seed." if unsure else ""
-    return f"{hits} of {n} runs were critical, in {len(modes)} failure mode{plural}.{doubt}{hidden}"
+    return f"{hits} of {n} runs of the search were critical, in {len(modes)} failure mode{plural}.{doubt}{hidden}"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from sbt.arrays import Points, Vector
@@ -38,7 +39,7 @@ class Mode:
     safe: int | None
 
 
-def connected(belief: Belief, u: Points) -> Vector:
+def connected(belief: Belief, u: Points) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
 
     Args:
@@ -46,7 +47,7 @@ def connected(belief: Belief, u: Points) -> Vector:
         u: (n, d) critical runs in the unit cube.
     """
     n = len(u)
-    group = np.arange(n)
+    group = np.arange(n, dtype=np.int64)
     distance = cdist(u, u)
     first, second = np.triu_indices(n, 1)
     order = np.argsort(distance[first, second], kind="stable")
@@ -111,6 +112,7 @@ def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed
     likely = history.records[mode.most_likely]
     told = {
         "representative": record.index, "inputs": dict(record.inputs), "metric": record.metrics[metric], "size": len(mode.rows),
+        "runs": [history.records[k].index for k in mode.rows],
         "confirmed": float(critical.contains(confirmed).mean()) if len(confirmed) else None, "confirmation_runs": len(confirmed),
         "most_likely": {"run": likely.index, "inputs": dict(likely.inputs), "metric": likely.metrics[metric]},
         "nearest_safe": None,

@@ -9,6 +9,7 @@ import typer
 from sbt import __version__
 from sbt.cli import campaign, inform, metrics, scenario
 from sbt.cli.benchmark import benchmark
+from sbt.cli.compare import compare
 from sbt.cli.console import verb
 from sbt.cli.new import new
 from sbt.cli.predict import predict
@@ -36,6 +37,7 @@ for _verb in (
 app.command()(verb(metrics.metrics))
 app.command()(verb(new))
 app.command()(verb(benchmark))
+app.command()(verb(compare))
 app.command("list")(verb(inform.list_))
 app.command()(verb(inform.schema))
 app.command()(verb(inform.doctor))

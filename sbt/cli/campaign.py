@@ -76,11 +76,21 @@ def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
         if isinstance(value, Mapping):
             lines.append(f"  {key.replace('_', ' ')}")
             lines += [f"    {name.replace('_', ' '):<24}{_number(item)}" for name, item in value.items()]
+        elif isinstance(value, list) and all(isinstance(item, Mapping) for item in value):
+            lines.append(f"  {key.replace('_', ' '):<26}{len(value)}")
+            lines += [f"    {_plain(item)}" for item in value]
         else:
             lines.append(f"  {key.replace('_', ' '):<26}{_number(value)}")
     path = Path(result["store"]) / "report.html"
     lines.append(f"report: {path}" if path.is_file() else f"store: {result['store']}")
     return lines
+
+
+def _plain(item: Mapping[str, Any]) -> str:
+    """Return the numbers of a record on one line, those inside inner records by their own names."""
+    inner = item.get("inputs", {})
+    values = {k: v for k, v in item.items() if isinstance(v, (int, float, str))} | dict(inner)
+    return ", ".join(f"{name.replace('_', ' ')} {_number(value)}" for name, value in values.items())
 
 
 def _number(value: Any) -> str:

@@ -73,7 +73,7 @@ CAMPAIGNS: Mapping[str, CampaignKind] = {
         methods=(
             "portfolio", "log_expected_improvement", "probability_of_violation", "lower_confidence_bound", "thompson", "cma_es",
         ),
-        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, most_initial=20, batch=10,
+        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, most_initial=10, batch=10,
     ),
     "estimation": CampaignKind(
         "probability of a critical scenario under the inputs' distribution", "difference",
@@ -318,12 +318,12 @@ class Configuration(_Strict):
     budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
     initial: int = Field(
         default_factory=_tenth, ge=1,
-        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10, in a falsification at most 20.",
+        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10, falsification: at most 10.",
     )  # fmt: skip
     batch: int = Field(
         default_factory=_batch,
         ge=1,
-        description="Runs per iteration; default: as many as initial, in a falsification 10.",
+        description="Runs per iteration; default: as many as initial, falsification: 10.",
     )
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(

@@ -12,6 +12,7 @@ from sbt.arrays import Vector
 from sbt.history import VALIDATION
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
+from sbt.report.modes import drawing_of_modes
 from sbt.report.projection import Predict, log_probability, most_telling_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words
@@ -52,6 +53,7 @@ def draw(
     """
     with figure_style():
         drawn = list(_runs(found, space, predict, weights))
+        drawn += [Drawing("modes", "Failure modes", *told) for told in drawing_of_modes(found, space, weights)]
         if predict is not None:
             drawn += [*_map(found, space, predict, weights), *_held_out(found, space, predict)]
         drawn += [*_validation(found, fits), *_counts(found)]

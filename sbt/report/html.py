@@ -13,6 +13,7 @@ from typing import Any
 
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
+from sbt.report.modes import mode_table
 from sbt.report.projection import Predict, influence, influence_from_runs
 from sbt.report.tables import critical_table, failed_table, input_table, iteration_table
 from sbt.report.words import NOTHING, SCORES, Findings, conclusion_sentences, number, requirement_words, warnings_for
@@ -52,6 +53,7 @@ def write_report(store: Store, scenario: LogicalScenario, predict: Predict | Non
         "warnings": warnings_for(found),
         "scores": _scores(found),
         "drawings": [_inline(drawing) for drawing in drawings],
+        "modes": mode_table(found, scenario.space),
         "inputs": input_table(scenario, weights),
         "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement),
         "critical": critical_table(found.history, scenario.requirement, reference),

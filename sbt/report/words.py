@@ -190,14 +190,16 @@ def _estimation(result: Mapping[str, Any]) -> list[str]:
 
 
 def _falsification(result: Mapping[str, Any]) -> list[str]:
+    """Return whether the requirement is falsified, and the campaign's own statement."""
     if "first_critical_run" not in result:
         return []
+    said = [str(result["statement"])] if result.get("statement") else []
     if result["first_critical_run"] is None:
-        return ["The requirement was not falsified: no critical run was found."]
+        return ["The requirement was not falsified: no critical run was found.", *said]
     modes = result.get("failure_modes")
     count = len(modes) if isinstance(modes, (list, tuple, dict)) else modes
     tail = f"; {count} distinct failure mode{'s' if count != 1 else ''}" if count is not None else ""
-    return [f"The requirement is falsified: the first critical run is number {result['first_critical_run']}{tail}."]
+    return [f"The requirement is falsified: the first critical run is number {result['first_critical_run']}{tail}.", *said]
 
 
 def _fraction(found: Findings) -> list[str]:

@@ -10,7 +10,9 @@ from scipy.special import erfcx, log_ndtr
 from sbt.arrays import Points, Vector
 from sbt.samplers.search import Belief, Picks, Search, believe, fill, known, refined, repelled
 
-__all__ = ["CRITERIA", "Criterion", "log_expected_improvement", "lower_confidence_bound", "probability_of_violation", "propose_by"]
+__all__ = [
+    "CRITERIA", "Criterion", "log_expected_improvement", "lower_confidence_bound", "probability_of_violation", "propose_by",
+]  # fmt: skip
 
 Criterion = Callable[[Belief, Points, float], Vector]
 """(belief, points (n, d), margin of the best run in warped units) -> (n,) scores, larger is better."""

@@ -21,7 +21,9 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled"]
+__all__ = [
+    "DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled",
+]  # fmt: skip
 
 DEFLATION = 0.22
 """Half the side of the box about a critical run that the search leaves alone (unit cube)."""
@@ -200,7 +202,7 @@ def refined(
 
 
 def repelled(u: Points, others: Points, radius: float) -> Vector:
-    """Return (n,) log factors: 0 far from the others, -inf on one of them."""
-    square = cdist(u, others, "sqeuclidean").min(axis=1)
+    """Return (n,) log factors: -inf on one of the others, 0 from three radii on, or all that is left would be corners."""
+    square = cdist(u, others, "sqeuclidean").min(axis=1) / radius**2
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(-np.expm1(-0.5 * square / radius**2)))
+        return np.where(square >= 9.0, 0.0, np.log(-np.expm1(-0.5 * square)))

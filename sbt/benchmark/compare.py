@@ -1,0 +1,188 @@
+"""Other samplers on the same scenario, requirement and budget, in a table that can be stopped and continued."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from sbt.arrays import Points, Vector
+from sbt.benchmark.outside import OUTSIDE
+from sbt.campaigns.falsification import CONFIRM, METHODS
+from sbt.config.load import Loaded
+from sbt.errors import InputError
+from sbt.execution.protocol import SerialExecutor
+from sbt.problem.outcome import Job, Status
+from sbt.run import assembly_of, run_campaign
+from sbt.samplers.search import DEFLATION
+from sbt.seeds import run_seed
+from sbt.store import Store
+
+__all__ = ["SAMPLERS", "Cell", "compare", "table"]
+
+SAMPLERS = (*(name for name in METHODS if name != "cma_es"), *OUTSIDE)
+"""What can be compared: the campaign's own methods, and samplers of others."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One sampler with one seed.
+
+    Args:
+        scenario, sampler, seed, budget: what was run.
+        runs: until it stopped, confirmations aside.
+        first: number of the first critical run, from 1; None: there was none.
+        critical: runs.
+        distinct: critical runs that are farther than the deflation radius from all earlier ones so counted.
+        seconds: wall clock.
+    """
+
+    scenario: str
+    sampler: str
+    seed: int
+    budget: int
+    runs: int
+    first: int | None
+    critical: int
+    distinct: int
+    seconds: float
+
+
+def compare(
+    loaded: Loaded, samplers: Sequence[str], seeds: int, folder: Path, told: Callable[[Cell], None] = lambda _: None
+) -> list[Cell]:
+    """Return one cell a sampler and seed; cells that the folder already holds are not run again.
+
+    Args:
+        loaded: a falsification; where `stop.failures` is set, every sampler stops there.
+        samplers: of `SAMPLERS`.
+        seeds: the configuration's seed and the ones after it.
+        folder: keeps `compare.jsonl`, a line a finished cell.
+        told: called after every cell.
+
+    Raises:
+        InputError: not a falsification, an unknown sampler, recorded rows, or a library that is not installed.
+    """
+    config = loaded.config
+    if config.campaign != "falsification":
+        raise InputError(f"compare needs campaign falsification, but got {config.campaign}")
+    for name in samplers:
+        if name not in SAMPLERS:
+            raise InputError(f"a sampler must be one of {', '.join(SAMPLERS)}, but got '{name}'")
+    if assembly_of(loaded).scenario.pool is not None:
+        raise InputError("compare needs a scenario that can be simulated, but got recorded rows")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "compare.jsonl"
+    asked = _asked(loaded)
+    finished = dict(_finished(path, asked))
+    cells = []
+    for seed in range(config.seed, config.seed + seeds):
+        for name in samplers:
+            cell = finished.get((name, seed))
+            if cell is None:
+                cell = _run(loaded, name, seed)
+                with path.open("a") as file:
+                    file.write(json.dumps({**vars(cell), "asked": asked}) + "\n")
+                told(cell)
+            cells.append(cell)
+    return cells
+
+
+def _asked(loaded: Loaded) -> dict[str, Any]:
+    """Return what a cell depends on beside sampler and seed."""
+    kept = loaded.config.model_dump(mode="json", exclude={"seed", "store", "executor", "acquisition"})
+    return json.loads(json.dumps(kept))
+
+
+def _finished(path: Path, asked: Mapping[str, Any]) -> Iterator[tuple[tuple[str, int], Cell]]:
+    """Yield the finished cells of the same question; a line cut short by a kill is none."""
+    for line in path.read_text().splitlines() if path.is_file() else []:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if row.pop("asked") == asked:
+            yield (row["sampler"], row["seed"]), Cell(**row)
+
+
+def _run(loaded: Loaded, name: str, seed: int) -> Cell:
+    config, start = loaded.config, time.perf_counter()
+    u, margin = (_outside if name in OUTSIDE else _own)(loaded, name, seed)
+    hits = np.flatnonzero(margin <= 0)
+    first = int(hits[0]) + 1 if len(hits) else None
+    return Cell(
+        config.scenario, name, seed, config.budget, len(margin), first, len(hits), _distinct(u[hits]),
+        round(time.perf_counter() - start, 3),
+    )  # fmt: skip
+
+
+def _own(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
+    """Return points and margins of a campaign with one of its own methods, as `sumo-sbt run` runs it."""
+    with tempfile.TemporaryDirectory() as folder:
+        store = str(Path(folder) / "store")
+        acquisition = loaded.config.acquisition.model_copy(update={"kind": name})
+        config = loaded.config.model_copy(update={"seed": seed, "store": store, "acquisition": acquisition})
+        run_campaign(replace(loaded, config=config), report=False)
+        with Store.read(Path(store)) as kept:
+            history = kept.history()
+    runs = history.where(history.stage != CONFIRM)
+    scenario = assembly_of(loaded).scenario
+    return scenario.space.to_unit(runs.x), np.asarray(scenario.requirement.critical.margin(runs.y(scenario.requirement.metric)))
+
+
+def _outside(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
+    """Return points and margins of another sampler, in batches of the configured size."""
+    config, parts = loaded.config, assembly_of(loaded)
+    space, requirement = parts.scenario.space, parts.scenario.requirement
+    limit = None if config.executor.timeout == float("inf") else config.executor.timeout
+    sampler = OUTSIDE[name](space.dimension, seed, config.initial)
+    points, margins, most = np.empty((0, space.dimension)), np.empty(0), config.stop.failures
+    with SerialExecutor(parts.spec, limit) as executor:
+        while len(margins) < config.budget and (most is None or (margins <= 0).sum() < most):
+            u = sampler.ask(min(config.batch, config.budget - len(margins)))
+            x, start = space.from_unit(u), len(margins)
+            jobs = [
+                Job(start + k, dict(zip(space.names, map(float, row), strict=True)), run_seed(seed, start + k))
+                for k, row in enumerate(x)
+            ]
+            y = np.full(len(jobs), np.nan)
+            for outcome in executor.run(jobs):
+                if outcome.status == Status.OK:
+                    y[outcome.index - start] = outcome.metrics[requirement.metric]
+            margin = np.asarray(requirement.critical.margin(y))
+            sampler.tell(margin)
+            points, margins = np.vstack([points, u]), np.concatenate([margins, margin])
+    return points, margins
+
+
+def _distinct(u: Points) -> int:
+    """Return how many critical runs are farther apart than the deflation radius, counted in order."""
+    kept = np.empty((0, u.shape[1]))
+    for point in u:
+        if len(kept) == 0 or cdist(point[None], kept, "chebyshev").min() > DEFLATION:
+            kept = np.vstack([kept, point])
+    return len(kept)
+
+
+def table(cells: Sequence[Cell]) -> str:
+    """Return the cells as a Markdown table: a row a sampler; a run that never came counts as infinite."""
+    lines = [
+        "| sampler | seeds | found | median runs to the first | 90th percentile | distinct failures | seconds |",
+        "|" + "---|" * 7,
+    ]
+    for name in dict.fromkeys(cell.sampler for cell in cells):
+        mine = [cell for cell in cells if cell.sampler == name]
+        budget = mine[0].budget
+        first = np.array([1e9 if c.first is None else c.first for c in mine])
+        shown = [f"{v:.0f}" if v <= budget else f"> {budget}" for v in np.quantile(first, (0.5, 0.9))]
+        found, distinct = np.mean(first <= budget), np.mean([c.distinct for c in mine])
+        seconds = np.median([c.seconds for c in mine])
+        lines.append(f"| {name} | {len(mine)} | {100 * found:.0f} % | {shown[0]} | {shown[1]} | {distinct:.1f} | {seconds:.2g} |")
+    return "\n".join(lines)

@@ -1,0 +1,137 @@
+"""Samplers of others, behind one small interface: ask for points, tell their margins."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import stream
+
+__all__ = ["OUTSIDE", "Outside"]
+
+_WORST = 1e9  # stands for the margin of a failed run where a library takes no failures
+
+
+class Outside(Protocol):
+    """A sampler with a memory of its own."""
+
+    def ask(self, n: int) -> Points:
+        """Return the next n points (n, d) in the unit cube."""
+        ...
+
+    def tell(self, margins: Vector) -> None:
+        """Take the margins (n,) of the points asked for last; NaN where a run failed."""
+        ...
+
+
+class Random:
+    """Independent uniform points."""
+
+    def __init__(self, dimension: int, seed: int, initial: int):
+        del initial
+        self._dimension, self._rng = dimension, stream(seed, "compare", "random")
+
+    def ask(self, n: int) -> Points:
+        """Return n points."""
+        return self._rng.random((n, self._dimension))
+
+    def tell(self, margins: Vector) -> None:
+        """Learn nothing."""
+
+
+class Sobol:
+    """One scrambled Sobol sequence."""
+
+    def __init__(self, dimension: int, seed: int, initial: int):
+        del initial
+        self._sequence, self._at = SobolSequence(dimension, seed), 0
+
+    def ask(self, n: int) -> Points:
+        """Return the next n points."""
+        self._at += n
+        return self._sequence.points(self._at - n, self._at)
+
+    def tell(self, margins: Vector) -> None:
+        """Learn nothing."""
+
+
+class Cma:
+    """CMA-ES of pycma: a population a batch, started anew at a random point once it has converged.
+
+    Source:
+        Hansen (2016), The CMA evolution strategy: a tutorial, arXiv 1604.00772.
+    """
+
+    def __init__(self, dimension: int, seed: int, initial: int):
+        del initial
+        _require("cma_es", "cma")
+        self._rng, self._dimension = stream(seed, "compare", "cma"), dimension
+        self._strategy: Any = None
+        self._asked: list[Any] = []
+
+    def ask(self, n: int) -> Points:
+        """Return the next generation."""
+        if self._strategy is None or self._strategy.stop():
+            import cma
+
+            options = {
+                "bounds": [0.0, 1.0], "popsize": max(n, 4), "verbose": -9, "seed": math.nan,
+                "randn": lambda *shape: self._rng.standard_normal(shape),
+            }  # fmt: skip
+            start = np.full(self._dimension, 0.5) if self._strategy is None else self._rng.random(self._dimension)
+            self._strategy = cma.CMAEvolutionStrategy(start.tolist(), 0.3, options)
+        self._asked = self._strategy.ask(n)
+        return np.clip(np.array(self._asked), 0.0, 1.0).reshape(n, -1)
+
+    def tell(self, margins: Vector) -> None:
+        """Adapt to the generation."""
+        self._strategy.tell(self._asked, np.where(np.isfinite(margins), margins, _WORST).tolist())
+
+
+class Tpe:
+    """The tree-structured Parzen estimator of Optuna, with constant liars within a batch.
+
+    Source:
+        Bergstra et al. (2011); library Optuna.
+    """
+
+    def __init__(self, dimension: int, seed: int, initial: int):
+        _require("tpe", "optuna")
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        number = int(stream(seed, "compare", "tpe").integers(0, 2**31 - 1))
+        sampler = optuna.samplers.TPESampler(seed=number, n_startup_trials=initial, constant_liar=True)
+        self._study = optuna.create_study(sampler=sampler)
+        self._dimension, self._trials = dimension, list[Any]()
+
+    def ask(self, n: int) -> Points:
+        """Return the next n points."""
+        self._trials = [self._study.ask() for _ in range(n)]
+        return np.array([[t.suggest_float(f"u{k}", 0.0, 1.0) for k in range(self._dimension)] for t in self._trials])
+
+    def tell(self, margins: Vector) -> None:
+        """Learn from the batch; failed runs are failed trials."""
+        from optuna.trial import TrialState
+
+        for trial, margin in zip(self._trials, margins, strict=True):
+            if math.isfinite(margin):
+                self._study.tell(trial, float(margin))
+            else:
+                self._study.tell(trial, state=TrialState.FAIL)
+
+
+OUTSIDE: Mapping[str, Callable[[int, int, int], Outside]] = {"random": Random, "sobol": Sobol, "cma_es": Cma, "tpe": Tpe}
+"""By name: (dimension, seed, runs before the first adaptation) -> sampler."""
+
+
+def _require(name: str, library: str) -> None:
+    if importlib.util.find_spec(library) is None:
+        raise InputError(f"sampler {name} needs the library {library}, but it is not installed: pip install 'sumo-sbt[compare]'")

@@ -1,0 +1,96 @@
+"""The failure modes of a falsification: a table, and where they lie among the runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sbt.arrays import Vector
+from sbt.problem.space import ParameterSpace
+from sbt.report.style import new_figure, to_svg
+from sbt.report.tables import Cell, Table
+from sbt.report.words import NOTHING, Findings, number, share
+
+__all__ = ["drawing_of_modes", "mode_table"]
+
+_MOST_COLOURS = 8
+_COLOURS = ("#c1272d", "#1f4e79", "#e08e0b", "#2e7d5b", "#7b4fa3", "#0e8fa0", "#8a5a2b", "#d1579a")
+_NOTE = (
+    "Critical runs that the metamodel joins by a segment with P(critical) > 0.5 are one mode, the deepest mode first. Confirmed:"
+    " share of repetitions of the representative with fresh seeds that were critical again. What makes it safe: the change of"
+    " inputs to the nearest run, in the unit cube, that is not critical. Most likely: the mode's run of largest density."
+)
+
+
+def mode_table(found: Findings, space: ParameterSpace) -> Table:
+    """Return one row a failure mode; no rows where the campaign found none or does not look for them."""
+    modes: Sequence[Mapping[str, Any]] = found.result.get("failure_modes") or []
+    rows = []
+    for number_of, mode in enumerate(modes, 1):
+        confirmed = NOTHING if mode["confirmed"] is None else f"{share(mode['confirmed'])} of {mode['confirmation_runs']}"
+        rows.append((
+            Cell.of(number_of), Cell.of(mode["representative"]), Cell.of(mode["metric"]), Cell.of(mode["size"]), Cell(confirmed),
+            *(Cell.of(mode["inputs"][name]) for name in space.names), Cell(_change(mode, space)),
+            Cell.of(mode["most_likely"]["run"]),
+        ))  # fmt: skip
+    metric = found.requirement.metric
+    columns = ("mode", "representative", metric, "runs", "confirmed", *space.names, "what makes it safe", "most likely")
+    return Table(columns, tuple(rows), _NOTE if rows else "")
+
+
+def _change(mode: Mapping[str, Any], space: ParameterSpace) -> str:
+    """Return the largest changes towards the nearest uncritical run, relative to the inputs' ranges."""
+    safe = mode["nearest_safe"]
+    if safe is None:
+        return "no uncritical run"
+    spans = {p.name: p.bounds[1] - p.bounds[0] for p in space.parameters}
+    units = {p.name: p.unit for p in space.parameters}
+    ranked = sorted(safe["change"].items(), key=lambda item: -abs(item[1]) / spans[item[0]])[:3]
+    told = ", ".join(f"{name} {change:+.3g} {units[name]}".strip() for name, change in ranked)
+    rest = len(safe["change"]) - len(ranked)
+    return f"{told}{f' and {rest} more' if rest > 0 else ''}: {number(safe['metric'])} (run {safe['run']})"
+
+
+def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) -> Iterator[tuple[str, str]]:
+    """Yield the figure's caption and SVG; nothing without a mode.
+
+    The two inputs are those of largest weight (d,); with one input the metric is drawn over it.
+    """
+    modes: Sequence[Mapping[str, Any]] = found.result.get("failure_modes") or []
+    if not modes:
+        return
+    history, y = found.history, found.history.y(found.requirement.metric)
+    order = np.argsort(-weights, kind="stable")[:2]
+    across = int(min(order))
+    up = int(max(order)) if space.dimension > 1 else None
+    vertical = y if up is None else history.x[:, up]
+    figure = new_figure(5.4, 4.4)
+    ax = figure.subplots()
+    ok = history.ok
+    ax.scatter(history.x[ok, across], vertical[ok], s=9, color="#c3c9cf", linewidths=0, label="other runs", zorder=1)
+    where = {int(index): row for row, index in enumerate(history.index)}
+    for k, mode in enumerate(modes[:_MOST_COLOURS]):
+        rows = [where[run] for run in mode["runs"] if run in where]
+        ax.scatter(
+            history.x[rows, across], vertical[rows], s=20, color=_COLOURS[k], linewidths=0, zorder=2, label=f"mode {k + 1}"
+        )
+        at, safe = where[mode["representative"]], mode["nearest_safe"]
+        ax.scatter(history.x[at, across], vertical[at], marker="*", s=150, color=_COLOURS[k], edgecolor="white", zorder=4)
+        if safe is not None and safe["run"] in where:
+            to = where[safe["run"]]
+            ax.annotate(
+                "", (history.x[to, across], vertical[to]), (history.x[at, across], vertical[at]), zorder=3,
+                arrowprops={"arrowstyle": "->", "color": _COLOURS[k], "lw": 1.2},
+            )  # fmt: skip
+    names = [f"{p.name} ({p.unit})" if p.unit else p.name for p in space.parameters]
+    ax.set_xlabel(names[across])
+    ax.set_ylabel(found.requirement.metric if up is None else names[up])
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    caption = "Critical runs by failure mode; star: representative; arrow: to the nearest run that is not critical."
+    if space.dimension > 2:
+        caption += " The two inputs of largest influence are shown; in the others the runs differ too."
+    if len(modes) > _MOST_COLOURS:
+        caption += f" The {_MOST_COLOURS} deepest of {len(modes)} modes."
+    yield caption, to_svg(figure, "modes")

@@ -1,0 +1,337 @@
+"""Falsification: what it finds, what it says where it finds nothing, and that the log alone decides."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sbt.benchmark.compare import compare, table
+from sbt.campaigns.falsification import CONFIRM, METHODS
+from sbt.cli import app
+from sbt.config.load import parse
+from sbt.history import VALIDATION
+from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.warp import Warp
+from sbt.problem.requirement import CriticalInterval
+from sbt.run import run_campaign
+from sbt.samplers import portfolio
+from sbt.samplers.criteria import log_expected_improvement
+from sbt.samplers.search import DEFLATION, Search, believe, deflated
+from sbt.seeds import stream
+from sbt.store import Store
+from sbt.testbeds import values
+
+CASES = '''
+import numpy as np
+from sbt.errors import RunError
+from sbt.testbeds import analytic
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+
+BOX = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
+LOW = (-np.inf, 0.0)
+
+
+def two_holes(x):
+    """Two discs of radius 0.1."""
+    return np.minimum(np.hypot(x[:, 0] - 0.2, x[:, 1] - 0.25), np.hypot(x[:, 0] - 0.8, x[:, 1] - 0.7)) - 0.1
+
+
+def half(values, seed):
+    if values["a"] < 0.5:
+        raise RunError("invalid", "a < 0.5 cannot be realised")
+    return {"y": values["b"] + 0.01}
+
+
+def coin(values, seed):
+    return {"y": float(np.hypot(values["a"] - 0.5, values["b"] - 0.5) - 0.2 + (seed % 2) * 0.4)}
+
+
+def own(name, evaluate):
+    space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
+    return LogicalScenario(name, space, Requirement("y", CriticalInterval(high=0.0)), evaluate=evaluate, metric_names=("y",))
+
+
+TWO = analytic(two_holes, inputs=BOX, critical=LOW, name="two holes")
+NOTHING = analytic(lambda x: 1.0 + x[:, 0], inputs=BOX, critical=LOW, name="nothing")
+EVERYTHING = analytic(lambda x: -1.0 - x[:, 0], inputs=BOX, critical=LOW, name="everything")
+BEYOND = analytic(lambda x: np.hypot(x[:, 0], x[:, 1]), inputs=BOX, critical=(5.0, 6.0), name="out of reach")
+PLATEAU = analytic(lambda x: np.where((x[:, 0] > 0.9) & (x[:, 1] > 0.8), -1.0, 10.0), inputs=BOX, critical=LOW, name="plateau")
+FLAT = analytic(lambda x: np.full(len(x), 3.0), inputs=BOX, critical=LOW, name="flat")
+MORE = {**BOX, "c": (0.0, 1.0), "d": (0.0, 1.0)}
+IDLE = analytic(lambda x: np.abs(x[:, 0] - 0.62) - 0.01, inputs=MORE, critical=LOW, name="idle")
+HALF = own("half fails", half)
+COIN = own("coin", coin)
+'''
+Run = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def hunted(tmp_path: Path) -> Run:
+    (tmp_path / "cases.py").write_text(CASES)
+
+    def run(scenario: str, store: str = "s", **keys: Any) -> dict[str, Any]:
+        import json
+
+        asked = {"campaign": "falsification", "scenario": scenario if ":" in scenario else f"cases.py:{scenario}", "budget": 50,
+                 "seed": 2, "initial": 10, "executor": {"kind": "serial"}, "store": str(tmp_path / store), **keys}  # fmt: skip
+        text = "".join(f"{k}: {json.dumps(v)}\n" for k, v in asked.items())
+        return run_campaign(parse(text, folder=tmp_path), report=False)
+
+    return run
+
+
+def rows(result: dict[str, Any]) -> list[Any]:
+    with Store.read(Path(result["store"])) as store:
+        return [(r.index, r.stage, r.iteration, dict(r.inputs), r.seed, dict(r.metrics)) for r in store.history().records]
+
+
+def test_both_holes_are_found_confirmed_and_told_apart(hunted: Run):
+    result = hunted("TWO", budget=80)
+    found = result["conclusion"]
+    assert len(found["failure_modes"]) == 2
+    assert found["critical_runs"] == sum(mode["size"] for mode in found["failure_modes"])
+    kept = rows(result)
+    first = next(k for k, row in enumerate(kept) if row[5]["y"] <= 0)
+    assert found["first_critical_run"] == first + 1
+    centres = {(0.2, 0.25), (0.8, 0.7)}
+    for mode in found["failure_modes"]:
+        at = kept[mode["representative"]]
+        assert (at[3], at[5]["y"]) == (mode["inputs"], mode["metric"])
+        centres -= {c for c in centres if math.hypot(mode["inputs"]["a"] - c[0], mode["inputs"]["b"] - c[1]) < 0.1}
+        again = [row for row in kept if row[1] == CONFIRM and row[3] == mode["inputs"]]
+        assert (mode["confirmed"], mode["confirmation_runs"], len(again)) == (1.0, 3, 3)
+        assert len({row[4] for row in again} | {at[4]}) == 4  # fresh seeds
+        safe = mode["nearest_safe"]
+        assert kept[safe["run"]][5]["y"] > 0
+        assert {k: v + safe["change"].get(k, 0.0) for k, v in mode["inputs"].items()} == pytest.approx(safe["inputs"])
+    assert centres == set()
+    assert result["runs"] == 80 + 6
+    assert found["bound"] is None
+    assert found["statement"].startswith(f"{found['critical_runs']} of 80 runs of the search were critical, in 2 failure modes.")
+
+
+def test_a_failure_of_one_seed_is_told_from_one_of_the_scenario(hunted: Run):
+    mode = hunted("COIN", budget=40)["conclusion"]["failure_modes"]
+    assert any(m["confirmed"] < 1.0 for m in mode)
+
+
+@pytest.mark.parametrize(
+    ("stop", "reason"), [({"failures": 1}, "failures"), ({"failures": 3}, "failures"), ({"modes": 2}, "modes"), ({}, "budget")]
+)
+def test_it_stops_where_it_was_told_to(hunted: Run, stop: dict[str, int], reason: str):
+    result = hunted("TWO", budget=80, stop=stop)
+    found = result["conclusion"]
+    assert result["stopped"] == reason
+    assert found["critical_runs"] >= stop.get("failures", 1)
+    assert len(found["failure_modes"]) >= stop.get("modes", 1)
+    kept = [row for row in rows(result) if row[1] != CONFIRM]
+    assert (len(kept) < 80) == (reason != "budget")
+    last = max(row[2] for row in kept)
+    if reason == "failures":
+        assert sum(row[5]["y"] <= 0 for row in kept if row[2] < last) < stop["failures"]  # not a batch too late
+
+
+def test_where_nothing_is_found_only_the_space_filling_runs_bound(hunted: Run):
+    for name in ("NOTHING", "BEYOND", "FLAT"):
+        result = hunted(name, name)
+        found = result["conclusion"]
+        assert (found["first_critical_run"], found["critical_runs"], found["failure_modes"]) == (None, 0, [])
+        stages = Counter(row[1] for row in rows(result))
+        assert stages == {"initial": 10, "search": 36, VALIDATION: 4}
+        assert found["bound"]["space_filling_runs"] == 14
+        assert found["bound"]["box_fraction"] == pytest.approx(1 - 0.05 ** (1 / 14))
+        assert found["bound"]["box_fraction_random_runs"] == pytest.approx(1 - 0.05 ** (1 / 4))
+        assert "No critical run in 50" in found["statement"]
+        assert "14 space-filling" in found["statement"]
+    assert found["closest"]["margin"] == 3.0
+    sobol = hunted("NOTHING", "sobol", validation={"share": 0})
+    assert Counter(row[1] for row in rows(sobol)) == {"initial": 10, "search": 36, "even": 4}
+    assert sobol["conclusion"]["bound"]["random_runs"] == 0
+
+
+def test_everything_critical_is_one_mode_and_the_search_spreads(hunted: Run):
+    result = hunted("EVERYTHING")
+    found = result["conclusion"]
+    assert (found["first_critical_run"], found["critical_runs"], len(found["failure_modes"])) == (1, 50, 1)
+    assert found["failure_modes"][0]["nearest_safe"] is None
+    assert "Every run that gave a metric was critical (50)" in found["statement"]
+
+
+def test_failed_runs_are_said_and_widen_the_bound(hunted: Run):
+    result = hunted("HALF")
+    found = result["conclusion"]
+    assert result["failed"] > 0
+    assert found["first_critical_run"] is None
+    assert found["bound"]["failed_runs"] > 0
+    assert found["bound"]["box_fraction_failed_as_critical"] > 0.5  # half of the box may hide anything
+    assert f"{result['failed']} runs failed" in found["statement"]
+    guided = [row for row in rows(result) if row[1] == "search"]
+    assert sum(row[3]["a"] >= 0.5 for row in guided) > 0
+
+
+def test_plateaus_and_idle_inputs(hunted: Run):
+    assert hunted("PLATEAU", budget=150, stop={"failures": 1})["conclusion"]["first_critical_run"] is not None
+    idle = hunted("IDLE", "idle", budget=60)["conclusion"]
+    assert 1 <= len(idle["failure_modes"]) <= 3  # one slab; idle inputs do not split it into many
+    assert idle["first_critical_run"] <= 40
+
+
+def test_a_budget_below_the_first_design_is_a_design_alone(hunted: Run):
+    result = hunted("TWO", budget=4, initial=4)
+    assert (result["stopped"], [row[1] for row in rows(result)][:4]) == ("budget", ["initial"] * 4)
+    if result["conclusion"]["first_critical_run"] is None:
+        assert result["conclusion"]["bound"]["space_filling_runs"] == 4
+    one = hunted("NOTHING", "one", budget=1, initial=1)
+    assert one["conclusion"]["bound"]["box_fraction"] == pytest.approx(0.95)
+    hit = hunted("EVERYTHING", "hit", budget=1, initial=1)
+    assert len(hit["conclusion"]["failure_modes"]) == 1
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m != "portfolio"] + ["even", "boundary"])
+def test_every_method_finds_a_hole(hunted: Run, method: str):
+    if method == "cma_es" and importlib.util.find_spec("cma") is None:
+        with pytest.raises(Exception, match=r"needs the library cma, .* pip install 'sumo-sbt\[compare\]'"):
+            hunted("TWO", acquisition={"kind": method})
+        return
+    result = hunted("TWO", budget=50, acquisition={"kind": method}, stop={"failures": 1})
+    assert result["conclusion"]["critical_runs"] > 0
+    if method in ("thompson", "cma_es"):
+        assert rows(result) == rows(hunted("TWO", "again", budget=50, acquisition={"kind": method}, stop={"failures": 1}))
+
+
+def test_two_workers_and_a_broken_off_campaign_give_the_same_rows(hunted: Run, monkeypatch: pytest.MonkeyPatch):
+    whole = hunted("TWO", "whole", budget=40)
+    local = hunted("TWO", "local", budget=40, executor={"kind": "local", "workers": 2})
+    assert rows(local) == rows(whole)
+    append, done = Store.append, 0
+
+    def dies(self: Store, *args: Any) -> None:
+        nonlocal done
+        done += 1
+        if done in (7, 25, 43):
+            raise KeyboardInterrupt
+        append(self, *args)
+
+    monkeypatch.setattr(Store, "append", dies)
+    for _ in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            hunted("TWO", "broken", budget=40)
+    assert rows(hunted("TWO", "broken", budget=40)) == rows(whole)
+
+
+def test_a_larger_budget_goes_on(hunted: Run):
+    small = rows(hunted("TWO", "grown", budget=40))
+    grown = hunted("TWO", "grown", budget=60)
+    assert rows(grown)[: len(small)] == small
+    at_once = [row[3] for row in rows(hunted("TWO", "at once", budget=60)) if row[1] != CONFIRM]
+    assert [row[3] for row in rows(grown) if row[1] != CONFIRM] == at_once
+
+
+def hartmann(seed: int, n: int) -> tuple[Any, Any]:
+    u = stream(seed, "test").random((n, 6))
+    return u, values("hartmann6_1e-3", u)
+
+
+def test_the_picks_depend_on_the_runs_alone_and_avoid_deflated_basins():
+    search = Search(CriticalInterval(high=-2.4), GaussianProcess(nu=2.5, input_noise=False))
+    u, y = hartmann(1, 40)
+    y[7] = -2.6  # a hit
+    y[9] = np.nan
+    one, two = (portfolio.propose(search, u, y, 9, stream(1, "picks")) for _ in range(2))
+    np.testing.assert_array_equal(one.u, two.u)
+    assert one.u.shape == (9, 6)
+    assert ((one.u >= 0) & (one.u <= 1)).all()
+    assert (np.abs(one.u - u[7]).max(axis=1) > DEFLATION).all()
+    assert len(np.unique(one.u, axis=0)) == 9
+    none = portfolio.propose(search, u[:1], y[:1], 5, stream(1, "picks"))
+    assert none.u.shape == (5, 6)
+
+
+def test_deflation_shrinks_rather_than_take_everything():
+    search = Search(CriticalInterval(high=0.0), GaussianProcess())
+    hits = stream(1, "hits").random((200, 2))
+    free = deflated(search, hits, stream(1, "probe"), 2)
+    assert free.radius < DEFLATION
+    assert free(stream(2, "probe").random((4000, 2))).mean() > 0.02
+    assert deflated(search, hits[:1], stream(1, "probe"), 2).radius == DEFLATION
+
+
+def test_a_trust_region_lasts_while_it_improves_and_is_halved_where_it_does_not():
+    centre = np.full(3, 0.5)
+    near = centre + 0.05 * stream(1, "near").standard_normal((60, 3))
+    far = stream(1, "far").random((60, 3))
+    u, batch = np.vstack([far, near]), np.repeat(np.arange(12.0), 10)
+    falling = np.concatenate([np.full(60, 5.0), np.linspace(4.0, 1.0, 60)])
+    stuck = np.concatenate([np.full(60, 5.0), [0.5], np.full(59, 4.0)])
+    assert portfolio.regions(u, falling, batch)[0].side == 0.8
+    region = portfolio.regions(u, stuck, batch)[0]
+    assert (region.side < 0.8, region.failures) == (True, 5)
+    assert portfolio.regions(u, np.full(120, 5.0), batch) == []  # a plateau
+
+
+@pytest.mark.parametrize("critical", [CriticalInterval(high=0.3), CriticalInterval(low=2.0), CriticalInterval(0.1, 0.4)])
+def test_the_warp_keeps_what_is_critical_and_the_order(critical: CriticalInterval):
+    y = np.sort(10.0 ** stream(3, "y").uniform(-3, 6, 300)) - 1.0
+    y = np.concatenate([y, [critical.low, critical.high]])
+    y = y[np.isfinite(y)]
+    warp = Warp.about(y, critical)
+    w = warp.values(y)
+    np.testing.assert_array_equal(np.argsort(w, kind="stable"), np.argsort(y, kind="stable"))
+    np.testing.assert_array_equal(warp.interval(critical).contains(w), critical.contains(y))
+
+
+def test_log_expected_improvement_is_the_expectation_and_finite_far_away():
+    search = Search(CriticalInterval(high=-2.4), GaussianProcess(nu=2.5, input_noise=False))
+    u, y = hartmann(2, 30)
+    belief = believe(search, u, y, stream(1, "fit"))
+    at = stream(3, "at").random((20, 6))
+    best = float(belief.critical.margin(belief.warp.values(y)).min())
+    told = log_expected_improvement(belief, at, best)
+    p = belief(at)
+    drawn = p.mu + p.sigma * stream(4, "normal").standard_normal((200_000, 1))
+    truth = np.maximum(best - belief.critical.margin(drawn), 0.0).mean(axis=0)
+    np.testing.assert_allclose(np.exp(told), truth, rtol=0.1, atol=1e-5)
+    assert np.isfinite(log_expected_improvement(belief, at, best - 1e5)).all()
+
+
+def test_draws_of_a_process_are_its_belief():
+    u, y = hartmann(2, 30)
+    process = GaussianProcess(nu=2.5, input_noise=False).fit(u, y, stream(1, "fit"))
+    at = stream(3, "at").random((5, 6))
+    drawn, p = process.draws(at, 40_000, stream(1, "draws")), process(at)
+    np.testing.assert_allclose(drawn.mean(axis=0), p.mu, atol=0.02)
+    np.testing.assert_allclose(drawn.std(axis=0), p.epistemic, rtol=0.05, atol=0.005)
+
+
+def test_compare_is_continued_and_tells_the_first_failure(tmp_path: Path):
+    text = (
+        "campaign: falsification\nscenario: testbed:himmelblau_partx\nbudget: 40\ninitial: 10\nstop: {failures: 1}\n"
+        f"executor: {{kind: serial}}\nstore: {tmp_path / 's'}\n"
+    )
+    loaded = parse(text)
+    ran: list[Any] = []
+    names = ["portfolio", "random", "sobol"]
+    half = compare(loaded, names, 1, tmp_path, ran.append)
+    path = tmp_path / "compare.jsonl"
+    path.write_text(path.read_text() + '{"scenario": "cut sh')
+    path.write_text(path.read_text() + "\n")
+    whole = compare(loaded, names, 2, tmp_path, ran.append)
+    assert (whole[:3], len(ran), len(whole)) == (half, 6, 6)
+    assert {c.sampler for c in whole if c.first} == set(names)  # 18 % of the box is critical
+    assert all(c.runs <= 40 and c.first <= c.runs for c in whole if c.first)
+    assert table(whole).count("\n") == 4
+    (tmp_path / "c.yaml").write_text(text)
+    done = CliRunner().invoke(app, ["compare", str(tmp_path / "c.yaml"), "--samplers", "rando", "--into", str(tmp_path)])
+    assert done.exit_code == 2
+    assert "a sampler must be one of" in done.output
