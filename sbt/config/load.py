@@ -94,7 +94,7 @@ def parse(text: str, overrides: Sequence[str] = (), *, name: str = "<text>", fol
 
 def resolve(config: Configuration) -> dict[str, Any]:
     """Return the configuration as plain data, every default filled in."""
-    return config.model_dump(mode="json")
+    return config.model_dump(mode="json", by_alias=True)
 
 
 def dump(config: Configuration) -> str:
