@@ -16,9 +16,10 @@ from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
-from sbt.history import Record
+from sbt.history import History, Record
 from sbt.learner import Learner
 from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store import Store
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from sbt.config.load import Loaded
     from sbt.config.model import Configuration
 
-__all__ = ["assembly_of", "loaded_from", "rebuild_report", "replay", "run_campaign", "settings_of"]
+__all__ = ["assembly_of", "earlier_runs", "loaded_from", "rebuild_report", "replay", "run_campaign", "settings_of"]
 
 _RESOLVED = "config.resolved.yaml"
 _MAY_CHANGE = {"budget", "folder", "yaml"}
@@ -110,7 +111,45 @@ def settings_of(loaded: Loaded, parts: Assembly) -> Settings:
         config.validation.share if learner is not None and not recorded else 0.0,
         0 if recorded else config.validation.reference, learner,
         parts.acquisition, config.acquisition.kind, config.stop.model_dump(),
+        None if config.gate is None else config.gate.model_dump(), earlier_runs(loaded, parts.scenario),
     )  # fmt: skip
+
+
+def earlier_runs(loaded: Loaded, scenario: LogicalScenario) -> History | None:
+    """Return the runs of the campaign that `from` names, to learn from; None where it names none.
+
+    Raises:
+        InputError: there is no finished campaign, or it ran another scenario, ego, step or other inputs, or
+            did not measure the metric.
+    """
+    config = loaded.config
+    if config.earlier is None:
+        return None
+    folder = loaded.folder / Path(config.earlier).expanduser()
+    with Store.read(folder) as store:
+        before, history, finished = loaded_from(store), store.history(), store.conclusion is not None
+    if not finished:
+        raise InputError(f"from must name a finished campaign, but the one in {folder} has not concluded")
+    if _what_runs(before) != _what_runs(loaded):
+        told = f"{before.config.scenario} there, {config.scenario} here"
+        raise InputError(f"from must name a campaign of the same scenario, ego and step, but {folder} has another ({told})")
+    space = assembly_of(before).scenario.space
+    if space.names != scenario.space.names:
+        told = f"{', '.join(space.names)} there, {', '.join(scenario.space.names)} here"
+        raise InputError(f"from must name a campaign of the same inputs, but {folder} has others ({told})")
+    kept = history.where(scenario.space.feasible(history.x)) if len(history) else history
+    if len(kept) and scenario.requirement.metric not in kept.metrics and kept.ok.any():
+        raise InputError(f"from must name a campaign that measured {scenario.requirement.metric}, but {folder} did not")
+    return kept
+
+
+def _what_runs(loaded: Loaded) -> tuple[Any, ...]:
+    """Return what decides the outcome of a concrete scenario: its code, the ego and the step."""
+    config = loaded.config
+    own = ".py:" in config.scenario or Path(config.scenario).suffix == ".yaml"
+    name = str((loaded.folder / config.scenario).resolve()) if own else config.scenario
+    ego = None if config.ego is None else config.ego.model_dump()
+    return name, ego, config.simulation.step_length
 
 
 def rebuild_report(folder: Path) -> Path:

@@ -44,10 +44,9 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
     return found
 
 
-def drawn_shares(log: Log, *, only_counted: bool = False) -> Vector:
-    """Return the share in proportion to the nominal law of every draw, of complete batches, in their order."""
-    phases = ("count",) if only_counted else ("count", "learn")
-    shares = [np.full(i["draws"], i["nominal"]) for i in log.iterations if i.get("phase") in phases]
+def drawn_shares(log: Log) -> Vector:
+    """Return the share in proportion to the nominal law of every counted draw, in their order."""
+    shares = [np.full(i["draws"], i["nominal"]) for i in log.iterations if i.get("phase") == "count"]
     return np.concatenate(shares) if shares else np.empty(0)
 
 

@@ -78,7 +78,7 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         return _uncounted(log, settings)
     low, high, seen = combined(safe), combined(critical), Seen.of(log, settings)
     hits, misses = _hits(safe), sum(len(b.critical) for b in critical) - _hits(critical)
-    counted = drawn_shares(log, only_counted=True)
+    counted = drawn_shares(log)
     undetected = few_hits_bound(seen.surprises, counted, _CONFIDENCE)
     value, rest = _clipped(low.value), {}
     limits, warnings = Limits(lambda c: low.limit(c, side=-1), lambda c: high.limit(c, side=1)), []
@@ -87,8 +87,7 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         rest["exact_bound"] = limits.upper(_CONFIDENCE)
         warnings.append(_NOTHING)
     elif not seen.safe:
-        every = drawn_shares(log)
-        limits = Limits(lambda c: 1.0 - few_hits_bound(seen.failed_draws, every, c), lambda _: 1.0)
+        limits = Limits(lambda c: 1.0 - few_hits_bound(seen.failed_draws, counted, c), lambda _: 1.0)
         warnings.append("everything was critical: the probability is only bounded from below, by the draws from the law")
     elif hits < FEWEST_HITS:
         limits = Limits(lambda _: 0.0, lambda c: few_hits_bound(_hits(critical), counted, c))

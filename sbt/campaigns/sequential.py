@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 from scipy.special import ndtr, ndtri
 
 from sbt.arrays import Mask, Points, Vector
@@ -34,7 +35,7 @@ from sbt.store import PlannedRun
 
 __all__ = ["FEWEST_BATCHES", "SequentialStage"]
 
-_HUNT = "hunt"
+_HUNT, _LEARN = "hunt", "learn"
 _POOL = 10_000
 _PARTICLES = 800
 _CANDIDATES = 6_000
@@ -43,7 +44,8 @@ _EVEN_SHARE = 0.1
 _PROBES = 9
 _COMMON = 0.02
 _STALLED = 1.5
-_LEARN = 0.6
+_LATEST = 0.6
+_CHOICE = 4
 _HUNTED_SHARE = (0.2, 0.1)
 FEWEST_BATCHES = 4
 """Batches that must count before a target is believed to be met."""
@@ -171,18 +173,22 @@ class SequentialStage:
         unsure = np.full(len(z), np.log(0.5))
         log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
         plan = planned(log_pi, log_not, log_w, log_wide, stratum, BLIND if known.one_sided else SHARES)
-        counts = self._counts(log, plan, size)
+        doubt = {"pool": _POOL, "prior": plan.prior, "anticipated": plan.anticipated, "components": len(mixture.shares)}
+        counts = known.one_sided or self._counts(log, plan, size)
         hunted = min(round(_HUNTED_SHARE[counts] * size), size - 1)
         n = size - hunted
+        picks = self._runs(self._hunt(known, log.iteration, hunted), _HUNT)
+        if not counts:
+            rows = _spread(self._coordinates(z), plan.doubt, known.u, n, rng)
+            how = {"method": "doubt", "phase": "learn", **doubt}
+            return Batch((*self._runs(z[rows], _LEARN, None), *picks), how)
         draws = chosen(plan, n, log_pi - log_not, rng)
         log_q = s.scenario.space.log_density(x[draws.rows]) - np.log(draws.coefficient)
         how = {
-            "method": plan.form, "phase": "count" if counts else "learn", "pool": _POOL, "draws": n,
-            "prior": plan.prior, "anticipated": plan.anticipated, "pool_variance": plan.pool_variance,
+            "method": plan.form, "phase": "count", "draws": n, **doubt, "pool_variance": plan.pool_variance,
             "nominal": plan.nominal, "coefficient": draws.coefficient.tolist(), "believed": draws.believed.tolist(),
-            "pi": np.exp(log_pi[draws.rows]).tolist(), "components": len(mixture.shares),
+            "pi": np.exp(log_pi[draws.rows]).tolist(),
         }  # fmt: skip
-        picks = self._runs(self._hunt(known, log.iteration, hunted), _HUNT)
         return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), how)
 
     def _mixture(self, belief: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
@@ -207,7 +213,7 @@ class SequentialStage:
         if any(i["phase"] == "count" for i in drawn):
             return True
         s, spent = self.settings, len(log.history)
-        if spent + size > _LEARN * s.budget:
+        if spent + size > _LATEST * s.budget:
             return True
         doubts = [
             _relative(i["anticipated"], i["prior"]) for i in (*drawn[-2:], {"anticipated": plan.anticipated, "prior": plan.prior})
@@ -219,6 +225,18 @@ class SequentialStage:
         target = s.stop.get("cov")
         target = _TARGET if target is None else target
         return len(drawn) >= 1 and math.sqrt(plan.anticipated / left) <= target * base
+
+
+def _spread(u: Points, probability: Vector, seen: Points, n: int, rng: np.random.Generator) -> Points:
+    """Return n rows of the pool u (N, d): of four times as many drawn by their doubt, those farthest from all others."""
+    rows = rng.choice(len(u), size=_CHOICE * n, p=probability)
+    scale = u[rows].std(axis=0) + 1e-3
+    near = cdist(u[rows] / scale, seen / scale).min(axis=1) if len(seen) else np.full(len(rows), np.inf)
+    taken = []
+    for _ in range(n):
+        taken.append(int(np.argmax(near)))
+        near = np.minimum(near, np.linalg.norm((u[rows] - u[rows[taken[-1]]]) / scale, axis=1))
+    return rows[taken]
 
 
 def _relative(anticipated: float, prior: float) -> float:

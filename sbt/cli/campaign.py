@@ -35,6 +35,9 @@ def run(
     fail_on_critical: Annotated[
         bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")
     ] = False,
+    junit: Annotated[
+        Path | None, typer.Option("--junit", metavar="FILE.xml", help="Write the verdict as JUnit XML, for a CI's view.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
@@ -54,10 +57,17 @@ def run(
             result = run_campaign(loaded, progress=show)
     except KeyboardInterrupt:
         raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+    if junit is not None:
+        from sbt.report.junit import write_junit
+
+        write_junit(junit, result, fail_on_critical=fail_on_critical)
     if as_json:
         print_json(result)
     else:
         print("\n".join(conclusion_lines(result)))
+    gate = result["conclusion"].get("gate")
+    if gate is not None and gate["verdict"] != "pass":
+        raise fail(f"gate {gate['verdict']}: {gate['statement']}", Exit.CRITICAL)
     if fail_on_critical and result["critical"] > 0:
         raise fail(f"{result['critical']} critical runs", Exit.CRITICAL)
     if 2 * result["failed"] > result["runs"]:

@@ -132,7 +132,7 @@ def checked(model: type[M], text: str, overrides: Sequence[str], name: str) -> t
 
 def resolve(config: Configuration) -> dict[str, Any]:
     """Return the configuration as plain data, every default filled in."""
-    return config.model_dump(mode="json")
+    return config.model_dump(mode="json", by_alias=True)
 
 
 def dump(config: Configuration) -> str:

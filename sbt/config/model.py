@@ -31,7 +31,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
     "CAMPAIGNS", "EXECUTORS", "AcquisitionChoice", "CampaignKind", "Choice", "Configuration",
-    "CorrelationEntry", "ExecutorChoice", "InputChange", "MetamodelChoice", "RequirementChange",
+    "CorrelationEntry", "ExecutorChoice", "GateChoice", "InputChange", "MetamodelChoice", "RequirementChange",
     "SimulationChoice", "StopRules", "ValidationChoice",
 ]  # fmt: skip
 
@@ -76,8 +76,9 @@ CAMPAIGNS: Mapping[str, CampaignKind] = {
         metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, most_initial=10, batch=10,
     ),
     "estimation": CampaignKind(
-        "probability of a critical scenario under the inputs' distribution", "difference",
-        stop={"cov": 0.1}, methods=("difference", "monte_carlo", "subset"),
+        "probability of a critical scenario under the inputs' distribution", "auto",
+        stop={"cov": 0.1}, methods=("auto", "difference", "monte_carlo", "subset"),
+        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False},
     ),
     "coverage": CampaignKind("evenly distributed points: the baseline, and data sets", "even", adaptive=False),
 }
@@ -255,6 +256,13 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class GateChoice(_Strict):
+    """When an estimation passes: the probability of a critical run is at most this, with this confidence."""
+
+    probability: float = Field(gt=0, lt=1, description="Largest probability of a critical run that passes.")
+    confidence: float = Field(default=0.95, gt=0.5, lt=1, description="Confidence of the verdict, pass or fail.")
+
+
 class ExecutorChoice(_Strict):
     """Where runs are executed; never changes their results."""
 
@@ -338,6 +346,13 @@ class Configuration(_Strict):
     stop: StopRules = Field(
         default_factory=StopRules, validate_default=True, description="When to stop before the budget is used up."
     )
+    gate: GateChoice | None = Field(
+        default=None, description="Estimation: pass, fail or undecided about a largest probability; null: no verdict."
+    )
+    earlier: Name | None = Field(
+        default=None, alias="from",
+        description="Estimation: store of a finished campaign of the same scenario; its runs teach, they are never counted.",
+    )  # fmt: skip
     executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")
     store: Name = Field(default_factory=_store, description="Folder of the results; default: runs/<campaign>_<scenario>.")
 
@@ -362,6 +377,13 @@ class Configuration(_Strict):
         name = info.data.get("campaign")
         if name is not None and not CAMPAIGNS[name].adaptive and value.kind != CAMPAIGNS[name].acquisition:
             raise ValueError(f"a {name} campaign draws by {CAMPAIGNS[name].acquisition}, but got '{value.kind}'")
+        return value
+
+    @field_validator("gate", "earlier")
+    @classmethod
+    def _of_estimation(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and info.data.get("campaign", "estimation") != "estimation":
+            raise ValueError(f"only an estimation campaign takes it, but the campaign is {info.data['campaign']}")
         return value
 
     @field_validator("stop")

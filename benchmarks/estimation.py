@@ -1,0 +1,95 @@
+"""Is the estimate right, and does its interval hold? Many seeds on testbeds with known probability.
+
+    python benchmarks/estimation.py [--seeds 50] [--problems four_branch_7@124,rp38] [--table runs/estimation.jsonl]
+
+Every cell (problem, runs, seed) is a campaign with default settings, through the public way. Finished
+cells are lines of the table: run again to go on where it stopped; `--show` only prints what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+from sbt.config.load import parse
+from sbt.run import run_campaign
+from sbt.testbeds import truth
+
+BARS = {
+    "four_branch_7@124": 0.05, "four_branch_7@200": 0.025, "rp38@200": 0.05, "cut_in_crash@200": 0.07, "pedestrian@200": 0.10,
+    "metaball@200": 0.10, "gayton_hat@200": 0.15, "linear_d10@200": 0.12, "rp110@250": 0.10, "damped_oscillator_15@300": 0.20,
+}  # fmt: skip
+"""Problem@runs: the largest relative RMSE of issue 5."""
+KEPT = ("probability", "low", "high", "cov", "hits", "undetected_mass_bound", "warnings")
+
+
+def campaign(cell: str, seed: int) -> dict:
+    name, _, runs = cell.partition("@")
+    with tempfile.TemporaryDirectory() as folder:
+        text = (
+            f"campaign: estimation\nscenario: testbed:{name}\nbudget: {runs}\nseed: {seed}\nstop: {{cov: null}}\n"
+            f"executor: {{kind: serial}}\nstore: {folder}/store\n"
+        )
+        start, cpu = time.perf_counter(), time.process_time()
+        result = run_campaign(parse(text), report=False)
+    took = {"seconds": round(time.perf_counter() - start, 1), "cpu": round(time.process_time() - cpu, 1)}
+    return {"cell": cell, "seed": seed, "runs": result["runs"], **took, **{k: result["conclusion"][k] for k in KEPT}}
+
+
+def finished(table: Path) -> dict[tuple[str, int], dict]:
+    rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
+    return {(row["cell"], row["seed"]): row for row in rows}
+
+
+def one_sided(row: dict) -> bool:
+    return any("bound is given" in w or "only bounded" in w for w in row["warnings"])
+
+
+def show(rows: list[dict]) -> None:
+    head = ("problem@runs", "seeds", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "covered", "one-sided", "crude runs", "CPU s")
+    print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+    every = []
+    for cell in dict.fromkeys(row["cell"] for row in rows):
+        p = truth(cell.partition("@")[0]).probability
+        mine = [row for row in rows if row["cell"] == cell]
+        error = np.array([row["probability"] / p - 1.0 for row in mine])
+        covered = [row["low"] <= p <= row["high"] for row in mine]
+        every += covered
+        rmse = float(np.sqrt(np.mean(error**2)))
+        cov = np.median([row["cov"] for row in mine if row["cov"] is not None])
+        print(
+            f"| {cell} | {len(mine)} | {rmse:.3f} | {BARS.get(cell, float('nan')):.3f} | {error.mean():+.3f} "
+            f"({error.std(ddof=1) / np.sqrt(len(error)):.3f}) | {cov:.3f} | {np.mean(covered):.2f} | "
+            f"{np.mean([one_sided(row) for row in mine]):.2f} | {(1 - p) / p / rmse**2:.2g} | {np.mean([r['cpu'] for r in mine]):.1f} |"
+        )
+    print(f"\npooled coverage of the 95 % interval: {np.mean(every):.3f} of {len(every)} campaigns")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--problems", default=",".join(BARS))
+    parser.add_argument("--table", type=Path, default=Path("runs/estimation.jsonl"))
+    parser.add_argument("--show", action="store_true")
+    args = parser.parse_args()
+    args.table.parent.mkdir(parents=True, exist_ok=True)
+    done, cells = finished(args.table), args.problems.split(",")
+    for seed in range(0 if args.show else args.seeds):
+        for cell in cells:
+            if (cell, seed) not in done:
+                done[cell, seed] = campaign(cell, seed)
+                with args.table.open("a") as file:
+                    file.write(json.dumps(done[cell, seed]) + "\n")
+    show([done[key] for cell in cells for key in done if key[0] == cell and key[1] < args.seeds])
+
+
+if __name__ == "__main__":
+    main()
