@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import betaincinv
 
+from sbt.acquisition import boundary
 from sbt.arrays import Points, Vector
 from sbt.campaign import Batch, Fit, Log
 from sbt.history import VALIDATION, History
@@ -130,7 +131,8 @@ class BatchStage:
             )
         start = int(log.iterations[-1][_POSITION]) if log.iterations else 0
         sobol = SobolSequence(space.dimension, s.seed)
-        return rejection(score, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=admissible)
+        bound = belief.log_ambiguity_bound if belief is not None and s.acquisition is boundary and self.adaptive else None
+        return rejection(score, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=admissible, bound=bound)
 
     def _pool(self, log: Log) -> PoolSequence | None:
         """Return the recorded rows that are left to choose from; None where runs are simulated."""

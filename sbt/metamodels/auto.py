@@ -12,12 +12,13 @@ import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, check_rows
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows
 from sbt.metamodels.ensemble import Ensemble
 from sbt.metamodels.et import ExtraTrees
 from sbt.metamodels.gp import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import check_device
+from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Auto", "Choice", "MixturePredictor"]
 
@@ -115,6 +116,18 @@ class MixturePredictor:
     predictors: tuple[Predictor, ...]
     weight: Vector
     choice: Choice
+
+    def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
+        """Return (n,) lower and (n,) upper bounds of P(y in M_c): quick where the predictors have quick ones."""
+        low, high = np.zeros(len(u)), np.zeros(len(u))
+        for weight, predict in zip(self.weight, self.predictors, strict=True):
+            if isinstance(predict, Screened):
+                ends = predict.probability_bounds(u, critical)
+            else:
+                p = predict(u).probability(critical)
+                ends = p * (1.0 - 1e-9), p * (1.0 + 1e-9)
+            low, high = low + weight * ends[0], high + weight * ends[1]
+        return low, np.minimum(high, 1.0)
 
     def __call__(self, u: Points) -> Prediction:
         """Return the belief at u (n, d)."""
