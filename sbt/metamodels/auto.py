@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -32,7 +33,8 @@ class Auto:
 
     Each model is scored on rows it was not fitted to (cross-validation); the weights are those of
     largest likelihood of the mixture there, shrunk a little to equal ones. Then all models are fitted
-    to all rows. Too few rows to score: equal weights of `gp` and `et`.
+    to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
+    every batch, takes about a quarter of the time up to 500 rows: no ensemble, two folds.
 
     Args:
         folds: of the cross-validation, >= 2.
@@ -53,6 +55,8 @@ class Auto:
     ensemble_rows: int = 100
     gp_rows: int = 4000
     device: str = "cpu"
+
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"folds": 2, "ensemble_rows": 500}}
 
     def __post_init__(self) -> None:
         for name in ("folds", "ensemble_rows", "gp_rows"):

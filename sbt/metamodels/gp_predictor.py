@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr
@@ -19,6 +21,7 @@ from sbt.problem.requirement import CriticalInterval
 __all__ = ["GaussianProcessPredictor", "Hyperparameters", "NoiseSpread", "matern", "relative"]
 
 _CHUNK = 2048  # points predicted at once
+_QUICK = 256  # points bounded at once: what is in between stays in the cache
 _BLOCK = 128  # rows summed in single precision
 _MARGIN = 3e-5  # of a mean in single precision: 128 roundings of 6e-8 in a sum, a few in each term
 _LOG_CHI2 = 1.27036  # -E[log chi^2_1]: what the mean of log z^2 lacks to the log of the mean of z^2
@@ -66,41 +69,58 @@ class GaussianProcessPredictor:
         )
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
-        """Return (n,) lower and (n,) upper bounds of P(y in M_c), from the mean alone.
+        """Return (n,) lower and (n,) upper bounds of P(y in M_c), from the mean and a bound of the variance.
 
-        The posterior variance is at most the prior's, and P grows with it where the mean lies outside of
-        M_c, shrinks where it lies inside. Several times quicker than the belief itself.
+        The variance given all rows is at most that given one of them, and P grows with it where the mean
+        lies outside of M_c, shrinks where it lies inside. Many times quicker than the belief itself.
         """
+        scale, noise = self.hyper.outputscale, self.hyper.noise
+        most = 1.0 if self.spread is None else self.spread.most
         with single_threaded():
-            chunks = [self._quick_mean(u[i : i + _CHUNK]) for i in range(0, max(len(u), 1), _CHUNK)]
-        mean = self.shift + self.scale * np.concatenate(chunks)
-        margin = self.scale * _MARGIN * self.hyper.outputscale * float(np.abs(self.alpha).sum())
-        spread = self.spread(u) if self.spread is not None and len(u) > 0 else np.ones(len(u))
-        sigma = 1.000001 * self.scale * np.sqrt(self.hyper.outputscale + self.hyper.noise * spread)
+            chunks = [self._quick(u[i : i + _QUICK]) for i in range(0, max(len(u), 1), _QUICK)]
+        quick, nearest = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+        rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # a small noise need not be known
+        at = np.full(len(u), most) if rough or self.spread is None else self.spread(u)
+        mean = self.shift + self.scale * quick
+        margin = self.scale * _MARGIN * scale * float(np.abs(self.alpha).sum())
+        latent = scale * (1.0 - np.maximum(nearest - 1e-6, 0.0) ** 2 * scale / (scale + noise * most))
+        sigma = 1.000001 * self.scale * np.sqrt(latent + noise * at)
         outside = np.maximum(np.maximum(critical.low - mean, mean - critical.high) - margin, 0.0)  # at least so far off
-        below, above = (np.maximum(gap - margin, 0.0) for gap in (mean - critical.low, critical.high - mean))
+        below, above = mean - critical.low - margin, critical.high - mean - margin
+        inside = (below > 0.0) & (above > 0.0)
         low, high = np.zeros(len(u)), np.zeros(len(u))
         for width in self.widths:
             std = width * sigma
             high += np.where(outside > 0.0, ndtr(-outside / std), 1.0) / len(self.widths)
-            low += np.maximum(1.0 - ndtr(-below / std) - ndtr(-above / std), 0.0) / len(self.widths)
+            low += np.where(inside, np.maximum(1.0 - ndtr(-below / std) - ndtr(-above / std), 0.0), 0.0) / len(self.widths)
         return low * (1.0 - 1e-9), np.minimum(high * (1.0 + 1e-9), 1.0)
 
-    def _quick_mean(self, u: Points) -> Vector:
-        """Return the (m,) mean, standardised, within `_MARGIN` of the sum of |alpha| times the output scale."""
-        a, b = self.u / self.hyper.lengthscale, u / self.hyper.lengthscale
-        squares = (b**2).sum(axis=1)[:, None] + (a**2).sum(axis=1) - 2.0 * (b @ a.T)  # (m, n)
-        r = np.sqrt(np.maximum(squares, 0.0), dtype=np.float32, casting="same_kind")
-        r *= np.float32(math.sqrt(2.0 * self.hyper.nu))
+    def _quick(self, u: Points) -> tuple[Vector, Vector]:
+        """Return (m,) means, standardised, and (m,) correlations with the nearest row, in single precision.
+
+        Means are off by at most `_MARGIN` times the output scale and the sum of |alpha|.
+        """
+        across, weights = self._prepared
+        b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
+        squares = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)]) @ across  # (m, n)
+        r = np.sqrt(np.maximum(squares, 0.0, out=squares), dtype=np.float32, casting="same_kind")
         correlation = np.exp(-r)
         if self.hyper.nu == 1.5:
-            correlation *= r + np.float32(1.0)
+            r += np.float32(1.0)
+            correlation *= r
         elif self.hyper.nu == 2.5:
             correlation *= r * r / np.float32(3.0) + r + np.float32(1.0)
-        weights, mean = (self.hyper.outputscale * self.alpha).astype(np.float32), np.zeros(len(u))
-        for i in range(0, len(a), _BLOCK):  # short sums lose few digits
+        mean = np.full(len(u), self.centre)
+        for i in range(0, len(weights), _BLOCK):  # short sums lose few digits
             mean += correlation[:, i : i + _BLOCK] @ weights[i : i + _BLOCK]
-        return self.centre + mean
+        return mean, correlation.max(axis=1).astype(np.float64)
+
+    @cached_property
+    def _prepared(self) -> tuple[Points, NDArray[np.float32]]:
+        """Return what squared distances of points and rows are made from, (d + 2, n), and (n,) weights."""
+        a = self.u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
+        across = np.column_stack([-2.0 * a, (a**2).sum(axis=1), np.ones(len(a))]).T
+        return np.ascontiguousarray(across), (self.hyper.outputscale * self.alpha).astype(np.float32)
 
     def _moments(self, u: Points) -> tuple[Vector, Vector]:
         """Return (m,) mean and (m,) variance without noise, standardised."""
@@ -142,7 +162,13 @@ class NoiseSpread:
 
     forests: tuple[ForestPredictor, ...]
 
+    @cached_property
+    def most(self) -> float:
+        """No point, and no row that was cross-fitted, has a larger relative noise variance."""
+        return float(relative(np.array([max(forest.most for forest in self.forests)]))[0])
+
     def __call__(self, u: Points) -> Vector:
+        """Return the (n,) relative noise variance at u (n, d)."""
         return relative(np.mean([forest.mu(u) for forest in self.forests], axis=0))
 
 
