@@ -14,7 +14,7 @@ from sbt.arrays import Mask, Points, Vector
 from sbt.errors import SbtError
 from sbt.execution.worker import place_of
 from sbt.history import History
-from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.scenario import LogicalScenario
@@ -39,12 +39,14 @@ class Belief:
             `ambiguous_volume`, the share with P between 0.05 and 0.95.
         runs: rows it learned from.
         seconds: the fit took.
+        log_ambiguity_bound: (n, d) points -> (n,) quick upper bounds of log a_BI; None: the metamodel has none.
     """
 
     predict: Callable[[Points], Prediction]
     scores: dict[str, Any]
     runs: int
     seconds: float
+    log_ambiguity_bound: Callable[[Points], Vector] | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,14 @@ class Learner:
             with self._named(len(training)):
                 return predictor(inputs)
 
-        return Belief(predict, self._scores(predict, history), len(training), seconds)
+        bound = None
+        if isinstance(predictor, Screened):
+            critical = self.scenario.requirement.critical
+
+            def bound(points: Points) -> Vector:
+                return log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
+
+        return Belief(predict, self._scores(predict, history), len(training), seconds, bound)
 
     def train(self, training: History) -> Predictor:
         """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""

@@ -183,13 +183,14 @@ def test_kernel_is_gpytorchs(nu):
 def test_gradient_is_that_of_the_objective():
     from scipy.optimize import approx_fprime
 
-    from sbt.metamodels.gp import _Hyperparameters, _Model
+    from sbt.metamodels.gp import _Model
+    from sbt.metamodels.gp_predictor import Hyperparameters
 
     u, y = rows(30, noise=0.1)
     z, spread = standardise(y)[0], np.linspace(0.5, 2.0, 30)
     for priors in (True, False):
         model = _Model.build(1.5, 3, priors=priors)
-        model.assign(_Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
+        model.assign(Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
         parameters = model.parameters()
 
         def value(vector, model=model, parameters=parameters):
@@ -204,12 +205,13 @@ def test_gradient_is_that_of_the_objective():
 
 
 def test_likelihood_is_gpytorchs():
-    from sbt.metamodels.gp import _Hyperparameters, _Model
+    from sbt.metamodels.gp import _Model
+    from sbt.metamodels.gp_predictor import Hyperparameters
 
     u, y = rows(30, noise=0.1)
     z = standardise(y)[0]
     model = _Model.build(1.5, 3, priors=False)
-    model.assign(_Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.3, 0.05))
+    model.assign(Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.3, 0.05))
     value = model.backward(torch.from_numpy(u), z, np.ones(30))
     covariance = model.kernel(torch.from_numpy(u)).to_dense().detach() + 0.05 * torch.eye(30)
     inverse = torch.linalg.inv(covariance)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from sbt.cli import app
-from sbt.predict import MODEL
+from sbt.errors import InputError
+from sbt.predict import MODEL, read_inputs
+from sbt.problem.parameter import Parameter
+from sbt.problem.space import ParameterSpace
 from sbt.run import assembly_of, loaded_from, settings_of
 from sbt.store import Store
 
@@ -22,9 +26,8 @@ def invoke(*args: object):
 
 
 @pytest.fixture
-def store(configured, tmp_path):
-    config = configured(campaign="coverage", budget=40, initial=20, batch=20, metamodel={"kind": "gp"}, store=str(tmp_path / "s"))
-    assert invoke("run", config, "--quiet").exit_code == 0
+def store(campaign, tmp_path):
+    campaign(campaign="coverage", budget=40, metamodel={"kind": "gp"}, store=str(tmp_path / "s"))
     (tmp_path / "rows.csv").write_text(ROWS)
     return tmp_path / "s"
 
@@ -50,12 +53,11 @@ def test_it_is_the_belief_of_the_campaign(store):
     assert found["rows"][0]["p_critical"] > 0.9 > 0.1 > found["rows"][1]["p_critical"]
 
 
-def test_it_is_fitted_once_for_the_same_rows(store, configured):
+def test_it_is_fitted_once_for_the_same_rows(store, campaign):
     first, second = predicted(store), predicted(store)
     assert (first["source"], second["source"]) == ("fitted", "loaded")
     assert first["rows"] == second["rows"]
-    config = configured(campaign="coverage", budget=60, metamodel={"kind": "gp"}, store=str(store))
-    assert invoke("run", config, "--quiet").exit_code == 0
+    campaign(campaign="coverage", budget=60, metamodel={"kind": "gp"}, store=str(store))
     third = predicted(store)
     assert third["source"] == "fitted"
     assert third["learned"] > first["learned"]
@@ -87,15 +89,15 @@ def test_text_goes_to_stdout_or_to_a_file(store, tmp_path):
         ("", r"rows.csv:1: the first line must name the columns"),
     ],
 )
-def test_a_wrong_table_is_refused(store, tmp_path, text, message):
+def test_a_wrong_table_is_refused(tmp_path, text, message):
     (tmp_path / "rows.csv").write_text(text)
-    done = invoke("predict", store, "--inputs", tmp_path / "rows.csv")
-    assert (done.exit_code, message in done.stderr) == (2, True), done.stderr
+    space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_inputs(tmp_path / "rows.csv", space)
 
 
-def test_a_campaign_without_metamodel_says_so(configured, tmp_path):
-    config = configured(campaign="coverage", budget=20, metamodel=None, store=str(tmp_path / "s"))
-    assert invoke("run", config, "--quiet").exit_code == 0
+def test_a_campaign_without_metamodel_says_so(campaign, tmp_path):
+    campaign(campaign="coverage", budget=20, metamodel=None, store=str(tmp_path / "s"))
     (tmp_path / "rows.csv").write_text(ROWS)
     done = invoke("predict", tmp_path / "s", "--inputs", tmp_path / "rows.csv")
     assert done.exit_code == 2

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.acquisition import Acquisition
+from sbt.acquisition import Acquisition, boundary
 from sbt.arrays import Points, Vector
 from sbt.benchmark.keeping import opened
 from sbt.benchmark.reference import reference_rows
@@ -165,6 +165,7 @@ class _BenchmarkStage:
             score, SobolSequence(space.dimension, self.seed), self.batch,
             start=int(log.iterations[-1][_POSITION]) if log.iterations else 0, seed=self.seed, label=log.iteration,
             max_candidates=max(self.max_candidates, self.batch), accept_filter=admissible,
+            bound=belief.log_ambiguity_bound if belief is not None and acquisition is boundary else None,
         )  # fmt: skip
         return draw, space.from_unit(draw.u)
 

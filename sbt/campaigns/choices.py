@@ -17,6 +17,7 @@ from sbt.acquisition import boundary, even
 from sbt.arrays import Mask, Points, Vector
 from sbt.campaign import Log
 from sbt.campaigns.settings import Acquisition, Settings
+from sbt.errors import InputError
 from sbt.learner import Belief
 from sbt.samplers.greedy import diverse, influence, refined
 from sbt.samplers.pool import PoolSequence
@@ -158,12 +159,17 @@ def _draw(
         return draw, scenario.pool.x[rows.rows[draw.positions]]
     sobol = SobolSequence(scenario.space.dimension, settings.seed)
     begin = _position(log) if start is None else start
+    bound = belief.log_ambiguity_bound if belief is not None and acquisition is boundary else None
     draw = rejection(
         score, sobol, n, start=begin, seed=settings.seed, label=label, max_candidates=max(most, n),
-        accept_filter=_admissible(settings),
+        accept_filter=_admissible(settings), bound=bound, fill=False,
     )  # fmt: skip
-    if draw.method == "pool":
+    if draw.method == "short" and acquisition is not even:
         draw = _particles(settings, score, draw, label, n)
+        if draw.method == "short":  # the score is -inf wherever one looks
+            return _draw(settings, belief, even, log, n, taken=taken, start=begin)
+    if len(draw.u) < n:
+        raise InputError(f"the constraints must admit {n} of {draw.candidates} candidates, but admitted {len(draw.u)}")
     return draw, scenario.space.from_unit(draw.u)
 
 

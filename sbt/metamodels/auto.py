@@ -7,17 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, check_rows
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows
 from sbt.metamodels.ensemble import Ensemble
 from sbt.metamodels.et import ExtraTrees
 from sbt.metamodels.gp import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import check_device
+from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Auto", "Choice", "MixturePredictor"]
 
@@ -31,7 +33,8 @@ class Auto:
 
     Each model is scored on rows it was not fitted to (cross-validation); the weights are those of
     largest likelihood of the mixture there, shrunk a little to equal ones. Then all models are fitted
-    to all rows. Too few rows to score: equal weights of `gp` and `et`.
+    to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
+    every batch, takes about a quarter of the time up to 500 rows: no ensemble, two folds.
 
     Args:
         folds: of the cross-validation, >= 2.
@@ -52,6 +55,8 @@ class Auto:
     ensemble_rows: int = 100
     gp_rows: int = 4000
     device: str = "cpu"
+
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"folds": 2, "ensemble_rows": 500}}
 
     def __post_init__(self) -> None:
         for name in ("folds", "ensemble_rows", "gp_rows"):
@@ -115,6 +120,18 @@ class MixturePredictor:
     predictors: tuple[Predictor, ...]
     weight: Vector
     choice: Choice
+
+    def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
+        """Return (n,) lower and (n,) upper bounds of P(y in M_c): quick where the predictors have quick ones."""
+        low, high = np.zeros(len(u)), np.zeros(len(u))
+        for weight, predict in zip(self.weight, self.predictors, strict=True):
+            if isinstance(predict, Screened):
+                ends = predict.probability_bounds(u, critical)
+            else:
+                p = predict(u).probability(critical)
+                ends = p * (1.0 - 1e-9), p * (1.0 + 1e-9)
+            low, high = low + weight * ends[0], high + weight * ends[1]
+        return low, np.minimum(high, 1.0)
 
     def __call__(self, u: Points) -> Prediction:
         """Return the belief at u (n, d)."""

@@ -9,18 +9,34 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Metamodel", "Predictor", "build", "check_rows", "split_validation", "standardise"]
+__all__ = ["Metamodel", "Predictor", "Screened", "build", "check_rows", "log_ambiguity_bound", "split_validation", "standardise"]
 
 Predictor = Callable[[Points], Prediction]
 """A fitted metamodel: (n, d) points -> belief at them. Picklable."""
+
+
+@runtime_checkable
+class Screened(Protocol):
+    """A predictor that can say quickly what P(y in M_c) at most and at least is."""
+
+    def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
+        """Return (n,) lower and (n,) upper bounds of P(y in M_c) at u (n, d)."""
+        ...
+
+
+def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterval) -> Vector:
+    """Return (n,) upper bounds of log a_BI = log(1 - 2 |P(y in M_c) - 0.5|), at least -700."""
+    low, high = predictor.probability_bounds(u, critical)
+    return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), 1e-304))
 
 
 class Metamodel(Protocol):

@@ -131,6 +131,11 @@ class ForestPredictor:
         """Return the (n,) mean of the trees, without the rest of the belief."""
         return np.asarray(self.mean[self._nodes(u)].mean(axis=0))
 
+    @property
+    def most(self) -> float:
+        """No point has a larger mean of the trees."""
+        return float(np.mean([part.max() for part in np.split(self.mean, self.offset[1:])]))
+
     def _nodes(self, u: Points) -> NDArray[np.int64]:
         """Return (k, n) rows of the tables: the leaves that the points fall into."""
         points = np.ascontiguousarray(u, dtype=np.float32)

@@ -17,27 +17,24 @@ import numpy as np
 import torch
 from gpytorch.constraints import GreaterThan, Positive
 from gpytorch.priors import LogNormalPrior
-from scipy.linalg import cho_solve, lapack, solve_triangular
+from scipy.linalg import cho_solve, lapack
 from scipy.optimize import minimize
-from scipy.spatial.distance import cdist
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
-from sbt.metamodels.et import ExtraTrees, ForestPredictor
-from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.et import ExtraTrees
+from sbt.metamodels.gp_predictor import GaussianProcessPredictor, Hyperparameters, NoiseSpread, cholesky, matern, relative
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import single_threaded
 
 __all__ = ["GaussianProcess", "GaussianProcessPredictor", "matern"]
 
-_CHUNK = 2048  # points predicted at once
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter
 _NOISE_FLOOR = 1e-4  # variance relative to that of y: keeps the covariance well conditioned
 _FOLDS = 5  # of the noise regression
 _FEWEST_FOR_NOISE = 2 * _FOLDS  # rows
 _FOREST = ExtraTrees(trees=10, min_samples_split=20)
-_LOG_CHI2 = 1.27036  # -E[log chi^2_1]: what the mean of log z^2 lacks to the log of the mean of z^2
 
 
 @dataclass(frozen=True)
@@ -112,117 +109,14 @@ class GaussianProcess:
         return _condition(self, hyper, u, z, at_rows, spread, shift, scale)
 
 
-@dataclass(frozen=True, eq=False)
-class GaussianProcessPredictor:
-    """A Gaussian process conditioned on n rows.
-
-    Args:
-        hyper: kernel, noise.
-        u: (n, d) rows.
-        factor: (n, n) lower Cholesky factor of their covariance, noise included.
-        alpha: (n,) covariance^-1 (z - centre).
-        centre: constant mean, in standardised units.
-        spread: how the noise depends on the input; None: not.
-        shift: y = shift + scale z.
-        scale: see `shift`.
-        widths: (k,) factors on sigma, equally likely: one factor of 1, or more for heavy tails.
-    """
-
-    hyper: _Hyperparameters
-    u: Points
-    factor: Points
-    alpha: Vector
-    centre: float
-    spread: _NoiseSpread | None
-    shift: float
-    scale: float
-    widths: Vector
-
-    def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
-        with single_threaded():
-            chunks = [self._moments(u[i : i + _CHUNK]) for i in range(0, max(len(u), 1), _CHUNK)]
-        mean, variance = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
-        spread = self.spread(u) if self.spread is not None and len(u) > 0 else np.ones(len(u))
-        noise = self.hyper.noise * spread
-        k, common = len(self.widths), math.sqrt(float(np.mean(self.widths**2)))
-        return Prediction(
-            mean=np.repeat((self.shift + self.scale * mean)[None], k, axis=0),
-            std=self.widths[:, None] * (self.scale * np.sqrt(variance + noise)),
-            weight=np.full(k, 1.0 / k),
-            noise=common * (self.scale * np.sqrt(noise)),
-        )
-
-    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m.
-
-        Source:
-            Rasmussen & Williams (2006), eq. (2.24) and appendix A.2.
-        """
-        with single_threaded():
-            cross = self.hyper.covariance(self.u, u)  # (rows, m)
-            mean = self.centre + self.alpha @ cross
-            half = solve_triangular(self.factor, cross, lower=True, overwrite_b=True, check_finite=False)
-            latent = self.hyper.covariance(u, u) - half.T @ half
-            root = _factor(latent, np.full(len(u), 1e-8 * self.hyper.outputscale))
-            return self.shift + self.scale * (mean + rng.standard_normal((n, len(u))) @ root.T)
-
-    def _moments(self, u: Points) -> tuple[Vector, Vector]:
-        """Return (m,) mean and (m,) variance without noise, standardised."""
-        cross = self.hyper.covariance(self.u, u)  # (n, m)
-        mean = self.centre + self.alpha @ cross
-        half = solve_triangular(self.factor, cross, lower=True, overwrite_b=True, check_finite=False)
-        variance = self.hyper.outputscale - np.einsum("nm,nm->m", half, half)
-        return mean, np.maximum(variance, 1e-10 * self.hyper.outputscale)
-
-
-def matern(distance: Points, nu: float) -> Points:
-    """Return the Matern correlation at scaled distances >= 0, for nu 0.5, 1.5 or 2.5.
-
-    Source:
-        Rasmussen & Williams (2006), eq. (4.17).
-    """
-    r = math.sqrt(2.0 * nu) * distance
-    polynomial = {0.5: 1.0, 1.5: 1.0 + r, 2.5: 1.0 + r + r**2 / 3.0}[nu]
-    return np.asarray(polynomial * np.exp(-r))
-
-
-@dataclass(frozen=True, eq=False)
-class _Hyperparameters:
-    """Kernel and noise variance, for standardised y."""
-
-    nu: float
-    lengthscale: Vector  # (d,)
-    outputscale: float
-    noise: float
-
-    def covariance(self, a: Points, b: Points) -> Points:
-        """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
-        return self.outputscale * matern(cdist(a / self.lengthscale, b / self.lengthscale), self.nu)
-
-
-@dataclass(frozen=True, eq=False)
-class _NoiseSpread:
-    """Noise variance at a point relative to the common one, within [1e-3, 1e3]."""
-
-    forests: tuple[ForestPredictor, ...]
-
-    def __call__(self, u: Points) -> Vector:
-        return _relative(np.mean([forest.mu(u) for forest in self.forests], axis=0))
-
-
-def _relative(log_ratio: Vector) -> Vector:
-    return np.exp(np.clip(log_ratio + _LOG_CHI2, -6.9, 6.9))
-
-
-def _fit_noise_spread(hyper: _Hyperparameters, u: Points, z: Vector, rng: np.random.Generator) -> tuple[_NoiseSpread, Vector]:
+def _fit_noise_spread(hyper: Hyperparameters, u: Points, z: Vector, rng: np.random.Generator) -> tuple[NoiseSpread, Vector]:
     """Return how the noise depends on the input, and (n,) its values at the rows.
 
     A regression on the log of squared leave-one-out residuals, relative to their variance. The values at
     the rows are cross-fitted: a row's own residual says nothing about its noise, or the process would
     trust the rows it happens to fit.
     """
-    solved = _solve(_factor(hyper.covariance(u, u), np.full(len(z), hyper.noise)), z)
+    solved = _solve(cholesky(hyper.covariance(u, u), np.full(len(z), hyper.noise)), z)
     variance = 1.0 / np.diag(solved.inverse)
     log_ratio = np.log((solved.alpha * variance) ** 2 / variance + 1e-4)
     fold = rng.permutation(len(z)) % _FOLDS
@@ -232,21 +126,21 @@ def _fit_noise_spread(hyper: _Hyperparameters, u: Points, z: Vector, rng: np.ran
         forest = _FOREST.fit(u[rest], log_ratio[rest], rng)
         at_rows[~rest] = forest.mu(u[~rest])
         forests.append(forest)
-    return _NoiseSpread(tuple(forests)), _relative(at_rows)
+    return NoiseSpread(tuple(forests)), relative(at_rows)
 
 
 def _condition(
     settings: GaussianProcess,
-    hyper: _Hyperparameters,
+    hyper: Hyperparameters,
     u: Points,
     z: Vector,
     at_rows: Vector,
-    spread: _NoiseSpread | None,
+    spread: NoiseSpread | None,
     shift: float,
     scale: float,
 ) -> GaussianProcessPredictor:
     """Return the predictor conditioned on all rows; `at_rows` is the relative noise variance there."""
-    factor = _factor(hyper.covariance(u, u), hyper.noise * at_rows)
+    factor = cholesky(hyper.covariance(u, u), hyper.noise * at_rows)
     by_one, by_z = cho_solve((factor, True), np.stack([np.ones(len(z)), z], axis=1)).T
     centre = float(by_one @ z / by_one.sum())
     widths = np.ones(1)
@@ -254,20 +148,6 @@ def _condition(
         solved = _solve(factor, z)
         widths = student_widths(solved.alpha / np.sqrt(np.diag(solved.inverse)))
     return GaussianProcessPredictor(hyper, u, factor, by_z - centre * by_one, centre, spread, shift, scale, widths)
-
-
-def _factor(covariance: Points, noise: Vector) -> Points:
-    """Return the (n, n) lower Cholesky factor of covariance + diag(noise); writes on `covariance`.
-
-    Where rounding made the sum indefinite, growing jitter is added to the diagonal.
-    """
-    diagonal = np.diag(covariance) + noise
-    for jitter in (0.0, 1e-8, 1e-6, 1e-4, 1e-2):
-        np.fill_diagonal(covariance, diagonal + jitter)
-        factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
-        if info == 0:
-            return np.asarray(factor)
-    raise InputError("the covariance of a Gaussian process must be positive definite, but is not, with jitter 0.01")
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,16 +201,16 @@ class _Model:
         both = (*self.kernel.parameters(), *self.likelihood.parameters())
         return [p for p in both if p.requires_grad]
 
-    def assign(self, hyper: _Hyperparameters) -> None:
+    def assign(self, hyper: Hyperparameters) -> None:
         """Set the parameters to the given values."""
         self.kernel.base_kernel.lengthscale = torch.from_numpy(hyper.lengthscale)
         self.kernel.outputscale = torch.tensor(hyper.outputscale, dtype=torch.float64)
         noise = max(hyper.noise, 1.001 * _NOISE_FLOOR)
         self.likelihood.noise = torch.tensor([noise], dtype=torch.float64)
 
-    def hyperparameters(self) -> _Hyperparameters:
+    def hyperparameters(self) -> Hyperparameters:
         base = self.kernel.base_kernel
-        return _Hyperparameters(
+        return Hyperparameters(
             nu=float(base.nu),
             lengthscale=base.lengthscale.detach().numpy().ravel().copy(),
             outputscale=float(self.kernel.outputscale.detach()),
@@ -345,7 +225,7 @@ class _Model:
         """
         n = len(z)
         latent, noise = self.kernel.forward(x, x), self.likelihood.noise
-        solved = _solve(_factor(latent.detach().numpy().copy(), noise.item() * spread), z)
+        solved = _solve(cholesky(latent.detach().numpy().copy(), noise.item() * spread), z)
         slope = (0.5 / n) * (solved.inverse - np.outer(solved.alpha, solved.alpha))
         penalties = [
             -prior.log_prob(value_of(module)).sum() / n
@@ -361,11 +241,11 @@ class _Model:
         return sum((p.item() for p in penalties), -solved.log_likelihood / n)
 
 
-def _fit_posterior(nu: float, u: Points, z: Vector, spread: Vector, start: _Hyperparameters | None) -> _Hyperparameters:
+def _fit_posterior(nu: float, u: Points, z: Vector, spread: Vector, start: Hyperparameters | None) -> Hyperparameters:
     """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
     model = _Model.build(nu, u.shape[1], priors=True)
     first = np.full(u.shape[1], 0.3 * math.sqrt(u.shape[1]))
-    model.assign(start if start is not None else _Hyperparameters(nu, first, 1.0, 0.02))
+    model.assign(start if start is not None else Hyperparameters(nu, first, 1.0, 0.02))
     x, parameters = torch.from_numpy(u), model.parameters()
 
     def loss(vector: Vector) -> tuple[float, Vector]:
@@ -384,11 +264,11 @@ def _fit_posterior(nu: float, u: Points, z: Vector, spread: Vector, start: _Hype
 
 def _fit_early_stopped(
     settings: GaussianProcess, u: Points, z: Vector, u_held_out: Points, z_held_out: Vector
-) -> _Hyperparameters:
+) -> Hyperparameters:
     """Return the hyperparameters of largest validation likelihood on Adam's way, the paper's rule."""
     model = _Model.build(settings.nu, u.shape[1], priors=False)
     half = math.log(2.0)  # GPyTorch's initial value of every positive parameter: softplus(0)
-    model.assign(_Hyperparameters(settings.nu, np.full(u.shape[1], half), half, half))
+    model.assign(Hyperparameters(settings.nu, np.full(u.shape[1], half), half, half))
     adam = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
     x, ones = torch.from_numpy(u), np.ones(len(z))
     best, best_value, since = model.hyperparameters(), -math.inf, 0

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.errors import InputError
-from sbt.metamodels import auto, bnn, ensemble, et, gp, sparse
+from sbt.metamodels import auto, bnn, ensemble, et, gp_predictor, sparse
 from sbt.metamodels.base import Predictor
 
 __all__ = ["FORMAT", "load", "read_info", "save"]
@@ -35,9 +35,9 @@ _KINDS: dict[str, Any] = {
         bnn.BayesianNetworkPredictor,
         ensemble.EnsemblePredictor,
         et.ForestPredictor,
-        gp.GaussianProcessPredictor,
-        gp._Hyperparameters,
-        gp._NoiseSpread,
+        gp_predictor.GaussianProcessPredictor,
+        gp_predictor.Hyperparameters,
+        gp_predictor.NoiseSpread,
         sparse.SparseLayer,
         sparse.SparsePredictor,
     )

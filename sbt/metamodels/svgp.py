@@ -14,6 +14,7 @@ from sbt.metamodels.sparse import SparsePredictor, Training, train
 
 __all__ = ["SparseGaussianProcess"]
 
+_ROWS = 2500  # from which on all steps are taken
 _FEWEST = 20  # inducing points that few rows may have
 
 
@@ -28,7 +29,8 @@ class SparseGaussianProcess:
             elbo (the evidence lower bound).
         learning_rate: first step of Adam, > 0, on a cosine schedule.
         batch: rows of a minibatch >= 1.
-        steps: minibatches >= 1, at least one pass over the rows.
+        steps: minibatches >= 1 from 2,500 rows on; with fewer rows fewer, in proportion, down to a fifth: more of
+            them make it overconfident.
         device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
@@ -57,9 +59,12 @@ class SparseGaussianProcess:
         z, shift, scale = standardise(y)
         return train(self._training(len(z)), u, z, shift, scale, rng)
 
+    def _steps(self, n: int) -> float:
+        return self.steps * min(max(n / _ROWS, 0.2), 1.0)
+
     def _training(self, n: int) -> Training:
         return Training(
             deep=False, kernel=self.kernel, inducing=min(self.inducing, max(n // 5, _FEWEST)), sites=1, objective=self.objective,
             penalty=1.0, learning_rate=self.learning_rate, batch=self.batch, patience=None,
-            max_epochs=max(round(self.steps / max(n // self.batch, 1)), 1), device=self.device,
+            max_epochs=max(round(self._steps(n) / max(n // self.batch, 1)), 1), device=self.device,
         )  # fmt: skip

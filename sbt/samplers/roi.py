@@ -49,9 +49,9 @@ class RoiDraw:
         positions: (n,) their positions in the sequence.
         next_position: the position at which the next draw starts.
         candidates: admissible candidates that were scored.
-        method: "rejection" (the exact density); "pool" (some points were picked from the rejected
-            candidates, see `rejection`); "even" (no candidate had a score above -inf); "smc" (particles
-            that took the place of a pool).
+        method: "rejection" (the exact density); "short" (the same, but fewer points than asked for); "pool"
+            (some points were picked from the rejected candidates, see `rejection`); "even" (no candidate had
+            a score above -inf); "smc" (particles took their place).
         acceptance: share of the scored candidates that rejection accepted, in [0, 1].
     """
 
@@ -59,7 +59,7 @@ class RoiDraw:
     positions: Positions
     next_position: int
     candidates: int
-    method: Literal["rejection", "pool", "even", "smc"]
+    method: Literal["rejection", "short", "pool", "even", "smc"]
     acceptance: float
 
 
@@ -74,6 +74,8 @@ def rejection(
     chunk: int = 4096,
     max_candidates: int = 2**19,
     accept_filter: Callable[[Points], Mask] | None = None,
+    bound: Callable[[Points], Vector] | None = None,
+    fill: bool = True,
 ) -> RoiDraw:
     """Draw n points with a density proportional to exp(score(u)) by rejection from a Sobol sequence.
 
@@ -96,6 +98,9 @@ def rejection(
         chunk: most candidates scored at once; does not change what is drawn.
         max_candidates: most positions looked at, >= n.
         accept_filter: (m, d) points -> (m,) booleans, the constraints of the parameter space.
+        bound: (m, d) points -> (m,) upper bounds of their log scores, quicker than `score`: candidates
+            that cannot be accepted are not scored. What is drawn is the same, point by point; needs fill False.
+        fill: take one of the two ways out; False: return the fewer points there are (`short`).
 
     Raises:
         InputError: a score above 0 or NaN, or fewer than n admissible candidates.
@@ -103,6 +108,8 @@ def rejection(
     Source:
         von Neumann (1951); Winkelmann et al. (2022), section V-A; top-k: Kool et al. (2019).
     """
+    if bound is not None and fill:
+        raise InputError("a bound leaves candidates without a score, and so there is no pool to fill from: fill must be False")
     if n < 0 or max_candidates < n or chunk < 1:
         raise InputError(
             "rejection needs n >= 0, max_candidates >= n and chunk >= 1, "
@@ -112,8 +119,7 @@ def rejection(
     position, end, size, scored = start, start + max_candidates, min(_FIRST_CHUNK, chunk), 0
     while len(accepted) < n and position < end:
         stop = min(position + size, end)
-        seen = _score(score, sobol, position, stop, accept_filter)
-        uniform, gumbel = _randomness(seen.positions, seed, label)
+        seen, uniform, gumbel = _seen(score, sobol, position, stop, seed, label, accept_filter, bound)
         hit = uniform < np.exp(seen.key)
         last = _index_of(hit, n - len(accepted))
         if last is not None:  # the batch is full: what comes after belongs to the next draw
@@ -126,6 +132,8 @@ def rejection(
     if len(accepted) == n:
         share = n / max(scored, 1)
         return RoiDraw(accepted.u, accepted.positions, position, scored, "rejection", share)
+    if not fill:
+        return RoiDraw(accepted.u, accepted.positions, position, scored, "short", len(accepted) / max(scored, 1))
     return _fall_back(accepted, rejected, n, scored, position)
 
 
@@ -174,25 +182,41 @@ def _fall_back(accepted: _Candidates, rejected: _Candidates, n: int, scored: int
     return RoiDraw(both.u, both.positions, end, scored, "pool", len(accepted) / scored)
 
 
-def _score(
+def _seen(
     score: Callable[[Points], Vector],
     sobol: Sequence,
     start: int,
     stop: int,
+    seed: int,
+    label: int | str,
     accept_filter: Callable[[Points], Mask] | None,
-) -> _Candidates:
-    """Return the admissible candidates at the positions, their checked log scores as key."""
+    bound: Callable[[Points], Vector] | None,
+) -> tuple[_Candidates, Vector, Vector]:
+    """Return the admissible candidates at the positions, checked log scores as key, uniforms and Gumbel numbers.
+
+    The key is -inf where the bound already tells that the candidate is rejected.
+    """
     u, positions = sobol.points(start, stop), np.arange(start, stop, dtype=np.int64)
     if accept_filter is not None:
         admissible = np.asarray(accept_filter(u), dtype=bool)
         u, positions = u[admissible], positions[admissible]
-    log_score = np.asarray(score(u), dtype=np.float64) if len(u) > 0 else np.empty(0)
-    if log_score.shape != (len(u),):
-        raise InputError(f"a score must return shape ({len(u)},), but got {log_score.shape}")
+    uniform, gumbel = _randomness(positions, seed, label)
+    log_score = np.full(len(u), -np.inf)
+    possible = np.ones(len(u), dtype=bool) if bound is None or len(u) == 0 else uniform < np.exp(bound(u))
+    if possible.any():
+        log_score[possible] = _checked(score(u[possible]), int(possible.sum()))
+    return _Candidates(u, positions, log_score), uniform, gumbel
+
+
+def _checked(found: Vector, n: int) -> Vector:
+    """Return (n,) log scores that rejection can use."""
+    log_score = np.asarray(found, dtype=np.float64)
+    if log_score.shape != (n,):
+        raise InputError(f"a score must return shape ({n},), but got {log_score.shape}")
     if not (log_score <= 1e-9).all():  # also NaN
         bad = log_score[~(log_score <= 1e-9)][0]
         raise InputError(f"a log score used for rejection must be <= 0 and not NaN, but got {bad}")
-    return _Candidates(u, positions, log_score)
+    return log_score
 
 
 def _randomness(positions: Positions, seed: int, label: int | str) -> tuple[Vector, Vector]:

@@ -1,0 +1,206 @@
+"""A fitted Gaussian process: plain NumPy, exact moments, and quick bounds of P(y in M_c)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack, solve_triangular
+from scipy.spatial.distance import cdist
+from scipy.special import ndtr
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+from sbt.metamodels.et import ForestPredictor
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.torch_tools import single_threaded
+from sbt.problem.requirement import CriticalInterval
+
+__all__ = ["GaussianProcessPredictor", "Hyperparameters", "NoiseSpread", "cholesky", "matern", "relative"]
+
+_CHUNK = 2048  # points predicted at once
+_QUICK = 256  # points bounded at once: what is in between stays in the cache
+_BLOCK = 128  # rows summed in single precision
+_MARGIN = 3e-5  # of a mean in single precision: 128 roundings of 6e-8 in a sum, a few in each term
+_LOG_CHI2 = 1.27036  # -E[log chi^2_1]: what the mean of log z^2 lacks to the log of the mean of z^2
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianProcessPredictor:
+    """A Gaussian process conditioned on n rows.
+
+    Args:
+        hyper: kernel, noise.
+        u: (n, d) rows.
+        factor: (n, n) lower Cholesky factor of their covariance, noise included.
+        alpha: (n,) covariance^-1 (z - centre).
+        centre: constant mean, in standardised units.
+        spread: how the noise depends on the input; None: not.
+        shift: y = shift + scale z.
+        scale: see `shift`.
+        widths: (k,) factors on sigma, equally likely: one factor of 1, or more for heavy tails.
+    """
+
+    hyper: Hyperparameters
+    u: Points
+    factor: Points
+    alpha: Vector
+    centre: float
+    spread: NoiseSpread | None
+    shift: float
+    scale: float
+    widths: Vector
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the belief at u (n, d)."""
+        with single_threaded():
+            chunks = [self._moments(u[i : i + _CHUNK]) for i in range(0, max(len(u), 1), _CHUNK)]
+        mean, variance = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+        spread = self.spread(u) if self.spread is not None and len(u) > 0 else np.ones(len(u))
+        noise = self.hyper.noise * spread
+        k, common = len(self.widths), math.sqrt(float(np.mean(self.widths**2)))
+        return Prediction(
+            mean=np.repeat((self.shift + self.scale * mean)[None], k, axis=0),
+            std=self.widths[:, None] * (self.scale * np.sqrt(variance + noise)),
+            weight=np.full(k, 1.0 / k),
+            noise=common * (self.scale * np.sqrt(noise)),
+        )
+
+    def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
+        """Return (n,) lower and (n,) upper bounds of P(y in M_c), from the mean and a bound of the variance.
+
+        The variance given all rows is at most that given one of them, and P grows with it where the mean
+        lies outside of M_c, shrinks where it lies inside. Many times quicker than the belief itself.
+        """
+        scale, noise = self.hyper.outputscale, self.hyper.noise
+        most = 1.0 if self.spread is None else self.spread.most
+        with single_threaded():
+            chunks = [self._quick(u[i : i + _QUICK]) for i in range(0, max(len(u), 1), _QUICK)]
+        quick, nearest = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+        rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # a small noise need not be known
+        at = np.full(len(u), most) if rough or self.spread is None else self.spread(u)
+        mean = self.shift + self.scale * quick
+        margin = self.scale * _MARGIN * scale * float(np.abs(self.alpha).sum())
+        latent = scale * (1.0 - np.maximum(nearest - 1e-6, 0.0) ** 2 * scale / (scale + noise * most))
+        sigma = 1.000001 * self.scale * np.sqrt(latent + noise * at)
+        outside = np.maximum(np.maximum(critical.low - mean, mean - critical.high) - margin, 0.0)  # at least so far off
+        below, above = mean - critical.low - margin, critical.high - mean - margin
+        inside = (below > 0.0) & (above > 0.0)
+        low, high = np.zeros(len(u)), np.zeros(len(u))
+        for width in self.widths:
+            std = width * sigma
+            high += np.where(outside > 0.0, ndtr(-outside / std), 1.0) / len(self.widths)
+            low += np.where(inside, np.maximum(1.0 - ndtr(-below / std) - ndtr(-above / std), 0.0), 0.0) / len(self.widths)
+        return low * (1.0 - 1e-9), np.minimum(high * (1.0 + 1e-9), 1.0)
+
+    def _quick(self, u: Points) -> tuple[Vector, Vector]:
+        """Return (m,) means, standardised, and (m,) correlations with the nearest row, in single precision.
+
+        Means are off by at most `_MARGIN` times the output scale and the sum of |alpha|.
+        """
+        across, weights = self._prepared
+        b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
+        squares = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)]) @ across  # (m, n)
+        r = np.sqrt(np.maximum(squares, 0.0, out=squares), dtype=np.float32, casting="same_kind")
+        correlation = np.exp(-r)
+        if self.hyper.nu == 1.5:
+            r += np.float32(1.0)
+            correlation *= r
+        elif self.hyper.nu == 2.5:
+            correlation *= r * r / np.float32(3.0) + r + np.float32(1.0)
+        mean = np.full(len(u), self.centre)
+        for i in range(0, len(weights), _BLOCK):  # short sums lose few digits
+            mean += correlation[:, i : i + _BLOCK] @ weights[i : i + _BLOCK]
+        return mean, correlation.max(axis=1).astype(np.float64)
+
+    @cached_property
+    def _prepared(self) -> tuple[Points, NDArray[np.float32]]:
+        """Return what squared distances of points and rows are made from, (d + 2, n), and (n,) weights."""
+        a = self.u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
+        across = np.column_stack([-2.0 * a, (a**2).sum(axis=1), np.ones(len(a))]).T
+        return np.ascontiguousarray(across), (self.hyper.outputscale * self.alpha).astype(np.float32)
+
+    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m.
+
+        Source:
+            Rasmussen & Williams (2006), eq. (2.24) and appendix A.2.
+        """
+        with single_threaded():
+            cross = self.hyper.covariance(self.u, u)  # (rows, m)
+            mean = self.centre + self.alpha @ cross
+            half = solve_triangular(self.factor, cross, lower=True, overwrite_b=True, check_finite=False)
+            latent = self.hyper.covariance(u, u) - half.T @ half
+            root = cholesky(latent, np.full(len(u), 1e-8 * self.hyper.outputscale))
+            return self.shift + self.scale * (mean + rng.standard_normal((n, len(u))) @ root.T)
+
+    def _moments(self, u: Points) -> tuple[Vector, Vector]:
+        """Return (m,) mean and (m,) variance without noise, standardised."""
+        cross = self.hyper.covariance(self.u, u)  # (n, m)
+        mean = self.centre + self.alpha @ cross
+        half = solve_triangular(self.factor, cross, lower=True, overwrite_b=True, check_finite=False)
+        variance = self.hyper.outputscale - np.einsum("nm,nm->m", half, half)
+        return mean, np.maximum(variance, 1e-10 * self.hyper.outputscale)
+
+
+def cholesky(covariance: Points, noise: Vector) -> Points:
+    """Return the (n, n) lower Cholesky factor of covariance + diag(noise); writes on `covariance`.
+
+    Where rounding made the sum indefinite, growing jitter is added to the diagonal.
+    """
+    diagonal = np.diag(covariance) + noise
+    for jitter in (0.0, 1e-8, 1e-6, 1e-4, 1e-2):
+        np.fill_diagonal(covariance, diagonal + jitter)
+        factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
+        if info == 0:
+            return np.asarray(factor)
+    raise InputError("the covariance of a Gaussian process must be positive definite, but is not, with jitter 0.01")
+
+
+def matern(distance: Points, nu: float) -> Points:
+    """Return the Matern correlation at scaled distances >= 0, for nu 0.5, 1.5 or 2.5.
+
+    Source:
+        Rasmussen & Williams (2006), eq. (4.17).
+    """
+    r = math.sqrt(2.0 * nu) * distance
+    polynomial = {0.5: 1.0, 1.5: 1.0 + r, 2.5: 1.0 + r + r**2 / 3.0}[nu]
+    return np.asarray(polynomial * np.exp(-r))
+
+
+@dataclass(frozen=True, eq=False)
+class Hyperparameters:
+    """Kernel and noise variance, for standardised y."""
+
+    nu: float
+    lengthscale: Vector  # (d,)
+    outputscale: float
+    noise: float
+
+    def covariance(self, a: Points, b: Points) -> Points:
+        """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
+        return self.outputscale * matern(cdist(a / self.lengthscale, b / self.lengthscale), self.nu)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSpread:
+    """Noise variance at a point relative to the common one, within [1e-3, 1e3]."""
+
+    forests: tuple[ForestPredictor, ...]
+
+    @cached_property
+    def most(self) -> float:
+        """No point, and no row that was cross-fitted, has a larger relative noise variance."""
+        return float(relative(np.array([max(forest.most for forest in self.forests)]))[0])
+
+    def __call__(self, u: Points) -> Vector:
+        """Return the (n,) relative noise variance at u (n, d)."""
+        return relative(np.mean([forest.mu(u) for forest in self.forests], axis=0))
+
+
+def relative(log_ratio: Vector) -> Vector:
+    """Return noise variances relative to the common one, from mean log squared residuals."""
+    return np.exp(np.clip(log_ratio + _LOG_CHI2, -6.9, 6.9))
