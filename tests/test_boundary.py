@@ -135,7 +135,7 @@ def test_shares_of_the_mix(tmp_path: Path):
         hows = store.iterations()[1:]
     assert [how["method"] for how in hows] == ["mix"] * 4
     drawn, filling, greedy, held_out = (sum(how[k] for how in hows) for k in ("drawn", "filling", "greedy", "held_out"))
-    assert drawn + filling + greedy == 72
+    assert drawn + filling + greedy + sum(how["hunted"] for how in hows) == 72
     assert held_out == 8
     assert 15 <= drawn <= 20
     assert 8 <= filling <= 12

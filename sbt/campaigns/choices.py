@@ -18,10 +18,13 @@ from sbt.arrays import Mask, Points, Vector
 from sbt.campaign import Log
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
+from sbt.history import VALIDATION
 from sbt.learner import Belief
 from sbt.samplers.greedy import diverse, influence, refined
 from sbt.samplers.pool import PoolSequence
+from sbt.samplers.portfolio import propose
 from sbt.samplers.roi import RoiDraw, rejection
+from sbt.samplers.search import Search
 from sbt.samplers.smc import smc
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
@@ -31,7 +34,8 @@ __all__ = ["Choice", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 _POSITION = "next_position"
 _FEW = 2**15  # candidates that the mix looks at by rejection before it turns to particles
 _CANDIDATES = 4096
-_RANDOM, _FILLING = 0.25, 0.15  # shares of the mix; the rest is chosen greedily
+_RANDOM, _FILLING, _HUNTING = 0.25, 0.15, 0.35  # shares of the mix; the rest is chosen greedily
+_RARE = 0.02  # critical share of the space below which a region is easily missed, and hunted
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +85,11 @@ def greedily(settings: Settings, belief: Belief | None, log: Log, n: int) -> Cho
 
 
 def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
-    """Return a batch of three parts: greedy, random from a_BI, and space filling.
+    """Return a batch of parts: greedy, random from a_BI, space filling, and a hunt where critical runs are rare.
 
-    15 % fill the space, 25 % are drawn from a_BI as in the paper (they insure against a missed
-    mode), the others are chosen one by one by a_BI times the squared distance to the nearest run.
+    15 % fill the space, 25 % are drawn from a_BI as in the paper (they insure against a missed mode), the
+    others are chosen one by one by a_BI times the squared distance to the nearest run. Where less than 2 %
+    of the space is believed critical, 35 % search for regions apart from those that are known.
     """
     if belief is None:
         return evenly(settings, belief, log, n)
@@ -92,7 +97,8 @@ def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen
     filling, random = min(filling, n), min(random, n - min(filling, n))
     first, fill = _draw(settings, belief, even, log, filling)
     second, drawn = _draw(settings, belief, boundary, log, random, taken=fill, start=first.next_position, most=_FEW)
-    so_far = np.concatenate([fill, drawn])
+    hunted = _hunted(settings, belief, log, min(_rounded(_HUNTING * n, log), n - filling - random))
+    so_far = np.concatenate([fill, drawn, hunted])
     greedy, looked = _greedy(settings, belief, boundary, log, n - len(so_far), so_far)
     so_far, last = np.concatenate([so_far, greedy]), second
     if len(so_far) < n:  # nothing is in doubt
@@ -101,9 +107,26 @@ def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen
     how = {
         "method": "mix", "random": second.method, "candidates": second.candidates + looked,
         "acceptance": second.acceptance, _POSITION: last.next_position, "filling": len(fill), "drawn": len(drawn),
-        "greedy": len(greedy),
+        "hunted": len(hunted), "greedy": len(greedy),
     }  # fmt: skip
     return Chosen(so_far, how)
+
+
+def _hunted(settings: Settings, belief: Belief, log: Log, n: int) -> Points:
+    """Return n points (none where critical runs are not rare) that search for another region, in the inputs' units."""
+    scenario, space, history = settings.scenario, settings.scenario.space, log.history
+    rare = belief.scores["critical_fraction"] < _RARE and scenario.pool is None and settings.learner is not None
+    if not rare or n == 0 or settings.learner is None:
+        return np.empty((0, space.dimension))
+    seen = history.where(history.stage != VALIDATION)
+    search = Search(
+        scenario.requirement.critical, settings.learner.metamodel, space.metamodel_inputs,
+        _admissible(settings) or (lambda u: np.ones(len(u), dtype=bool)),
+    )  # fmt: skip
+    y = np.where(seen.ok, seen.y(scenario.requirement.metric), np.nan)
+    u = np.clip(space.to_unit(seen.x), 0.0, 1.0)
+    picks = propose(search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration)
+    return space.from_unit(np.clip(picks.u, 1e-12, 1 - 1e-12))
 
 
 def _rounded(wanted: float, log: Log) -> int:
