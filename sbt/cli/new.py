@@ -77,28 +77,29 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> list[P
     Raises:
         InputError: the configuration cannot be read, has no such vehicle, or there is a scenario already.
     """
+    from sbt.sumo.asked import number_or_none
     from sbt.sumo.files import SumoFiles, options_of_config
 
     if (folder / "scenario.yaml").exists():
         raise InputError(f"FOLDER must not have a scenario.yaml yet, but '{folder}' has")
     files = SumoFiles.of(options_of_config(config), config.resolve().parent, str(config))
-    vehicles = [name for t in files.templates for name, a in t.vehicles.items() if a[""] in ("vehicle", "trip")]
+    vehicles = [name for t in files.templates for name, v in t.vehicles.items() if v.tag != "flow"]
     names = vehicles or [f"{name}.0" for name in files.names()]
     ego = ego or (names[0] if names else "")
-    if files.vehicle(ego) is None:
+    found = files.vehicle(ego)
+    if found is None:
         raise InputError(f"--ego must be a vehicle of the files ({', '.join(names[:8]) or 'none'}), but got '{ego}'")
     folder.mkdir(parents=True, exist_ok=True)
     inputs = {name: "{min: 0.0, max: 1.0}    # your range" for hole in files.holes() for name in hole.formula.names()}
     written, routes = [], ""
     if not inputs:
         inputs = {"speed_factor": "{min: 0.8, max: 1.2}    # of the ego: its speed by the allowed one"}
-        copy = _copied(files, ego, folder)
+        source = found[1]
+        copy = _copied(files, source, ego, folder)
         written.append(copy)
-        own = _file_of(files, ego).path
-        routes = f"  routes: [{', '.join(_relative(copy if p == own else p, folder) for p in files.routes)}]\n"
-    attributes = (files.vehicle(ego) or ({}, ""))[0]
-    depart = attributes.get("depart", attributes.get("begin", "0"))
-    wait = 60 + (float(depart) if re.fullmatch(r"[\d.]+", depart) else 3540)
+        routes = f"  routes: [{', '.join(_relative(copy if p == source.path else p, folder) for p in files.routes)}]\n"
+    depart = number_or_none(found[0].depart)
+    wait = 3600.0 if depart is None else depart + 60.0
     step = "" if files.step_length() is not None else "step_length: 0.1            # SUMO's own default is 1 s\n"
     scenario = _SCENARIO.format(
         folder=folder, config=_relative(config.resolve(), folder), routes=routes, ego=ego, duration=30,
@@ -115,19 +116,12 @@ def _relative(path: Path, folder: Path) -> str:
     return os.path.relpath(path.resolve(), folder.resolve())
 
 
-def _file_of(files: SumoFiles, ego: str) -> Template:
-    """Return the file in which the ego stands."""
-    place = (files.vehicle(ego) or ({}, ""))[1]
-    return next(t for t in files.templates if place in t.lines.values())
-
-
-def _copied(files: SumoFiles, ego: str, folder: Path) -> Path:
+def _copied(files: SumoFiles, source: Template, ego: str, folder: Path) -> Path:
     """Copy the ego's route file with a placeholder as its speedFactor; what it includes stays where it is.
 
     Raises:
         InputError: the ego stands in an included file, or its file is packed.
     """
-    source = _file_of(files, ego)
     if source.path not in files.routes or source.path.suffix == ".gz":
         raise InputError(
             f"the ego must stand in a route file that is named by the configuration, but '{ego}' is in {source.path}"

@@ -42,18 +42,17 @@ class Asked:
 
 def asked_of(files: SumoFiles, values: Mapping[str, float], ego: str) -> dict[str, Asked]:
     """Return what is asked of the ego and of every vehicle that has a placeholder."""
+    own = files.vehicle(ego)
+    wanted = [(name, one) for one in files.templates for name in one.varying]
+    if own is not None and ego in own[1].vehicles:
+        wanted.append((ego, own[1]))
     found: dict[str, Asked] = {}
-    for one in files.templates:
-        for name, written in one.vehicles.items():
-            if written[""] not in ("vehicle", "trip") or (name != ego and not any("${" in v for v in written.values())):
-                continue
-
-            def read(key: str, written: Mapping[str, str] = written, place: str = one.lines[name]) -> float | None:
-                return number_or_none(fill(written.get(key, ""), values, place))
-
-            found[name] = Asked(
-                f"{one.lines[name]}: ", read("depart"), read("departPos"), read("departSpeed"), read("departLane")
-            )
+    for name, one in wanted:
+        vehicle = one.vehicles[name]
+        if vehicle.tag != "flow":
+            place = f"{one.path}:{vehicle.place[0]}:{vehicle.place[1]}: "
+            start = (vehicle.depart, vehicle.position, vehicle.speed, vehicle.lane)
+            found[name] = Asked(place, *(number_or_none(fill(value or "", values, place)) for value in start))
     return found
 
 

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 from sbt.errors import InputError
-from sbt.sumo.template import Hole, Template, fill, holes, template
+from sbt.sumo.template import Hole, Template, Vehicle, fill, holes, template
 
 __all__ = ["OWN", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
 
@@ -92,6 +92,10 @@ class SumoFiles:
             InputError: one of them is not what it should be.
         """
         found = tuple(t for path in (self.net, *self.routes, *self.additional) for t in template(path).tree())
+        for name, value in self.options.items():
+            for path in map(Path, _split(value) if _of_files(name) else ()):
+                if path.name.endswith((".xml", ".xml.gz")) and path.is_file():
+                    template(path)
         _check_net(template(self.net))
         return found
 
@@ -102,17 +106,17 @@ class SumoFiles:
         for name, value in self.options.items():
             yield from holes(value, f"{self.places.get(name, '')}: {name}")
 
-    def vehicle(self, name: str) -> tuple[Mapping[str, str], str] | None:
-        """Return attributes and place of a vehicle, or of the flow that makes it; None where there is none."""
+    def vehicle(self, name: str) -> tuple[Vehicle, Template] | None:
+        """Return a vehicle, or the flow that makes it, and its file; None where there is none."""
         for wanted in (name, name.rpartition(".")[0]):
             for one in self.templates:
                 if wanted in one.vehicles:
-                    return one.vehicles[wanted], one.lines[wanted]
+                    return one.vehicles[wanted], one
         return None
 
     def names(self) -> list[str]:
         """Return the ids of all vehicles, trips and flows."""
-        return [name for one in self.templates for name, kind in one.vehicles.items() if kind[""] in ("vehicle", "trip", "flow")]
+        return [name for one in self.templates for name in one.vehicles]
 
     def launch(self, values: Mapping[str, float], folder: Path, step_length: float | None = None) -> Launch:
         """Return the command line for these values; filled copies go to `folder`.
@@ -198,9 +202,13 @@ def _found(option: str, name: str, folder: Path, place: str) -> Path:
     return path
 
 
+def _of_files(option: str) -> bool:
+    return option.endswith(("-file", "-files", "load-state"))
+
+
 def _absolute(option: str, value: str, folder: Path) -> str:
     """Return the value with names of existing files absolute, where the option is about files."""
-    if not option.endswith(("-file", "-files", "load-state")):
+    if not _of_files(option):
         return value
     return ",".join(
         str((folder / name).resolve()) if (folder / name).exists() or option in _FILES else name for name in _split(value)

@@ -16,19 +16,20 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 from sbt.errors import InputError, RunError
 from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
 
-__all__ = ["Hole", "Template", "fill", "holes", "template"]
+__all__ = ["Hole", "Template", "Vehicle", "fill", "holes", "template"]
 
 _HOLE = re.compile(r"\$\{([^{}]*)\}")
 _TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
 _REFERRING = ("include", "variableSpeedSign", "rerouter")
 """Elements whose `href` or `file` SUMO reads, relative to the file they stand in."""
-_VEHICLES = ("vehicle", "trip", "flow", "person", "personFlow")
+_VEHICLES = ("vehicle", "trip", "flow")
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,21 @@ class _Part:
     end: int
     hole: Hole | None = None
     target: Path | None = None
-    included: bool = False
+
+
+class Vehicle(NamedTuple):
+    """What a file says of the start of a vehicle, trip or flow, as it is written; None where it says nothing.
+
+    `place` is its line and column, `varies` whether any of its attributes has a placeholder.
+    """
+
+    tag: str
+    place: tuple[int, int]
+    varies: bool
+    depart: str | None
+    position: str | None
+    speed: str | None
+    lane: str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +73,25 @@ class Template:
         path: absolute.
         root: name and attributes of its outermost element.
         parts: what is replaced in a copy, in order.
-        vehicles: attributes of the vehicles, trips, flows and persons by id, as they are written.
-        lines: where each of them stands (`file:line:column`).
+        vehicles: its vehicles, trips and flows by id.
         data: its bytes, kept only where there are parts to replace.
     """
 
     path: Path
     root: tuple[str, Mapping[str, str]]
     parts: tuple[_Part, ...]
-    vehicles: Mapping[str, Mapping[str, str]]
-    lines: Mapping[str, str]
+    vehicles: Mapping[str, Vehicle]
     data: bytes = b""
+
+    @cached_property
+    def varying(self) -> tuple[str, ...]:
+        """Ids of the vehicles with a placeholder."""
+        return tuple(name for name, vehicle in self.vehicles.items() if vehicle.varies)
 
     @cached_property
     def includes(self) -> tuple[Template, ...]:
         """The files it includes, as templates."""
-        return tuple(template(p.target) for p in self.parts if p.included and p.target is not None)
+        return tuple(template(p.target) for p in self.parts if p.target is not None)
 
     def tree(self, above: tuple[Path, ...] = ()) -> Iterator[Template]:
         """Yield the file and all that it includes.
@@ -115,7 +133,7 @@ class Template:
             return number(part.hole, values).encode()
         if part.target is None:
             raise InputError(f"a part of {self.path} must have a value or a file")
-        target = template(part.target).write(values, folder) if part.included else part.target
+        target = template(part.target).write(values, folder)
         return b'"' + str(target).encode() + b'"'
 
 
@@ -178,9 +196,8 @@ def template(path: Path) -> Template:
     parser = xml.parsers.expat.ParserCreate()
     roots: list[tuple[str, Mapping[str, str]]] = []
     parts: list[_Part] = []
-    vehicles: dict[str, Mapping[str, str]] = {}
-    lines: dict[str, str] = {}
-    every = b"${" in data or b"<include" in data
+    vehicles: dict[str, Vehicle] = {}
+    every = b"${" in data or any(b"<" + tag.encode() in data for tag in _REFERRING)
 
     def place() -> str:
         return f"{path}:{parser.CurrentLineNumber}:{parser.CurrentColumnNumber + 1}"
@@ -194,8 +211,11 @@ def template(path: Path) -> Template:
             if tag == "net" and not every:  # large, and only its root matters
                 parser.StartElementHandler = None
         if tag in _VEHICLES and "id" in attributes:
-            vehicles[attributes["id"]], lines[attributes["id"]] = {"": tag, **attributes}, place()
-        if every:
+            at = (parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
+            varies = every and any("${" in value for value in attributes.values())
+            asked = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane"))
+            vehicles[attributes["id"]] = Vehicle(tag, at, varies, *asked)
+        if every and (tag in _REFERRING or any("${" in value for value in attributes.values())):
             parts.extend(_parts(path, data, parser.CurrentByteIndex, tag, place()))
 
     parser.StartDoctypeDeclHandler = refuse
@@ -205,7 +225,7 @@ def template(path: Path) -> Template:
         parser.Parse(data, True)
     except xml.parsers.expat.ExpatError as error:
         raise InputError(f"{path}:{error.lineno}:{error.offset + 1}: a SUMO file must be well-formed XML, but: {error}") from None
-    return Template(path, roots[0], tuple(parts), vehicles, lines, data if parts else b"")
+    return Template(path, roots[0], tuple(parts), vehicles, data if parts else b"")
 
 
 def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_Part]:
@@ -222,7 +242,7 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_
             if tag == "include" and not target.is_file():
                 raise InputError(f"{place}: an included file must exist, but got '{name}'")
             if target.is_file():
-                taken.append(_Part(at + match.start(2), at + match.end(2), target=target, included=tag == "include"))
+                taken.append(_Part(at + match.start(2), at + match.end(2), target=target))
     for match in re.finditer(_HOLE.pattern.encode(), text):
         taken.append(_Part(at + match.start(), at + match.end(), hole=_hole(match.group(1).decode(), place)))
     yield from sorted(taken, key=lambda part: part.start)
