@@ -33,9 +33,8 @@ NAMES = ("crossing_pedestrian", "highway_merge", "roundabout_entry", "unprotecte
 CRITICAL = [
     (
         "crossing_pedestrian",
-        {"v_ego": 50.9239, "v_ped": 2.892, "t_ped": 0.3784, "flow_co": 110.9939, "ego_decel": 3.2014,
-         "ego_jmCrossingGap": 1.1114},
-        1548870491,
+        {"v_ego": 57.5, "v_ped": 2.86, "t_ped": 0.57, "flow_co": 257.76, "ego_decel": 3.95, "ego_jmCrossingGap": 8.48},
+        628138296,
     ),
     (
         "highway_merge",
