@@ -47,7 +47,9 @@ def level(scenario: LogicalScenario, isolation: str, values: list[dict[str, floa
     def run() -> None:
         for first in range(0, len(jobs), CHUNK):
             outcomes = run_jobs(configured, jobs[first : first + CHUNK], lambda _: None)
-            assert all(o.status == Status.OK for o in outcomes)
+            failed = [o.reason for o in outcomes if o.status != Status.OK]
+            if failed:
+                raise RuntimeError(f"every run must be ok, but {failed[0]}")
 
     return run
 
