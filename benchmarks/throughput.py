@@ -81,13 +81,9 @@ def traci_load(scenario: LogicalScenario, values: list[dict[str, float]], progra
     fresh = scenario.configured(isolation="fresh")
 
     def run() -> None:
-        own, direct = sumo_session.session(), sumo_session.session()._sumo
-        own._sumo = client
-        try:
+        with sumo_session.session().through(client):  # the subprocess stays, `traci.load` goes on with it
             for k, v in enumerate(values):
                 fresh.run(v, k)
-        finally:
-            own._sumo = direct  # the subprocess stays, `traci.load` goes on with it
 
     return run
 
