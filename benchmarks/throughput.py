@@ -47,7 +47,9 @@ def level(scenario: LogicalScenario, isolation: str, values: list[dict[str, floa
     def run() -> None:
         for first in range(0, len(jobs), CHUNK):
             outcomes = run_jobs(configured, jobs[first : first + CHUNK], lambda _: None)
-            assert all(o.status == Status.OK for o in outcomes)
+            failed = [o.reason for o in outcomes if o.status != Status.OK]
+            if failed:
+                raise RuntimeError(f"every run must be ok, but {failed[0]}")
 
     return run
 
@@ -79,13 +81,9 @@ def traci_load(scenario: LogicalScenario, values: list[dict[str, float]], progra
     fresh = scenario.configured(isolation="fresh")
 
     def run() -> None:
-        own, direct = sumo_session.session(), sumo_session.session()._sumo
-        own._sumo = client
-        try:
+        with sumo_session.session().through(client):  # the subprocess stays, `traci.load` goes on with it
             for k, v in enumerate(values):
                 fresh.run(v, k)
-        finally:
-            own._sumo = direct  # the subprocess stays, `traci.load` goes on with it
 
     return run
 

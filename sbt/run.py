@@ -171,12 +171,12 @@ def loaded_from(store: Store) -> Loaded:
     return parse(kept["yaml"], name=str(store.folder / _RESOLVED), folder=Path(kept["folder"]))
 
 
-def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None]:
+def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None, LogicalScenario]:
     """Execute a stored run again, as the campaign did.
 
     Returns:
-        The stored row, the outcome now, and the trace; no trace where the scenario has none or the
-        run fails.
+        The stored row, the outcome now, the trace (none where the scenario has none or the run fails),
+        and the scenario as it was configured.
 
     Raises:
         InputError: the store has no finished run of this index.
@@ -187,10 +187,11 @@ def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None]:
     if not found:
         raise InputError(f"a run must be a finished one of {folder} (0 to {len(records) - 1}), but got {index}")
     record = found[0]
-    scenario = assembly_of(loaded).spec.resolve()
+    parts = assembly_of(loaded)
+    scenario = replace(parts.spec.resolve(), requirement=parts.scenario.requirement)
     outcome = run_job(scenario, Job(index, record.inputs, record.seed))
     again = scenario.simulate is not None and outcome.status == Status.OK
-    return record, outcome, scenario.simulate(record.inputs, record.seed) if again and scenario.simulate else None
+    return record, outcome, scenario.simulate(record.inputs, record.seed) if again and scenario.simulate else None, scenario
 
 
 def _report(store: Store, settings: Settings) -> Path:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sbt.cli.campaign import Folder
 from sbt.cli.console import Exit, clean_stdout, fail, print_json
+from sbt.errors import InputError
+
+if TYPE_CHECKING:
+    from sbt.history import Record
+    from sbt.problem.scenario import LogicalScenario
+    from sbt.problem.trace import Trace
 
 __all__ = ["replay"]
 
@@ -17,22 +24,23 @@ def replay(
     folder: Folder,
     run: Annotated[int, typer.Argument(metavar="RUN", help="Index of the run, as in the report.")],
     *,
+    gui: Annotated[bool, typer.Option("--gui", help="Watch it in sumo-gui.")] = False,
+    gif: Annotated[Path | None, typer.Option(metavar="FILE.gif", help="Draw it from above, with the metric over time.")] = None,
+    export: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write network, trajectories (FCD, CSV) and a scene for sumo-gui.")
+    ] = None,
     trace: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write the states over time.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
-    """Execute a stored run again and compare it with the store, bit by bit."""
+    """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
         from sbt.run import replay as execute
 
-        record, outcome, states = execute(folder, run)
-        if trace is not None and states is not None:
-            import csv
-
-            rows = states.rows()
-            with trace.open("w", newline="") as file:
-                writer = csv.DictWriter(file, list(rows[0]))
-                writer.writeheader()
-                writer.writerows(rows)
+        record, outcome, states, scenario = execute(folder, run)
+        if gui or gif or export or trace:
+            if states is None:
+                raise InputError(f"only a run with a trace can be shown or written out, but run {run} has none: {outcome.reason}")
+            _show(scenario, record, states, gui=gui, gif=gif, export=export, trace=trace)
     same = str(outcome.status) == record.status and dict(outcome.metrics) == dict(record.metrics)
     if as_json:
         print_json({
@@ -49,3 +57,35 @@ def replay(
     if not same:
         now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
         raise fail(f"a replay must equal the stored run, but got {now}, not {stored}", Exit.INTERNAL)
+
+
+def _show(
+    scenario: LogicalScenario,
+    record: Record,
+    states: Trace,
+    *,
+    gui: bool,
+    gif: Path | None,
+    export: Path | None,
+    trace: Path | None,
+) -> None:
+    """Show a run, or write it out, in the ways that are asked for."""
+    from sbt.report.film import write_film
+    from sbt.report.outside import write_csv, write_folder
+    from sbt.sumo.nets import lanes, net_file
+    from sbt.sumo.window import gui_program, watch
+
+    net = getattr(scenario.simulate, "net", None)
+    if trace is not None:
+        write_csv(trace, states)
+    if export is not None:
+        write_folder(export, states, None if net is None else net_file(net))
+    if gif is not None:
+        need = scenario.requirement
+        metric = next(m for m in scenario.metrics if m.name == need.metric)
+        title = f"{scenario.name}, run {record.index}: {metric.name} = {record.metrics[metric.name]:.3g} {metric.unit}"
+        write_film(gif, states, metric, need, lanes=() if net is None else lanes(net), title=title)
+    if gui:
+        watched = watch(scenario.simulate, record.inputs, record.seed, gui_program())
+        if not watched.identical(states):
+            print("what sumo-gui showed differs from the run in the last digits", file=sys.stderr)

@@ -63,10 +63,11 @@ class AccAeb:
         self._time_gap, self._distance_min = time_gap, distance_min
         self._acc_accel, self._acc_braking = acc_accel, acc_braking
         self._aeb_braking, self._aeb_reserve, self._aeb_distance = aeb_braking, aeb_reserve, aeb_distance
-        self._sensor = RangeSensor(rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise)
-        self._delay = DeadTime(reaction_time)
-        self._lag = FirstOrderLag(lag)
-        self._lag_2 = FirstOrderLag(lag_2) if lag_2 > 0 else None
+        sensor = RangeSensor(rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise)
+        self._sensor = sensor.__call__  # a bound method is called faster than an object
+        self._delay = DeadTime(reaction_time).__call__
+        self._lag = FirstOrderLag(lag).__call__
+        self._lag_2 = FirstOrderLag(lag_2).__call__ if lag_2 > 0 else None
         self._last = self._reached = 0.0
         self._braking = False
 

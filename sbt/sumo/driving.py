@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -205,14 +206,21 @@ def _contact(states: list[State], solid: list[int], rows: bytearray, dt: float) 
 
     Exact only when near: the others are too far away for it, however they are turned.
     """
-    ego, others = states[0], [(states[j], j) for j in solid]
-    near = max(s.length for s in states) * 2
+    ego, near = states[0], 2.0 * max(s.length for s in states)
+    width, place = _ROW.size * len(states), struct.Struct("=2d").unpack_from
+    others = [(s, j, _ROW.size * j, 0.5 * (math.hypot(ego.length, ego.width) + math.hypot(s.length, s.width)))
+              for j, s in ((j, states[j]) for j in solid)]  # fmt: skip
 
     def touching(k: int) -> bool:
         x, y, speed = ego.x, ego.y, ego.speed
-        for other, j in others:
+        for other, j, column, radii in others:
             dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
             if -reach < dx < reach and -reach < dy < reach:
+                (x_0, y_0), (u_0, v_0) = place(rows, max(k - 1, 0) * width), place(rows, max(k - 1, 0) * width + column)
+                dx_0, dy_0 = u_0 - x_0, v_0 - y_0
+                circles = radii + 1.5 * max(abs(dx - dx_0), abs(dy - dy_0))  # about both, and what they moved
+                if min(dx * dx + dy * dy, dx_0 * dx_0 + dy_0 * dy_0) > circles * circles:
+                    continue
                 step = _table(rows, max(k - 1, 0), k + 1, len(states))
                 if contact_index(_track(step, 0, ego), _track(step, j, other)) is not None:
                     return True

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import gzip
+import xml.etree.ElementTree as ET
 import xml.parsers.expat
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from sbt.errors import InputError
 
-__all__ = ["net_file", "nets_folder"]
+__all__ = ["Lane", "lanes", "net_file", "nets_folder"]
+
+
+class Lane(NamedTuple):
+    """A lane as it lies in the plane: its middle line (n, 2) and its width (m)."""
+
+    shape: tuple[tuple[float, float], ...]
+    width: float
 
 
 @cache
@@ -39,6 +48,22 @@ def net_file(net: str) -> Path:
         raise InputError(f"a network must be one of {known}, or an existing .net.xml file, but got '{net}'")
     _check_well_formed(path)
     return path.resolve()
+
+
+def lanes(net: str) -> tuple[Lane, ...]:
+    """Return the lanes of a network, those inside junctions too.
+
+    Raises:
+        InputError: there is no such network.
+    """
+    path = net_file(net)
+    found = []
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        for _, element in ET.iterparse(file):
+            if element.tag == "lane":
+                points = [tuple(map(float, pair.split(",")[:2])) for pair in element.get("shape", "").split()]
+                found.append(Lane(tuple((x, y) for x, y in points), float(element.get("width", "3.2"))))
+    return tuple(found)
 
 
 def _check_well_formed(path: Path) -> None:

@@ -158,6 +158,15 @@ class Session:
                 self._flush()
                 raise
 
+    @contextlib.contextmanager
+    def through(self, client: Any) -> Iterator[None]:
+        """Let runs go through another client than libsumo for a while: traci, or what looks like it."""
+        own, self._sumo, self._setup = self._sumo, client, None
+        try:
+            yield
+        finally:
+            self._sumo, self._setup = own, None
+
     def route(self, edges: tuple[str, ...]) -> str:
         """Return the id of the route over these edges, known to SUMO from now on."""
         name = "route:" + ">".join(edges)

@@ -1,0 +1,155 @@
+"""Replay: a stored run again as a film, as files, in another SUMO program; the same run each time."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sbt.cli import app
+from sbt.config.load import parse
+from sbt.errors import InputError
+from sbt.metrics.fcd import read_fcd
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.trace import Trace
+from sbt.report.film import metric_so_far
+from sbt.run import replay, run_campaign
+from sbt.sumo import window
+from sbt.sumo.nets import lanes
+from sbt.sumo.session import libsumo, session
+
+pytestmark = pytest.mark.sumo
+
+Run = tuple[Path, Trace, LogicalScenario]
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
+    """A campaign of a few runs of two scenarios: the store, the trace of run 1, the scenario."""
+    found = {}
+    for name in ("cut_in", "jaywalking"):
+        folder = tmp_path_factory.mktemp(name) / "store"
+        text = (
+            f"campaign: coverage\nscenario: {name}\nbudget: 4\nbatch: 4\nvalidation: {{share: 0}}\n"
+            f"executor: {{kind: serial}}\nstore: {folder}\n"
+        )
+        run_campaign(parse(text), report=False)
+        _, _, trace, scenario = replay(folder, 1)
+        assert trace is not None
+        found[name] = (folder, trace, scenario)
+    return found
+
+
+@pytest.mark.parametrize("name", ["cut_in", "jaywalking"])
+def test_the_film_is_small_and_plays_in_real_time(name: str, stored: dict[str, Run], tmp_path: Path):
+    from PIL import Image
+
+    folder, trace, _ = stored[name]
+    done = CliRunner().invoke(app, ["replay", str(folder), "1", "--gif", str(tmp_path / "run.gif"), "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["identical"] is True
+    assert 5_000 < (tmp_path / "run.gif").stat().st_size < 600_000
+    with Image.open(tmp_path / "run.gif") as film:
+        pictures, seconds = [], 0.0
+        for k in range(film.n_frames):
+            film.seek(k)
+            seconds += film.info["duration"] / 1000
+            pictures.append(np.asarray(film.convert("RGB")).astype(int))
+    assert seconds == pytest.approx(trace.time[-1] + 1.2, abs=0.35)
+    assert np.abs(pictures[-1] - pictures[0]).max() > 50
+    blue = (np.abs(pictures[0] - np.array([0x1F, 0x6F, 0xB4])).max(axis=2) < 12).sum()
+    assert blue > 100  # ego is there, in its colour
+
+
+def test_the_metric_so_far_ends_with_the_metric(stored: dict[str, Run]):
+    _, trace, scenario = stored["cut_in"]
+    metric = next(m for m in scenario.metrics if m.name == "ttc_min")
+    values = metric_so_far(trace, metric, range(len(trace.time)))
+    assert values[-1] == metric(trace)
+    assert (np.diff(values) <= 0).all()  # a smallest value only falls
+
+
+def test_what_is_exported_is_the_run(stored: dict[str, Run], tmp_path: Path):
+    folder, trace, _ = stored["jaywalking"]
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, ["replay", str(folder), "1", "--export", str(out), "--trace", str(tmp_path / "t.csv")])
+    assert done.exit_code == 0, done.output
+    names = {path.name for path in out.iterdir()}
+    assert names == {"trace.csv", "fcd.xml", "street.net.xml", "scene.add.xml", "scene.sumocfg"}
+    assert (out / "trace.csv").read_bytes() == (tmp_path / "t.csv").read_bytes()
+    recording = read_fcd(out / "fcd.xml")
+    assert sorted(recording.names) == sorted(trace.actors)
+    assert sorted(recording.length.tolist()) == sorted(trace.length.tolist())
+    libsumo()
+    with session().run(_setup(), 0, "fresh"):
+        libsumo().load(["-c", str(out / "scene.sumocfg"), "--no-step-log", "true", "--no-warnings", "true"])
+        shapes = libsumo().polygon.getIDList()
+        assert {"ego_start", "ego_end", "ego_path", "child_path", "machine_start"} <= set(shapes)
+        first = np.array(libsumo().polygon.getShape("ego_start"))
+    assert np.ptp(first[:, 0]) == pytest.approx(5.0, abs=1e-3)
+
+
+def _setup():
+    from sbt.plugins import load
+    from sbt.sumo.actors import Scene
+
+    return load("scenarios", "jaywalking").simulate.setup(Scene(()))
+
+
+def test_exported_positions_follow_sumos_conventions(stored: dict[str, Run], tmp_path: Path):
+    import xml.etree.ElementTree as ET
+
+    from sbt.report.outside import write_fcd
+
+    _, trace, _ = stored["jaywalking"]
+    write_fcd(tmp_path / "fcd.xml", trace)
+    steps = ET.parse(tmp_path / "fcd.xml").getroot().findall("timestep")
+    assert len(steps) == len(trace.time)
+    ego, child = steps[3].find("vehicle[@id='ego']"), steps[3].find("person[@id='child']")
+    assert ego is not None
+    assert child is not None
+    assert float(ego.attrib["x"]) == pytest.approx(trace.x[3, 0] + 2.5)
+    assert float(ego.attrib["angle"]) == pytest.approx(90.0)
+    assert float(child.attrib["y"]) == trace.y[3, 1]
+    assert float(child.attrib["angle"]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_replay_that_cannot_be_shown_says_so(stored: dict[str, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shutil, "which", lambda *_: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda *_: None)
+    with pytest.raises(InputError, match="needs sumo-gui on the path, but it is not there"):
+        window.gui_program()
+    monkeypatch.setattr(shutil, "which", lambda *_: "/bin/sumo-gui")
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(InputError, match="needs a display, but neither DISPLAY"):
+        window.gui_program()
+    text = f"campaign: coverage\nscenario: testbed:four_branch_7\nbudget: 4\nexecutor: {{kind: serial}}\nstore: {tmp_path}/s\n"
+    run_campaign(parse(text), report=False)
+    done = CliRunner().invoke(app, ["replay", str(tmp_path / "s"), "1", "--gif", str(tmp_path / "x.gif")])
+    assert done.exit_code == 2
+    assert "only a run with a trace can be shown" in done.output
+
+
+@pytest.mark.skipif(shutil.which("sumo") is None, reason="needs the program sumo (extra `tools`)")
+@pytest.mark.parametrize("name", ["cut_in", "jaywalking"])
+def test_another_sumo_program_shows_the_same_run(name: str, stored: dict[str, Run]):
+    folder, trace, scenario = stored[name]
+    record = replay(folder, 1)[0]
+    program = shutil.which("sumo")
+    assert program is not None
+    assert window.watch(scenario.simulate, record.inputs, record.seed, program).identical(trace)
+    assert scenario.simulate(record.inputs, record.seed).identical(trace)  # and libsumo goes on as before
+
+
+def test_lanes_are_where_the_network_has_them():
+    shapes = lanes("straight")
+    assert [lane.shape[0][1] for lane in shapes] == [-8.75, -5.25, -1.75]
+    assert {lane.width for lane in shapes} == {3.5}
+    assert math.isclose(shapes[0].shape[-1][0], 4000.0)
