@@ -4,7 +4,7 @@
 
 Every cell is a campaign as `sumo-sbt run` runs it, or a sampler of others on the same scenario, in this
 process. Finished cells are kept in FOLDER and not run again: stop and continue as you like. `random` and
-`sobol` have 2,000 runs, the others 400; initial designs and batches are the defaults (10 runs each). The
+`sobol` have 2,000 runs, on SUMO and all others 400; initial designs and batches are the defaults (10 runs each). The
 samplers cma_es and tpe need: pip install 'sumo-sbt[compare]'.
 """
 
@@ -36,14 +36,15 @@ CASES = {
     "interval_ring_d3": ("testbed:interval_ring_d3", None, (55, 95)),
     "plateau_ttc_d6": ("testbed:plateau_ttc_d6", None, (100, 220)),
     "hartmann6_in_25": ("testbed:hartmann6_in_25", None, (65, 95)),
-    "sumo_cut_in": ("cut_in", (-5.0, -0.95), None),
+    "sumo_cut_in": ("cut_in", "{critical: [-5.0, -0.95]}", None),
+    "sumo_emergency_braking": ("emergency_braking", "{metric: impact_speed, critical: [20.3, .inf]}", None),
 }
 MINIMA = np.array([[0.20169, 0.150011, 0.476874, 0.275332, 0.311652, 0.6573], [0.4047, 0.8824, 0.8436, 0.5740, 0.1389, 0.0385]])
 
 
 def configuration(case: str, budget: int, seed: int = 0, stop: str = "{failures: 1}", store: str = "unused") -> str:
-    scenario, critical, _ = CASES[case]
-    requirement = "" if critical is None else f"requirement: {{critical: [{critical[0]}, {critical[1]}]}}\n"
+    scenario, tighter, _ = CASES[case]
+    requirement = "" if tighter is None else f"requirement: {tighter}\n"
     return (
         f"campaign: falsification\nscenario: {scenario}\n{requirement}budget: {budget}\nseed: {seed}\nstop: {stop}\n"
         f"executor: {{kind: serial}}\nstore: {store}\n"
@@ -53,7 +54,7 @@ def configuration(case: str, budget: int, seed: int = 0, stop: str = "{failures:
 def first_failures(args: argparse.Namespace, case: str) -> None:
     cells = []
     for name in args.samplers.split(","):
-        budget = 2000 if name in ("random", "sobol") else 400
+        budget = 2000 if name in ("random", "sobol") and not case.startswith("sumo") else 400
         cells += compare(parse(configuration(case, budget)), [name], args.seeds, args.into / case)
     bar = CASES[case][2]
     print(f"\n{case}" + (f", bar {bar[0]} / {bar[1]}" if bar else "") + f"\n\n{table(cells)}", flush=True)

@@ -30,12 +30,14 @@ from sbt.store import Store
 from sbt.testbeds import values
 
 CASES = '''
+from dataclasses import replace
+
 import numpy as np
 from sbt.errors import RunError
 from sbt.testbeds import analytic
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, Pool
 from sbt.problem.space import ParameterSpace
 
 BOX = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
@@ -70,6 +72,8 @@ PLATEAU = analytic(lambda x: np.where((x[:, 0] > 0.9) & (x[:, 1] > 0.8), -1.0, 1
 FLAT = analytic(lambda x: np.full(len(x), 3.0), inputs=BOX, critical=LOW, name="flat")
 MORE = {**BOX, "c": (0.0, 1.0), "d": (0.0, 1.0)}
 IDLE = analytic(lambda x: np.abs(x[:, 0] - 0.62) - 0.01, inputs=MORE, critical=LOW, name="idle")
+GRID = np.stack(np.meshgrid(*[np.linspace(0.03, 0.97, 9)] * 2), axis=-1).reshape(-1, 2)
+RECORDED = replace(TWO, name="recorded", pool=Pool(GRID, {"y": two_holes(GRID)}))
 HALF = own("half fails", half)
 COIN = own("coin", coin)
 '''
@@ -185,6 +189,20 @@ def test_plateaus_and_idle_inputs(hunted: Run):
     idle = hunted("IDLE", "idle", budget=60)["conclusion"]
     assert 1 <= len(idle["failure_modes"]) <= 3  # one slab; idle inputs do not split it into many
     assert idle["first_critical_run"] <= 40
+
+
+def test_recorded_rows_are_chosen_once_each_and_never_repeated(hunted: Run):
+    result = hunted("RECORDED", budget=200, batch=30)
+    assert result["stopped"] == "no rows left"
+    points = [tuple(row[3].values()) for row in rows(result)]
+    assert (len(points), len(set(points))) == (81, 81)
+    assert [m["confirmed"] for m in result["conclusion"]["failure_modes"]] == [None, None]
+
+
+def test_constraints_hold_for_every_run(hunted: Run):
+    result = hunted("TWO", budget=50, constraints=["a + b < 1.2"])
+    assert all(row[3]["a"] + row[3]["b"] < 1.2 for row in rows(result))
+    assert len(result["conclusion"]["failure_modes"]) == 1
 
 
 def test_a_budget_below_the_first_design_is_a_design_alone(hunted: Run):

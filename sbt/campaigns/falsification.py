@@ -112,7 +112,7 @@ class Hunt:
             found.append(described(mode, searched, self.settings.scenario, again.y(metric)))
         bound = None if len(hits) else _bound(searched)
         return {
-            "first_critical_run": int(searched.index[hits[0]]) + 1 if len(hits) else None, "critical_runs": len(hits),
+            "first_critical_run": int(hits[0]) + 1 if len(hits) else None, "critical_runs": len(hits),
             "failure_modes": found, "bound": bound, "closest": None if len(hits) else _closest(searched, margin, metric),
             "statement": _statement(searched, len(hits), found, bound),
         }  # fmt: skip
