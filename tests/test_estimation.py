@@ -1,0 +1,184 @@
+"""The estimation campaign: true statements in every case, the same on every way, nothing counted that was not drawn."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sbt.campaign import Log
+from sbt.campaigns.counting import counted_batches
+from sbt.campaigns.gate import Limits, decided
+from sbt.cli import app
+from sbt.config.load import ConfigError, load, parse
+from sbt.errors import InputError
+from sbt.run import assembly_of, run_campaign, settings_of
+from sbt.store import Store
+from sbt.testbeds import truth
+
+Run = Callable[..., dict[str, Any]]
+GP = {"kind": "gp", "nu": 2.5, "input_noise": False}
+QUICK = {"campaign": "estimation", "metamodel": GP, "budget": 60, "initial": 10, "batch": 10, "stop": {"cov": None}}
+DISC = np.pi * 0.09
+
+
+def testbed(name: str, folder: Path, **keys: Any) -> dict[str, Any]:
+    given = {"campaign": "estimation", "scenario": f"testbed:{name}", "executor": {"kind": "serial"}, "store": str(folder / "s")}
+    return run_campaign(parse(json.dumps({**given, **keys})), report=False)
+
+
+def test_a_known_probability(tmp_path):
+    p = truth("four_branch_7").probability
+    found = testbed("four_branch_7", tmp_path, budget=120, stop={"cov": None})["conclusion"]
+    assert found["probability"] == pytest.approx(p, rel=0.15)
+    assert found["low"] <= p <= found["high"]
+    assert found["hits"] >= 10
+    assert any("no interval can see" in w for w in found["warnings"])  # 2e-3 is below what 50 draws can exclude
+
+
+@pytest.mark.slow
+def test_intervals_cover_over_seeds(tmp_path):
+    p, covered = truth("four_branch_7").probability, 0
+    for seed in range(12):
+        found = testbed("four_branch_7", tmp_path / str(seed), budget=124, seed=seed, stop={"cov": None})["conclusion"]
+        covered += found["low"] <= p <= found["high"]
+    assert covered >= 11
+
+
+def test_it_stops_at_its_target(tmp_path):
+    result = testbed("linear_d2", tmp_path, budget=300, batch=15, stop={"cov": 0.2})
+    assert (result["stopped"], result["runs"] < 300) == ("cov", True)
+    assert result["conclusion"]["cov"] <= 0.2
+
+
+def test_interrupted_and_in_two_processes_it_is_the_same(campaign: Run, configured: Callable[..., Path], rows: Any):
+    whole = campaign("whole", **QUICK)
+
+    def interrupt(progress: Any) -> None:
+        if progress.done == 47:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(load(configured("again", **QUICK)), progress=interrupt, report=False)
+    again = campaign("again", **QUICK)
+    two = campaign("two", **QUICK | {"executor": {"kind": "local", "workers": 2}})
+    assert whole["conclusion"] == again["conclusion"] == two["conclusion"]
+    assert rows(whole["store"]) == rows(again["store"]) == rows(two["store"])
+
+
+def test_nothing_critical(campaign: Run):
+    found = campaign(**QUICK, requirement={"critical": [-9.0, -8.0]})["conclusion"]
+    assert (found["probability"], found["low"], found["hits"]) == (0.0, 0.0, 0)
+    assert found["high"] > found["exact_bound"] > 0.0  # 97.5 % and 95 %
+    assert found["exact_bound"] < 0.25  # 3 over half of about 30 draws
+    assert any("nothing critical was met" in w for w in found["warnings"])
+
+
+def test_everything_critical(campaign: Run):
+    found = campaign(**QUICK, requirement={"critical": [-9.0, 9.0]})["conclusion"]
+    assert (found["probability"], found["high"]) == (1.0, 1.0)
+    assert 0.7 < found["low"] < 1.0
+
+
+def test_half_of_the_space_fails(campaign: Run):
+    result = campaign(scenario="SOME_FAIL", **QUICK | {"budget": 100})
+    found = result["conclusion"]
+    assert result["failed"] > 0
+    assert found["failed_as_safe"] < found["failed_as_critical"]
+    assert found["low"] < DISC < found["high"]  # the hidden part of the disc lies where runs fail
+    assert found["high"] > 0.3  # all that fails may be critical
+    assert "runs failed" in found["warnings"][0]
+
+
+def test_a_budget_without_a_counted_draw_gives_no_number(campaign: Run):
+    found = campaign(**QUICK | {"budget": 10})["conclusion"]
+    assert (found["probability"], found["low"], found["high"]) == (None, 0.0, 1.0)
+    assert "no draw counts" in found["warnings"][0]
+
+
+@pytest.mark.parametrize("critical", [(0.0, 0.005), (0.45, 9.0)], ids=["thin ring", "four corners"])
+def test_thin_and_separated_regions(campaign: Run, critical):
+    """Of the square: the ring 0.3 < r < 0.305, and what is farther than 0.75 from the middle: nothing."""
+    low, high = critical
+    found = campaign(**QUICK | {"budget": 120, "requirement": {"critical": [low, high]}})["conclusion"]
+    p = np.pi * (0.305**2 - 0.3**2) if high < 1 else 0.0
+    assert found["low"] <= p <= found["high"]
+
+
+def test_an_input_without_influence(campaign: Run):
+    found = campaign(**QUICK | {"budget": 100, "requirement": {"metric": "y", "critical": [-9.0, -0.25]}})["conclusion"]
+    assert found["low"] <= np.pi * 0.05**2 <= found["high"]
+
+
+def test_crude_monte_carlo(campaign: Run):
+    crude = QUICK | {"acquisition": {"kind": "monte_carlo"}, "budget": 400, "batch": 200}
+    found = campaign(**crude)["conclusion"]
+    assert (found["low"] < DISC < found["high"], found["counted"]) == (True, 400)
+    assert found["probability"] == found["hits"] / 400
+
+
+def test_subset_simulation_with_repeats(tmp_path):
+    found = testbed("hartmann6_in_25", tmp_path, budget=3000)  # auto: 25 inputs
+    assert found["stopped"] in ("converged", "budget")
+    conclusion = found["conclusion"]
+    assert conclusion["low"] <= truth("hartmann6_in_25").probability <= conclusion["high"]
+
+
+def test_it_refuses_runs_of_unknown_density(campaign: Run, configured: Callable[..., Path]):
+    result = campaign(**QUICK)
+    with Store.read(Path(result["store"])) as store:
+        log = Log(store.history(), tuple(store.iterations()), ())
+    loaded = load(configured(**QUICK))
+    settings = settings_of(loaded, assembly_of(loaded))
+    assert counted_batches(log, settings)
+    blank = tuple(replace(r, log_q=None) for r in log.history.records)
+    with pytest.raises(InputError, match="known proposal density"):
+        counted_batches(replace(log, history=replace(log.history, records=blank)), settings)
+
+
+def test_incomplete_batches_do_not_count(campaign: Run, configured: Callable[..., Path]):
+    """Runs that crash end early: a batch with what came back would over-count them."""
+    result = campaign(**QUICK)
+    with Store.read(Path(result["store"])) as store:
+        log = Log(store.history(), tuple(store.iterations()), ())
+    loaded = load(configured(**QUICK))
+    settings = settings_of(loaded, assembly_of(loaded))
+    cut = replace(log, history=replace(log.history, records=log.history.records[:-3]))
+    assert len(counted_batches(cut, settings)) == len(counted_batches(log, settings)) - 1
+
+
+def test_an_earlier_campaign_teaches_and_is_not_counted(campaign: Run, configured: Callable[..., Path]):
+    before = campaign("before", campaign="boundary", budget=40)
+    result = campaign("after", **QUICK, **{"from": before["store"]})
+    assert result["runs"] == 60
+    with Store.read(Path(result["store"])) as store:
+        assert store.iterations()[0]["method"] != "sobol"  # it has learned already
+    assert result["conclusion"]["low"] <= DISC <= result["conclusion"]["high"]
+    with pytest.raises(InputError, match="same scenario"):
+        campaign("other", "LINE", **QUICK, **{"from": before["store"]})
+    with pytest.raises(ConfigError, match="from: only an estimation campaign"):
+        load(configured("wrong", **{"from": before["store"]}))
+
+
+def test_the_gate_decides_by_one_sided_limits():
+    limits = Limits(lambda c: 0.01 * (1 - c), lambda c: 0.01 * (1 + c))
+    assert decided(limits, probability=0.02, confidence=0.95)["verdict"] == "pass"
+    assert decided(limits, probability=0.0001, confidence=0.95)["verdict"] == "fail"
+    assert decided(limits, probability=0.01, confidence=0.95)["verdict"] == "undecided"
+
+
+@pytest.mark.parametrize(("probability", "code", "verdict"), [(0.9, 0, "pass"), (0.05, 3, "fail"), (0.28, 3, "undecided")])
+def test_the_gate_is_an_exit_code_and_junit(configured: Callable[..., Path], tmp_path, probability, code, verdict):
+    config = configured(**QUICK | {"acquisition": {"kind": "monte_carlo"}, "budget": 100, "gate": {"probability": probability}})
+    done = CliRunner().invoke(app, ["run", str(config), "--json", "--junit", str(tmp_path / "j.xml")])
+    assert done.exit_code == code
+    assert json.loads(done.stdout.splitlines()[0])["conclusion"]["gate"]["verdict"] == verdict
+    suite = ET.parse(tmp_path / "j.xml").getroot()
+    assert (suite.get("failures"), suite.get("tests")) == (str(int(code == 3)), "2")

@@ -1,0 +1,166 @@
+"""Laws of the estimators: unbiased for any belief, weights fixed in advance, bounds that are exact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from sbt.estimators.importance import BLIND, SHARES, chosen, planned
+from sbt.estimators.intervals import Counted, binomial_upper, combined, few_hits_bound
+from sbt.estimators.mixture import Mixture, Normals, fitted, log_normal, particles, wide_scales
+from sbt.estimators.monte_carlo import Share
+from sbt.estimators.subset import Repeat, spread_of
+from sbt.seeds import stream
+
+WIDE = wide_scales(np.zeros(2))
+TRUTH = ndtr(-2.0)  # of x1 > 2
+
+
+def wrong(z):
+    """A belief that is wrong everywhere: it takes the failure to lie at x2 > 1.5, and half doubts the rest."""
+    pi = np.clip(0.9 * (z[:, 1] > 1.5) + 0.02, 0.0, 1.0)
+    return np.log(pi), np.log1p(-pi)
+
+
+def nothing(z):
+    """A belief that denies every failure."""
+    return np.full(len(z), -60.0), np.full(len(z), -1e-26)
+
+
+H = Mixture(WIDE, Normals(np.ones(1), np.array([[2.2, 0.5]]), np.eye(2)[None]))
+
+
+def replicate(belief, rng, *, form=None, n=20, shares=SHARES):
+    """Return one batch on the line x1 = 2 with a fresh, rather small pool."""
+    z, stratum = H.sample(300, rng)
+    log_h = H.log_density(z)
+    log_pi, log_not = belief(z)
+    plan = planned(log_pi, log_not, log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum, shares)
+    if form == "meta":
+        plan = replace(plan, form="meta", prior=0.0, believed=np.zeros(len(z)))
+    draws = chosen(plan, n, log_pi, rng)
+    critical = (z[draws.rows, 0] > 2.0).astype(float)
+    return Counted(plan.prior, plan.anticipated, plan.pool_variance, draws.coefficient, draws.believed, critical)
+
+
+@pytest.mark.parametrize("form", [None, "meta"])
+@pytest.mark.parametrize("belief", [wrong, nothing])
+def test_unbiased_with_a_wrong_belief(belief, form):
+    rng = stream(1, "unbiased")
+    values = np.array([replicate(belief, rng, form=form).value for _ in range(250)])
+    error = values.std(ddof=1) / math.sqrt(len(values))
+    assert abs(values.mean() - TRUTH) < 3 * error
+    assert error < 0.5 * TRUTH  # the law says something
+
+
+def test_the_mean_of_p_over_q_is_one():
+    rng = stream(2, "weights")
+    means = np.array([replicate(wrong, rng, n=50).coefficient.mean() for _ in range(120)])
+    assert abs(means.mean() - 1.0) < 3 * means.std(ddof=1) / math.sqrt(len(means))
+
+
+@pytest.mark.parametrize("shares", [SHARES, BLIND])
+def test_the_defence_bounds_the_weights(shares):
+    assert sum(shares) == pytest.approx(1.0)
+    assert replicate(wrong, stream(3, "bounded"), shares=shares).coefficient.max() <= 1.05 / shares[1]
+
+
+def test_every_pool_point_is_expected_as_often_as_its_probability_says():
+    rng = stream(4, "systematic")
+    z, stratum = Mixture(WIDE).sample(60, rng)
+    log_h = Mixture(WIDE).log_density(z)
+    plan = planned(*wrong(z), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
+    counts = np.zeros(60)
+    for _ in range(4000):
+        counts += np.bincount(chosen(plan, 10, z[:, 0], rng).rows, minlength=60)
+    expected = 4000 * 10 * plan.probability
+    assert np.all(np.abs(counts - expected) < 5 * np.sqrt(expected) + 5)
+
+
+def test_the_mixture_has_the_density_it_claims():
+    rng = stream(5, "mixture")
+    cloud = rng.standard_normal((400, 2)) * [0.3, 1.0] + [3.0, -1.0]
+    h = fitted((cloud, cloud + [-6.0, 0.0]), WIDE, rng)
+    z, _ = h.sample(40_000, rng)
+    ratio = np.exp(log_normal(z) - h.log_density(z))
+    assert ratio.mean() == pytest.approx(1.0, abs=4 * ratio.std() / 200)
+    far = log_normal(z - [3.0, -1.0], np.array([0.3, 1.0]))  # a density that h was fitted to
+    ratio = np.exp(far - h.log_density(z))
+    assert ratio.mean() == pytest.approx(1.0, abs=4 * ratio.std() / 200)
+
+
+def test_particles_follow_their_target():
+    rng = stream(9, "particles")
+    z, _ = Mixture(WIDE).sample(2000, rng)
+    found = particles(lambda v: np.where(v[:, 0] > 2.0, log_normal(v), -np.inf), z, Mixture(WIDE).log_density(z), 800, rng)
+    assert (found[:, 0] > 2.0).all()
+    assert found[:, 0].mean() == pytest.approx(2.373, abs=0.06)  # phi(2) / Phi(-2)
+    assert found[:, 1].std() == pytest.approx(1.0, abs=0.12)
+
+
+def batch(values, anticipated=0.0):
+    critical = np.asarray(values, dtype=float)
+    return Counted(0.0, anticipated, 0.0, np.ones(len(critical)), np.zeros(len(critical)), critical)
+
+
+def test_weights_of_batches_look_at_no_result():
+    """Inverse variance would give nearly all weight to the calm batch."""
+    calm, wild = batch([0.1] * 10), batch([0.0] * 9 + [5.0])
+    c = np.array([1.0, math.sqrt(2.0)]) / (1.0 + math.sqrt(2.0))
+    assert combined([calm, wild]).value == pytest.approx(c @ [0.1, 0.5])
+    assert combined([wild, calm]).value == pytest.approx(c @ [0.5, 0.1])
+
+
+def test_the_interval_believes_the_larger_variance():
+    alike = [batch([0.5] * 4 + [0.5]) for _ in range(5)]
+    assert combined(alike).std_error == pytest.approx(0.0, abs=1e-12)
+    assert combined([batch([0.5] * 5, anticipated=1.0) for _ in range(5)]).std_error > 0.1  # anticipated
+    apart = [batch([v] * 5) for v in (0.1, 0.9, 0.2, 0.8)]
+    assert combined(apart).std_error > 0.1  # between the batches
+    c = combined(apart)
+    assert c.limit(0.975, side=-1) < c.limit(0.9, side=-1) < c.value < c.limit(0.9, side=1) < c.limit(0.975, side=1)
+
+
+@pytest.mark.parametrize("hits", [0, 1, 7])
+def test_few_hits_bound_is_the_binomial_one_where_all_draws_are_nominal(hits):
+    assert few_hits_bound(hits, np.ones(50), 0.95) == pytest.approx(binomial_upper(hits, 50, 0.95), rel=1e-6)
+    assert few_hits_bound(hits, np.full(50, 0.5), 0.95) > binomial_upper(hits, 50, 0.95)
+    assert few_hits_bound(0, np.full(300, 0.05), 0.95) == pytest.approx(3.0 / 15.0, rel=0.02)  # 3 / n_p
+    assert few_hits_bound(hits, np.empty(0), 0.95) == 1.0
+
+
+def test_crude_monte_carlo_covers():
+    rng, p = stream(6, "crude"), 0.03
+    shares = [Share(100, int(rng.binomial(100, p))) for _ in range(2000)]
+    assert np.mean([s.lower(0.975) <= p <= s.upper(0.975) for s in shares]) >= 0.95
+    assert Share(100, 2, failed=5).upper(0.9) == Share(100, 7).upper(0.9)
+    assert Share(100, 2, failed=5).lower(0.9) == Share(100, 2).lower(0.9)
+
+
+def test_subset_simulation_meets_a_plane_in_many_dimensions():
+    truth = float(ndtr(-3.0))
+    found = []
+    for k in range(10):
+        repeat, rng = Repeat(300, 30), stream(7, "subset", k)
+        while not repeat.finished:
+            z = repeat.asked(rng)
+            repeat = repeat.told(z, 3.0 - z.sum(axis=1) / math.sqrt(30))
+        found.append(repeat.share)
+    spread = spread_of(found)
+    assert abs(spread.value - truth) < 3 * spread.std_error < 1.5 * truth
+
+
+def test_subset_simulation_ends_on_a_plateau_and_without_a_run():
+    for margin in (np.ones(100), np.full(100, np.nan)):
+        repeat = Repeat(100, 3)
+        for _ in range(300):
+            if repeat.finished:
+                break
+            z = repeat.asked(stream(8, "plateau"))
+            repeat = repeat.told(z, margin[: len(z)])
+        assert repeat.finished
+        assert repeat.share == 0.0
