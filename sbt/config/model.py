@@ -167,7 +167,7 @@ class Choice(_Strict):
 
 
 class MetamodelChoice(Choice):
-    """The metamodel; further keys are its settings."""
+    """The metamodel; further keys are its settings, and `recalibrate: true` scales its sigma on held-out rows."""
 
     preset: Name | None = Field(
         default=None, description="Named settings of the metamodel, such as paper; further keys override it."
@@ -247,7 +247,10 @@ def _store(data: dict[str, Any]) -> str:
 
 
 def _metamodel(data: dict[str, Any]) -> MetamodelChoice | None:
-    return MetamodelChoice.model_validate({"kind": "gp"}) if CAMPAIGNS[data["campaign"]].adaptive else None
+    if not CAMPAIGNS[data["campaign"]].adaptive:
+        return None
+    default = {"kind": "auto", "preset": "quick"} if data["campaign"] == "boundary" else {"kind": "gp"}
+    return MetamodelChoice.model_validate(default)
 
 
 def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
@@ -287,7 +290,7 @@ class Configuration(_Strict):
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
         default_factory=_metamodel,
-        description="What learns the safety metric; default: gp, none for coverage.",
+        description="What learns the safety metric; default: boundary auto (quick), others gp, coverage none.",
     )
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,
