@@ -159,9 +159,10 @@ def _finished(figure: Figure, panels: Sequence[Axes], title: str) -> Figure:
 
 def _grid(results: Results, draw: Callable[[Axes, Cell, bool], None], across: str, up: str) -> Figure | None:
     """Draw a panel for each metamodel (lines) and scenario (columns): boundary in colour, even in grey behind."""
-    lines, columns, drawn = len(results.metamodels), len(results.scenarios), False
+    metamodels = [m for m in results.metamodels if _any_done(results, results.scenarios, m)]
+    lines, columns, drawn = max(len(metamodels), 1), len(results.scenarios), False
     figure = new_figure(1.75 * columns + 0.8, 1.65 * lines + 0.6)
-    for i, metamodel in enumerate(results.metamodels):
+    for i, metamodel in enumerate(metamodels):
         for j, scenario in enumerate(results.scenarios):
             ax = figure.add_subplot(lines, columns, i * columns + j + 1)
             for acquisition in ("even", "boundary"):
@@ -174,6 +175,11 @@ def _grid(results: Results, draw: Callable[[Axes, Cell, bool], None], across: st
             ax.set_xlabel(across if i == lines - 1 else "")
             ax.set_ylabel(f"{metamodel}\n{up}" if j == 0 else "")
     return figure if drawn else None
+
+
+def _any_done(results: Results, scenarios: Sequence[str], metamodel: str) -> bool:
+    """Return whether a cell of the metamodel is finished, so that it has predictions to draw."""
+    return any(results.median_cell(s, metamodel, a) is not None for s in scenarios for a in ("even", "boundary"))
 
 
 def _load(cell: Cell) -> dict[str, Any]:
@@ -204,11 +210,12 @@ def _reliability(ax: Axes, cell: Cell, behind: bool) -> None:
 
 def _scatter(results: Results, scenario: str) -> Figure | None:
     """Draw predicted over true values of one scenario: even above, boundary below, a column a metamodel."""
-    columns, drawn = len(results.metamodels), None
+    metamodels = [m for m in results.metamodels if _any_done(results, (scenario,), m)]
+    columns, drawn = max(len(metamodels), 1), None
     figure = new_figure(2.1 * columns + 0.9, 4.6)
     axes = []
     for i, acquisition in enumerate(("even", "boundary")):
-        for j, metamodel in enumerate(results.metamodels):
+        for j, metamodel in enumerate(metamodels):
             ax = figure.add_subplot(2, columns, i * columns + j + 1)
             axes.append(ax)
             cell = results.median_cell(scenario, metamodel, acquisition)

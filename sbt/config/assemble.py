@@ -18,6 +18,7 @@ from sbt.config.source import Key, Problems, must_be_one_of
 from sbt.config.space import configured_space
 from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
+from sbt.metamodels.recalibrated import Recalibrated
 from sbt.plugins import load
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -156,8 +157,12 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
             f"a metamodel must be a class with fit(u, y, rng), but '{choice.kind}' is not",
         )
         return None
-    made: Metamodel | None = problems.attempt(("metamodel",), lambda: build(kind, choice.preset, choice.settings))
-    return made
+    settings = choice.settings
+    recalibrate = settings.pop("recalibrate", False)
+    if not isinstance(recalibrate, bool):
+        problems.add(("metamodel", "recalibrate"), f"must be true or false, but got {recalibrate!r}")
+    made: Metamodel | None = problems.attempt(("metamodel",), lambda: build(kind, choice.preset, settings))
+    return Recalibrated(made) if recalibrate is True and made is not None else made
 
 
 def _acquisition(loaded: Loaded, problems: Problems) -> Acquisition | None:

@@ -65,7 +65,7 @@ class CampaignKind:
 CAMPAIGNS: Mapping[str, CampaignKind] = {
     "boundary": CampaignKind(
         "identify where critical meets uncritical", "mix", stop={"stable": None, "misclassified": None},
-        methods=("mix", "u", "straddle", "expected_feasibility"),
+        methods=("mix", "u", "straddle", "expected_feasibility"), metamodel={"kind": "auto", "preset": "quick"},
     ),
     "falsification": CampaignKind(
         "find critical concrete scenarios, and distinct failure modes", "portfolio",
@@ -192,7 +192,7 @@ class Choice(_Strict):
 
 
 class MetamodelChoice(Choice):
-    """The metamodel; further keys are its settings."""
+    """The metamodel; further keys are its settings, and `recalibrate: true` scales its sigma on held-out rows."""
 
     preset: Name | None = Field(
         default=None, description="Named settings of the metamodel, such as paper; further keys override it."
@@ -336,7 +336,7 @@ class Configuration(_Strict):
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
         default_factory=_metamodel,
-        description="What learns the safety metric; default: gp, none for coverage.",
+        description="What learns the safety metric; default: boundary auto (quick), others gp, coverage none.",
     )
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,

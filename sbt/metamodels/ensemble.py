@@ -24,7 +24,7 @@ from sbt.metamodels.torch_tools import check_device, device_of, minibatches, sin
 
 __all__ = ["Ensemble", "EnsemblePredictor"]
 
-_ROWS = (200, 1000, 2500)  # a fifth of the steps up to the first number of rows, all of them between the others
+_ROWS = 2500  # up to which the number of steps does not grow
 _CHUNK = 1024  # points predicted at once
 _CHECKS = 50  # of the validation rows
 _VALIDATION = 500  # most validation rows of a member
@@ -35,16 +35,15 @@ class Ensemble:
     """Settings of a deep ensemble.
 
     Each member is validated on another share 1/members of the rows, so that together they learn from
-    all of them. Below 1,000 rows, training takes fewer and larger steps, in proportion to the rows down to
-    a fifth; beyond 2,500 rows it takes more.
+    all of them. Beyond 2,500 rows, training takes more steps, in proportion to the rows.
 
     Args:
         members: number of networks k >= 2.
         layers: hidden layers of a network >= 1.
         width: units of a hidden layer >= 1.
-        steps: minibatches >= 1 from 1,000 to 2,500 rows.
+        steps: minibatches >= 1 up to 2,500 rows.
         batch: rows of a minibatch >= 1.
-        learning_rate: largest step of AdamW, > 0, on a one-cycle schedule; up to twice as large with fewer steps.
+        learning_rate: largest step of AdamW, > 0, on a one-cycle schedule.
         decay: weight decay of AdamW times the number of rows, >= 0: a prior that counts less with more rows.
         beta: exponent in [0, 1] of the variance that weights the loss; 0: likelihood, 1: squared error.
         sigma_floor: smallest sigma of a member, as a share > 0 of the standard deviation of y.
@@ -159,18 +158,6 @@ def _folds(members: int, n: int, rng: np.random.Generator) -> tuple[NDArray[np.i
     return np.stack([o[:v] for o in own]), np.stack([o[v:] for o in own])
 
 
-def _pace(settings: Ensemble, n: int) -> tuple[int, float]:
-    """Return number of minibatches and largest learning rate for n rows.
-
-    >>> _pace(Ensemble(), 200), _pace(Ensemble(), 2000), _pace(Ensemble(), 5000)
-    ((500, 0.006), (2500, 0.003), (5000, 0.003))
-    """
-    least, full, most = _ROWS
-    share = min(max(n, least) / full, 1.0)
-    steps = max(round(settings.steps * share * max(1.0, n / most)), 1)
-    return steps, settings.learning_rate * min(share**-0.5, 2.0)
-
-
 def _train(
     settings: Ensemble, u: Points, z: Vector, rng: np.random.Generator
 ) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]:
@@ -180,10 +167,10 @@ def _train(
     parameters = [p for layer in layers for p in layer]
     x, target = _centre(u).to(device), torch.from_numpy(z.astype(np.float32)).to(device)
     validation, training = _folds(settings.members, n, rng)
-    steps, rate = _pace(settings, n)
-    decay = min(settings.decay / n, 0.1 / rate)  # at most a tenth of the weights a step
-    adam = torch.optim.AdamW(parameters, lr=rate, weight_decay=decay, fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(adam, rate, total_steps=steps + 1)
+    steps = round(settings.steps * max(1.0, n / _ROWS))
+    decay = min(settings.decay / n, 0.1 / settings.learning_rate)  # at most a tenth of the weights a step
+    adam = torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=decay, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(adam, settings.learning_rate, total_steps=steps + 1)
     best, best_loss = [p.detach().clone() for p in parameters], torch.full((settings.members,), math.inf, device=device)
     batches = minibatches(training, settings.batch, rng)
     for step in range(1, steps + 1):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.errors import InputError
-from sbt.metamodels import auto, bnn, ensemble, et, gp_predictor, sparse
+from sbt.metamodels import auto, bnn, ensemble, et, gp_predictor, recalibrated, sparse
 from sbt.metamodels.base import Predictor
 
 __all__ = ["FORMAT", "load", "read_info", "save"]
@@ -38,6 +38,7 @@ _KINDS: dict[str, Any] = {
         gp_predictor.GaussianProcessPredictor,
         gp_predictor.Hyperparameters,
         gp_predictor.NoiseSpread,
+        recalibrated.RecalibratedPredictor,
         sparse.SparseLayer,
         sparse.SparsePredictor,
     )

@@ -18,6 +18,7 @@ __all__ = ["Recalibrated", "RecalibratedPredictor"]
 
 _FEWEST = 50  # rows from which on the held-out fifth says something about sigma
 _PRIOR = 5.0  # rows that speak for no change
+_LEAST = 1e-3  # of the factor: a belief that was exact by chance keeps a sigma
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,9 @@ class Recalibrated:
         if len(y) >= _FEWEST:
             held_out, training = split_validation(len(y))
             belief = self.metamodel.fit(u[training], y[training], rng)(u[held_out])
-            squares = ((y[held_out] - belief.mu) / belief.sigma) ** 2
-            factor = float(np.sqrt((squares.sum() + _PRIOR) / (len(squares) + _PRIOR)))
+            z = (y[held_out] - belief.mu) / belief.sigma
+            size = max(float(np.sqrt(np.mean(z**2))), _LEAST)
+            factor = size ** (len(z) / (len(z) + _PRIOR))
         return RecalibratedPredictor(self.metamodel.fit(u, y, rng), factor)
 
 
