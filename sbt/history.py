@@ -102,6 +102,11 @@ class History:
         return self.where(self.ok & (self.stage != VALIDATION))
 
     @property
+    def finished(self) -> History:
+        """All runs that finished well: what the final answer of a campaign learns from, once it has been scored."""
+        return self.where(self.ok)
+
+    @property
     def held_out(self) -> History:
         """Runs that no metamodel learns from."""
         return self.where(self.ok & (self.stage == VALIDATION))

@@ -71,6 +71,9 @@ class Table:
 def predict_rows(folder: Path, inputs: Path) -> Table:
     """Return what a campaign's metamodel believes about the rows of a CSV file.
 
+    It learns from all runs that finished well. The campaign's validation scores are those of the same
+    metamodel without the held-out runs, and so rather too low.
+
     Args:
         folder: of a store.
         inputs: CSV with a column for each input, named as the input or as in exports (`x.<input>`).
@@ -88,7 +91,7 @@ def predict_rows(folder: Path, inputs: Path) -> Table:
         raise InputError(f"predict needs a campaign with a metamodel, but {folder} has none (add metamodel: {{kind: auto}})")
     space, requirement = settings.scenario.space, settings.scenario.requirement
     x, ignored = read_inputs(inputs, space)
-    training = history.training
+    training = history.finished
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
     predictor, source = _predictor(folder, learner, training, json.dumps(choice.model_dump(mode="json"), sort_keys=True))

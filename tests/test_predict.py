@@ -43,7 +43,7 @@ def test_it_is_the_belief_of_the_campaign(store):
     with Store.read(store) as opened:
         loaded, history = loaded_from(opened), opened.history()
     settings = settings_of(loaded, assembly_of(loaded))
-    belief = settings.learner.fit(history).predict(np.array([[0.5, 0.5], [0.9, 0.1]]))
+    belief = settings.learner.train(history.finished)(np.array([[0.5, 0.5], [0.9, 0.1]]))  # held-out runs, too
     assert [(row["a"], row["b"]) for row in found["rows"]] == [(0.5, 0.5), (0.9, 0.1)]
     for name, values in {
         "mu": belief.mu, "sigma": belief.sigma, "epistemic": belief.epistemic, "noise": belief.noise,

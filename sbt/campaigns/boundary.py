@@ -64,17 +64,17 @@ def _choice(settings: Settings) -> tuple[Settings, Choice]:
 
 
 def boundary_points(settings: Settings, history: History, most: int = 500) -> Points:
-    """Return up to `most` points (m, d) in the inputs' units where P(critical) crosses 0.5.
+    """Return up to `most` points (m, d) in the inputs' units where P(critical), learned from all runs, crosses 0.5.
 
     Raises:
         InputError: there is no metamodel, or fewer than two runs to learn from.
     """
-    belief = settings.learner.fit(history) if settings.learner is not None else None
-    if belief is None:
+    if settings.learner is None or len(history.finished) < 2:
         raise InputError("boundary points need a metamodel and two finished runs, but there are none")
+    predictor = settings.learner.train(history.finished)
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
     u = SobolSequence(space.dimension, settings.seed).points(0, 8192)
-    found = crossings(lambda points: belief.predict(points).probability(critical), u, most)
+    found = crossings(lambda v: predictor(space.metamodel_inputs(v)).probability(critical), u, most)
     x = space.from_unit(found)
     return x[space.feasible(x)]
 
