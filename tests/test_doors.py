@@ -155,6 +155,12 @@ def test_a_scenario_is_no_campaign(study):
     assert {"sumo", "inputs", "ego", "duration", "requirement"} <= set(schema["properties"])
 
 
+def test_check_passes_on_what_sumo_warns_of(study):
+    person = '    <person id="p" depart="0"><walk edges="road" departPos="300" arrivalPos="400"/></person>\n</routes>'
+    code, output = check(study({CARS: [("</routes>", person)]}))
+    assert (code, "SUMO warns: The attribute departPos is no longer supported for walks" in output) == (0, True), output
+
+
 def test_everything_wrong_is_told_at_once(study):
     path = study({YAML: [("ego: ego", "ego: egon"), ("- ttc_min", "- ttc_mim")], CARS: [("${105 + gap}", "150")]})
     with pytest.raises(InputError) as raised:
