@@ -25,6 +25,8 @@ __all__ = ["Finding", "check_scenario"]
 
 _CORNERS_UP_TO = 4
 """With more inputs than this, every input goes to its ends alone instead of all 2^d corners."""
+_WARNINGS = 3
+"""Most warnings of the simulator that are shown."""
 _RUN_DEADLINE = 60.0
 """Longest run (s), where the scenario looks at the clock."""
 _WORKER_DEADLINE = 300.0
@@ -60,7 +62,7 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
         scenario: the configured scenario, where its ranges or requirement differ from those of `spec`.
 
     Returns:
-        One finding a rule; the last, whether both sides of the requirement were met, is only information.
+        One finding a rule; what SUMO warned of and, at last, whether both sides of the requirement were met is only information.
 
     Raises:
         InputError: the scenario cannot be loaded.
@@ -69,7 +71,8 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
     points = list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
     first = _runs(spec, jobs)
-    findings = [_all_ok(first, points), _finite(first, asked)]
+    warned = _warned(spec)
+    findings = [_all_ok(first, points), _finite(first, asked), *warned]
     if not findings[0].ok:
         return tuple(findings)
     again = _runs(spec, jobs[::-1])[::-1]
@@ -204,6 +207,15 @@ def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: 
             expected, at = [fresh[k] for k in order], [points[k] for k in order]
             findings.append(_equal(f"isolation {level} = fresh", expected, kept, at))
     return findings
+
+
+def _warned(spec: ScenarioSpec) -> list[Finding]:
+    """Return what the simulator warned of in the last run, where the scenario passes it on (a user's own SUMO files)."""
+    said = getattr(spec.resolve().simulate, "said", None)
+    lines = () if said is None else said()
+    more = f" (and {len(lines) - _WARNINGS} more)" if len(lines) > _WARNINGS else ""
+    told = "; ".join(line.removeprefix("Warning: ") for line in lines[:_WARNINGS]) + more
+    return [Finding("for information: SUMO warns", ok=True, detail=told)] if lines else []
 
 
 def _sides(runs: list[_Run], scenario: LogicalScenario) -> Finding:

@@ -155,6 +155,12 @@ def test_a_scenario_is_no_campaign(study):
     assert {"sumo", "inputs", "ego", "duration", "requirement"} <= set(schema["properties"])
 
 
+def test_check_passes_on_what_sumo_warns_of(study):
+    person = '    <person id="p" depart="0"><walk edges="road" departPos="300" arrivalPos="400"/></person>\n</routes>'
+    code, output = check(study({CARS: [("</routes>", person)]}))
+    assert (code, "SUMO warns: The attribute departPos is no longer supported for walks" in output) == (0, True), output
+
+
 def test_everything_wrong_is_told_at_once(study):
     path = study({YAML: [("ego: ego", "ego: egon"), ("- ttc_min", "- ttc_mim")], CARS: [("${105 + gap}", "150")]})
     with pytest.raises(InputError) as raised:
@@ -215,16 +221,17 @@ def test_a_route_that_is_not_connected(study):
 
 
 def test_a_gzipped_net_relative_includes_and_placeholders_everywhere(study, tmp_path):
-    """In a configuration's value, in an included file, and in the network itself."""
+    """In a configuration's value, in a file that an additional file includes, in the routes and in the network itself."""
     path = study({
-        CARS: [('<vType id="slow" length="5.0" width="1.8" sigma="0.5" maxSpeed="${v_lead}"/>', '<include href="parts/slow.rou.xml"/>')],
-        "my.sumocfg": [('<step-length value="0.1"/>', '<step-length value="${step}"/>')],
+        CARS: [('<vType id="slow" length="5.0" width="1.8" sigma="0.5" maxSpeed="${v_lead}"/>', "")],
+        "my.sumocfg": [('<step-length value="0.1"/>', '<step-length value="${step}"/>'),
+                       ("</input>", '<additional-files value="parts/slow.add.xml"/></input>')],
         ROAD: [('speed="50.00"', 'speed="${limit}"')],
         YAML: [("ego: ego", "  step: {min: 0.05, max: 0.2}\n  limit: {min: 20, max: 50, unit: m/s}\nego: ego")],
     })  # fmt: skip
     (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "slow.rou.xml").write_text('<routes><include href="../deeper.rou.xml"/></routes>')
-    (tmp_path / "deeper.rou.xml").write_text('<routes><vType id="slow" sigma="0" maxSpeed="${v_lead}"/></routes>')
+    (tmp_path / "parts" / "slow.add.xml").write_text('<additional><include href="../deeper.add.xml"/></additional>')
+    (tmp_path / "deeper.add.xml").write_text('<additional><vType id="slow" sigma="0" maxSpeed="${v_lead}"/></additional>')
     net = tmp_path / ROAD
     (tmp_path / "road.net.xml.gz").write_bytes(gzip.compress(net.read_bytes()))
     net.unlink()
@@ -238,6 +245,20 @@ def test_a_gzipped_net_relative_includes_and_placeholders_everywhere(study, tmp_
         scenario.simulate.files.launch({"gap": 1, "v_lead": 2, "step": 0.1, "limit": 3}, tmp_path).arguments.count("--net-file")
         == 1
     )
+
+
+def test_a_loop_over_files_only_steps(study):
+    """With files in the scenario SUMO is started already; what the loop does shows, and starting again is refused."""
+    loop = "def simulate(sumo, values, rng):\n    while True:\n"
+    loop += "        sumo.simulation.step()\n        sumo.vehicle.setSpeed('lead', 3.0)\n"
+    path = study({YAML: [("sumo: my.sumocfg", "sumo: my.sumocfg\nsimulate: mine.py:simulate")], "mine.py": [("", loop)]})
+    _, trace = simulated(path, gap=80.0, v_lead=20.0)
+    assert trace.actor("lead").speed[[0, 60]] == pytest.approx([20.0, 3.0])
+    (path.parent / "again.py").write_text("def simulate(sumo, values, rng):\n    sumo.start(['sumo', '-c', 'my.sumocfg'])\n")
+    other = path.parent / "again.yaml"
+    other.write_text(path.read_text().replace("mine.py", "again.py"))
+    with pytest.raises(RunError, match=r"sumo.start must be called once.*again.py:2"):
+        simulated(other)
 
 
 def test_files_that_include_each_other_are_refused(tmp_path):

@@ -125,6 +125,11 @@ class OwnSimulation:
         """
         return self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"))
 
+    def said(self) -> tuple[str, ...]:
+        """Return what SUMO warned of in the last run of this process, each once: about the files, not about the traffic."""
+        lines = (line for line in session().said() if line.startswith(("Warning:", "Error:")) and "time=" not in line)
+        return tuple(dict.fromkeys(lines))
+
     def shown(self, values: Mapping[str, float], seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
         """Run one concrete scenario under a SUMO program of its own, such as sumo-gui, through traci.
 

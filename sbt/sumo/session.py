@@ -217,10 +217,13 @@ class Session:
             os.dup2(saved, 2)
             os.close(saved)
 
-    def _reason(self, error: Exception) -> str:
+    def said(self) -> tuple[str, ...]:
+        """Return the lines that SUMO wrote to file descriptor 2 in the last run."""
         self._stderr.seek(0)
-        written = [line.strip() for line in self._stderr.read().decode(errors="replace").splitlines() if line.strip()]
-        return "SUMO: " + "; ".join(dict.fromkeys([str(error).strip(), *written[-5:]]))
+        return tuple(line.strip() for line in self._stderr.read().decode(errors="replace").splitlines() if line.strip())
+
+    def _reason(self, error: Exception) -> str:
+        return "SUMO: " + "; ".join(dict.fromkeys([str(error).strip(), *self.said()[-5:]]))
 
 
 @cache
