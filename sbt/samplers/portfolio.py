@@ -53,7 +53,8 @@ def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generat
     if len(seen.u) < 2:
         return Picks(fill(seen.admissible, n, d, rng), ("global",) * n)
     belief = believe(search, seen.u, seen.y, rng)
-    found = regions(seen.u, search.critical.margin(seen.y), seen.batch)
+    fresh = ~seen.flank
+    found = regions(seen.u[fresh], search.critical.margin(seen.y[fresh]), seen.batch[fresh])
     niches = _hopeful(belief, found, seen.admissible, rng)
     drawn = _thompson(belief, niches, round(_THOMPSON * n), d, rng)
     picks = _globally(belief, drawn, n, u, niches, seen.admissible, rng)
@@ -98,7 +99,7 @@ def regions(u: Points, margin: Vector, batch: Vector) -> list[Region]:
         batch: (n,) number of the batch of each run, increasing.
     """
     found: list[Region] = []
-    left = margin < np.median(margin)  # on a plateau no run is better than the others
+    left = margin < np.median(margin) if len(u) else np.zeros(0, dtype=bool)  # on a plateau no run is better than the others
     while left.any() and len(found) < _MOST_REGIONS:
         best = int(np.flatnonzero(left)[np.argmin(margin[left])])
         near = np.abs(u - u[best]).max(axis=1) <= _APART
