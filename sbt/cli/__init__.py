@@ -8,6 +8,7 @@ import typer
 
 from sbt import __version__
 from sbt.cli import campaign, inform, metrics, scenario
+from sbt.cli.compare_ego import compare_ego
 from sbt.cli.console import verb
 from sbt.cli.replay import replay
 
@@ -30,6 +31,7 @@ for _verb in (
 ):
     app.command()(verb(_verb))
 app.command()(verb(metrics.metrics))
+app.command()(verb(compare_ego))
 app.command("list")(verb(inform.list_))
 app.command()(verb(inform.schema))
 app.command()(verb(inform.doctor))
