@@ -55,8 +55,8 @@ def one_sided(row: dict) -> bool:
 
 def show(rows: list[dict]) -> None:
     head = (
-        "problem@runs", "seeds", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "covered", "one-sided", "crude runs",
-        "CPU s",
+        "problem@runs", "seeds", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "covered", "one-sided",
+        "crude runs", "CPU s",
     )  # fmt: skip
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     every = []

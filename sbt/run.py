@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from sbt.config.load import Loaded
     from sbt.config.model import Configuration
 
-__all__ = ["assembly_of", "earlier_runs", "loaded_from", "rebuild_report", "replay", "run_campaign", "scenario_of_run", "settings_of"]
+__all__ = [
+    "assembly_of", "earlier_runs", "loaded_from", "rebuild_report", "replay", "run_campaign", "scenario_of_run", "settings_of",
+]  # fmt: skip
 
 _RESOLVED = "config.resolved.yaml"
 _UNLEARNED = ("monte_carlo", "subset")

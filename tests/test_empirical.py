@@ -58,7 +58,7 @@ def test_in_a_configuration_and_what_is_wrong_with_it(speeds):
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=told):
             of(**wrong)
+    few = speeds.with_name("few.csv")
+    few.write_text("v\n1\n2\n")
     with pytest.raises(InputError, match="at least 10"):
-        few = speeds.with_name("few.csv")
-        few.write_text("v\n1\n2\n")
         Distribution.of(kind="empirical", file=str(few), column="v")

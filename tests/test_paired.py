@@ -48,7 +48,8 @@ BETTER = scenario(better)
     assert (found["verdict"], found["new"], found["pairs"]) == ("fell", [], 300)
     assert len(found["fixed"]) == found["before"]["critical"] - found["after"]["critical"] > 0
     assert found["low"] <= np.pi * (0.2**2 - 0.3**2) <= found["high"] < 0
-    again = CliRunner().invoke(app, ["compare-ego", str(b), str(a), "--store", str(tmp_path / "back"), "--runs", "300", "--fail-if-rose"])
+    back = ["compare-ego", str(b), str(a), "--store", str(tmp_path / "back"), "--runs", "300", "--fail-if-rose"]
+    again = CliRunner().invoke(app, back)
     assert again.exit_code == 3
     assert ": rose" in again.stdout
 
@@ -64,7 +65,8 @@ def test_different_questions_are_refused(configured, tmp_path):
 def test_egos_of_sumo(tmp_path):
     def config(name, ego):
         path = tmp_path / f"{name}.yaml"
-        path.write_text(json.dumps({"campaign": "coverage", "scenario": "cut_in", "budget": 60, "executor": {"kind": "serial"}} | ego))
+        keys = {"campaign": "coverage", "scenario": "cut_in", "budget": 60, "executor": {"kind": "serial"}}
+        path.write_text(json.dumps(keys | ego))
         return path
 
     a, b = config("a", {}), config("b", {"ego": {"kind": "acc_aeb", "reaction_time": 1.5}})

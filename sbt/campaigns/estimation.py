@@ -108,8 +108,22 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,
         effective_sample_size=low.effective_sample_size, failed_as_critical=max(_clipped(high.value), value),
         undetected_mass_bound=undetected, warnings=warnings, largest_weight_share=low.largest_share,
+        convergence=_convergence(log, safe, critical),
         counted=int(sum(len(b.critical) for b in safe)), **rest,
     ), limits  # fmt: skip
+
+
+def _convergence(log: Log, safe: list[Counted], critical: list[Counted]) -> list[dict[str, float]]:
+    """Return estimate and interval after each counted batch but the first, whose spread is not known."""
+    counted = [how["iteration"] for how in log.iterations if how.get("phase") == "count"]
+    tail, steps = 0.5 * (1.0 + _CONFIDENCE), []
+    for k in range(2, len(safe) + 1):
+        low, high = combined(safe[:k]), combined(critical[:k])
+        runs = int((log.history.iteration <= counted[k - 1]).sum())
+        steps.append({
+            "runs": runs, "probability": _clipped(low.value), "low": low.limit(tail, side=-1), "high": high.limit(tail, side=1)
+        })  # fmt: skip
+    return steps
 
 
 def _uncounted(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:

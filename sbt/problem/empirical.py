@@ -103,7 +103,7 @@ def kernel_density(given: Mapping[str, float | str]) -> KernelDensity:
     values = _column(str(given["file"]), str(given["column"]))
     bandwidth = given.get("bandwidth", silverman(values))
     if isinstance(bandwidth, str) or not (math.isfinite(bandwidth) and bandwidth > 0):
-        raise InputError(f"distribution 'empirical' needs a bandwidth > 0, but got {bandwidth} (give one in the unit of the values)")
+        raise InputError(f"distribution 'empirical' needs a bandwidth > 0, in the unit of the values, but got {bandwidth}")
     return KernelDensity(values, float(bandwidth))
 
 
