@@ -3,9 +3,9 @@
     python benchmarks/boundary_table.py [--problems a,b] [--methods mix,boundary,even] [--seeds 20] [--store FOLDER]
 
 A cell is a campaign of one problem, method and seed with the product's defaults (10 % of the runs are held out
-while it goes on, and count), whose final metamodel, of all runs, is scored on a reference set that no campaign saw: 20,000 uniform points of a
-testbed, 20,000 pseudo-random SUMO runs, or the rows of the table that were not chosen. Finished cells are
-lines of FOLDER/cells.jsonl: stopped and started again it goes on; reference sets are kept there too.
+while it goes on, and count), whose final metamodel, of all runs, is scored on a reference set that no campaign
+saw: 20,000 uniform points of a testbed, 20,000 pseudo-random SUMO runs, or the rows of the table that were not
+chosen. Finished cells are lines of FOLDER/cells.jsonl: stopped and started again it goes on; reference sets are kept there too.
 """
 
 from __future__ import annotations

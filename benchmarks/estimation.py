@@ -54,7 +54,10 @@ def one_sided(row: dict) -> bool:
 
 
 def show(rows: list[dict]) -> None:
-    head = ("problem@runs", "seeds", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "covered", "one-sided", "crude runs", "CPU s")
+    head = (
+        "problem@runs", "seeds", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "covered", "one-sided",
+        "crude runs", "CPU s",
+    )  # fmt: skip
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     every = []
     for cell in dict.fromkeys(row["cell"] for row in rows):
@@ -63,12 +66,12 @@ def show(rows: list[dict]) -> None:
         error = np.array([row["probability"] / p - 1.0 for row in mine])
         covered = [row["low"] <= p <= row["high"] for row in mine]
         every += covered
-        rmse = float(np.sqrt(np.mean(error**2)))
+        rmse, cpu = float(np.sqrt(np.mean(error**2))), np.mean([row["cpu"] for row in mine])
         cov = np.median([row["cov"] for row in mine if row["cov"] is not None])
         print(
             f"| {cell} | {len(mine)} | {rmse:.3f} | {BARS.get(cell, float('nan')):.3f} | {error.mean():+.3f} "
             f"({error.std(ddof=1) / np.sqrt(len(error)):.3f}) | {cov:.3f} | {np.mean(covered):.2f} | "
-            f"{np.mean([one_sided(row) for row in mine]):.2f} | {(1 - p) / p / rmse**2:.2g} | {np.mean([r['cpu'] for r in mine]):.1f} |"
+            f"{np.mean([one_sided(row) for row in mine]):.2f} | {(1 - p) / p / rmse**2:.2g} | {cpu:.1f} |"
         )
     print(f"\npooled coverage of the 95 % interval: {np.mean(every):.3f} of {len(every)} campaigns")
 

@@ -28,9 +28,13 @@ if TYPE_CHECKING:
     from sbt.config.load import Loaded
     from sbt.config.model import Configuration
 
-__all__ = ["assembly_of", "earlier_runs", "loaded_from", "rebuild_report", "replay", "run_campaign", "settings_of"]
+__all__ = [
+    "assembly_of", "earlier_runs", "loaded_from", "rebuild_report", "replay", "run_campaign", "scenario_of_run", "settings_of",
+]  # fmt: skip
 
 _RESOLVED = "config.resolved.yaml"
+_UNLEARNED = ("monte_carlo", "subset")
+"""Ways to draw that look at no metamodel."""
 _MAY_CHANGE = {"budget", "folder", "yaml"}
 
 
@@ -84,6 +88,11 @@ def assembly_of(loaded: Loaded) -> Assembly:
     return assemble(loaded)
 
 
+def scenario_of_run(loaded: Loaded) -> LogicalScenario:
+    """Return the scenario as a configuration asks for it."""
+    return assembly_of(loaded).scenario
+
+
 def _stored(folder: Path) -> dict[str, Any]:
     """Return the configuration of the store that is there, empty without one."""
     if not Store.begun(folder):
@@ -105,7 +114,8 @@ def _kept(loaded: Loaded, settings: Settings) -> dict[str, Any]:
 def settings_of(loaded: Loaded, parts: Assembly) -> Settings:
     """Return what the campaigns are built from."""
     config, recorded = loaded.config, parts.scenario.pool is not None
-    learner = None if parts.metamodel is None else Learner(parts.scenario, parts.metamodel, config.seed)
+    blind = config.campaign == "estimation" and config.acquisition.kind in _UNLEARNED
+    learner = None if parts.metamodel is None or blind else Learner(parts.scenario, parts.metamodel, config.seed)
     return Settings(
         parts.scenario, config.seed, config.budget, config.initial, config.batch,
         config.validation.share if learner is not None and not recorded else 0.0,

@@ -29,14 +29,14 @@ QUICK = {"campaign": "estimation", "metamodel": GP, "budget": 60, "initial": 10,
 DISC = np.pi * 0.09
 
 
-def testbed(name: str, folder: Path, **keys: Any) -> dict[str, Any]:
+def on_testbed(name: str, folder: Path, **keys: Any) -> dict[str, Any]:
     given = {"campaign": "estimation", "scenario": f"testbed:{name}", "executor": {"kind": "serial"}, "store": str(folder / "s")}
     return run_campaign(parse(json.dumps({**given, **keys})), report=False)
 
 
 def test_a_known_probability(tmp_path):
     p = truth("four_branch_7").probability
-    found = testbed("four_branch_7", tmp_path, budget=120, stop={"cov": None})["conclusion"]
+    found = on_testbed("four_branch_7", tmp_path, budget=120, stop={"cov": None})["conclusion"]
     assert found["probability"] == pytest.approx(p, rel=0.15)
     assert found["low"] <= p <= found["high"]
     assert found["hits"] >= 10
@@ -47,13 +47,13 @@ def test_a_known_probability(tmp_path):
 def test_intervals_cover_over_seeds(tmp_path):
     p, covered = truth("four_branch_7").probability, 0
     for seed in range(12):
-        found = testbed("four_branch_7", tmp_path / str(seed), budget=124, seed=seed, stop={"cov": None})["conclusion"]
+        found = on_testbed("four_branch_7", tmp_path / str(seed), budget=124, seed=seed, stop={"cov": None})["conclusion"]
         covered += found["low"] <= p <= found["high"]
     assert covered >= 11
 
 
 def test_it_stops_at_its_target(tmp_path):
-    result = testbed("linear_d2", tmp_path, budget=300, batch=15, stop={"cov": 0.2})
+    result = on_testbed("linear_d2", tmp_path, budget=300, batch=15, stop={"cov": 0.2})
     assert (result["stopped"], result["runs"] < 300) == ("cov", True)
     assert result["conclusion"]["cov"] <= 0.2
 
@@ -125,7 +125,7 @@ def test_crude_monte_carlo(campaign: Run):
 
 
 def test_subset_simulation_with_repeats(tmp_path):
-    found = testbed("hartmann6_in_25", tmp_path, budget=3000)  # auto: 25 inputs
+    found = on_testbed("hartmann6_in_25", tmp_path, budget=3000)  # auto: 25 inputs
     assert found["stopped"] in ("converged", "budget")
     conclusion = found["conclusion"]
     assert conclusion["low"] <= truth("hartmann6_in_25").probability <= conclusion["high"]

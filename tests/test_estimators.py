@@ -83,8 +83,8 @@ def test_every_pool_point_is_expected_as_often_as_its_probability_says():
 
 def test_the_mixture_has_the_density_it_claims():
     rng = stream(5, "mixture")
-    cloud = rng.standard_normal((400, 2)) * [0.3, 1.0] + [3.0, -1.0]
-    h = fitted((cloud, cloud + [-6.0, 0.0]), WIDE, rng)
+    cloud = rng.standard_normal((400, 2)) * np.array([0.3, 1.0]) + np.array([3.0, -1.0])
+    h = fitted((cloud, cloud - np.array([6.0, 0.0])), WIDE, rng)
     z, _ = h.sample(40_000, rng)
     ratio = np.exp(log_normal(z) - h.log_density(z))
     assert ratio.mean() == pytest.approx(1.0, abs=4 * ratio.std() / 200)

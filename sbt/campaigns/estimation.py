@@ -63,7 +63,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Any) -> Campaign:
 def _conclusion(probability: float | None, limits: Limits, **rest: Any) -> Conclusion:
     """Return the keys of an estimation in their order."""
     tail = 0.5 * (1.0 + _CONFIDENCE)
-    found = {
+    found: Conclusion = {
         "probability": probability, "low": limits.lower(tail), "high": limits.upper(tail), "confidence": _CONFIDENCE,
         "cov": None, "effective_sample_size": 0.0, "hits": 0, "failed_as_safe": probability, "failed_as_critical": probability,
         "undetected_mass_bound": 1.0, "warnings": [],
@@ -108,8 +108,22 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,
         effective_sample_size=low.effective_sample_size, failed_as_critical=max(_clipped(high.value), value),
         undetected_mass_bound=undetected, warnings=warnings, largest_weight_share=low.largest_share,
+        convergence=_convergence(log, safe, critical),
         counted=int(sum(len(b.critical) for b in safe)), **rest,
     ), limits  # fmt: skip
+
+
+def _convergence(log: Log, safe: list[Counted], critical: list[Counted]) -> list[dict[str, float]]:
+    """Return estimate and interval after each counted batch but the first, whose spread is not known."""
+    counted = [how["iteration"] for how in log.iterations if how.get("phase") == "count"]
+    tail, steps = 0.5 * (1.0 + _CONFIDENCE), []
+    for k in range(2, len(safe) + 1):
+        low, high = combined(safe[:k]), combined(critical[:k])
+        runs = int((log.history.iteration <= counted[k - 1]).sum())
+        steps.append({
+            "runs": runs, "probability": _clipped(low.value), "low": low.limit(tail, side=-1), "high": high.limit(tail, side=1)
+        })  # fmt: skip
+    return steps
 
 
 def _uncounted(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
@@ -165,10 +179,10 @@ def _from_repeats(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         ), limits  # fmt: skip
     failed = int((~log.history.ok).sum())
     limits = Limits(lambda c: found.limit(c, side=-1), lambda c: first.upper(c) if failed else found.limit(c, side=1))
-    told = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
+    unseen = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
     return _conclusion(
         found.value, limits, cov=found.std_error / found.value, hits=hits, effective_sample_size=float(found.repeats),
-        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected, warnings=told,
+        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected, warnings=unseen,
     ), limits  # fmt: skip
 
 

@@ -232,11 +232,11 @@ def _spread(u: Points, probability: Vector, seen: Points, n: int, rng: np.random
     rows = rng.choice(len(u), size=_CHOICE * n, p=probability)
     scale = u[rows].std(axis=0) + 1e-3
     near = cdist(u[rows] / scale, seen / scale).min(axis=1) if len(seen) else np.full(len(rows), np.inf)
-    taken = []
+    taken: list[int] = []
     for _ in range(n):
         taken.append(int(np.argmax(near)))
         near = np.minimum(near, np.linalg.norm((u[rows] - u[rows[taken[-1]]]) / scale, axis=1))
-    return rows[taken]
+    return np.asarray(rows[taken])
 
 
 def _relative(anticipated: float, prior: float) -> float:

@@ -10,6 +10,7 @@ from sbt import __version__
 from sbt.cli import campaign, inform, metrics, scenario
 from sbt.cli.benchmark import benchmark
 from sbt.cli.compare import compare
+from sbt.cli.compare_ego import compare_ego
 from sbt.cli.console import verb
 from sbt.cli.new import new
 from sbt.cli.predict import predict
@@ -38,6 +39,7 @@ app.command()(verb(metrics.metrics))
 app.command()(verb(new))
 app.command()(verb(benchmark))
 app.command()(verb(compare))
+app.command()(verb(compare_ego))
 app.command("list")(verb(inform.list_))
 app.command()(verb(inform.schema))
 app.command()(verb(inform.doctor))

@@ -83,7 +83,11 @@ def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
         f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}",
     ]
     for key, value in result.get("conclusion", {}).items():
-        if isinstance(value, Mapping):
+        if key == "convergence":
+            continue  # a figure of the report
+        if key == "warnings":
+            lines += [f"  warning: {told}" for told in value]
+        elif isinstance(value, Mapping):
             lines.append(f"  {key.replace('_', ' ')}")
             lines += [f"    {name.replace('_', ' '):<24}{_number(item)}" for name, item in value.items()]
         elif isinstance(value, list) and all(isinstance(item, Mapping) for item in value):

@@ -124,7 +124,7 @@ def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
     for path, chosen in steps:
         if path[0] != "executor" or len(problems.found) == before:
             scenario = problems.attempt(path, chosen.resolve) or scenario
-    space = configured_space(config, scenario.space, problems)
+    space = configured_space(config, scenario.space, problems, loaded.folder)
     requirement = _requirement(loaded, scenario, problems)
     return replace(scenario, space=space, requirement=requirement)
 

@@ -215,7 +215,7 @@ class InputChange(_Strict):
     max: float | None = Field(default=None, description="Upper end of the range, in the input's unit.")
     distribution: Choice | None = Field(
         default=None, description="Law, truncated to the range: {kind: normal, mean: 40, std: 15}, "
-        "or uniform, lognormal, exponential, gumbel, weibull, beta, triangular, scipy.",
+        "or uniform, lognormal, exponential, gumbel, weibull, beta, triangular, scipy, empirical.",
     )  # fmt: skip
 
 

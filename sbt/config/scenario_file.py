@@ -94,7 +94,7 @@ class _Builder:
         for name, entry in self._model.inputs.items():
             law, choice = None, entry.distribution
             if choice is not None:
-                law = self._problems.attempt(("inputs", name, "distribution"), partial(law_of, choice))
+                law = self._problems.attempt(("inputs", name, "distribution"), partial(law_of, choice, self._folder))
             make = partial(Parameter, name, entry.min, entry.max, entry.unit, law, entry.kind, entry.description)
             made = self._problems.attempt(("inputs", name), make)
             if made is not None:

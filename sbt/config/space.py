@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,14 +31,16 @@ class SpaceChanges:
     features: Mapping[str, str] = field(default_factory=dict)
 
 
-def configured_space(config: Configuration | SpaceChanges, space: ParameterSpace, problems: Problems) -> ParameterSpace:
+def configured_space(
+    config: Configuration | SpaceChanges, space: ParameterSpace, problems: Problems, folder: Path | None = None
+) -> ParameterSpace:
     """Return the space with the configured changes; what is wrong with them is added to `problems`."""
     changed = {p.name: p for p in space.parameters}
     for name, change in config.inputs.items():
         if name not in changed:
             problems.add(("inputs", name), must_be_one_of("an input", name, space.names), at_key=True)
         else:
-            changed[name] = _parameter(changed[name], change, problems)
+            changed[name] = _parameter(changed[name], change, problems, folder or Path())
     before = len(problems.found)
     correlation = _correlation(config.correlation, space, problems)
     constraints = _expressions("constraints", dict(enumerate(config.constraints)), space, problems)
@@ -65,13 +68,13 @@ def _changed(space: ParameterSpace, step: Mapping[str, Any]) -> ParameterSpace:
     return space
 
 
-def _parameter(old: Parameter, change: InputChange, problems: Problems) -> Parameter:
+def _parameter(old: Parameter, change: InputChange, problems: Problems, folder: Path) -> Parameter:
     """Return the input with another range or law."""
     path: Key = ("inputs", old.name)
     distribution = old.distribution
     if change.distribution is not None:
         law = change.distribution
-        distribution = problems.attempt((*path, "distribution"), lambda: law_of(law))
+        distribution = problems.attempt((*path, "distribution"), lambda: law_of(law, folder))
         if distribution is None:
             return old
     low = old.low if change.min is None else change.min
@@ -79,17 +82,20 @@ def _parameter(old: Parameter, change: InputChange, problems: Problems) -> Param
     return problems.attempt(path, lambda: replace(old, low=low, high=high, distribution=distribution)) or old
 
 
-def law_of(choice: Choice) -> Distribution:
-    """Return the law that a configuration describes.
+def law_of(choice: Choice, folder: Path | None = None) -> Distribution:
+    """Return the law that a configuration describes; a recorded sample's file is relative to the folder.
 
     Raises:
         InputError: there is no such law, or not with these parameters.
     """
-    for name, value in choice.settings.items():
+    given = choice.settings
+    if choice.kind == "empirical" and isinstance(given.get("file"), str):
+        given["file"] = str(((folder or Path.cwd()) / Path(str(given["file"])).expanduser()).resolve())
+    for name, value in given.items():
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise InputError(f"a distribution's parameters must be numbers, but got {name}: {value!r}")
     try:
-        return Distribution.of(choice.kind, **choice.settings)
+        return Distribution.of(choice.kind, **given)
     except TypeError as error:
         raise InputError(f"distribution '{choice.kind}' cannot have the parameters {choice.settings}: {error}") from None
 

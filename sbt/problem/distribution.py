@@ -1,7 +1,8 @@
 """The law of one input: a distribution of SciPy, truncated to the input's range.
 
 Named kinds take the parameters engineers know (mean and standard deviation of the variable itself);
-`kind: scipy` takes any continuous law of `scipy.stats` with its own arguments.
+`kind: scipy` takes any continuous law of `scipy.stats` with its own arguments; `kind: empirical` is the
+kernel density of a recorded sample.
 """
 
 from __future__ import annotations
@@ -70,6 +71,10 @@ class Distribution:
         from scipy import stats
 
         given = dict(self.parameters)
+        if self.kind == "empirical":
+            from sbt.problem.empirical import kernel_density
+
+            return kernel_density(given)
         if self.kind == "scipy":
             name = given.pop("name", None)
             family = getattr(stats, str(name), None)
@@ -77,7 +82,8 @@ class Distribution:
                 raise InputError(f"kind scipy needs the name of a continuous law of scipy.stats, but got {name}")
             return self._checked(family(**given))
         if self.kind not in KINDS:
-            raise InputError(f"a distribution's kind must be one of {', '.join([*KINDS, 'scipy'])}, but got '{self.kind}'")
+            known = ", ".join([*KINDS, "scipy", "empirical"])
+            raise InputError(f"a distribution's kind must be one of {known}, but got '{self.kind}'")
         names, build = KINDS[self.kind]
         if set(given) != set(names):
             raise InputError(

@@ -12,6 +12,7 @@ from sbt.arrays import Vector
 from sbt.history import VALIDATION
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
+from sbt.report.convergence import drawing_of_convergence
 from sbt.report.modes import drawing_of_modes
 from sbt.report.projection import Predict, log_probability, most_telling_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
@@ -52,7 +53,8 @@ def draw(
         weights: (d,) importance of the inputs, to choose which are shown.
     """
     with figure_style():
-        drawn = list(_runs(found, space, predict, weights))
+        drawn = [Drawing("convergence", "The estimate over the runs", *told) for told in drawing_of_convergence(found)]
+        drawn += _runs(found, space, predict, weights)
         drawn += [Drawing("modes", "Failure modes", *told) for told in drawing_of_modes(found, space, weights)]
         if predict is not None:
             drawn += [*_map(found, space, predict, weights), *_held_out(found, space, predict)]

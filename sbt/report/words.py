@@ -168,9 +168,12 @@ def _not_a_share(found: Findings) -> str:
 def _estimation(result: Mapping[str, Any]) -> list[str]:
     """Return the probability with its interval, or the bound where nothing was critical."""
     if result.get("exact_bound") is not None:
-        return [f"No critical run was drawn: with confidence, the probability of one is at most {number(result['exact_bound'])}."]
+        sure = share(result.get("confidence") or 0.95)
+        bound = number(result["exact_bound"])
+        told = f"No critical run was drawn: with {sure} confidence, the probability of one is at most {bound}."
+        return [told, *_verdict(result)]
     if result.get("probability") is None:
-        return []
+        return _verdict(result)
     confidence = share(result.get("confidence") or 0.95)
     said = [
         f"Probability of a critical run under the inputs' distribution: {number(result['probability'])}"
@@ -184,9 +187,17 @@ def _estimation(result: Mapping[str, Any]) -> list[str]:
     given = [f"{name} {number(result[key], 3)}" for name, key in details.items() if result.get(key) is not None]
     if given:
         said.append(f"Behind it: {', '.join(given)}.")
+    if result.get("failed_as_critical") not in (None, result["probability"]):
+        said.append(f"If every failed run were critical, it would be {number(result['failed_as_critical'])}.")
     if result.get("undetected_mass_bound") is not None:
         said.append(f"A critical region that no run has met may hold up to {number(result['undetected_mass_bound'], 3)} more.")
-    return said
+    return [*said, *_verdict(result)]
+
+
+def _verdict(result: Mapping[str, Any]) -> list[str]:
+    """Return what the gate says, where there is one."""
+    gate = result.get("gate")
+    return [] if gate is None else [f"Gate: {gate['verdict']}; {gate['statement']}."]
 
 
 def _falsification(result: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,55 @@
+"""The verb `compare-ego`: two egos on the same draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+
+__all__ = ["compare_ego"]
+
+_SHOWN = 5
+
+
+def compare_ego(
+    first: Annotated[Path, typer.Argument(metavar="A.yaml", help="Configuration with the ego before.")],
+    second: Annotated[Path, typer.Argument(metavar="B.yaml", help="The same with the ego after.")],
+    *,
+    store: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of both campaigns.")] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Pairs of runs; default: the budget of A.")] = None,
+    fail_if_rose: Annotated[bool, typer.Option("--fail-if-rose", help="Exit 3 if the probability rose.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
+) -> None:
+    """Run both on the same draws: did the probability fall, which failures were fixed, which are new."""
+    folder = store if store is not None else Path("runs") / f"compare_{first.stem}_{second.stem}"
+    try:
+        with clean_stdout(), ProgressDisplay(silent=as_json) as show:
+            from sbt.paired import compare_egos
+
+            result = compare_egos(first, second, store=folder, runs=runs, progress=show)
+    except KeyboardInterrupt:
+        raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+    if as_json:
+        print_json(result)
+    else:
+        print("\n".join(_lines(result)))
+    if fail_if_rose and result["verdict"] == "rose":
+        raise fail("the probability of a critical run rose", Exit.CRITICAL)
+
+
+def _lines(result: Mapping[str, Any]) -> list[str]:
+    """Return the comparison for people."""
+    lines = [f"{result['pairs']} pairs of runs with common draws and seeds, {result['confidence']:.0%} intervals"]
+    for name in ("before", "after"):
+        s = result[name]
+        lines.append(f"  {name:<8}{s['probability']:.4g} ({s['low']:.4g} to {s['high']:.4g}), {s['failed']} failed runs")
+    lines.append(f"  change  {result['difference']:+.4g} ({result['low']:+.4g} to {result['high']:+.4g}): {result['verdict']}")
+    for name in ("fixed", "new"):
+        found = result[name]
+        shown = ", ".join(str(f["run"]) for f in found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
+        lines.append(f"  {len(found)} {name}" + (f": runs {shown}" if found else ""))
+    return [*lines, f"  {result['still']} critical with both"]

@@ -1,0 +1,146 @@
+"""Two egos on the same draws: did the probability of a critical run fall, what was fixed, what is new.
+
+Both configurations run as crude Monte Carlo with one seed: draws of the inputs and seeds of the runs are
+the same (common random numbers), so that only the runs with different verdicts tell the egos apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import betaincinv
+
+from sbt.arrays import Mask
+from sbt.campaign import Progress
+from sbt.config.load import load
+from sbt.errors import InputError
+from sbt.estimators.monte_carlo import Share
+from sbt.history import History
+from sbt.run import run_campaign, scenario_of_run
+from sbt.store import Store
+
+__all__ = ["Pairs", "compare_egos"]
+
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Verdicts of n pairs of runs, (n,) each; a failed run has none.
+
+    Args:
+        before, after: critical with the first and with the second ego.
+        failed_before, failed_after: the run failed.
+    """
+
+    before: Mask
+    after: Mask
+    failed_before: Mask
+    failed_after: Mask
+
+    @property
+    def fixed(self) -> Mask:
+        """(n,) critical before, safe after."""
+        return self.before & ~self.after & ~self.failed_after
+
+    @property
+    def new(self) -> Mask:
+        """(n,) safe before, critical after."""
+        return self.after & ~self.before & ~self.failed_before
+
+    def difference(self, confidence: float = _CONFIDENCE) -> tuple[float, float]:
+        """Return an interval of P(critical) after minus before that holds at least with this confidence.
+
+        Exact binomial limits of the shares of new and of fixed failures, each with half of the error
+        (Bonferroni); a failed run counts as whatever is worse for the end in question.
+        """
+        n, tail = len(self.before), (1.0 - confidence) / 4.0
+        perhaps_new = (self.after | self.failed_after) & (~self.before | self.failed_before)
+        perhaps_fixed = (self.before | self.failed_before) & (~self.after | self.failed_after)
+        return (
+            _low(int(self.new.sum()), n, tail) - _high(int(perhaps_fixed.sum()), n, tail),
+            _high(int(perhaps_new.sum()), n, tail) - _low(int(self.fixed.sum()), n, tail),
+        )
+
+
+def _low(hits: int, n: int, tail: float) -> float:
+    return float(betaincinv(hits, n - hits + 1, tail)) if hits else 0.0
+
+
+def _high(hits: int, n: int, tail: float) -> float:
+    return float(betaincinv(hits + 1, n - hits, 1.0 - tail)) if hits < n else 1.0
+
+
+def compare_egos(
+    first: Path, second: Path, *, store: Path, runs: int | None = None, progress: Callable[[Progress], None] | None = None
+) -> dict[str, Any]:
+    """Run both configurations on the same draws, or go on where the stores stopped, and compare them.
+
+    Args:
+        first: configuration with the ego before.
+        second: configuration with the ego after; same scenario, inputs and requirement.
+        store: folder; the campaigns are its subfolders a and b.
+        runs: pairs; None: the budget of the first.
+        progress: called after every run.
+
+    Returns:
+        Probabilities with intervals, their difference with its interval, a verdict (`fell`, `rose`,
+        `undecided`), and the runs that were fixed and that are new, with inputs and seed.
+
+    Raises:
+        InputError: the configurations ask for different inputs, laws or requirements.
+    """
+    loaded = load(first)
+    budget = loaded.config.budget if runs is None else runs
+    common = [
+        "campaign=estimation", "acquisition={kind: monte_carlo}", "metamodel={kind: gp}", "stop={cov: null}", "gate=null",
+        "from=null", f"seed={loaded.config.seed}", f"budget={budget}", f"initial={min(budget, 200)}", f"batch={min(budget, 200)}",
+    ]  # fmt: skip
+    pair = [load(path, [*common, f"store='{store / name}'"]) for path, name in ((first, "a"), (second, "b"))]
+    one, other = (scenario_of_run(p) for p in pair)
+    if one.space != other.space:
+        raise InputError(f"compare-ego needs the same inputs with the same laws, but {first} and {second} differ in them")
+    if one.requirement != other.requirement:
+        told = f"{one.requirement} in {first}, {other.requirement} in {second}"
+        raise InputError(f"compare-ego needs one requirement, but got {told}")
+    for config in pair:
+        run_campaign(config, progress=progress, report=False)
+    histories = [_history(store / name) for name in ("a", "b")]
+    return _result(histories[0], histories[1], one.requirement)
+
+
+def _history(folder: Path) -> History:
+    with Store.read(folder) as store:
+        return store.history()
+
+
+def _result(first: History, second: History, requirement: Any) -> dict[str, Any]:
+    """Return the comparison of two histories of the same draws."""
+    same = [(r.inputs, r.seed) for r in first.records] == [(r.inputs, r.seed) for r in second.records]
+    if not same:
+        raise InputError("compare-ego needs the same draws in both stores, but they differ: give another --store")
+    critical = [requirement.critical.contains(h.y(requirement.metric)) for h in (first, second)]
+    pairs = Pairs(critical[0], critical[1], ~first.ok, ~second.ok)
+    low, high = pairs.difference()
+    shares = [Share(len(h), int(c.sum()), int((~h.ok).sum())) for h, c in zip((first, second), critical, strict=True)]
+    tail = 0.5 * (1.0 + _CONFIDENCE)
+    return {
+        "pairs": len(first), "confidence": _CONFIDENCE,
+        **{
+            name: {"probability": s.value, "low": s.lower(tail), "high": s.upper(tail), "critical": s.hits, "failed": s.failed}
+            for name, s in zip(("before", "after"), shares, strict=True)
+        },
+        "difference": shares[1].value - shares[0].value, "low": low, "high": high,
+        "verdict": "fell" if high < 0 else "rose" if low > 0 else "undecided",
+        "fixed": _listed(first, pairs.fixed), "new": _listed(first, pairs.new),
+        "still": int((pairs.before & pairs.after).sum()),
+    }  # fmt: skip
+
+
+def _listed(history: History, mask: Mask) -> list[dict[str, Any]]:
+    found = [history.records[k] for k in np.flatnonzero(mask)]
+    return [{"run": r.index, "inputs": dict(r.inputs), "seed": r.seed} for r in found]

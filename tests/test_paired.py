@@ -1,0 +1,75 @@
+"""Two egos on common draws: the interval holds, what was fixed and what is new is told."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sbt.cli import app
+from sbt.paired import Pairs
+from sbt.seeds import stream
+
+
+def test_the_interval_of_the_difference_covers():
+    rng, none = stream(1, "pairs"), np.zeros(200, dtype=bool)
+    covered = []
+    for _ in range(400):
+        before = rng.random(200) < 0.2
+        after = np.where(before, rng.random(200) < 0.5, rng.random(200) < 0.02)
+        low, high = Pairs(before, after, none, none).difference()
+        covered.append(low <= 0.2 * 0.5 + 0.8 * 0.02 - 0.2 <= high)
+    assert np.mean(covered) >= 0.95
+
+
+def test_failed_runs_widen_it_on_both_sides():
+    none, half = np.zeros(100, dtype=bool), np.arange(100) < 10
+    low, high = Pairs(none, none, none, none).difference()
+    wide = Pairs(none, none, half, half).difference()
+    assert wide[0] < low < 0 < high < wide[1]
+
+
+def test_one_change_through_the_command(configured, tmp_path):
+    """The critical disc shrinks when the metric is shifted: only fixed failures, none new."""
+    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + '''
+
+def better(values, seed):
+    return {"y": disc(values, seed)["y"] + 0.1, "noise": 0.0}
+
+
+BETTER = scenario(better)
+''')
+    a, b = configured("a", budget=300), configured("b", "BETTER")
+    done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both"), "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert (found["verdict"], found["new"], found["pairs"]) == ("fell", [], 300)
+    assert len(found["fixed"]) == found["before"]["critical"] - found["after"]["critical"] > 0
+    assert found["low"] <= np.pi * (0.2**2 - 0.3**2) <= found["high"] < 0
+    back = ["compare-ego", str(b), str(a), "--store", str(tmp_path / "back"), "--runs", "300", "--fail-if-rose"]
+    again = CliRunner().invoke(app, back)
+    assert again.exit_code == 3
+    assert ": rose" in again.stdout
+
+
+def test_different_questions_are_refused(configured, tmp_path):
+    a, b = configured("a"), configured("b", requirement={"critical": [-1.0, -0.1]})
+    done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both")])
+    assert done.exit_code == 2
+    assert "one requirement" in done.output + str(done.stderr)
+
+
+@pytest.mark.sumo
+def test_egos_of_sumo(tmp_path):
+    def config(name, ego):
+        path = tmp_path / f"{name}.yaml"
+        keys = {"campaign": "coverage", "scenario": "cut_in", "budget": 60, "executor": {"kind": "serial"}}
+        path.write_text(json.dumps(keys | ego))
+        return path
+
+    a, b = config("a", {}), config("b", {"ego": {"kind": "acc_aeb", "reaction_time": 1.5}})
+    done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both"), "--json"])
+    found = json.loads(done.stdout)
+    assert found["after"]["critical"] >= found["before"]["critical"] > 0
