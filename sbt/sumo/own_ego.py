@@ -14,6 +14,7 @@ from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import State
 from sbt.sumo.ego import SUMO, Ego
+from sbt.sumo.models import checked
 
 __all__ = ["EGO_TYPE", "OwnEgo", "Pilot"]
 
@@ -63,7 +64,7 @@ class OwnEgo:
         """Return the XML of the type that SUMO's other model needs; None where it needs none."""
         if self.driver is None or self.driver.kind != SUMO:
             return None
-        settings = {("carFollowModel" if k == "model" else k): str(v) for k, v in self.driver.settings}
+        settings = checked(dict(self.driver.settings))
         return '<vType id="{}" {}/>'.format(EGO_TYPE, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
 
     def take_over(self, sumo: Any, rng: np.random.Generator) -> Pilot | None:
@@ -102,7 +103,7 @@ class OwnEgo:
 
     def _retype(self, sumo: Any) -> None:
         """Change the ego's type to the one with the other model; what that does not say stays as it is."""
-        given = dict(self.driver.settings) if self.driver is not None else {}
+        given = checked(dict(self.driver.settings)) if self.driver is not None else {}
         for name in _KEPT:
             attribute = _ATTRIBUTE.get(name, name[0].lower() + name[1:])
             if attribute not in given:
