@@ -98,8 +98,8 @@ def _frames(trace: Trace, metric: Metric, requirement: Requirement, lanes: Seque
     instants = [*range(0, last, _every(trace)), last]
     figure = Figure(figsize=_SIZE, dpi=_DPI)
     canvas: Any = FigureCanvasAgg(figure)
-    above, below = figure.add_axes((0.02, 0.34, 0.96, 0.58)), figure.add_axes((0.12, 0.13, 0.85, 0.17))
-    width, height = 0.96 * _SIZE[0], 0.58 * _SIZE[1]
+    above, below = figure.add_axes((0.02, 0.36, 0.96, 0.57)), figure.add_axes((0.08, 0.12, 0.89, 0.17))
+    width, height = 0.96 * _SIZE[0], 0.57 * _SIZE[1]
     middle, (half_x, half_y) = window(trace, width / height)
     above.grid(visible=False)
     for side in above.spines.values():
@@ -153,7 +153,7 @@ def _draw_metric(axes: Any, trace: Trace, metric: Metric, requirement: Requireme
         axes.axhline(edge, color=CRITICAL, linewidth=0.9, linestyle="--")
     axes.plot(time, values, color=MODEL, drawstyle="default")
     axes.set_xlabel("time (s)", labelpad=1)
-    axes.set_ylabel(label(metric.name, metric.unit), fontsize=8)
+    axes.set_title(f"{label(metric.name, metric.unit)} so far", loc="left", fontsize=8, pad=2)
     return axes.axvline(0.0, color="#222222", linewidth=1.0)
 
 

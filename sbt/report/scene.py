@@ -70,17 +70,18 @@ class Scenery:
 
         self._trace = trace
         self._shapes: list[Any] = []
-        stands = [bool(np.ptp(trace.x[:, k]) + np.ptp(trace.y[:, k]) < 1e-6) for k in range(len(trace.actors))]
+        self._stands = stands = [bool(np.ptp(trace.x[:, k]) + np.ptp(trace.y[:, k]) < 1e-6) for k in range(len(trace.actors))]
         for k, (length, width) in enumerate(zip(trace.length.tolist(), trace.width.tolist(), strict=True)):
             color = EGO if k == 0 else STANDING if stands[k] else OTHER
-            look = {"facecolor": color, "edgecolor": "#333333", "linewidth": 0.6, "zorder": 5 if k else 6}
+            look: dict[str, Any] = {"facecolor": color, "edgecolor": "#333333", "linewidth": 0.6}
+            look |= {"zorder": 5 if k else 6, "alpha": 0.7 if stands[k] else 1.0}
             shape = (
                 Circle((0.0, 0.0), 0.5 * length, **look) if length == width else Polygon(np.zeros((5, 2)), closed=True, **look)
             )
             self._shapes.append(axes.add_patch(shape))
 
     def show(self, k: int) -> None:
-        """Move every shape to instant k; the nose of a vehicle is pointed a little."""
+        """Move every shape to instant k; the nose of a vehicle that moves is pointed a little."""
         t = self._trace
         for j, shape in enumerate(self._shapes):
             x, y, heading = float(t.x[k, j]), float(t.y[k, j]), float(t.heading[k, j])
@@ -88,6 +89,7 @@ class Scenery:
                 shape.set_center((x, y))
                 continue
             a, b = 0.5 * float(t.length[j]), 0.5 * float(t.width[j])
-            local = np.array([[a, 0.0], [0.86 * a, b], [-a, b], [-a, -b], [0.86 * a, -b]])
+            nose = a if self._stands[j] else 0.86 * a
+            local = np.array([[a, 0.0], [nose, b], [-a, b], [-a, -b], [nose, -b]])
             cos, sin = math.cos(heading), math.sin(heading)
             shape.set_xy(local @ np.array([[cos, sin], [-sin, cos]]) + (x, y))

@@ -39,6 +39,8 @@ class MarkingSensor:
     """Weight of the last coefficients in points^2 of information: little against two markings in full sight
     (40, 3e3, 8e5, 2e8), much against the few points in front of an obstacle, so that noise does not steer."""
 
+    _KNOWN = np.diag(_MEMORY)
+
     def __init__(
         self, rng: np.random.Generator, left: np.ndarray, right: np.ndarray, *, lane: float,
         obstacles: tuple[Obstacle, ...] = (), reach: float = 20.0, noise: float = 0.05,
@@ -47,7 +49,7 @@ class MarkingSensor:
         self._points = np.concatenate([left, right])
         self._x, self._y = np.ascontiguousarray(self._points.T)
         self._side = np.concatenate([np.full(len(left), 0.5 * lane), np.full(len(right), -0.5 * lane)])
-        self._obstacles = [(o, reach + math.hypot(0.5 * o.length, 0.5 * o.width)) for o in obstacles]
+        self._obstacles = [(o, math.hypot(0.5 * o.length, 0.5 * o.width)) for o in obstacles]
         self._boxes: dict[tuple[Obstacle, ...], Boxes] = {}
         self._fit = np.zeros(4)
         self.seen = (0, 0)
@@ -58,7 +60,7 @@ class MarkingSensor:
         eye = np.array([own.x, own.y])
         east, north = self._x - own.x, self._y - own.y
         near = np.flatnonzero((east * east + north * north < self._reach**2) & (east * own.cos + north * own.sin > 0.0))
-        around = tuple([o for o, far in self._obstacles if math.hypot(o.pose[0] - own.x, o.pose[1] - own.y) < far])
+        around = tuple([o for o, radius in self._obstacles if self._may_hide(own, o.pose[0] - own.x, o.pose[1] - own.y, radius)])
         if around:
             if around not in self._boxes:
                 self._boxes[around] = Boxes((*o.pose, o.length, o.width) for o in around)
@@ -72,12 +74,16 @@ class MarkingSensor:
         turn = np.arctan(c1 + x * (2.0 * c2 + 3.0 * c3 * x))  # from a marking to the middle, across the lane as known
         x, y = x + side * np.sin(turn), y - side * np.cos(turn)
         square = x * x
-        terms = np.array([np.ones(len(x)), x, square, square * x])  # (4, n)
+        terms = np.empty((4, len(x)))
+        terms[0], terms[1], terms[2], terms[3] = 1.0, x, square, square * x
         weighted = terms / (1.0 + square / self._reach**2)
-        normal = weighted @ terms.T
-        normal.flat[::5] += self._MEMORY
+        normal = weighted @ terms.T + self._KNOWN
         self._fit = np.linalg.solve(normal, weighted @ y + self._MEMORY * self._fit)
         return self._fit
+
+    def _may_hide(self, own: State, east: float, north: float, radius: float) -> bool:
+        """Return whether a circle reaches into the half disc in which points are seen."""
+        return math.hypot(east, north) < self._reach + radius and east * own.cos + north * own.sin > -radius
 
 
 class LaneKeeping:
