@@ -26,7 +26,7 @@ _NOTE = (
 
 def mode_table(found: Findings, space: ParameterSpace) -> Table:
     """Return one row a failure mode; no rows where the campaign found none or does not look for them."""
-    modes: Sequence[Mapping[str, Any]] = found.result.get("failure_modes") or []
+    modes = _modes(found)
     rows = []
     for number_of, mode in enumerate(modes, 1):
         confirmed = NOTHING if mode["confirmed"] is None else f"{share(mode['confirmed'])} of {mode['confirmation_runs']}"
@@ -38,6 +38,12 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     metric = found.requirement.metric
     columns = ("mode", "representative", metric, "runs", "confirmed", *space.names, "what makes it safe", "most likely")
     return Table(columns, tuple(rows), _NOTE if rows else "")
+
+
+def _modes(found: Findings) -> Sequence[Mapping[str, Any]]:
+    """Return the described failure modes of the conclusion."""
+    told = found.result.get("failure_modes")
+    return [mode for mode in told if "representative" in mode] if isinstance(told, list) else []
 
 
 def _change(mode: Mapping[str, Any], space: ParameterSpace) -> str:
@@ -58,7 +64,7 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
 
     The two inputs are those of largest weight (d,); with one input the metric is drawn over it.
     """
-    modes: Sequence[Mapping[str, Any]] = found.result.get("failure_modes") or []
+    modes = _modes(found)
     if not modes:
         return
     history, y = found.history, found.history.y(found.requirement.metric)
