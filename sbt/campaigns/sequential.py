@@ -15,6 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr, ndtri
+from threadpoolctl import threadpool_limits
 
 from sbt.arrays import Mask, Points, Vector
 from sbt.campaign import Batch, Log
@@ -86,7 +87,11 @@ class SequentialStage:
         return None
 
     def propose(self, log: Log) -> Batch:
-        """Return the next batch."""
+        """Return the next batch; on one thread, so that the machine does not decide the last digit."""
+        with threadpool_limits(1):
+            return self._proposed(log)
+
+    def _proposed(self, log: Log) -> Batch:
         s = self.settings
         if log.iteration == 0 and (s.earlier is None or len(s.earlier.training) < 2):
             return self._initial(min(s.initial, s.budget))
