@@ -63,7 +63,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Any) -> Campaign:
 def _conclusion(probability: float | None, limits: Limits, **rest: Any) -> Conclusion:
     """Return the keys of an estimation in their order."""
     tail = 0.5 * (1.0 + _CONFIDENCE)
-    found = {
+    found: Conclusion = {
         "probability": probability, "low": limits.lower(tail), "high": limits.upper(tail), "confidence": _CONFIDENCE,
         "cov": None, "effective_sample_size": 0.0, "hits": 0, "failed_as_safe": probability, "failed_as_critical": probability,
         "undetected_mass_bound": 1.0, "warnings": [],
@@ -179,10 +179,10 @@ def _from_repeats(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         ), limits  # fmt: skip
     failed = int((~log.history.ok).sum())
     limits = Limits(lambda c: found.limit(c, side=-1), lambda c: first.upper(c) if failed else found.limit(c, side=1))
-    told = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
+    caution = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
     return _conclusion(
         found.value, limits, cov=found.std_error / found.value, hits=hits, effective_sample_size=float(found.repeats),
-        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected, warnings=told,
+        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected, warnings=caution,
     ), limits  # fmt: skip
 
 
