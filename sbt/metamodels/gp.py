@@ -154,11 +154,7 @@ class GaussianProcessPredictor:
         )
 
     def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m.
-
-        Source:
-            Rasmussen & Williams (2006), eq. (2.24) and appendix A.2.
-        """
+        """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m."""
         with single_threaded():
             cross = self.hyper.covariance(self.u, u)  # (rows, m)
             mean = self.centre + self.alpha @ cross
@@ -236,15 +232,9 @@ def _fit_noise_spread(hyper: _Hyperparameters, u: Points, z: Vector, rng: np.ran
 
 
 def _condition(
-    settings: GaussianProcess,
-    hyper: _Hyperparameters,
-    u: Points,
-    z: Vector,
-    at_rows: Vector,
-    spread: _NoiseSpread | None,
-    shift: float,
-    scale: float,
-) -> GaussianProcessPredictor:
+    settings: GaussianProcess, hyper: _Hyperparameters, u: Points, z: Vector, at_rows: Vector, spread: _NoiseSpread | None,
+    shift: float, scale: float,
+) -> GaussianProcessPredictor:  # fmt: skip
     """Return the predictor conditioned on all rows; `at_rows` is the relative noise variance there."""
     factor = _factor(hyper.covariance(u, u), hyper.noise * at_rows)
     by_one, by_z = cho_solve((factor, True), np.stack([np.ones(len(z)), z], axis=1)).T

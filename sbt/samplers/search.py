@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from sbt.arrays import Mask, Points, Vector
@@ -21,11 +22,14 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled"]
+__all__ = [
+    "DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled",
+]  # fmt: skip
 
 DEFLATION = 0.22
 """Half the side of the box about a critical run that the search leaves alone (unit cube)."""
 _FEWEST_FREE = 0.05  # of the space that deflation must leave
+_FLANK = 0.15  # beyond a deflated box
 _CANDIDATES = 1500
 
 
@@ -112,18 +116,31 @@ class Free:
     """The part of the cube that is not deflated.
 
     Args:
-        hits: (k, d) critical runs.
-        radius: half the side of the box that each takes away.
+        low, high: (k, d) ends of the boxes that are.
+        radius: by which each box reaches beyond its critical runs.
     """
 
-    hits: Points
+    low: Points
+    high: Points
     radius: float
 
-    def __call__(self, u: Points) -> Mask:
-        """Return (n,) booleans: u is in no box."""
-        if len(self.hits) == 0:
-            return np.ones(len(u), dtype=bool)
-        return np.asarray(cdist(u, self.hits, "chebyshev").min(axis=1) > self.radius)
+    @classmethod
+    def about(cls, hits: Points, radius: float) -> Free:
+        """Return what boxes about critical runs (n, d) leave; runs whose boxes touch share one box, their hull."""
+        if len(hits) == 0:
+            return cls(hits, hits, radius)
+        count, group = connected_components(cdist(hits, hits, "chebyshev") <= 2.0 * radius, directed=False)
+        members = [hits[group == k] for k in range(count)]
+        return cls(
+            np.array([m.min(axis=0) for m in members]) - radius, np.array([m.max(axis=0) for m in members]) + radius, radius
+        )
+
+    def __call__(self, u: Points, beyond: float = 0.0) -> Mask:
+        """Return (n,) booleans: u is in no box, each grown by `beyond`."""
+        inside = np.zeros(len(u), dtype=bool)
+        for low, high in zip(self.low - beyond, self.high + beyond, strict=True):
+            inside |= ((u >= low) & (u <= high)).all(axis=1)
+        return ~inside
 
 
 def deflated(search: Search, hits: Points, rng: np.random.Generator, dimension: int) -> Free:
@@ -131,9 +148,9 @@ def deflated(search: Search, hits: Points, rng: np.random.Generator, dimension: 
     probe = rng.random((512, dimension))
     probe = probe[search.feasible(probe)] if search.feasible(probe).any() else probe
     radius = search.deflation
-    while radius > 1e-6 and Free(hits, radius)(probe).mean() < _FEWEST_FREE:
+    while radius > 1e-6 and Free.about(hits, radius)(probe).mean() < _FEWEST_FREE:
         radius /= 2
-    return Free(hits, radius)
+    return Free.about(hits, radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,12 +159,14 @@ class Known:
 
     Args:
         u, y, batch: (m, d), (m,), (m,) runs that neither failed nor lie in a deflated basin.
+        flank: (m,) the run lies just outside of a deflated basin: near-critical for what is known already.
         admissible: (n, d) points to (n,) booleans: feasible and not deflated.
     """
 
     u: Points
     y: Vector
     batch: Vector
+    flank: Mask
     admissible: Callable[[Points], Mask]
 
 
@@ -161,12 +180,13 @@ def known(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.ra
         batch: (m,) number of the batch that each run came with; None: each run by itself.
         rng: the only source of randomness.
     """
-    number = np.arange(len(u)) if batch is None else np.asarray(batch)
+    number = np.arange(len(u), dtype=np.float64) if batch is None else np.asarray(batch, dtype=np.float64)
     ok = np.isfinite(y)
     hit = ok & search.critical.contains(y)
     free = deflated(search, u[hit], rng, u.shape[1])
     left = ok & ~hit & free(u)
-    return Known(u[left], y[left], number[left], lambda points: search.feasible(points) & free(points))
+    flank = ~free(u[left], _FLANK)
+    return Known(u[left], y[left], number[left], flank, lambda points: search.feasible(points) & free(points))
 
 
 def fill(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:
@@ -200,7 +220,7 @@ def refined(
 
 
 def repelled(u: Points, others: Points, radius: float) -> Vector:
-    """Return (n,) log factors: 0 far from the others, -inf on one of them."""
-    square = cdist(u, others, "sqeuclidean").min(axis=1)
+    """Return (n,) log factors: -inf on one of the others, 0 from three radii on, or all that is left would be corners."""
+    square = cdist(u, others, "sqeuclidean").min(axis=1) / radius**2
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(-np.expm1(-0.5 * square / radius**2)))
+        return np.where(square >= 9.0, 0.0, np.log(-np.expm1(-0.5 * square)))
