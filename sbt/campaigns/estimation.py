@@ -182,7 +182,8 @@ def _from_repeats(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
     caution = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
     return _conclusion(
         found.value, limits, cov=found.std_error / found.value, hits=hits, effective_sample_size=float(found.repeats),
-        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected, warnings=caution,
+        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected,
+        warnings=caution,
     ), limits  # fmt: skip
 
 
