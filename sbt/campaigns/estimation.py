@@ -179,10 +179,11 @@ def _from_repeats(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         ), limits  # fmt: skip
     failed = int((~log.history.ok).sum())
     limits = Limits(lambda c: found.limit(c, side=-1), lambda c: first.upper(c) if failed else found.limit(c, side=1))
-    unseen = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
+    caution = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
     return _conclusion(
         found.value, limits, cov=found.std_error / found.value, hits=hits, effective_sample_size=float(found.repeats),
-        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected, warnings=unseen,
+        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected,
+        warnings=caution,
     ), limits  # fmt: skip
 
 

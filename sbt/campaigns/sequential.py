@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.distance import cdist
 from scipy.special import ndtr, ndtri
 from threadpoolctl import threadpool_limits
 
@@ -46,7 +45,7 @@ _PROBES = 9
 _COMMON = 0.02
 _STALLED = 1.5
 _LATEST = 0.6
-_CHOICE = 4
+_FEWEST_LEARNED = 3
 _HUNTED_SHARE = (0.2, 0.1)
 FEWEST_BATCHES = 4
 """Batches that must count before a target is believed to be met."""
@@ -184,7 +183,7 @@ class SequentialStage:
         n = size - hunted
         picks = self._runs(self._hunt(known, log.iteration, hunted), _HUNT)
         if not counts:
-            rows = _spread(self._coordinates(z), plan.doubt, known.u, n, rng)
+            rows = chosen(plan, n, log_pi - log_not, rng).rows
             how = {"method": "doubt", "phase": "learn", **doubt}
             return Batch((*self._runs(z[rows], _LEARN, None), *picks), how)
         draws = chosen(plan, n, log_pi - log_not, rng)
@@ -229,19 +228,7 @@ class SequentialStage:
         base = max(plan.prior, 1e-300)
         target = s.stop.get("cov")
         target = _TARGET if target is None else target
-        return len(drawn) >= 1 and math.sqrt(plan.anticipated / left) <= target * base
-
-
-def _spread(u: Points, probability: Vector, seen: Points, n: int, rng: np.random.Generator) -> Points:
-    """Return n rows of the pool u (N, d): of four times as many drawn by their doubt, those farthest from all others."""
-    rows = rng.choice(len(u), size=_CHOICE * n, p=probability)
-    scale = u[rows].std(axis=0) + 1e-3
-    near = cdist(u[rows] / scale, seen / scale).min(axis=1) if len(seen) else np.full(len(rows), np.inf)
-    taken: list[int] = []
-    for _ in range(n):
-        taken.append(int(np.argmax(near)))
-        near = np.minimum(near, np.linalg.norm((u[rows] - u[rows[taken[-1]]]) / scale, axis=1))
-    return np.asarray(rows[taken])
+        return len(drawn) >= _FEWEST_LEARNED and math.sqrt(plan.anticipated / left) <= target * base
 
 
 def _relative(anticipated: float, prior: float) -> float:

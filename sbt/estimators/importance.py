@@ -40,7 +40,6 @@ class Plan:
         anticipated: variance of one draw if the metamodel is right.
         pool_variance: of P_t through the pool, in total.
         nominal: share of the draws in proportion to the nominal law.
-        doubt: (N,) the part of r that the metamodel decides, sum 1.
     """
 
     form: str
@@ -51,7 +50,6 @@ class Plan:
     anticipated: float
     pool_variance: float
     nominal: float
-    doubt: Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +81,7 @@ def planned(
     plans = []
     for form, log_doubt in doubt.items():
         r = shares[1] * w / w.sum() + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
-        main = _normalised(log_doubt + log_w, alive)
-        r += shares[0] * main
+        r += shares[0] * _normalised(log_doubt + log_w, alive)
         r /= r.sum()
         mean = float((w * pi).sum())
         second = float((w**2 * pi / np.where(alive, r, 1.0)).sum())
@@ -95,7 +92,7 @@ def planned(
         spread = _stratified_variance(n * w * pi, stratum)
         plans.append(Plan(
             form, r, pi if form == "difference" else np.zeros(n), w, mean if form == "difference" else 0.0,
-            max(variance, 0.0), spread, shares[1], main,
+            max(variance, 0.0), spread, shares[1],
         ))  # fmt: skip
     return min(plans, key=lambda plan: plan.anticipated)
 
