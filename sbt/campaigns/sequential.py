@@ -21,7 +21,7 @@ from sbt.campaign import Batch, Log
 from sbt.campaigns.counting import DRAWN, counted_batches
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
-from sbt.estimators.importance import BLIND, SHARES, Plan, chosen, planned
+from sbt.estimators.importance import BLIND, SHARES, chosen, planned
 from sbt.estimators.intervals import combined
 from sbt.estimators.mixture import Mixture, fitted, log_normal, particles, wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability, learned
@@ -178,7 +178,7 @@ class SequentialStage:
         log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
         plan = planned(log_pi, log_not, log_w, log_wide, stratum, BLIND if known.one_sided else SHARES)
         doubt = {"pool": _POOL, "prior": plan.prior, "anticipated": plan.anticipated, "components": len(mixture.shares)}
-        counts = known.one_sided or self._counts(log, plan, size)
+        counts = known.one_sided or self._counts(log, size)
         hunted = min(round(_HUNTED_SHARE[counts] * size), size - 1)
         n = size - hunted
         picks = self._runs(self._hunt(known, log.iteration, hunted), _HUNT)
@@ -211,24 +211,26 @@ class SequentialStage:
         clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, doubt))
         return fitted(clouds, self._wide, rng)
 
-    def _counts(self, log: Log, plan: Plan, size: int) -> bool:
-        """Return whether this batch counts: from the stopping time on, which looks only at what is past."""
+    def _counts(self, log: Log, size: int) -> bool:
+        """Return whether this batch counts: from the stopping time on.
+
+        It looks only at earlier batches. Were it to look at this batch's pool, pools in which much is believed
+        critical would begin the count more often, and the estimate would be too high.
+        """
         drawn = [i for i in log.iterations if i.get("phase") in ("learn", "count")]
         if any(i["phase"] == "count" for i in drawn):
             return True
         s, spent = self.settings, len(log.history)
         if spent + size > _LATEST * s.budget:
             return True
-        doubts = [
-            _relative(i["anticipated"], i["prior"]) for i in (*drawn[-2:], {"anticipated": plan.anticipated, "prior": plan.prior})
-        ]
-        if len(doubts) == 3 and max(doubts) < _STALLED * min(doubts):
+        if len(drawn) < _FEWEST_LEARNED:
+            return False
+        doubts = [_relative(i["anticipated"], i["prior"]) for i in drawn[-3:]]
+        if max(doubts) < _STALLED * min(doubts):
             return True  # learning no longer pays
         left = (1.0 - _HUNTED_SHARE[True]) * (s.budget - spent)
-        base = max(plan.prior, 1e-300)
         target = s.stop.get("cov")
-        target = _TARGET if target is None else target
-        return len(drawn) >= _FEWEST_LEARNED and math.sqrt(plan.anticipated / left) <= target * base
+        return doubts[-1] / math.sqrt(left) <= (_TARGET if target is None else target)
 
 
 def _relative(anticipated: float, prior: float) -> float:
