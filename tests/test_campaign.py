@@ -297,7 +297,7 @@ def test_exact_binomial_intervals():
 
 
 def test_an_interruption_can_be_resumed(configured: Callable[..., Path], rows: Rows, campaign: Run):
-    config = configured("c", "SLOW", budget=120)
+    config = configured("c", "SLOW", budget=240)
     driver = subprocess.Popen([sys.executable, "-m", "sbt", "run", str(config), "--json"], stdout=subprocess.PIPE,
                               stderr=subprocess.PIPE, text=True)  # fmt: skip
     while not len(_finished(config.parent / "c")):
@@ -305,4 +305,4 @@ def test_an_interruption_can_be_resumed(configured: Callable[..., Path], rows: R
     os.kill(driver.pid, signal.SIGINT)
     out, err = driver.communicate(timeout=30)
     assert (driver.returncode, out, err.splitlines()[-1]) == (130, "", "interrupted, run again to resume")
-    assert rows(campaign("c", "SLOW", budget=120)["store"]) == rows(campaign("d", "SLOW", budget=120)["store"])
+    assert rows(campaign("c", "SLOW", budget=240)["store"]) == rows(campaign("d", "SLOW", budget=240)["store"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -161,12 +162,15 @@ class _BenchmarkStage:
             n = min(self.batch, len(pool))
             draw = rejection(score, pool, n, start=0, seed=self.seed, label=log.iteration, max_candidates=len(pool))
             return draw, self.scenario.pool.x[pool.rows[draw.positions]]
-        draw = rejection(
-            score, SobolSequence(space.dimension, self.seed), self.batch,
+        draws = partial(
+            rejection, score, SobolSequence(space.dimension, self.seed), self.batch,
             start=int(log.iterations[-1][_POSITION]) if log.iterations else 0, seed=self.seed, label=log.iteration,
             max_candidates=max(self.max_candidates, self.batch), accept_filter=admissible,
-            bound=belief.log_ambiguity_bound if belief is not None and acquisition is boundary else None,
         )  # fmt: skip
+        screen = belief.log_ambiguity_bound if belief is not None and acquisition is boundary else None
+        draw = draws(bound=screen, fill=False)
+        if draw.method == "short":
+            draw = draws()  # the pool ranks what was rejected, so all of it has to be scored
         return draw, space.from_unit(draw.u)
 
 
