@@ -34,7 +34,8 @@ __all__ = ["Choice", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 _POSITION = "next_position"
 _FEW = 2**15  # candidates that the mix looks at by rejection before it turns to particles
 _CANDIDATES = 4096
-_RANDOM, _FILLING, _HUNTING = 0.25, 0.15, 0.35  # shares of the mix; the rest is chosen greedily
+_RANDOM, _FILLING = 0.25, 0.15  # shares of the mix; the rest is chosen greedily
+_HUNTING = (0.35, 0.1)  # share that hunts, in the first and in the second half of the budget
 _RARE = 0.02  # critical share of the space below which a region is easily missed, and hunted
 
 
@@ -89,7 +90,8 @@ def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen
 
     15 % fill the space, 25 % are drawn from a_BI as in the paper (they insure against a missed mode), the
     others are chosen one by one by a_BI times the squared distance to the nearest run. Where less than 2 %
-    of the space is believed critical, 35 % search for regions apart from those that are known.
+    of the space is believed critical, 35 % (in the second half of the budget 10 %) search for regions apart
+    from those that are known.
     """
     if belief is None:
         return evenly(settings, belief, log, n)
@@ -97,7 +99,8 @@ def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen
     filling, random = min(filling, n), min(random, n - min(filling, n))
     first, fill = _draw(settings, belief, even, log, filling)
     second, drawn = _draw(settings, belief, boundary, log, random, taken=fill, start=first.next_position, most=_FEW)
-    hunted = _hunted(settings, belief, log, min(_rounded(_HUNTING * n, log), n - filling - random))
+    share = _HUNTING[2 * len(log.history) >= settings.budget]
+    hunted = _hunted(settings, belief, log, min(_rounded(share * n, log), n - filling - random))
     so_far = np.concatenate([fill, drawn, hunted])
     greedy, looked = _greedy(settings, belief, boundary, log, n - len(so_far), so_far)
     so_far, last = np.concatenate([so_far, greedy]), second

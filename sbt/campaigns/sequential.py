@@ -43,7 +43,7 @@ _PHASE_0 = 0.4
 _EVEN_SHARE = 0.1
 _PROBES = 9
 _COMMON = 0.02
-_STALLED = 1.5
+_STALLED, _USABLE = 1.5, 0.5
 _LATEST = 0.6
 _FEWEST_LEARNED = 3
 _HUNTED_SHARE = (0.2, 0.1)
@@ -225,12 +225,12 @@ class SequentialStage:
             return True
         if len(drawn) < _FEWEST_LEARNED:
             return False
-        doubts = [_relative(i["anticipated"], i["prior"]) for i in drawn[-3:]]
-        if max(doubts) < _STALLED * min(doubts):
+        left = math.sqrt((1.0 - _HUNTED_SHARE[True]) * (s.budget - spent))
+        doubts = [_relative(i["anticipated"], i["prior"]) / left for i in drawn[-3:]]
+        if max(doubts) < _STALLED * min(doubts) and doubts[-1] < _USABLE:
             return True  # learning no longer pays
-        left = (1.0 - _HUNTED_SHARE[True]) * (s.budget - spent)
         target = s.stop.get("cov")
-        return doubts[-1] / math.sqrt(left) <= (_TARGET if target is None else target)
+        return doubts[-1] <= (_TARGET if target is None else target)
 
 
 def _relative(anticipated: float, prior: float) -> float:
