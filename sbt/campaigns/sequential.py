@@ -21,7 +21,7 @@ from sbt.campaign import Batch, Log
 from sbt.campaigns.counting import DRAWN, counted_batches
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
-from sbt.estimators.importance import BLIND, SHARES, chosen, planned
+from sbt.estimators.importance import BLIND, SHARES, Plan, chosen, planned
 from sbt.estimators.intervals import combined
 from sbt.estimators.mixture import Mixture, fitted, log_normal, particles, wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability, learned
@@ -47,6 +47,7 @@ _STALLED, _USABLE = 1.5, 0.5
 _LATEST = 0.6
 _FEWEST_LEARNED = 3
 _HUNTED_SHARE = (0.2, 0.1)
+_LOST, _MEMORY, _SURPRISE = 10.0, 4, 0.01
 FEWEST_BATCHES = 4
 """Batches that must count before a target is believed to be met."""
 _TARGET = 0.02
@@ -167,17 +168,16 @@ class SequentialStage:
     def _drawn(self, log: Log, known: _Known, belief: LogProbability | None, size: int) -> Batch:
         """Return draws from a fresh pool, and hunting picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
-        mixture = self._mixture(belief, known, rng)
-        z, stratum = mixture.sample(_POOL, rng)
-        x = s.scenario.space.from_normal(z)
-        log_w = log_normal(z) - mixture.log_density(z)
-        if s.scenario.space.constraints:
-            log_w = np.where(s.scenario.space.feasible(x), log_w - np.log(s.scenario.space.feasible_mass), -np.inf)
-        log_wide = log_normal(z, self._wide) - mixture.log_density(z)
-        unsure = np.full(len(z), np.log(0.5))
-        log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
-        plan = planned(log_pi, log_not, log_w, log_wide, stratum, BLIND if known.one_sided else SHARES)
-        doubt = {"pool": _POOL, "prior": plan.prior, "anticipated": plan.anticipated, "components": len(mixture.shares)}
+        shares = BLIND if known.one_sided else SHARES
+        pool = self._pooled(belief, known, shares, rng)
+        earlier = self._earlier(log, known, _relative(pool.plan.anticipated, pool.plan.prior))
+        if earlier is not None:
+            pool = self._pooled(earlier, known, shares, rng)
+        mixture, z, x, plan, log_pi, log_not = pool.mixture, pool.z, pool.x, pool.plan, pool.log_pi, pool.log_not
+        doubt = {
+            "pool": _POOL, "prior": plan.prior, "anticipated": plan.anticipated, "components": len(mixture.shares),
+            "earlier": earlier is not None,
+        }  # fmt: skip
         counts = known.one_sided or self._counts(log, size)
         hunted = min(round(_HUNTED_SHARE[counts] * size), size - 1)
         n = size - hunted
@@ -194,6 +194,44 @@ class SequentialStage:
             "pi": np.exp(log_pi[draws.rows]).tolist(),
         }  # fmt: skip
         return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), how)
+
+    def _pooled(self, belief: LogProbability | None, known: _Known, shares: tuple[float, ...], rng: np.random.Generator) -> _Pool:
+        """Return a fresh pool and how a batch would be drawn from it with this belief."""
+        space = self.settings.scenario.space
+        mixture = self._mixture(belief, known, rng)
+        z, stratum = mixture.sample(_POOL, rng)
+        x = space.from_normal(z)
+        log_w = log_normal(z) - mixture.log_density(z)
+        if space.constraints:
+            log_w = np.where(space.feasible(x), log_w - np.log(space.feasible_mass), -np.inf)
+        log_wide = log_normal(z, self._wide) - mixture.log_density(z)
+        unsure = np.full(len(z), np.log(0.5))
+        log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
+        plan = planned(log_pi, log_not, log_w, log_wide, stratum, shares)
+        return _Pool(mixture, z, x, plan, log_pi, log_not)
+
+    def _earlier(self, log: Log, known: _Known, doubt: float) -> LogProbability | None:
+        """Return an earlier belief to draw with, where the newest one has lost its precision for no reason.
+
+        A fit can fail: hyperparameters of another mode of their posterior. That shows in a doubt ten times as large
+        as that of an earlier batch, although no run since then has surprised the belief of that batch. The estimate
+        is unbiased with any belief that knows only earlier runs.
+        """
+        drawn = [i for i in log.iterations if i.get("phase") in ("learn", "count") and not i.get("earlier")]
+        if not drawn:
+            return None
+        best = min(drawn[-_MEMORY:], key=lambda i: _relative(i["anticipated"], i["prior"]))
+        if doubt <= _LOST * _relative(best["anticipated"], best["prior"]):
+            return None
+        iteration = int(best["iteration"])
+        before = _Known.of(log.history.where(log.history.iteration < iteration), self._coordinates, self.settings)
+        belief = before.learn(stream(self.settings.seed, "fit", iteration))
+        since = known.batch >= iteration
+        if belief is None or not since.any():
+            return None
+        p = np.exp(belief(known.z[since])[0])
+        surprised = np.where(known.critical[since], p < _SURPRISE, p > 1.0 - _SURPRISE).any()
+        return None if surprised else belief
 
     def _mixture(self, belief: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
         """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
@@ -231,6 +269,18 @@ class SequentialStage:
             return True  # learning no longer pays
         target = s.stop.get("cov")
         return doubts[-1] <= (_TARGET if target is None else target)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pool:
+    """A pool: points z (N, d) and x (N, d), how a batch is drawn from it, and what is believed there."""
+
+    mixture: Mixture
+    z: Points
+    x: Points
+    plan: Plan
+    log_pi: Vector
+    log_not: Vector
 
 
 def _relative(anticipated: float, prior: float) -> float:
