@@ -223,3 +223,11 @@ def test_verdict_of_a_merge(configured: Configured, tmp_path: Path):
     shutil.rmtree(tmp_path / "m")
     done = CliRunner().invoke(app, ["merge", folders[0], *into])
     assert done.exit_code == 2
+
+
+def test_dask_that_is_not_installed_is_told_before_anything_is_written(configured: Configured, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sbt.execution.dask.find_spec", lambda _: None)
+    config = configured("c", executor={"kind": "dask"})
+    with pytest.raises(InputError, match=r"needs dask\.distributed: pip install 'sumo-sbt\[dask\]', or choose local"):
+        run_campaign(load(config))
+    assert not (config.parent / "c").exists()

@@ -109,38 +109,43 @@ class DaskExecutor:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome a job as they finish."""
-        from distributed import as_completed
+        suspects = yield from self._drain(deque(jobs))
+        for job in suspects:
+            if (yield from self._drain(deque([job]))):
+                reason = "the dask worker died, also when this run was tried again alone"
+                yield Outcome(job.index, Status.CRASHED, {}, reason)
 
-        queue, alone = deque(jobs), deque[Job]()
+    def _drain(self, queue: deque[Job]) -> Any:
+        """Run what is queued; return the jobs whose workers died."""
+        from distributed import KilledWorker, as_completed
+
         flying: dict[Any, list[Job]] = {}
-        finished = as_completed()
-        while queue or alone or flying:
-            workers = len(self._workers())
-            while (queue or alone) and len(flying) < 2 * max(workers, 1):
-                chunk = [alone.popleft()] if alone else chunk_of(queue, _TARGET / self._seconds, workers)
+        finished = as_completed(loop=self._client.loop)
+        suspects: list[Job] = []
+        while queue or flying:
+            workers = max(len(self._workers()), 1)
+            while queue and len(flying) < 2 * workers:
+                chunk = chunk_of(queue, _TARGET / self._seconds, workers)
                 future = self._client.submit(_run, self._spec, chunk, self._timeout, pure=False)
                 flying[future] = chunk
                 finished.add(future)
             future = next(finished)
             chunk = flying.pop(future)
-            outcomes = self._outcomes(future, chunk)
-            alone.extend(chunk if outcomes is None else ())
-            for outcome in outcomes or ():
+            try:
+                outcomes = self._result(future)
+            except KilledWorker:
+                suspects += chunk
+                continue
+            for outcome in outcomes:
                 self._seconds += 0.1 * (max(outcome.seconds, 1e-4) - self._seconds)
                 yield outcome
+        return suspects
 
-    def _outcomes(self, future: Any, chunk: list[Job]) -> list[Outcome] | None:
-        """Return what came of a chunk; None where its workers died and its runs are to be tried one by one."""
+    def _result(self, future: Any) -> list[Outcome]:
         from concurrent.futures import CancelledError
-
-        from distributed import KilledWorker
 
         try:
             return list(future.result())
-        except KilledWorker:
-            if len(chunk) > 1:
-                return None
-            return [Outcome(chunk[0].index, Status.CRASHED, {}, "every worker died that was given this run alone")]
         except CancelledError:
             where = self._address or "the one on this machine"
             raise SbtError(f"the dask scheduler must stay until the end, but {where} is gone; run again to resume") from None
