@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sbt import plugins
-from sbt.campaign import Campaign, Progress, run_stages
+from sbt.campaign import Campaign, Progress, Shard, check_shard, run_shard, run_stages
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
+from sbt.execution.dask import DaskExecutor
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
-from sbt.execution.worker import run_job
+from sbt.execution.worker import run_job, versions
 from sbt.history import History, Record
 from sbt.learner import Learner
 from sbt.problem.outcome import Job, Outcome, Status
@@ -29,17 +29,19 @@ if TYPE_CHECKING:
     from sbt.config.model import Configuration
 
 __all__ = [
-    "assembly_of", "earlier_runs", "loaded_from", "rebuild_report", "replay", "run_campaign", "scenario_of_run", "settings_of",
+    "RESOLVED", "assembly_of", "earlier_runs", "keep_configuration", "kept_of", "loaded_from", "rebuild_report", "replay",
+    "result_of", "run_campaign", "scenario_of_run", "settings_of", "whole_budget",
 ]  # fmt: skip
 
-_RESOLVED = "config.resolved.yaml"
+RESOLVED = "config.resolved.yaml"
+"""The configuration with its defaults, in a store's folder."""
 _UNLEARNED = ("monte_carlo", "subset")
 """Ways to draw that look at no metamodel."""
 _MAY_CHANGE = {"budget", "folder", "yaml"}
 
 
 def run_campaign(
-    loaded: Loaded, *, progress: Callable[[Progress], None] | None = None, report: bool = True
+    loaded: Loaded, *, progress: Callable[[Progress], None] | None = None, report: bool = True, shard: Shard | None = None
 ) -> dict[str, Any]:
     """Run a campaign to its end, or go on where the store stopped.
 
@@ -47,16 +49,18 @@ def run_campaign(
         loaded: a checked configuration.
         progress: called after every run.
         report: write `report.html` in the end.
+        shard: run only its share of the runs, into a store that `sbt.merge` joins with the others'; no report.
 
     Returns:
         What `run --json` prints: campaign, scenario, store, runs, ok, failed, critical, iterations,
         stopped, seconds, conclusion.
 
     Raises:
-        InputError: the configuration does not fit the scenario, or the store belongs to another one.
+        InputError: the configuration does not fit the scenario, the store belongs to another one, or the
+            campaign cannot be run in shards.
         StoreError: the store cannot be written.
     """
-    from sbt.config.load import dump, resumed
+    from sbt.config.load import resumed
 
     folder = Path(loaded.config.store)
     loaded = replace(loaded, config=resumed(loaded.config, _stored(folder)))
@@ -64,21 +68,40 @@ def run_campaign(
     parts = assembly_of(loaded)
     settings = settings_of(loaded, parts)
     campaign: Campaign = plugins.load("campaigns", config.campaign)(settings)
-    kept = _kept(loaded, settings)
+    kept = kept_of(loaded, settings, shard)
+    executor = _executor(config, parts.spec)
+    common: dict[str, Any] = {
+        "seed": config.seed, "requirement": settings.scenario.requirement, "versions": versions(),
+        "listener": progress or (lambda _: None),
+    }  # fmt: skip
+    if shard is not None:
+        check_shard(campaign)
     with Store.open(folder, kept) as store:
         _check_same(store, kept)
-        store.update_configuration(kept)
-        _write_text(folder / _RESOLVED, dump(config))
-        with _executor(config, parts.spec) as executor:
-            stopped, conclusion, seconds = run_stages(
-                campaign, store, executor, seed=config.seed, budget=config.budget + config.validation.reference,
-                requirement=settings.scenario.requirement, versions=_versions(), listener=progress or (lambda _: None),
-            )  # fmt: skip
-        result = _result(store, settings, config, stopped, conclusion, seconds)
+        keep_configuration(store, config, kept)
+        with executor:
+            if shard is None:
+                found = run_stages(campaign, store, executor, budget=whole_budget(config), **common)
+            else:
+                found = run_shard(campaign, shard, store, executor, **common)
+        result = result_of(store, settings, config, *found)
         store.conclude(result)
-        if report:
+        if report and shard is None:
             _report(store, settings)
     return result
+
+
+def whole_budget(config: Configuration) -> int:
+    """Return the number of runs, those included that only score."""
+    return config.budget + config.validation.reference
+
+
+def keep_configuration(store: Store, config: Configuration, kept: Mapping[str, Any]) -> None:
+    """Write what a store remembers of its configuration, and the YAML beside it."""
+    from sbt.config.load import dump
+
+    store.update_configuration(kept)
+    _write_text(store.folder / RESOLVED, dump(config))
 
 
 def assembly_of(loaded: Loaded) -> Assembly:
@@ -101,13 +124,14 @@ def _stored(folder: Path) -> dict[str, Any]:
         return store.configuration
 
 
-def _kept(loaded: Loaded, settings: Settings) -> dict[str, Any]:
+def kept_of(loaded: Loaded, settings: Settings, shard: Shard | None = None) -> dict[str, Any]:
     """Return what the store remembers of a configuration: plain JSON, and the YAML to read back."""
     from sbt.config.load import dump, fingerprint
 
     return {
         **fingerprint(loaded.config), "budget": loaded.config.budget, "names": list(settings.scenario.space.names),
         "folder": str(Path(loaded.folder).resolve()), "yaml": dump(loaded.config),
+        **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
     }  # fmt: skip
 
 
@@ -178,7 +202,7 @@ def loaded_from(store: Store) -> Loaded:
     from sbt.config.load import parse
 
     kept = store.configuration
-    return parse(kept["yaml"], name=str(store.folder / _RESOLVED), folder=Path(kept["folder"]))
+    return parse(kept["yaml"], name=str(store.folder / RESOLVED), folder=Path(kept["folder"]))
 
 
 def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None, LogicalScenario]:
@@ -195,7 +219,8 @@ def replay(folder: Path, index: int) -> tuple[Record, Outcome, Trace | None, Log
         loaded, records = loaded_from(store), store.history().records
     found = [r for r in records if r.index == index]
     if not found:
-        raise InputError(f"a run must be a finished one of {folder} (0 to {len(records) - 1}), but got {index}")
+        have = f"{records[0].index} to {records[-1].index}" if records else "none yet"
+        raise InputError(f"a run must be a finished one of {folder} ({have}), but got {index}")
     record = found[0]
     parts = assembly_of(loaded)
     scenario = replace(parts.spec.resolve(), requirement=parts.scenario.requirement)
@@ -216,37 +241,37 @@ def _executor(config: Configuration, spec: ScenarioSpec) -> Executor:
     limit = None if choice.timeout == float("inf") else choice.timeout
     if choice.kind == "serial":
         return SerialExecutor(spec, limit)
+    if choice.kind == "dask":
+        return DaskExecutor(spec, choice.address, choice.workers, limit)
     return LocalExecutor(spec, choice.workers, limit)
 
 
 def _check_same(store: Store, kept: Mapping[str, Any]) -> None:
     """Refuse to go on with a store that another configuration made.
 
-    Only the budget may change, and where runs are executed.
+    Only the budget may change (a shard's must not: its share was planned with it), and where runs are executed.
     """
     before = store.configuration
-    changed = sorted(key for key in {*kept, *before} - _MAY_CHANGE if kept.get(key) != before.get(key))
+    fixed = {*kept, *before} - (_MAY_CHANGE - {"budget"} if "shard" in kept else _MAY_CHANGE)
+    changed = sorted(key for key in fixed if kept.get(key) != before.get(key))
     if changed:
         told = "; ".join(f"{key}: {before.get(key)} there, {kept.get(key)} now" for key in changed)
         raise InputError(f"a store belongs to one configuration, but {store.folder} was made with another ({told})")
 
 
-def _result(
+def result_of(
     store: Store, settings: Settings, config: Configuration, stopped: str, conclusion: Mapping[str, Any],
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
+    """Return what `run --json` prints."""
     history = store.history()
     ok = int(history.ok.sum())
     critical = settings.scenario.requirement.critical.contains(history.y(settings.scenario.requirement.metric))
     return {
-        "campaign": config.campaign, "scenario": config.scenario, "store": str(store.folder), "runs": len(history),
+        "campaign": config.campaign, "scenario": config.scenario, "store": str(Path(config.store)), "runs": len(history),
         "ok": ok, "failed": len(history) - ok, "critical": int(critical.sum()), "iterations": len(store.iterations()),
         "stopped": stopped, "seconds": {k: round(v, 4) for k, v in seconds.items()}, "conclusion": dict(conclusion),
     }  # fmt: skip
-
-
-def _versions() -> str:
-    return f"sbt {version('sumo-sbt')}, libsumo {version('libsumo')}"
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -61,10 +61,13 @@ class Store:
         self._lock = lock
 
     @classmethod
-    def open(cls, folder: Path, configuration: Mapping[str, Any]) -> Store:
+    def open(cls, folder: Path, configuration: Mapping[str, Any], *, durable: bool = True) -> Store:
         """Open for writing: a new store with this configuration, or the one that is there.
 
-        `configuration` is what must not change between a campaign and its resumption.
+        Args:
+            folder: made where there is none.
+            configuration: what must not change between a campaign and its resumption.
+            durable: every commit reaches the disk; False where the whole file can be written again.
         """
         folder = Path(folder)
         with _reported(folder):
@@ -75,7 +78,7 @@ class Store:
             except BlockingIOError:
                 raise StoreError(f"a store takes one writer, but another process is writing {folder}") from None
             db = sqlite3.connect(folder / DATABASE, isolation_level=None)
-            _set_journal(db)
+            _set_journal(db, durable=durable)
             store = cls(folder, db, lock)
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
                 with store._transaction():
@@ -165,21 +168,24 @@ class Store:
             self._set_meta("conclusion", dict(conclusion))
 
     def plan(
-        self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: Mapping[str, Any]
-    ) -> None:
+        self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: Mapping[str, Any],
+        *, indices: Sequence[int] | None = None,
+    ) -> None:  # fmt: skip
         """Write a batch before it runs, all of it or nothing.
 
         Args:
             iteration: number of the batch, from 0.
             stage: what asked for it.
-            runs: the batch; indices continue those of the store.
+            runs: the batch.
             seeds: one a run.
             proposal: how the batch was chosen (JSON), such as the position in the Sobol sequence.
+            indices: of the runs; None: they continue those of the store.
         """
         start = self.planned
+        places = range(start, start + len(runs)) if indices is None else indices
         rows = [
-            (start + k, run.stage, iteration, _dump(dict(run.inputs)), seeds[k], run.log_q, PLANNED)
-            for k, run in enumerate(runs)
+            (index, run.stage, iteration, _dump(dict(run.inputs)), seed, run.log_q, PLANNED)
+            for index, run, seed in zip(places, runs, seeds, strict=True)
         ]
         with self._transaction():
             self._db.executemany(
@@ -256,12 +262,12 @@ def _connected(path: Path) -> sqlite3.Connection:
     return db
 
 
-def _set_journal(db: sqlite3.Connection) -> None:
-    """Use WAL, or the DELETE journal where the file system cannot; every commit reaches the disk."""
+def _set_journal(db: sqlite3.Connection, *, durable: bool) -> None:
+    """Use WAL, or the DELETE journal where the file system cannot."""
     mode = db.execute("PRAGMA journal_mode = WAL").fetchone()[0]
     if mode != "wal":
         db.execute("PRAGMA journal_mode = DELETE")
-    db.execute("PRAGMA synchronous = FULL")
+    db.execute(f"PRAGMA synchronous = {'FULL' if durable else 'OFF'}")
 
 
 @contextmanager

@@ -32,7 +32,7 @@ FLOORS = (
     ("learner", "campaign", "tables"),
     ("campaigns", "scenario_check"),
     ("config", "run", "replay"),
-    ("report", "benchmark", "export", "testing", "predict", "paired"),
+    ("report", "benchmark", "export", "testing", "predict", "paired", "merge"),
     ("cli", "__main__"),
 )
 """Rooms from the ground up; those on one floor do not know each other unless stated in NEIGHBOURS."""

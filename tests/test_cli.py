@@ -284,6 +284,15 @@ def test_check_of_a_sound_scenario(folder: Path, target: str):
     assert "critical by margin" in done.stdout.splitlines()[-1]
 
 
+@pytest.mark.parametrize(("name", "ok", "code"), [("SCENARIO", True, 0), ("REFUSED", False, 2)])
+def test_check_prints_one_json_object(folder: Path, name: str, ok: bool, code: int):
+    done = process("check", f"plane.py:{name}", "--json")
+    found = json.loads(done.stdout)
+    assert (done.returncode, found["target"], found["ok"]) == (code, f"plane.py:{name}", ok)
+    assert all(f["ok"] for f in found["findings"]) is ok
+    assert {"rule", "ok", "detail"} == set(found["findings"][0])
+
+
 @pytest.mark.parametrize(
     ("name", "rule"),
     [
@@ -310,6 +319,7 @@ def test_list_shows_what_is_installed():
     assert {"scenarios", "metamodels", "acquisitions", "metrics", "campaigns"} <= set(found)
     assert all(entry["summary"] for entries in found.values() for entry in entries)
     assert "boundary" in {entry["name"] for entry in found["campaigns"]}
+    assert {"table:FOLDER", "testbed:NAME", "testbed:four_branch_7"} <= {entry["name"] for entry in found["sources"]}
     assert call("list", "acquisitions").stdout.startswith("acquisitions:\n")
     wrong = call("list", "metrcs")
     assert (wrong.exit_code, "did you mean 'metrics'?" in wrong.stderr) == (2, True)

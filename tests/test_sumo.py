@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -168,8 +169,17 @@ def test_a_start_that_differs_tells_what_was_asked_and_what_was_given(monkeypatc
 
 def test_a_vehicle_that_leaves_the_road_fails_the_run():
     found = outcome(driving(car(position=3990.0, speed=40.0)))
-    assert (found.status, "ego" in found.reason, found.metrics) == (Status.FAILED, True, {})
+    told = r"ego must stay on the road, but it was gone at t = 0\.\d+ s \(its route ended, or SUMO took it away\)"
+    assert (found.status, found.metrics) == (Status.FAILED, {})
+    assert re.fullmatch(told, found.reason)
     assert healthy().identical(healthy())
+
+
+@pytest.mark.parametrize("lane", [99, -1, 3, 0.5])
+def test_a_lane_that_the_edge_does_not_have_fails_the_run(lane: Any):
+    found = outcome(driving(car(act=Action(speed=20.0, lane=lane))))
+    reason = f"the controller of ego must give a lane of the edge, 0 to 2 on road, but gave {lane}"
+    assert (found.status, found.reason) == (Status.FAILED, reason)
 
 
 @pytest.mark.parametrize(

@@ -26,4 +26,4 @@ def recipe(settings: Settings) -> Campaign:
             conclusion["validation"] = validation_of(belief.scores)
         return conclusion, fit_of(belief)
 
-    return Campaign((BatchStage("even", settings, evenly),), conclude)
+    return Campaign((BatchStage("even", settings, evenly),), conclude, depends=None)

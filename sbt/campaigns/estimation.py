@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from sbt.campaign import Campaign, Fit, Log, Stage
@@ -37,7 +38,9 @@ def recipe(settings: Settings) -> Campaign:
     if method == "auto":
         method = "subset" if settings.scenario.space.dimension >= _HIGH_DIMENSION else "difference"
     if method == "monte_carlo":
-        return _campaign(settings, MonteCarloStage(settings), _from_law)
+        cov = settings.stop.get("cov")
+        depends = None if cov is None else f"stop.cov = {cov:g} ends it where the results say (null: the whole budget is run)"
+        return replace(_campaign(settings, MonteCarloStage(settings), _from_law), depends=depends)
     if method == "subset":
         return _campaign(settings, SubsetStage(settings), _from_repeats)
     if method == "difference":

@@ -26,6 +26,7 @@ app = typer.Typer(
 )
 for _verb in (
     campaign.run,
+    campaign.merge,
     scenario.simulate,
     scenario.check,
     campaign.status,

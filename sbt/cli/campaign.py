@@ -1,10 +1,11 @@
-"""The verbs of a campaign: run, status, report, export."""
+"""The verbs of a campaign: run, merge, status, report, export."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,14 +15,20 @@ from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_jso
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
+    from sbt.config.load import Loaded
     from sbt.store import Store
 
-__all__ = ["export", "report", "run", "status"]
+__all__ = ["export", "merge", "report", "run", "status"]
 
 _SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
 """What `status` tells of the last validation."""
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign (its store).")]
+FailOnCritical = Annotated[bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")]
+JUnit = Annotated[
+    Path | None, typer.Option("--junit", metavar="FILE.xml", help="Write the verdict as JUnit XML, for a CI's view.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
 
 
 def run(
@@ -32,14 +39,14 @@ def run(
         list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one key; repeatable.")
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Worker processes.")] = None,
-    fail_on_critical: Annotated[
-        bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")
-    ] = False,
-    junit: Annotated[
-        Path | None, typer.Option("--junit", metavar="FILE.xml", help="Write the verdict as JUnit XML, for a CI's view.")
+    shard: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="Only every N-th run, into STORE/shard-I-of-N or --store; merge joins them."),
     ] = None,
+    fail_on_critical: FailOnCritical = False,
+    junit: JUnit = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run a campaign, or resume it where it was interrupted."""
     overrides = list(changes or [])
@@ -54,9 +61,45 @@ def run(
             loaded = load(config, overrides)
             from sbt.run import run_campaign  # after the configuration, which is wrong more often
 
-            result = run_campaign(loaded, progress=show)
+            if shard is None:
+                result = run_campaign(loaded, progress=show)
+            else:
+                result = _run_shard(loaded, shard, show, own_folder=store is None)
     except KeyboardInterrupt:
         raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+    _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
+
+
+def _run_shard(loaded: Loaded, text: str, show: ProgressDisplay, *, own_folder: bool) -> dict[str, Any]:
+    """Run one shard, in a folder inside the campaign's where the user names none."""
+    from sbt.campaign import Shard
+    from sbt.run import run_campaign
+
+    shard = Shard.parse(text)
+    if own_folder:
+        folder = Path(loaded.config.store) / f"shard-{shard.number}-of-{shard.of}"
+        loaded = replace(loaded, config=loaded.config.model_copy(update={"store": str(folder)}))
+    return run_campaign(loaded, progress=show, shard=shard)
+
+
+def merge(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="The stores of all shards of one campaign.")],
+    *,
+    into: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the whole campaign.")],
+    fail_on_critical: FailOnCritical = False,
+    junit: JUnit = None,
+    as_json: AsJson = False,
+) -> None:
+    """Join the stores of shards (run --shard) into the one that a run without shards would have written."""
+    with clean_stdout():
+        from sbt.merge import merge as merged
+
+        result = merged([_with_store(folder) for folder in folders], into)
+    _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
+
+
+def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path | None, as_json: bool) -> None:
+    """Print the result of a campaign, and end with the exit code that it deserves."""
     if junit is not None:
         from sbt.report.junit import write_junit
 

@@ -15,7 +15,9 @@ from sbt.errors import InputError, PluginError
 
 __all__ = ["doctor", "list_", "schema"]
 
-_KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
+_KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
+_WRITTEN = {"table": "table:FOLDER", "testbed": "testbed:NAME", "yaml": "FOLDER/scenario.yaml"}
+"""How the sources of this package are asked for a scenario; others as PREFIX:REST."""
 
 
 def list_(
@@ -36,7 +38,7 @@ def list_(
     for each, entries in found.items():
         print(f"{each}:" if entries else f"{each}: none installed")
         for entry in entries:
-            print(f"  {entry['name']:<24}{entry['summary']}".rstrip())
+            print(f"  {entry['name']:<28} {entry['summary']}".rstrip())
 
 
 def _entries(kind: str) -> list[dict[str, str]]:
@@ -47,6 +49,8 @@ def _entries(kind: str) -> list[dict[str, str]]:
         from sbt.config.model import CAMPAIGNS
 
         return [{"name": name, "summary": campaign.description} for name, campaign in CAMPAIGNS.items()]
+    if kind == "sources":
+        return _sources()
     entries = []
     for name in names(kind):
         try:
@@ -55,6 +59,15 @@ def _entries(kind: str) -> list[dict[str, str]]:
             summary = f"cannot be loaded: {error}"
         entries.append({"name": name, "summary": summary})
     return entries
+
+
+def _sources() -> list[dict[str, str]]:
+    """Return how scenarios are named that come from somewhere else, and the testbeds there are."""
+    from sbt import testbeds
+    from sbt.plugins import load, names
+
+    found = [{"name": _WRITTEN.get(n, f"{n}:REST"), "summary": _summary(load("sources", n))} for n in names("sources")]
+    return found + [{"name": f"testbed:{n}", "summary": testbeds.find(n).title} for n in testbeds.names()]
 
 
 def _summary(thing: Any) -> str:

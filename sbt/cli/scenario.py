@@ -123,6 +123,7 @@ def check(
     *,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the runs.")] = 0,
     isolation: Isolation = "auto",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as one JSON object.")] = False,
 ) -> None:
     """Try out the contract of a scenario: corners run, same seed same trace, also elsewhere and reused."""
     with clean_stdout():
@@ -131,9 +132,12 @@ def check(
         _check_choices(None, None, isolation)
         spec, scenario = _target(target, isolation)
         findings = check_scenario(spec, seed, scenario)
-    for finding in findings:
-        print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.rule}: {finding.detail}")
     broken = sum(not finding.ok for finding in findings)
+    if as_json:
+        print_json({"target": target, "ok": not broken, "findings": [vars(finding) for finding in findings]})
+    else:
+        for finding in findings:
+            print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.rule}: {finding.detail}")
     if broken:
         raise fail(f"{target}: {broken} of {len(findings)} rules are broken", Exit.INPUT)
 

@@ -36,19 +36,16 @@ __all__ = [
 ]  # fmt: skip
 
 
-EXECUTORS = ("serial", "local")
-"""The executors of this release."""
-_LATER = ("dask",)
+EXECUTORS = ("serial", "local", "dask")
+"""Where runs can be executed."""
 
 
 def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
-    """Return a check for these values that names as such what is planned for a later release."""
+    """Return a check for these values."""
 
     def check(value: str) -> str:
         if value in choices:
             return value
-        if value in _LATER:
-            raise ValueError(f"'{value}' is not in this release; choose {' or '.join(choices)}")
         near = get_close_matches(value, choices, 1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{hint}")
@@ -219,13 +216,30 @@ class GateChoice(_Strict):
 class ExecutorChoice(_Strict):
     """Where runs are executed; never changes their results."""
 
-    kind: ExecutorName = Field(default="local", description="serial: in this process; local: worker processes.")
-    workers: int = Field(default_factory=_cores, ge=1, description="Worker processes of local; default: the usable cores.")
+    kind: ExecutorName = Field(
+        default="local", description="serial: in this process; local: worker processes; dask: workers of a dask cluster."
+    )
+    workers: int = Field(
+        default_factory=_cores, ge=1,
+        description="Worker processes of local, and of dask without an address; default: the usable cores.",
+    )  # fmt: skip
+    address: Name | None = Field(
+        default=None, description="Of dask's scheduler, such as tcp://host:8786; null: dask workers on this machine."
+    )
     timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped; .inf: never.")
     isolation: Literal["auto", "fresh", "reuse", "replicas"] = Field(
         default="auto",
         description="SUMO is loaded per run (fresh) or kept (reuse, replicas); auto: the fastest allowed.",
     )
+
+    @field_validator("address")
+    @classmethod
+    def _of_dask(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is not None and info.data.get("kind", "dask") != "dask":
+            raise ValueError(f"only the executor dask takes it, but the executor is {info.data['kind']}")
+        if value is not None and "://" not in value:
+            raise ValueError(f"must be a scheduler's address such as tcp://host:8786, but got '{value}'")
+        return value
 
 
 def _tenth(data: dict[str, Any]) -> int:

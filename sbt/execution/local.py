@@ -24,7 +24,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
-from sbt.execution.protocol import CHUNK
+from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_jobs
 from sbt.problem.outcome import Job, Outcome, Status
@@ -117,7 +117,7 @@ class LocalExecutor:
         broken = False
         while (queue or flying) and not broken:
             while queue and len(flying) < 2 * self._workers and not broken:
-                chunk = self._chunk(queue)
+                chunk = chunk_of(queue, _TARGET / max(self._seconds, 1e-4), self._workers)
                 try:
                     flying[self._pool.submit(_run_chunk, self._spec, chunk, self._folder, self._timeout)] = chunk
                 except _broken():
@@ -152,12 +152,6 @@ class LocalExecutor:
         mean = sum(o.seconds for o in outcomes) / len(outcomes)
         self._seconds += 0.3 * (mean - self._seconds)
         return outcomes
-
-    def _chunk(self, queue: deque[Job]) -> list[Job]:
-        """Take so many jobs that a chunk lasts about 50 ms and every worker stays busy to the end."""
-        size = int(_TARGET / max(self._seconds, 1e-4))
-        size = max(1, min(size, CHUNK, len(queue) // (2 * self._workers)))
-        return [queue.popleft() for _ in range(min(size, len(queue)))]
 
     def _at_work(self) -> list[tuple[tuple[int, ...], int, float]]:
         """Return (indices of the runs, process, time on the monotonic clock) of every worker with runs at work."""

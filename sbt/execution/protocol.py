@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Protocol, Self
@@ -10,7 +11,7 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_jobs
 from sbt.problem.outcome import Job, Outcome
 
-__all__ = ["CHUNK", "Executor", "SerialExecutor"]
+__all__ = ["CHUNK", "Executor", "SerialExecutor", "chunk_of"]
 
 CHUNK = 64
 """So many runs are begun, at most, before the outcome of the first is there."""
@@ -49,3 +50,9 @@ class SerialExecutor:
         """Yield one outcome a job, in order."""
         for first in range(0, len(jobs), CHUNK):
             yield from run_jobs(self._scenario, jobs[first : first + CHUNK], lambda _: None)
+
+
+def chunk_of(queue: deque[Job], size: float, workers: int) -> list[Job]:
+    """Take about `size` jobs from a queue, fewer towards its end, so that every worker stays busy."""
+    n = max(1, min(int(size), CHUNK, len(queue) // (2 * max(workers, 1))))
+    return [queue.popleft() for _ in range(min(n, len(queue)))]

@@ -7,6 +7,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib.metadata import version
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["place_of", "run_job", "run_jobs"]
+__all__ = ["place_of", "run_job", "run_jobs", "versions"]
 
 
 def run_job(scenario: LogicalScenario, job: Job) -> Outcome:
@@ -96,3 +97,8 @@ def place_of(error: BaseException) -> str:
     """Return file:line where the error was raised."""
     frames = traceback.extract_tb(error.__traceback__)
     return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "no place"
+
+
+def versions() -> str:
+    """Return the versions of what runs a concrete scenario, for the store."""
+    return f"sbt {version('sumo-sbt')}, libsumo {version('libsumo')}"

@@ -144,11 +144,23 @@ def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: flo
                 if not actor.person:
                     set_speed(name, speed)
             if lane is not None:
-                sumo.vehicle.changeLane(name, lane, 3600.0)
+                _change_lane(sumo, actor, name, lane)
             if pose is not None or own.steered is not None:
                 put(own, name, action, speed)
 
     return control
+
+
+def _change_lane(sumo: Any, actor: Actor, name: str, lane: int) -> None:
+    """Start the change to a lane; SUMO would say nothing where the edge has no such lane."""
+    edge = sumo.vehicle.getRoadID(name)
+    lanes = range(sumo.edge.getLaneNumber(edge)) if edge and not edge.startswith(":") else None  # of a junction's inside: any
+    if lanes is not None and lane not in lanes:
+        raise RunError(
+            Status.FAILED, f"the controller of {actor.name} must give a lane of the edge, 0 to {len(lanes) - 1} on {edge}, "
+            f"but gave {lane}",
+        )  # fmt: skip
+    sumo.vehicle.changeLane(name, int(lane), 3600.0)
 
 
 def _reached(speed: float, acceleration: float, aim: float | None, dt: float) -> float:
@@ -178,9 +190,14 @@ def _observer(
     def observe(k: int) -> None:
         at = k * len(watched) * size
         for state, name, half, position, angle_of, speed_of in watched:
-            x, y = position(name)
+            try:
+                x, y = position(name)
+            except Exception as error:  # of libsumo or of traci
+                if "is not known" in str(error):
+                    raise _gone(state, k * dt) from None
+                raise
             if x == ABSENT:
-                raise RunError(Status.FAILED, f"{state.name} must stay on the road, but it was gone at t = {k * dt:g} s")
+                raise _gone(state, k * dt)
             angle = angle_of(name)
             if angle != state.angle:
                 state.turn(angle)
@@ -193,6 +210,11 @@ def _observer(
             at += size
 
     return observe
+
+
+def _gone(state: State, t: float) -> RunError:
+    reason = f"{state.name} must stay on the road, but it was gone at t = {t:g} s (its route ended, or SUMO took it away)"
+    return RunError(Status.FAILED, reason)
 
 
 def _table(rows: bytearray, first: int, last: int, actors: int) -> np.ndarray:

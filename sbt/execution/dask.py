@@ -1,0 +1,188 @@
+"""Workers of a dask cluster, on this machine or elsewhere: each runs its jobs in a process of its own.
+
+A dask worker hands its jobs to a `LocalExecutor` of one process, so that libsumo has a process to
+itself, and a run that hangs or kills its process is treated exactly as on one machine. What is left to
+dask is the death of a whole worker (a lost node, the end of its time): its jobs are run elsewhere, and
+are tried alone where they seem to have caused several deaths.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import deque
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
+from typing import Any, Self
+
+from sbt.errors import InputError, SbtError
+from sbt.execution.local import LocalExecutor
+from sbt.execution.protocol import chunk_of
+from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import versions
+from sbt.problem.outcome import Job, Outcome, Status
+
+__all__ = ["DaskExecutor"]
+
+_TARGET = 0.5
+"""Runs are handed out in chunks of about so many seconds: a task of dask costs milliseconds."""
+_PATIENCE = 60
+"""So many seconds a scheduler may take to answer and to have its first worker."""
+
+
+class DaskExecutor:
+    """Runs on the workers of a dask cluster; workers may come and go.
+
+    Args:
+        spec: the scenario; workers resolve it themselves, so its files must be where they are here.
+        address: of the scheduler, `tcp://host:port`; None: a cluster on this machine for as long as it is needed.
+        workers: number of workers where there is no address.
+        timeout: wall-clock seconds a run may take; None: no limit.
+
+    Raises:
+        InputError: dask.distributed is not installed, or (when entered) the scheduler does not answer, or a
+            worker has several threads or other versions than this process.
+        SbtError: the scheduler is gone; what is done is done, and the campaign can be resumed.
+    """
+
+    def __init__(self, spec: ScenarioSpec, address: str | None, workers: int, timeout: float | None = None):
+        if find_spec("distributed") is None:
+            raise InputError("executor.kind dask needs dask.distributed: pip install 'sumo-sbt[dask]', or choose local")
+        self._spec, self._address, self._count, self._timeout = spec, address, workers, timeout
+        self._cluster: Any = None
+        self._client: Any = None
+        self._seconds = _TARGET
+
+    def __enter__(self) -> Self:
+        """Connect, check the workers, and let them load the scenario."""
+        from distributed import Client, LocalCluster
+
+        if self._address is None:
+            self._cluster = LocalCluster(
+                n_workers=self._count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None,
+                silence_logs="ERROR",
+            )  # fmt: skip
+        try:
+            self._client = Client(self._address or self._cluster, timeout=_PATIENCE, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=_PATIENCE)
+            self._prepare()
+        except (OSError, TimeoutError) as error:
+            self.__exit__()
+            raise InputError(f"a dask scheduler with workers must answer at {self._address} in {_PATIENCE} s: {error}") from None
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Free the workers, and stop those that were started here."""
+        if self._client is not None:
+            if self._cluster is None and self._client.status == "running":
+                self._free()
+            self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+        self._client = self._cluster = None
+
+    def _free(self) -> None:
+        """Let every worker end its process, after what it is at."""
+        from distributed import fire_and_forget
+
+        for worker in self._client.nthreads():
+            fire_and_forget(self._client.submit(_end, self._spec, self._timeout, workers=[worker], pure=False))
+
+    def _prepare(self) -> None:
+        """Start each worker's process, all at once."""
+        here = versions()
+        found = {w: self._client.submit(_begin, self._spec, self._timeout, workers=[w], pure=False) for w in self._workers()}
+        for worker, future in found.items():
+            there = future.result()
+            if there != here:
+                raise InputError(f"every worker must have the versions of this process ({here}), but {worker} has {there}")
+
+    def _workers(self) -> list[str]:
+        """Return the addresses of the workers there are now."""
+        threads: dict[str, int] = self._client.nthreads()
+        for worker, n in threads.items():
+            if n != 1:
+                raise InputError(f"every worker must have one thread (dask worker --nthreads 1), but {worker} has {n}")
+        return list(threads)
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Yield one outcome a job as they finish."""
+        suspects = yield from self._drain(deque(jobs))
+        for job in suspects:
+            if (yield from self._drain(deque([job]))):
+                reason = "the dask worker died, also when this run was tried again alone"
+                yield Outcome(job.index, Status.CRASHED, {}, reason)
+
+    def _drain(self, queue: deque[Job]) -> Any:
+        """Run what is queued; return the jobs whose workers died."""
+        from distributed import KilledWorker, as_completed
+
+        flying: dict[Any, list[Job]] = {}
+        finished = as_completed(loop=self._client.loop)
+        suspects: list[Job] = []
+        while queue or flying:
+            workers = max(len(self._workers()), 1)
+            while queue and len(flying) < 2 * workers:
+                chunk = chunk_of(queue, _TARGET / self._seconds, workers)
+                future = self._client.submit(_run, self._spec, chunk, self._timeout, pure=False)
+                flying[future] = chunk
+                finished.add(future)
+            future = next(finished)
+            chunk = flying.pop(future)
+            try:
+                outcomes = self._result(future)
+            except KilledWorker:
+                suspects += chunk
+                continue
+            for outcome in outcomes:
+                self._seconds += 0.1 * (max(outcome.seconds, 1e-4) - self._seconds)
+                yield outcome
+        return suspects
+
+    def _result(self, future: Any) -> list[Outcome]:
+        from concurrent.futures import CancelledError
+
+        try:
+            return list(future.result())
+        except CancelledError:
+            where = self._address or "the one on this machine"
+            raise SbtError(f"the dask scheduler must stay until the end, but {where} is gone; run again to resume") from None
+
+
+_held: list[tuple[ScenarioSpec, float | None, LocalExecutor]] = []
+"""In a worker: the one executor it keeps."""
+
+
+def _executor_of(spec: ScenarioSpec, timeout: float | None) -> LocalExecutor:
+    """Return this worker's executor; another campaign's is ended first."""
+    if not (_held and _held[0][:2] == (spec, timeout)):
+        _drop()
+        multiprocessing.current_process().daemon = False  # dask's workers are daemons, which may have no children
+        executor = LocalExecutor(spec, 1, timeout)
+        executor.__enter__()
+        _held.append((spec, timeout, executor))
+    return _held[0][2]
+
+
+def _drop() -> None:
+    while _held:
+        _held.pop()[2].__exit__()
+
+
+def _begin(spec: ScenarioSpec, timeout: float | None) -> str:
+    """Start a worker's process, and return the versions there."""
+    _executor_of(spec, timeout)
+    return versions()
+
+
+def _run(spec: ScenarioSpec, jobs: list[Job], timeout: float | None) -> list[Outcome]:
+    """Run jobs in a worker."""
+    return list(_executor_of(spec, timeout).run(jobs))
+
+
+def _end(spec: ScenarioSpec, timeout: float | None) -> None:
+    """End a worker's process, unless another campaign has taken the worker over."""
+    if _held and _held[0][:2] == (spec, timeout):
+        _drop()

@@ -1,0 +1,124 @@
+"""The executor of dask clusters: the same rows, the same fate of bad runs, and workers that come and go."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sbt.errors import InputError
+from sbt.execution.protocol import SerialExecutor
+from sbt.execution.spec import ScenarioSpec
+from sbt.problem.outcome import Job, Outcome, Status
+from sbt.seeds import run_seed
+
+distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed (pip install 'sumo-sbt[dask]')")
+from sbt.execution.dask import DaskExecutor  # noqa: E402
+
+DEADLY = '''
+import os, signal, time
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+
+
+def deadly(values, seed):
+    """Where a < 0.1 the dask worker itself is killed, above the process of the run."""
+    if values["a"] < 0.1:
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(60)
+    return {"y": values["a"]}
+
+
+SPACE = ParameterSpace((Parameter("a", 0.0, 1.0),))
+SCENARIO = LogicalScenario("deadly", SPACE, Requirement("y", CriticalInterval(high=0.0)), evaluate=deadly, metric_names=("y",))
+'''
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    import dask
+
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}), distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, memory_limit=0, dashboard_address=None, silence_logs="CRITICAL"
+    ) as started:  # fmt: skip
+        yield started
+
+
+def jobs(n: int, kind: Callable[[int], float]) -> list[Job]:
+    return [Job(k, {"a": kind(k), "b": k / n}, run_seed(0, k)) for k in range(n)]
+
+
+def found(outcomes: Iterator[Outcome]) -> dict[int, Outcome]:
+    rows = list(outcomes)
+    assert len({o.index for o in rows}) == len(rows), "a run was reported twice"
+    return {o.index: replace(o, seconds=0.0) for o in rows}
+
+
+def test_rows_are_those_of_the_serial_executor_and_bad_runs_have_the_same_fate(cluster: Any, analytic: Path):
+    spec = ScenarioSpec("analytic.py:AWKWARD", str(analytic.parent))
+    work = jobs(60, lambda k: {7: 0.01, 11: 0.02, 12: 0.03, 13: 0.04}.get(k, 0.5))
+    with DaskExecutor(spec, cluster.scheduler_address, 1, timeout=1.0) as executor:
+        rows = found(executor.run(work))
+        assert found(executor.run(jobs(5, lambda k: 0.5))).keys() == set(range(5))
+    assert sorted(rows) == list(range(60))
+    healthy = found(SerialExecutor(spec).run([job for job in work if job.index not in (7, 11)]))
+    assert {k: o for k, o in rows.items() if k not in (7, 11)} == healthy
+    assert (rows[7].status, rows[7].reason) == (
+        Status.CRASHED, "the worker process died, also when this run was tried again alone",
+    )  # fmt: skip
+    assert (rows[11].status, rows[11].reason) == (
+        Status.TIMEOUT, "a run must take at most 1 s: its process was stopped",
+    )  # fmt: skip
+
+
+def test_a_worker_that_is_killed_costs_nothing(cluster: Any, analytic: Path):
+    spec = ScenarioSpec("analytic.py:AWKWARD", str(analytic.parent))
+    with DaskExecutor(spec, cluster.scheduler_address, 1) as executor:
+        outcomes = executor.run(jobs(40, lambda k: 0.05))
+        first = next(outcomes)
+        os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
+        rows = found(iter([first, *outcomes]))
+    assert sorted(rows) == list(range(40))
+    assert {o.status for o in rows.values()} == {Status.OK}
+
+
+def test_a_run_that_kills_dask_workers_is_crashed_and_its_neighbours_are_not(cluster: Any, tmp_path: Path):
+    (tmp_path / "deadly.py").write_text(DEADLY)
+    with DaskExecutor(ScenarioSpec("deadly.py:SCENARIO", str(tmp_path)), cluster.scheduler_address, 1) as executor:
+        rows = found(executor.run([Job(k, {"a": 0.05 if k == 3 else 0.5}, k) for k in range(16)]))
+    assert [k for k, o in sorted(rows.items()) if o.status != Status.OK] == [3]
+    assert (rows[3].status, rows[3].reason) == (Status.CRASHED, "the dask worker died, also when this run was tried again alone")
+    assert len(rows) == 16
+
+
+@pytest.mark.sumo
+def test_a_campaign_on_dask_is_the_serial_one(cluster: Any, rows: Callable[..., Any], campaign: Callable[..., Any]):
+    keys = {"budget": 12, "initial": 6, "batch": 6}
+    one = campaign("one", **keys)
+    many = campaign("many", **keys, executor={"kind": "dask", "address": cluster.scheduler_address})
+    assert rows(many["store"]) == rows(one["store"])
+    cut_in = ScenarioSpec("cut_in")
+    work = [Job(k, {"d_v": 10.0 * k, "d_t": 1.0}, run_seed(1, k)) for k in range(8)]
+    with DaskExecutor(cut_in, cluster.scheduler_address, 1) as executor:
+        assert found(executor.run(work)) == found(SerialExecutor(cut_in).run(work))
+
+
+def test_workers_with_threads_are_refused(analytic: Path):
+    spec = ScenarioSpec("analytic.py:SCENARIO", str(analytic.parent))
+    threads = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**threads, host="tcp://127.0.0.1", silence_logs="CRITICAL") as wrong:  # noqa: SIM117
+        with pytest.raises(InputError, match=r"one thread \(dask worker --nthreads 1\), but tcp://.* has 2"):
+            DaskExecutor(spec, wrong.scheduler_address, 1).__enter__()
+
+
+def test_a_scheduler_that_does_not_answer_is_told(analytic: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sbt.execution.dask._PATIENCE", 1)
+    with pytest.raises(InputError, match=r"a dask scheduler with workers must answer at tcp://127\.0\.0\.1:9 in 1 s"):
+        DaskExecutor(ScenarioSpec("analytic.py:SCENARIO", str(analytic.parent)), "tcp://127.0.0.1:9", 1).__enter__()
