@@ -26,6 +26,7 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import run_seed, stream
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State, VehicleType
 from sbt.sumo.ego import Ego
+from sbt.sumo.sensors import Track
 from sbt.sumo.session import libsumo
 from sbt.sumo.simulation import DEADLINE_STEPS, SumoSimulation
 
@@ -352,6 +353,19 @@ def test_harsher_braking_ahead_makes_nothing_safer():
         y = [_median_ttc(BRAKING, {**values, "a_co": a}) for a in (-1.0, -3.0, -5.0, -7.0, -10.0)]
         assert (np.diff(y) <= 0.05).all(), (values, y)
         assert y[-1] < y[0]
+
+
+def test_a_track_follows_hard_braking_without_a_lag_and_smooths_the_noise():
+    t = np.arange(60) * 0.05
+    gap, speed = 60.0 - 20.0 * t + 4.0 * t**2, 15.0 + 8.0 * t  # ego at 35 m/s, the target's speed grows by 8 m/s^2
+    noise = stream(1, "track").standard_normal((60, 2)) * (0.25, 0.15)
+    exact, noisy = Track(0.3), Track(0.3)
+    ego, co = [35.0] * 60, ["co"] * 60
+    still = np.array([exact(*row) for row in zip(t, co, ego, gap, speed, strict=True)])
+    assert np.abs(still[-20:] - np.stack([gap, 35.0 - speed], axis=1)[-20:]).max() < 0.02
+    rough = np.array([noisy(*row) for row in zip(t, co, ego, gap + noise[:, 0], speed + noise[:, 1], strict=True)])
+    assert (np.diff(rough[-30:] - still[-30:], axis=0).std(axis=0) < 0.5 * np.diff(noise[-30:], axis=0).std(axis=0)).all()
+    assert noisy(3.0, "another", 35.0, 7.0, 30.0) == (7.0, 5.0)  # a new track begins with what is measured
 
 
 def test_the_collision_verdict_is_sumos_where_sumo_has_one():

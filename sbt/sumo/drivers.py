@@ -42,6 +42,7 @@ class AccAeb:
         gap_noise, speed_noise: standard deviations of the sensor (m, m/s).
         sensor_range: of the radar (m).
         path_margin: lateral clearance up to which a road user counts as in the path (m).
+        smoothing: time constant of the radar's track of the target (s); 0: raw measurements.
 
     Raises:
         InputError: a negative time, distance or limit.
@@ -51,7 +52,7 @@ class AccAeb:
         self, rng: np.random.Generator, set_speed: float, *, reaction_time: float = 0.2, lag: float = 0.1, lag_2: float = 0.0,
         time_gap: float = 1.5, distance_min: float = 3.0, acc_accel: float = 2.0, acc_braking: float = 3.5,
         aeb_braking: float = 9.0, aeb_reserve: float | None = 0.5, aeb_distance: float = 1.0, gap_noise: float = 0.25,
-        speed_noise: float = 0.15, sensor_range: float = 200.0, path_margin: float = 0.85,
+        speed_noise: float = 0.15, sensor_range: float = 200.0, path_margin: float = 0.85, smoothing: float = 0.0,
     ):  # fmt: skip
         given = {k: v for k, v in locals().items() if k not in ("self", "rng")}
         for name, value in given.items():
@@ -63,7 +64,9 @@ class AccAeb:
         self._time_gap, self._distance_min = time_gap, distance_min
         self._acc_accel, self._acc_braking = acc_accel, acc_braking
         self._aeb_braking, self._aeb_reserve, self._aeb_distance = aeb_braking, aeb_reserve, aeb_distance
-        sensor = RangeSensor(rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise)
+        sensor = RangeSensor(
+            rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise, smoothing=smoothing
+        )
         self._sensor = sensor.__call__  # a bound method is called faster than an object
         self._delay = DeadTime(reaction_time).__call__
         self._lag = FirstOrderLag(lag).__call__

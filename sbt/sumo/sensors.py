@@ -2,17 +2,65 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sbt.sumo.actors import State
 
-__all__ = ["RangeSensor", "Target"]
+__all__ = ["RangeSensor", "Target", "Track"]
 
 
 Target = tuple[float, float]
 """The nearest road user ahead in the path, as measured: gap from bumper to bumper (m), rate at which it shrinks (m/s)."""
 
 _BLOCK = 128
+
+
+class Track:
+    """What a radar keeps of one road user: gap, speed and acceleration, smoothed over the measurements.
+
+    The speed passes an alpha-beta filter, critically damped, which follows a constant acceleration without a
+    lag; the gap is carried on with the closing speed in between, and so has none either.
+
+    Args:
+        smoothing: time constant (s), > 0.
+
+    Source:
+        Brookner (1998), Tracking and Kalman Filtering Made Easy, 1.2.6 (critically damped g-h filter).
+    """
+
+    def __init__(self, smoothing: float):
+        self._smoothing = smoothing
+        self._name = ""
+        self._dt = self._last = 0.0
+        self._gains = (1.0, 1.0, 1.0)
+        self._state = (0.0, 0.0, 0.0, 0.0)
+
+    def __call__(self, t: float, name: str, own_speed: float, gap: float, speed: float) -> Target:
+        """Put in what was measured of `name` at time t (m, m/s); another road user begins a new track."""
+        dt = t - self._last
+        self._last = t
+        if name != self._name:
+            self._name, acceleration = name, 0.0
+        else:
+            if abs(dt - self._dt) > 1e-9:
+                fading = math.exp(-dt / self._smoothing)
+                self._dt, self._gains = dt, (1.0 - fading, 1.0 - fading**2, (1.0 - fading) ** 2 / dt)
+            of_gap, of_speed, of_acceleration = self._gains
+            before, expected, acceleration, closing = self._state
+            expected += acceleration * dt
+            off = speed - expected
+            speed = expected + of_speed * off
+            acceleration += of_acceleration * off
+            expected_gap = before - 0.5 * dt * (closing + own_speed - speed)
+            gap = expected_gap + of_gap * (gap - expected_gap)
+        self._state = (gap, speed, acceleration, own_speed - speed)
+        return gap if gap > 0.0 else 0.0, own_speed - speed
+
+    def lose(self) -> None:
+        """Forget the road user: it is out of the path."""
+        self._name = ""
 
 
 class RangeSensor:
@@ -28,14 +76,16 @@ class RangeSensor:
         margin: lateral clearance up to which a road user counts as in the path (m).
         gap_noise: standard deviation of the gap (m).
         speed_noise: standard deviation of the closing speed (m/s).
+        smoothing: time constant of the `Track` that it keeps (s); 0: the measurements as they are.
     """
 
     def __init__(
         self, rng: np.random.Generator, *, period: float = 0.05, reach: float = 200.0, margin: float = 0.85,
-        gap_noise: float = 0.25, speed_noise: float = 0.15,
+        gap_noise: float = 0.25, speed_noise: float = 0.15, smoothing: float = 0.0,
     ):  # fmt: skip
         self._rng = rng
         self._period, self._reach, self._margin = period, reach, margin
+        self._track = Track(smoothing) if smoothing > 0.0 else None
         self._noise = (gap_noise, speed_noise)
         self._buffer: list[tuple[float, float]] = []
         self._next = 0
@@ -57,11 +107,15 @@ class RangeSensor:
                 nearest, smallest = other, gap
         if nearest is None:
             self._held = None
+            if self._track is not None:
+                self._track.lose()
             return None
         noise = self._buffer[tick] if tick < len(self._buffer) else self._draw(tick)
-        closing = own.speed - nearest.speed * (nearest.cos * cos + nearest.sin * sin) + noise[1]
-        gap = smallest + noise[0]
-        self._held = held = (gap if gap > 0.0 else 0.0, closing)
+        gap, speed = smallest + noise[0], nearest.speed * (nearest.cos * cos + nearest.sin * sin) - noise[1]
+        if self._track is not None:
+            self._held = held = self._track(t, nearest.name, own.speed, gap, speed)
+        else:
+            self._held = held = (gap if gap > 0.0 else 0.0, own.speed - speed)
         return held
 
     def _draw(self, tick: int) -> tuple[float, float]:
