@@ -25,6 +25,8 @@ __all__ = ["DaskExecutor"]
 
 _TARGET = 0.5
 """Runs are handed out in chunks of about so many seconds: a task of dask costs milliseconds."""
+_GRACE = 5
+"""So many seconds the client may take to say goodbye."""
 _PATIENCE = 60
 """So many seconds a scheduler may take to answer and to have its first worker."""
 
@@ -78,7 +80,7 @@ class DaskExecutor:
         if self._client is not None:
             if self._cluster is None and self._client.status == "running":
                 self._free()
-            self._client.close()
+            self._client.close(timeout=_GRACE)
         if self._cluster is not None:
             self._cluster.close()
         self._client = self._cluster = None
@@ -101,7 +103,10 @@ class DaskExecutor:
 
     def _workers(self) -> list[str]:
         """Return the addresses of the workers there are now."""
-        threads: dict[str, int] = self._client.nthreads()
+        try:
+            threads: dict[str, int] = self._client.nthreads()
+        except OSError as error:  # the client has tried to connect again by now
+            raise self._lost() from error
         for worker, n in threads.items():
             if n != 1:
                 raise InputError(f"every worker must have one thread (dask worker --nthreads 1), but {worker} has {n}")
@@ -146,9 +151,12 @@ class DaskExecutor:
 
         try:
             return list(future.result())
-        except CancelledError:
-            where = self._address or "the one on this machine"
-            raise SbtError(f"the dask scheduler must stay until the end, but {where} is gone; run again to resume") from None
+        except CancelledError as error:
+            raise self._lost() from error
+
+    def _lost(self) -> SbtError:
+        where = self._address or "the one on this machine"
+        return SbtError(f"the dask scheduler must stay until the end, but {where} is gone; run again to resume")
 
 
 _held: list[tuple[ScenarioSpec, float | None, LocalExecutor]] = []
