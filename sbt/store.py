@@ -184,8 +184,8 @@ class Store:
         start = self.planned
         places = range(start, start + len(runs)) if indices is None else indices
         rows = [
-            (index, run.stage, iteration, _dump(dict(run.inputs)), seed, run.log_q, PLANNED)
-            for index, run, seed in zip(places, runs, seeds, strict=True)
+            (index, run.stage, iteration, _dump(dict(run.inputs)), seeds[k], run.log_q, PLANNED)
+            for k, (index, run) in enumerate(zip(places, runs, strict=True))
         ]
         with self._transaction():
             self._db.executemany(
