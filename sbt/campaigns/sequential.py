@@ -214,7 +214,7 @@ class SequentialStage:
         """Return an earlier belief to draw with, where the newest one has lost its precision for no reason.
 
         A fit can fail: hyperparameters of another mode of their posterior. That shows in a doubt ten times as large
-        as that of an earlier batch, although no run since then has surprised the belief of that batch. The estimate
+        as that of an earlier batch, although no critical run since then lay where that batch denied it. The estimate
         is unbiased with any belief that knows only earlier runs.
         """
         drawn = [i for i in log.iterations if i.get("phase") in ("learn", "count") and not i.get("earlier")]
@@ -229,8 +229,8 @@ class SequentialStage:
         since = known.batch >= iteration
         if belief is None or not since.any():
             return None
-        p = np.exp(belief(known.z[since])[0])
-        surprised = np.where(known.critical[since], p < _SURPRISE, p > 1.0 - _SURPRISE).any()
+        met = known.z[since & known.critical]
+        surprised = len(met) > 0 and bool((np.exp(belief(met)[0]) < _SURPRISE).any())
         return None if surprised else belief
 
     def _mixture(self, belief: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
