@@ -111,11 +111,12 @@ class RangeSensor:
                 self._track.lose()
             return None
         noise = self._buffer[tick] if tick < len(self._buffer) else self._draw(tick)
-        gap, speed = smallest + noise[0], nearest.speed * (nearest.cos * cos + nearest.sin * sin) - noise[1]
+        closing = own.speed - nearest.speed * (nearest.cos * cos + nearest.sin * sin) + noise[1]
+        gap = smallest + noise[0]
         if self._track is not None:
-            self._held = held = self._track(t, nearest.name, own.speed, gap, speed)
+            self._held = held = self._track(t, nearest.name, own.speed, gap, own.speed - closing)
         else:
-            self._held = held = (gap if gap > 0.0 else 0.0, own.speed - speed)
+            self._held = held = (gap if gap > 0.0 else 0.0, closing)
         return held
 
     def _draw(self, tick: int) -> tuple[float, float]:
