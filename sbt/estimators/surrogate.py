@@ -59,7 +59,7 @@ def learned(
     metamodel: Metamodel, coordinates: Coordinates, critical: CriticalInterval, z: Points, y: Vector, rng: np.random.Generator
 ) -> LogProbability:
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,)."""
-    u, warp = coordinates(z), Warp.about(y, critical)
+    u, warp = coordinates(z), Warp.about(y, critical, quantile=0.5)
     t, inside = warp.values(y), warp.interval(critical)
     plain = metamodel.fit(u, t, rng)
     trend = _trend(u, t)

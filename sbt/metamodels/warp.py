@@ -17,8 +17,6 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Warp"]
 
-_QUANTILE = 0.25
-
 
 @dataclass(frozen=True)
 class Warp:
@@ -37,14 +35,18 @@ class Warp:
     scale: float
 
     @classmethod
-    def about(cls, y: Vector, critical: CriticalInterval) -> Warp:
-        """Return the warp for values y (n,), about the end of the interval that is nearer to their median."""
+    def about(cls, y: Vector, critical: CriticalInterval, quantile: float = 0.25) -> Warp:
+        """Return the warp for values y (n,), about the end of the interval that is nearer to their median.
+
+        The scale is a quantile of the distances to the edge. A small one shrinks as runs gather at the edge, and
+        with it the warp becomes a step; where they gather much, take a larger one.
+        """
         ends = [end for end in (critical.low, critical.high) if math.isfinite(end)]
         middle = float(np.median(y)) if len(y) else ends[0]
         edge = min(ends, key=lambda end: abs(end - middle))
         distance = np.abs(y - edge)
         distance = distance[distance > 0]
-        scale = float(np.quantile(distance, _QUANTILE)) if len(distance) else 1.0
+        scale = float(np.quantile(distance, quantile)) if len(distance) else 1.0
         return cls(edge, scale)
 
     def values(self, y: Vector) -> Vector:
