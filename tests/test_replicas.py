@@ -96,7 +96,7 @@ class Awkward:
         if self.kind == 2 and t > 0.2:
             return Action(speed=math.nan)
         if self.kind == 3:
-            time.sleep(0.001)
+            time.sleep(0.005)
         if self.kind == 4 and t > 0.2:
             os._exit(3)
         if self.kind == 5 and t > 0.2:
@@ -156,7 +156,7 @@ def test_a_run_that_cannot_share_costs_no_other_and_says_what_it_says_alone(kind
 
 def test_a_run_that_is_too_slow_is_a_timeout_and_its_company_is_not(alone: list[int]):
     long = replace(AWKWARD, duration=0.05 * (DEADLINE_STEPS + 50), step_length=0.05)
-    found = long.limited(0.1).simulate_many(awkward([0, 3, 0, 0]))
+    found = long.limited(0.2).simulate_many(awkward([0, 3, 0, 0]))
     assert [isinstance(t, Trace) for t in found] == [True, False, True, True]
     assert isinstance(found[1], RunError)
     assert found[1].status == Status.TIMEOUT
