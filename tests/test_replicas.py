@@ -15,6 +15,7 @@ import pytest
 
 from sbt import plugins
 from sbt.errors import InputError, RunError
+from sbt.execution import local
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import SerialExecutor
 from sbt.execution.spec import ScenarioSpec
@@ -190,7 +191,7 @@ def test_a_death_or_a_hang_among_runs_at_once_costs_itself_only(
     (tmp_path / "awkward.py").write_text(f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\n" + AWKWARD_FILE)
     jobs = [Job(k, {"kind": kind if k == 4 else 0.0, "v": 20.0 + k}, k) for k in range(12)]
     spec = ScenarioSpec("awkward.py:SCENARIO", str(tmp_path))
-    monkeypatch.setattr(LocalExecutor, "_chunk", lambda self, queue: [queue.popleft() for _ in range(min(6, len(queue)))])
+    monkeypatch.setattr(local, "chunk_of", lambda queue, *_: [queue.popleft() for _ in range(min(6, len(queue)))])
     with LocalExecutor(spec, 1, timeout=1.5) as executor:
         found = {o.index: o for o in executor.run(jobs)}
     assert sorted(found) == list(range(12))
