@@ -18,7 +18,7 @@ import numpy as np
 
 from sbt import testbeds
 from sbt.config.load import parse
-from sbt.learner import _chunked
+from sbt.learner import chunked
 from sbt.metamodels.scores import scores
 from sbt.run import assembly_of, run_campaign, settings_of
 from sbt.seeds import stream
@@ -58,7 +58,7 @@ def boundary(size: int, seed: int) -> dict:
             history = store.history()
     space, seconds = settings.scenario.space, done["result"]["seconds"]
     u = stream(99, "reference").random((20_000, space.dimension))
-    belief = _chunked(settings.learner.train(history.finished), space.metamodel_inputs(u))
+    belief = chunked(settings.learner.train(history.finished), space.metamodel_inputs(u))
     y = testbeds.values(BOUNDARY, space.from_unit(u))
     hours = (done["result"]["iterations"] * SIMULATION + seconds["fit"] + seconds["propose"]) / 3600
     return {"value": scores(belief, y, settings.scenario.requirement.critical)["f1"], "hours": hours}

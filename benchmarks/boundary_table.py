@@ -23,7 +23,7 @@ import numpy as np
 from sbt import testbeds
 from sbt.config.load import parse
 from sbt.execution.local import LocalExecutor
-from sbt.learner import _chunked
+from sbt.learner import chunked
 from sbt.metamodels.scores import scores
 from sbt.problem.outcome import Job
 from sbt.run import assembly_of, run_campaign, settings_of
@@ -85,7 +85,7 @@ def cell(problem: str, method: str, seed: int, folder: Path, n: int) -> dict[str
     predictor = settings.learner.train(history.finished)
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
     x, y = settings.learner.unseen(history) if problem == "table" else reference(problem, settings, folder, n)
-    found = scores(_chunked(predictor, space.metamodel_inputs(space.to_unit(x))), y, critical)
+    found = scores(chunked(predictor, space.metamodel_inputs(space.to_unit(x))), y, critical)
     return {**{k: found[k] for k in (*SHOWN, "base_rate")}, "cpu_s": seconds}
 
 

@@ -21,7 +21,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 
-__all__ = ["Belief", "Learner"]
+__all__ = ["Belief", "Learner", "changed_share", "chunked"]
 
 _PROBE = 4096
 _CHUNK = 4096
@@ -110,7 +110,7 @@ class Learner:
     def _scores(self, predict: Predictor, history: History) -> dict[str, Any]:
         critical, space = self.scenario.requirement.critical, self.scenario.space
         x, y = self.unseen(history)
-        found: dict[str, Any] = scores(_chunked(predict, space.to_unit(x)), y, critical) if len(y) else {}
+        found: dict[str, Any] = scores(chunked(predict, space.to_unit(x)), y, critical) if len(y) else {}
         p = self._probe(predict)
         found["critical_fraction"] = float(p.mean())
         found["expected_misclassified"] = float(np.minimum(p, 1.0 - p).mean())
@@ -127,7 +127,7 @@ class Learner:
         return predict(u).probability(self.scenario.requirement.critical)
 
 
-def _chunked(predict: Predictor, u: Points) -> Prediction:
+def chunked(predict: Predictor, u: Points) -> Prediction:
     """Return the belief at many points, a few thousand at a time."""
     parts = [predict(u[k : k + _CHUNK]) for k in range(0, len(u), _CHUNK)]
     if len(parts) == 1:

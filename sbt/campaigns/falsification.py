@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -68,9 +68,16 @@ def recipe(settings: Settings) -> Campaign:
 
 @dataclass(frozen=True)
 class Hunt:
-    """A falsification as functions of its runs; both stages and the conclusion ask it."""
+    """A falsification as functions of its runs; both stages and the conclusion ask it.
+
+    Args:
+        settings: of the campaign.
+        found: failure modes by the indices of the runs they were found in; stages ask again and again, and rows
+            that are finished never change.
+    """
 
     settings: Settings
+    found: dict[tuple[int, ...], list[Mode]] = field(default_factory=dict, repr=False, compare=False)
 
     @cached_property
     def search(self) -> Search:
@@ -90,6 +97,13 @@ class Hunt:
 
     def modes(self, history: History) -> list[Mode]:
         """Return the failure modes among these runs."""
+        runs = tuple(record.index for record in history.records)
+        if runs not in self.found:
+            self.found.clear()  # only the last answer is asked for again
+            self.found[runs] = self._modes(history)
+        return self.found[runs]
+
+    def _modes(self, history: History) -> list[Mode]:
         scenario = self.settings.scenario
         ok = np.flatnonzero(history.ok)
         if not (self.margin(history) <= 0).any():
@@ -191,7 +205,7 @@ class SearchStage:
         if s.acquisition is not None:
             return self._scored(log, n), {}
         if s.method == "cma_es":
-            picks = self._evolved(runs, u, y, n)
+            picks = self._evolved(runs, u, n)
         elif s.method == "portfolio":
             picks = portfolio.propose(search, u, y, n, rng, runs.iteration)
         else:
@@ -199,14 +213,13 @@ class SearchStage:
         names, counts = np.unique(np.array(picks.why, dtype=np.str_), return_counts=True)
         return picks.u, {str(name): int(count) for name, count in zip(names, counts, strict=True)}
 
-    def _evolved(self, runs: History, u: Points, y: Vector, n: int) -> Picks:
+    def _evolved(self, runs: History, u: Points, n: int) -> Picks:
         """Return the next generation of CMA-ES, which starts at the best run of the even start."""
         s, margin = self.hunt.settings, self.hunt.margin(runs)
         begin = np.where(np.isfinite(margin) & (runs.iteration == 0), margin, np.inf)
         generations = [
             margin[(runs.iteration == k) & (runs.stage == _SEARCH)] for k in np.unique(runs.iteration[runs.stage == _SEARCH])
         ]
-        del y
         return evolution.propose(u[int(np.argmin(begin))], generations, n, s.seed)
 
     def _scored(self, log: Log, n: int) -> Points:

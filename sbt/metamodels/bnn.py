@@ -20,7 +20,7 @@ from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.torch_tools import check_device, device_of, minibatches, single_threaded
+from sbt.metamodels.torch_tools import centred, check_device, device_of, minibatches, single_threaded
 
 __all__ = ["BayesianNetwork", "BayesianNetworkPredictor"]
 
@@ -143,7 +143,7 @@ class BayesianNetworkPredictor:
         with single_threaded(), torch.inference_mode():
             for first in range(0, n, _CHUNK):
                 rows = slice(first, first + _CHUNK)
-                m, v = _forward(layers, masks, _centre(u[rows]).to(device))
+                m, v = _forward(layers, masks, centred(u[rows]).to(device))
                 mean[:, rows], log_variance[:, rows] = m.cpu().numpy(), v.cpu().numpy()
         variance = np.exp(log_variance)
         return Prediction(
@@ -152,11 +152,6 @@ class BayesianNetworkPredictor:
             weight=np.full(k, 1.0 / k),
             noise=self.scale * np.sqrt(variance.mean(axis=0)),
         )
-
-
-def _centre(u: Points) -> torch.Tensor:
-    """Return u (n, d) with mean 0 and variance 1 over the unit cube, float32."""
-    return torch.from_numpy(((u - 0.5) * math.sqrt(12.0)).astype(np.float32))
 
 
 def _mask(logit: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
@@ -186,8 +181,8 @@ def _train(
     layers = [_initial(a, b, rng, device) for a, b in pairwise(sizes)]
     logits = [torch.full((), math.log(0.1 / 0.9), device=device, requires_grad=True) for _ in layers]
     parameters = [*(p for layer in layers for p in layer), *logits]
-    x, target = _centre(rows[0]).to(device), torch.from_numpy(rows[1].astype(np.float32)).to(device)
-    x_out, target_out = _centre(held_out[0]).to(device), torch.from_numpy(held_out[1].astype(np.float32)).to(device)
+    x, target = centred(rows[0]).to(device), torch.from_numpy(rows[1].astype(np.float32)).to(device)
+    x_out, target_out = centred(held_out[0]).to(device), torch.from_numpy(held_out[1].astype(np.float32)).to(device)
     source = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
     adam = torch.optim.Adam(parameters, lr=settings.learning_rate, fused=True)
     schedule = torch.optim.lr_scheduler.StepLR(adam, settings.decay_every, settings.decay)

@@ -20,7 +20,7 @@ from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, standardise
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.torch_tools import check_device, device_of, minibatches, single_threaded
+from sbt.metamodels.torch_tools import centred, check_device, device_of, minibatches, single_threaded
 
 __all__ = ["Ensemble", "EnsemblePredictor"]
 
@@ -115,7 +115,7 @@ class EnsemblePredictor:
         with single_threaded(), torch.inference_mode():
             for first in range(0, n, _CHUNK):
                 rows = slice(first, first + _CHUNK)
-                m, v = _forward(layers, _centre(u[rows]).to(device), self.sigma_floor)
+                m, v = _forward(layers, centred(u[rows]).to(device), self.sigma_floor)
                 mean[:, rows], variance[:, rows] = m.cpu().numpy(), v.cpu().numpy()
         return Prediction(
             mean=self.shift + self.scale * mean,
@@ -123,11 +123,6 @@ class EnsemblePredictor:
             weight=np.full(k, 1.0 / k),
             noise=self.scale * np.sqrt(variance.mean(axis=0)),
         )
-
-
-def _centre(u: Points) -> torch.Tensor:
-    """Return u (n, d) with mean 0 and variance 1 over the unit cube, float32."""
-    return torch.from_numpy(((u - 0.5) * math.sqrt(12.0)).astype(np.float32))
 
 
 def _forward(layers: Any, x: torch.Tensor, sigma_floor: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -165,7 +160,7 @@ def _train(
     device, n = device_of(settings.device), len(z)
     layers = [[torch.from_numpy(a).to(device).requires_grad_() for a in layer] for layer in _initial(settings, u.shape[1], rng)]
     parameters = [p for layer in layers for p in layer]
-    x, target = _centre(u).to(device), torch.from_numpy(z.astype(np.float32)).to(device)
+    x, target = centred(u).to(device), torch.from_numpy(z.astype(np.float32)).to(device)
     validation, training = _folds(settings.members, n, rng)
     steps = round(settings.steps * max(1.0, n / _ROWS))
     decay = min(settings.decay / n, 0.1 / settings.learning_rate)  # at most a tenth of the weights a step

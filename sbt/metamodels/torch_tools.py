@@ -1,7 +1,8 @@
-"""What the metamodels built on PyTorch share: one thread, a device by name, shuffled minibatches."""
+"""What the metamodels built on PyTorch share: one thread, a device by name, centred inputs, minibatches."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -11,9 +12,10 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from sbt.arrays import Points
 from sbt.errors import InputError
 
-__all__ = ["DEVICES", "check_device", "device_of", "minibatches", "single_threaded"]
+__all__ = ["DEVICES", "centred", "check_device", "device_of", "minibatches", "single_threaded"]
 
 DEVICES = ("auto", "cpu", "cuda")
 _THREADS = ThreadpoolController()  # knows the pools that are loaded by now
@@ -33,6 +35,11 @@ def single_threaded() -> Iterator[None]:
             yield
         finally:
             torch.set_num_threads(before)
+
+
+def centred(u: Points) -> torch.Tensor:
+    """Return u (n, d) with mean 0 and variance 1 over the unit cube, float32."""
+    return torch.from_numpy(((u - 0.5) * math.sqrt(12.0)).astype(np.float32))
 
 
 def check_device(device: str) -> None:
