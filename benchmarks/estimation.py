@@ -1,6 +1,6 @@
 """Is the estimate right, and does its interval hold? Many seeds on testbeds with known probability.
 
-    python benchmarks/estimation.py [--seeds 50] [--problems four_branch_7@124,rp38] [--table runs/estimation.jsonl]
+    python benchmarks/estimation.py [--seeds 50] [--problems four_branch_7@124,rp38@200] [--table runs/estimation.jsonl]
 
 Every cell (problem, runs, seed) is a campaign with default settings, through the public way. Finished
 cells are lines of the table: run again to go on where it stopped; `--show` only prints what is there.
@@ -85,6 +85,8 @@ def main() -> None:
     args = parser.parse_args()
     args.table.parent.mkdir(parents=True, exist_ok=True)
     done, cells = finished(args.table), args.problems.split(",")
+    if unknown := set(cells) - set(BARS):
+        parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join(BARS)}")
     for seed in range(0 if args.show else args.seeds):
         for cell in cells:
             if (cell, seed) not in done:

@@ -251,11 +251,11 @@ def _check_same(store: Store, kept: Mapping[str, Any]) -> None:
 
     Only the budget may change (a shard's must not: its share was planned with it), and where runs are executed.
     """
+    from sbt.config.load import differences
+
     before = store.configuration
     fixed = {*kept, *before} - (_MAY_CHANGE - {"budget"} if "shard" in kept else _MAY_CHANGE)
-    changed = sorted(key for key in fixed if kept.get(key) != before.get(key))
-    if changed:
-        told = "; ".join(f"{key}: {before.get(key)} there, {kept.get(key)} now" for key in changed)
+    if told := differences(before, kept, fixed):
         raise InputError(f"a store belongs to one configuration, but {store.folder} was made with another ({told})")
 
 

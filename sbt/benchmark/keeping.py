@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sbt.config.load import Loaded, dump, fingerprint
+from sbt.config.load import Loaded, differences, dump, fingerprint
 from sbt.errors import InputError
 from sbt.problem.scenario import LogicalScenario
 from sbt.store import Store
@@ -33,11 +33,8 @@ def opened(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: obje
         "folder": str(loaded.folder.resolve()), "yaml": dump(loaded.config), **more,
     }  # fmt: skip
     store = Store.open(folder, kept)
-    before = store.configuration
-    changed = sorted(key for key in (*_IDENTITY, *more) if kept.get(key) != before.get(key))
-    if changed:
+    if told := differences(store.configuration, kept, (*_IDENTITY, *more)):
         store.close()
-        told = "; ".join(f"{key}: {before.get(key)} there, {kept.get(key)} now" for key in changed)
         raise InputError(f"a cell belongs to one configuration, but {folder} was made with another ({told})")
     store.update_configuration(kept)
     return store

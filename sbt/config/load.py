@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -26,8 +26,8 @@ from sbt.config.model import Configuration
 from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
 
 __all__ = [
-    "ConfigError", "Loaded", "checked", "dump", "fingerprint", "load", "located", "parse", "read_text", "resolve", "resumed",
-    "schema",
+    "ConfigError", "Loaded", "checked", "differences", "dump", "fingerprint", "load", "located", "parse", "read_text", "resolve",
+    "resumed", "schema",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=BaseModel)
@@ -148,6 +148,22 @@ def fingerprint(config: Configuration) -> dict[str, Any]:
     Plain JSON data: infinite numbers are the texts "inf" and "-inf".
     """
     return {key: _jsonable(value) for key, value in resolve(config).items() if key not in _NOT_IDENTITY}
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: Collection[str]) -> str:
+    """Return in words where two fingerprints differ in these keys; "" where they agree.
+
+    An unset key (None) and a missing one are the same, so that a later version may have more keys.
+
+    >>> differences({"seed": 1, "ego": {"kind": "idm"}}, {"seed": 2, "ego": {"kind": "idm", "tau": None}}, ["seed", "ego"])
+    'seed: 1 there, 2 now'
+    """
+    changed = sorted(key for key in keys if _stated(before.get(key)) != _stated(now.get(key)))
+    return "; ".join(f"{key}: {before.get(key)} there, {now.get(key)} now" for key in changed)
+
+
+def _stated(value: Any) -> Any:
+    return {k: _stated(v) for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
 
 
 def resumed(config: Configuration, stored: Mapping[str, Any]) -> Configuration:
