@@ -37,8 +37,9 @@ from sbt.errors import RunError
 from sbt.testbeds import analytic
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Pool
+from sbt.problem.scenario import LogicalScenario, Metric, Pool
 from sbt.problem.space import ParameterSpace
+from sbt.problem.trace import Trace
 
 BOX = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
 LOW = (-np.inf, 0.0)
@@ -75,6 +76,20 @@ IDLE = analytic(lambda x: np.abs(x[:, 0] - 0.62) - 0.01, inputs=MORE, critical=L
 GRID = np.stack(np.meshgrid(*[np.linspace(0.03, 0.97, 9)] * 2), axis=-1).reshape(-1, 2)
 RECORDED = replace(TWO, name="recorded", pool=Pool(GRID, {"y": two_holes(GRID)}))
 HALF = own("half fails", half)
+
+
+def beside(values, seed):
+    """The other stands ahead of ego where b < 0.5, on its left elsewhere."""
+    x, y = (6.0, 0.0) if values["b"] < 0.5 else (0.0, 3.0)
+    still = np.zeros((1, 2))
+    at = np.array([[0.0, x]]), np.array([[0.0, y]])
+    return Trace(np.zeros(1), ("ego", "co"), *at, still, still + values["a"], still, np.full(2, 4.0), np.full(2, 1.8))
+
+
+SIDES = LogicalScenario(
+    "sides", TWO.space, Requirement("speed", CriticalInterval(high=2.0)), simulate=beside,
+    metrics=(Metric("speed", lambda trace: float(trace.speed[0, 0])),),
+)
 COIN = own("coin", coin)
 '''
 Run = Callable[..., dict[str, Any]]
@@ -123,6 +138,16 @@ def test_both_holes_are_found_confirmed_and_told_apart(hunted: Run):
     assert result["runs"] == 80 + 6
     assert found["bound"] is None
     assert found["statement"].startswith(f"{found['critical_runs']} of 80 runs of the search were critical, in 2 failure modes.")
+
+
+def test_what_differs_in_the_traces_is_not_one_mode(hunted: Run):
+    result = hunted("SIDES", budget=30, stop={"failures": None})
+    kept, modes = rows(result), result["conclusion"]["failure_modes"]
+    assert {mode["conflict"] for mode in modes} == {"ahead of ego, same direction", "left of ego, same direction"}
+    assert sum(mode["size"] for mode in modes) == 30  # everything is critical, and joined by the metamodel
+    assert len(modes) == 2
+    for mode in modes:
+        assert {kept[run][3]["b"] < 0.5 for run in mode["runs"]} == {mode["conflict"].startswith("ahead")}
 
 
 def test_a_failure_of_one_seed_is_told_from_one_of_the_scenario(hunted: Run):

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from sbt.metrics.conflict_type import conflict_type
 from sbt.metrics.geometry import contact_index, corners, rectangle_distance, swept_contact
 from sbt.metrics.longitudinal import BESIDE, HORIZON, OVERTAKEN, collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.trace import ActorTrace, Trace
@@ -234,3 +235,19 @@ def test_more_road_users_only_add_collisions():
     assert ttc_min(other="far")(trio) == OVERTAKEN  # in another lane, and passed in the end
     calm = replace(trio, x=trio.x + np.array([0.0, 500.0, 0.0]), y=trio.y - np.array([0.0, 0.0, 500.0]))
     assert (collision()(calm), ttc_min()(calm), impact_speed()(calm)) == (1.0, HORIZON, 0.0)
+
+
+@given(st.integers(0, 3), st.integers(0, 3), st.floats(-40, 40), st.floats(-40, 40), angle, coordinate, coordinate)
+def test_the_conflict_type_is_side_and_course_wherever_north_is(side, course, off, askew, turn, x, y):
+    bearing, apart = math.radians(90 * side + off / 2), 9.0
+    poses = [(x, y, turn), (x + apart * math.cos(turn + bearing), y + apart * math.sin(turn + bearing),
+             turn + math.radians(90 * course + askew))]  # fmt: skip
+    poses.append((x + 99.0, y, 0.0))  # further away
+    now = np.array(poses)
+    before = now + [20.0, 0.0, 1.0] * np.arange(3)[:, None]  # further away still
+    xs, ys, headings = np.moveaxis(np.stack([before, now, np.full_like(now, np.nan)]), 2, 0).copy()
+    still = np.zeros_like(xs)
+    sizes = np.full(3, 2.0), np.full(3, 2.0)  # as wide as long: bearings alone decide
+    trace = Trace(np.arange(3.0), ("ego", "co", "far"), xs, ys, headings, still, still, *sizes)
+    assert conflict_type()(trace) == 4 * side + course
+    assert conflict_type()(replace(trace, x=np.where([True, False, False], xs, np.nan))) == -1

@@ -1,4 +1,4 @@
-"""Failure modes: critical runs that the metamodel's critical region connects, and what is said of each."""
+"""Failure modes: critical runs of one conflict type that the metamodel's critical region connects; what is said of each."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from scipy.spatial.distance import cdist
 
 from sbt.arrays import Points, Vector
 from sbt.history import History
+from sbt.metrics.conflict_type import NAME as CONFLICT_TYPE
+from sbt.metrics.conflict_type import conflict_type_in_words
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import Belief
 
@@ -19,6 +21,8 @@ __all__ = ["Mode", "connected", "described", "modes_of"]
 _PROBES = 9  # on the segment between two runs
 _MOST = 200  # critical runs that are compared with each other; further ones join the nearest
 _CHUNK = 100  # segments asked for at once
+_UNMEASURED = -2.0
+_FAR = 1e6  # beyond any distance in the unit cube
 _NOT_WITHIN = 1e-9
 
 
@@ -39,17 +43,20 @@ class Mode:
     safe: int | None
 
 
-def connected(belief: Belief, u: Points) -> NDArray[np.int64]:
+def connected(belief: Belief, u: Points, kind: Vector) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
 
     Args:
         belief: of the metamodel.
         u: (n, d) critical runs in the unit cube.
+        kind: (n,) only runs of the same kind are joined.
     """
     n = len(u)
     group = np.arange(n, dtype=np.int64)
     distance = cdist(u, u)
     first, second = np.triu_indices(n, 1)
+    alike = kind[first] == kind[second]
+    first, second = first[alike], second[alike]
     order = np.argsort(distance[first, second], kind="stable")
     first, second = first[order], second[order]
     steps = np.linspace(0.0, 1.0, _PROBES + 2)[1:-1, None]
@@ -83,9 +90,10 @@ def modes_of(belief: Belief, history: History, scenario: LogicalScenario) -> lis
     u = scenario.space.to_unit(history.x)
     depth = critical.margin(y)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
-    group = connected(belief, u[chosen])
-    nearest = cdist(u[hits], u[chosen]).argmin(axis=1)
-    label = group[nearest]
+    kind = _kind(history)
+    group = connected(belief, u[chosen], kind[chosen])
+    apart = kind[hits][:, None] != kind[chosen][None, :]
+    label = group[(cdist(u[hits], u[chosen]) + _FAR * apart).argmin(axis=1)]
     log_p = scenario.space.log_density(history.x[hits])
     uncritical = np.flatnonzero(np.isfinite(y) & ~critical.contains(y))
     found = []
@@ -96,6 +104,11 @@ def modes_of(belief: Belief, history: History, scenario: LogicalScenario) -> lis
         safe = int(uncritical[cdist(u[[representative]], u[uncritical])[0].argmin()]) if len(uncritical) else None
         found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
     return sorted(found, key=lambda mode: (depth[mode.representative], mode.representative))
+
+
+def _kind(history: History) -> Vector:
+    """Return (n,) the type of conflict of every run; all the same where it is not measured."""
+    return np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED)
 
 
 def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed: Vector) -> dict[str, Any]:
@@ -112,6 +125,7 @@ def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed
     likely = history.records[mode.most_likely]
     told = {
         "representative": record.index, "inputs": dict(record.inputs), "metric": record.metrics[metric], "size": len(mode.rows),
+        "conflict": conflict_type_in_words(record.metrics.get(CONFLICT_TYPE, -1.0)),
         "runs": [history.records[k].index for k in mode.rows],
         "confirmed": float(critical.contains(confirmed).mean()) if len(confirmed) else None, "confirmation_runs": len(confirmed),
         "most_likely": {"run": likely.index, "inputs": dict(likely.inputs), "metric": likely.metrics[metric]},

@@ -99,7 +99,8 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     ego = None if config.ego is None else _plain_ego(config.ego, loaded.folder)
     folder = str(loaded.folder.resolve())
     step, formula = config.simulation.step_length, config.requirement.stl
-    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, step, formula)
+    types = config.campaign == "falsification"  # its failure modes are told apart by them
+    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, step, formula, types)
 
 
 def _plain_ego(ego: Choice, folder: Path) -> dict[str, Any]:

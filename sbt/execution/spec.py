@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from sbt.errors import InputError, PluginError
+from sbt.metrics.conflict_type import conflict_type
 from sbt.plugins import load
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, Metric
 
 __all__ = ["ScenarioSpec"]
 
@@ -31,6 +32,7 @@ class ScenarioSpec:
         isolation: auto, fresh, reuse or replicas; scenarios without SUMO ignore it.
         step_length: simulation step (s); None: the scenario's own.
         formula: of signal temporal logic, measured as the metric `stl` and required; None: the scenario's own requirement.
+        conflict_type: measure how ego and the nearest other met as well, where runs have a trace.
     """
 
     name: str
@@ -39,6 +41,7 @@ class ScenarioSpec:
     isolation: str = "auto"
     step_length: float | None = None
     formula: str | None = None
+    conflict_type: bool = False
 
     def resolve(self) -> LogicalScenario:
         """Return the scenario; loaded once per process and specification.
@@ -48,12 +51,13 @@ class ScenarioSpec:
             InputError: the scenario does not offer one of the choices.
         """
         ego = None if self.ego is None else json.dumps(dict(self.ego), sort_keys=True)
-        return _resolve(self.name, str(Path(self.folder).resolve()), ego, self.isolation, self.step_length, self.formula)
+        folder = str(Path(self.folder).resolve())
+        return _resolve(self.name, folder, ego, self.isolation, self.step_length, self.formula, self.conflict_type)
 
 
 @cache
 def _resolve(
-    name: str, folder: str, ego: str | None, isolation: str, step_length: float | None, formula: str | None
+    name: str, folder: str, ego: str | None, isolation: str, step_length: float | None, formula: str | None, conflict: bool
 ) -> LogicalScenario:
     scenario = load("scenarios", name, Path(folder))
     if not isinstance(scenario, LogicalScenario):
@@ -61,6 +65,8 @@ def _resolve(
         raise PluginError(f"a scenario must be a LogicalScenario, but '{name}' is a {type(scenario).__name__}{hint}")
     if formula is not None:
         scenario = _requiring(scenario, formula)
+    if conflict and scenario.simulate is not None:
+        scenario = _measuring(scenario, conflict_type(scenario.roles.ego))
     chosen = scenario.configured(None if ego is None else json.loads(ego), None, step_length)
     return chosen.configured(isolation=isolation)  # afterwards: what is allowed may depend on the ego
 
@@ -73,5 +79,9 @@ def _requiring(scenario: LogicalScenario, formula: str) -> LogicalScenario:
         raise InputError(f"a formula needs the trace of a run, but scenario {scenario.name} gives its metrics directly")
     roles = scenario.roles
     metric = stl(formula, "stl", roles.ego, roles.other, roles.margin)
-    others = tuple(m for m in scenario.metrics if m.name != metric.name)
-    return replace(scenario, metrics=(*others, metric), requirement=Requirement(metric.name, CriticalInterval(high=0.0)))
+    return replace(_measuring(scenario, metric), requirement=Requirement(metric.name, CriticalInterval(high=0.0)))
+
+
+def _measuring(scenario: LogicalScenario, metric: Metric) -> LogicalScenario:
+    """Return the scenario with one more metric, in place of one of the same name."""
+    return replace(scenario, metrics=(*(m for m in scenario.metrics if m.name != metric.name), metric))

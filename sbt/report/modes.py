@@ -18,25 +18,28 @@ __all__ = ["drawing_of_modes", "mode_table"]
 _MOST_COLOURS = 8
 _COLOURS = ("#c1272d", "#1f4e79", "#e08e0b", "#2e7d5b", "#7b4fa3", "#0e8fa0", "#8a5a2b", "#d1579a")
 _NOTE = (
-    "Critical runs that the metamodel joins by a segment with P(critical) > 0.5 are one mode, the deepest mode first. Confirmed:"
-    " share of repetitions of the representative with fresh seeds that were critical again. What makes it safe: the change of"
-    " inputs to the nearest run, in the unit cube, that is not critical. Most likely: the mode's run of largest density."
+    "Critical runs are one mode where the metamodel joins them by a segment with P(critical) > 0.5 and the nearest road user"
+    " was on the same side of ego and on the same course; the deepest mode first. Confirmed: share of repetitions of the"
+    " representative with fresh seeds that were critical again. What makes it safe: the change of inputs to the nearest run, in"
+    " the unit cube, that is not critical. Most likely: the mode's run of largest density."
 )
 
 
 def mode_table(found: Findings, space: ParameterSpace) -> Table:
     """Return one row a failure mode; no rows where the campaign found none or does not look for them."""
     modes = _modes(found)
-    rows = []
+    rows, typed = [], any(mode.get("conflict") for mode in modes)
     for number_of, mode in enumerate(modes, 1):
         confirmed = NOTHING if mode["confirmed"] is None else f"{share(mode['confirmed'])} of {mode['confirmation_runs']}"
         rows.append((
             Cell.of(number_of), Cell.of(mode["representative"]), Cell.of(mode["metric"]), Cell.of(mode["size"]), Cell(confirmed),
+            *(() if not typed else (Cell(mode.get("conflict") or NOTHING),)),
             *(Cell.of(mode["inputs"][name]) for name in space.names), Cell(_change(mode, space)),
             Cell.of(mode["most_likely"]["run"]),
         ))  # fmt: skip
     metric = found.requirement.metric
-    columns = ("mode", "representative", metric, "runs", "confirmed", *space.names, "what makes it safe", "most likely")
+    who = ("other road user",) if typed else ()
+    columns = ("mode", "representative", metric, "runs", "confirmed", *who, *space.names, "what makes it safe", "most likely")
     return Table(columns, tuple(rows), _NOTE if rows else "")
 
 

@@ -1,0 +1,82 @@
+"""The type of a conflict: on which side of ego, and on what course, the nearest other was when it was nearest.
+
+Runs that fail in the same way have the same type; falsification tells failure modes apart by it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sbt.metrics.geometry import rectangle_distance
+from sbt.metrics.longitudinal import FAR
+from sbt.problem.scenario import Metric
+from sbt.problem.trace import ActorTrace, Trace
+
+__all__ = ["NAME", "conflict_type", "conflict_type_in_words"]
+
+NAME = "conflict_type"
+_SIDES = ("ahead of ego", "left of ego", "behind ego", "right of ego")
+_COURSES = ("same direction", "crossing from the right", "oncoming", "crossing from the left")
+_ALONE = -1
+
+
+def conflict_type(ego: str = "ego") -> Metric:
+    """Return the metric `conflict_type`: 4 side + course at the instant of the smallest distance, -1 with nobody within 1 km.
+
+    Side: 0 ahead, 1 left, 2 behind, 3 right of ego's rectangle, whichever face the other is farther outside of.
+    Course: the other's heading relative to ego's, 0 the same, 1 turned left by 45 to 135 degrees (it comes from the
+    right), 2 oncoming, 3 turned right. A road user that is not there at an instant (NaN) does not count.
+    """
+
+    def function(trace: Trace) -> float:
+        own, column = trace.actor(ego), trace.actors.index(ego)
+        reach = 0.5 * np.hypot(trace.length, trace.width)
+        centres = np.hypot(trace.x - own.x[:, None], trace.y - own.y[:, None])  # (t, m)
+        least = np.where(np.isfinite(centres), centres, np.inf).min(axis=0) - reach - reach[column]
+        best, code = FAR, _ALONE
+        for k in np.argsort(least, kind="stable").tolist():  # the nearest first
+            if k != column and least[k] < best:
+                other = trace.actor(trace.actors[k])
+                distance, at = _nearest(own, other)
+                if distance < best:
+                    best, code = distance, _code(own, other, at)
+        return float(code)
+
+    return Metric(
+        NAME, function, "", "low", _ALONE, "side of ego and course of the nearest other, when nearest: 4 side + course, -1 nobody"
+    )
+
+
+def _nearest(ego: ActorTrace, other: ActorTrace) -> tuple[float, int]:
+    """Return the smallest distance of the rectangles (m, inf where they never meet) and its first instant."""
+    distance = rectangle_distance(ego, other)
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    k = int(distance.argmin())
+    return float(distance[k]), k
+
+
+def _code(ego: ActorTrace, other: ActorTrace, k: int) -> int:
+    cos, sin = math.cos(ego.heading[k]), math.sin(ego.heading[k])
+    dx, dy = other.x[k] - ego.x[k], other.y[k] - ego.y[k]
+    along, across = cos * dx + sin * dy, cos * dy - sin * dx
+    turned = math.remainder(other.heading[k] - ego.heading[k], 2.0 * math.pi)
+    c, s = abs(math.cos(turned)), abs(math.sin(turned))
+    outside_along = abs(along) - 0.5 * (ego.length + c * other.length + s * other.width)
+    outside_across = abs(across) - 0.5 * (ego.width + s * other.length + c * other.width)
+    lengthwise = 0 if along >= 0 else 2
+    side = lengthwise if outside_along >= outside_across else 1 if across > 0 else 3
+    return 4 * side + round(turned / (0.5 * math.pi)) % 4
+
+
+def conflict_type_in_words(code: float) -> str:
+    """Return the type in words; "" without anyone.
+
+    >>> conflict_type_in_words(0.0), conflict_type_in_words(13.0), conflict_type_in_words(-1.0)
+    ('ahead of ego, same direction', 'right of ego, crossing from the right', '')
+    """
+    return "" if code < 0 else f"{_SIDES[int(code) // 4]}, {_COURSES[int(code) % 4]}"
+
+
+CONFLICT_TYPE = conflict_type()
