@@ -6,14 +6,17 @@ import importlib.util
 import os
 import shutil
 import sys
+import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from sbt.errors import InputError
 from sbt.sumo.session import session
 
 __all__ = ["gui_program", "watch"]
+
+_EGO = (193, 39, 45, 255)
+_ZOOM = 2000.0
 
 
 def gui_program() -> str:
@@ -33,7 +36,18 @@ def gui_program() -> str:
     return found
 
 
-def watch(simulate: Any, values: Any, seed: int, program: str, delay: float = 0.05) -> Any:
+class _Instead:
+    """Another object with some of its attributes replaced."""
+
+    def __init__(self, original: Any, **replaced: Any):
+        self._original = original
+        self.__dict__.update(replaced)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._original, name)
+
+
+def watch(simulate: Any, values: Any, seed: int, program: str, linger: float = 2.0) -> Any:
     """Run one concrete scenario in another SUMO program, and return its trace.
 
     Args:
@@ -41,40 +55,38 @@ def watch(simulate: Any, values: Any, seed: int, program: str, delay: float = 0.
         values: its inputs.
         seed: of the run.
         program: sumo-gui, or sumo.
-        delay: wall-clock time of a step (s).
+        linger: how long the window shows the first and the last instant (s); between them it goes in real time.
 
     Raises:
         RunError: the program ends, or the run fails.
     """
     import traci
 
-    seen: list[str] = []
+    due: list[float] = []  # when, on the clock, the next step is; empty until the ego is there
+    in_window = "gui" in Path(program).name
 
     def start(command: list[str]) -> None:
-        shown = ["--start", "--quit-on-end", "--delay", str(round(1000 * delay))] if "gui" in Path(program).name else []
+        shown = ["--start", "--quit-on-end", "--window-size", "1200,800"] if in_window else []
         traci.start([program, *command[1:], *shown])
 
     def step(*_: Any) -> None:
+        if due:  # SUMO's own delay has no effect when traci makes the steps
+            time.sleep(max(0.0, due[0] - time.monotonic()))
+            due[0] += simulate.step_length
         traci.simulationStep()
-        if shown_in_window and not seen and "ego" in traci.vehicle.getIDList():
-            seen.append("ego")
+        if in_window and not due and "ego" in traci.vehicle.getIDList():
+            traci.vehicle.setColor("ego", _EGO)
+            traci.gui.setSchema(traci.gui.DEFAULT_VIEW, "real world")
             traci.gui.trackVehicle(traci.gui.DEFAULT_VIEW, "ego")
-            traci.gui.setZoom(traci.gui.DEFAULT_VIEW, 800)
+            traci.gui.setZoom(traci.gui.DEFAULT_VIEW, _ZOOM)
+            due.append(time.monotonic() + linger)
 
-    shown_in_window = "gui" in Path(program).name
-    simulation = SimpleNamespace(
-        step=step,
-        getCollisions=traci.simulation.getCollisions,
-        getCollidingVehiclesNumber=traci.simulation.getCollidingVehiclesNumber,
-    )
-    client = SimpleNamespace(
-        vehicle=traci.vehicle, person=traci.person, polygon=traci.polygon, route=traci.route, simulation=simulation,
-        load=traci.load, isLoaded=traci.isLoaded, start=start, simulationStep=step,
-        TraCIException=traci.TraCIException, FatalTraCIError=traci.FatalTraCIError,
-    )  # fmt: skip
+    client = _Instead(traci, simulation=_Instead(traci.simulation, step=step), start=start, simulationStep=step)
     with session().through(client):
         try:
-            return simulate.configured(isolation="fresh")(values, seed)
+            trace = simulate.configured(isolation="fresh")(values, seed)
+            time.sleep(linger if in_window else 0.0)
+            return trace
         finally:
             if traci.isLoaded():
                 traci.close()
