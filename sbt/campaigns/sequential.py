@@ -239,11 +239,14 @@ class SequentialStage:
             return Mixture(self._wide)
         z, log_q = Mixture(self._wide).sample_near(_CANDIDATES, known.z[known.critical], rng)
 
+        at_start = belief(z)  # both clouds begin there
+
         def mass(points: Points) -> Vector:
-            return log_normal(points) + belief(points)[0]
+            log_pi, _ = at_start if points is z else belief(points)
+            return log_normal(points) + log_pi
 
         def doubt(points: Points) -> Vector:
-            log_pi, log_not = belief(points)
+            log_pi, log_not = at_start if points is z else belief(points)
             return log_normal(points) + 0.5 * (log_pi + log_not)
 
         clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, doubt))

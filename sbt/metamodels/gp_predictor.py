@@ -21,7 +21,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["GaussianProcessPredictor", "Hyperparameters", "NoiseSpread", "cholesky", "matern", "relative"]
 
-_CHUNK = 2048  # points predicted at once
+_CHUNK = 512  # points predicted at once
 _QUICK = 256  # points bounded at once: what is in between stays in the cache
 _BLOCK = 128  # rows summed in single precision
 _MARGIN = 3e-5  # of a mean in single precision: 128 roundings of 6e-8 in a sum, a few in each term
@@ -167,8 +167,13 @@ def matern(distance: Points, nu: float) -> Points:
         Rasmussen & Williams (2006), eq. (4.17).
     """
     r = math.sqrt(2.0 * nu) * distance
-    polynomial = {0.5: 1.0, 1.5: 1.0 + r, 2.5: 1.0 + r + r**2 / 3.0}[nu]
-    return np.asarray(polynomial * np.exp(-r))
+    correlation = np.negative(r)
+    np.exp(correlation, out=correlation)
+    if nu > 0.5:  # in place: these arrays are large
+        square = r * r / 3.0 if nu == 2.5 else None
+        r += 1.0
+        correlation *= r if square is None else np.add(r, square, out=r)
+    return correlation
 
 
 @dataclass(frozen=True, eq=False)
