@@ -41,8 +41,8 @@ def proposal(campaign: str, testbed: str, runs: int, seed: int) -> float:
     try:
         with tempfile.TemporaryDirectory() as folder:
             text = (
-                f"campaign: {campaign}\nscenario: testbed:{testbed}\nbudget: {runs + 10}\ninitial: {runs}\nbatch: 10\nseed: {seed}\n"
-                f"executor: {{kind: serial}}\nstore: {folder}/store\n"
+                f"campaign: {campaign}\nscenario: testbed:{testbed}\nbudget: {runs + 10}\ninitial: {runs}\nbatch: 10\n"
+                f"seed: {seed}\nexecutor: {{kind: serial}}\nstore: {folder}/store\n"
             )
             if campaign == "falsification":
                 text += "stop: {failures: null}\n"
