@@ -250,4 +250,5 @@ def test_the_conflict_type_is_side_and_course_wherever_north_is(side, course, of
     sizes = np.full(3, 2.0), np.full(3, 2.0)  # as wide as long: bearings alone decide
     trace = Trace(np.arange(3.0), ("ego", "co", "far"), xs, ys, headings, still, still, *sizes)
     assert conflict_type()(trace) == 4 * side + course
+    assert conflict_type("nobody")(trace) == 4 * side + course
     assert conflict_type()(replace(trace, x=np.where([True, False, False], xs, np.nan))) == -1

@@ -27,11 +27,13 @@ def conflict_type(ego: str = "ego") -> Metric:
 
     Side: 0 ahead, 1 left, 2 behind, 3 right of ego's rectangle, whichever face the other is farther outside of.
     Course: the other's heading relative to ego's, 0 the same, 1 turned left by 45 to 135 degrees (it comes from the
-    right), 2 oncoming, 3 turned right. A road user that is not there at an instant (NaN) does not count.
+    right), 2 oncoming, 3 turned right. A road user that is not there at an instant (NaN) does not count. Where nobody has
+    the name `ego`, ego is the first actor: a scenario need not say how it calls its own.
     """
 
     def function(trace: Trace) -> float:
-        own, column = trace.actor(ego), trace.actors.index(ego)
+        column = trace.actors.index(ego) if ego in trace.actors else 0
+        own = trace.actor(trace.actors[column])
         reach = 0.5 * np.hypot(trace.length, trace.width)
         centres = np.hypot(trace.x - own.x[:, None], trace.y - own.y[:, None])  # (t, m)
         least = np.where(np.isfinite(centres), centres, np.inf).min(axis=0) - reach - reach[column]
