@@ -33,8 +33,8 @@ _POSITION = "next_position"
 _FEW = 2**14  # candidates that the mix looks at by rejection before it turns to particles
 _CANDIDATES = 4096
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
-_TYPICAL = 0.5  # share of what neither hunts nor fills the space; the rest is chosen greedily
-_DRAWN, _MOST_DRAWN = 400, 2000  # points that the representative ones are chosen from
+_TYPICAL = 0.8  # share of what neither hunts nor fills the space; the rest is chosen greedily
+_DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def _typical(
 ) -> tuple[RoiDraw, Points]:
     """Return a draw from a_BI, and the n of its points that represent it best beside the runs there are."""
     space = settings.scenario.space
-    drawn = max(n, min(_DRAWN + 4 * n, _MOST_DRAWN)) if n else 0
+    drawn = max(n, min(_DRAWN + 2 * n, _MOST_DRAWN)) if n else 0
     draw, x = _draw(settings, belief, boundary, log, drawn, taken=taken, start=start, most=_FEW)
     u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.history.x, taken])))
     scale = influence(belief.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
