@@ -1,6 +1,7 @@
-"""Does a_BI find the boundary better than evenly distributed runs? Scored on one common reference set.
+"""Does an active campaign find the boundary better than evenly distributed runs? Scored on one common reference set.
 
     python benchmarks/boundary.py [--scenario cut_in] [--seeds 10] [--budget 200] [--reference 20000]
+                                 [--acquisition mix]
 
 For each seed two campaigns of equal budget run in SUMO: `boundary` and `coverage`, with the same
 metamodel. After each batch the metamodel is fitted to the runs so far and scored on pseudo-random
@@ -33,9 +34,11 @@ METRICS = ("precision_at_recall_90", "average_precision", "f1", "log_likelihood_
 
 
 def configuration(args: argparse.Namespace, campaign: str, seed: int, folder: str) -> str:
+    kind = args.acquisition if campaign == "boundary" else "even"
     return (
         f"campaign: {campaign}\nscenario: {args.scenario}\nseed: {seed}\nbudget: {args.budget}\ninitial: {args.batch}\n"
         f"batch: {args.batch}\nmetamodel: {{kind: {args.metamodel}}}\nvalidation: {{share: 0}}\nstore: {folder}\n"
+        f"acquisition: {{kind: {kind}}}\n"
     )
 
 
@@ -65,6 +68,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="cut_in")
     parser.add_argument("--metamodel", default="gp")
+    parser.add_argument("--acquisition", default="mix", help="of the campaign boundary; `boundary`: the paper's rule")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--budget", type=int, default=200)
     parser.add_argument("--batch", type=int, default=50)

@@ -8,17 +8,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 from typer.testing import CliRunner
 
 from sbt import testbeds
 from sbt.acquisition import expected_feasibility, straddle
+from sbt.campaign import Log
+from sbt.campaigns.hunt import HUNTED, in_vain, is_on
+from sbt.campaigns.settings import Settings
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.history import VALIDATION
+from sbt.history import VALIDATION, History, Record
+from sbt.learner import Belief, Learner
+from sbt.metamodels.gp import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
 from sbt.run import run_campaign
-from sbt.samplers.greedy import diverse, influence, refined
+from sbt.samplers.greedy import diverse, influence, refined, representative
 from sbt.samplers.smc import smc
 from sbt.samplers.surface import crossings
 from sbt.seeds import stream
@@ -129,16 +135,98 @@ def test_every_rule_finds_the_boundary(tmp_path: Path, method: str):
     assert len(np.unique(chosen, axis=0)) == len(chosen) == 90
 
 
-def test_shares_of_the_mix(tmp_path: Path):
-    run(tmp_path, scenario="'testbed:cut_in_crash:box'", budget=120, initial=40, batch=20, validation="{share: 0.1}")
+@pytest.mark.parametrize(("share", "filling"), [(0.1, 0), (0.0, 8)])
+def test_shares_of_the_mix(tmp_path: Path, share: float, filling: int):
+    """Ten percent fill the space, held-out runs included; of the others four fifths are representative."""
+    keys = {"scenario": "'testbed:cut_in_crash:box'", "budget": 120, "initial": 40, "batch": 20}
+    run(tmp_path, **keys, validation=f"{{share: {share}}}")
     with Store.read(tmp_path / "store") as store:
         hows = store.iterations()[1:]
     assert [how["method"] for how in hows] == ["mix"] * 4
-    drawn, filling, greedy, held_out = (sum(how[k] for how in hows) for k in ("drawn", "filling", "greedy", "held_out"))
-    assert drawn + filling + greedy + sum(how["hunted"] for how in hows) == 72
-    assert held_out == 8
-    assert 15 <= drawn <= 20
-    assert 8 <= filling <= 12
+    counted = {k: sum(how[k] for how in hows) for k in ("hunted", "filling", "representative", "greedy", "held_out")}
+    assert sum(counted.values()) == 80
+    assert counted["hunted"] == 0  # 14 % of the space is critical
+    assert counted["filling"] + counted["held_out"] == 8
+    assert counted["filling"] == filling
+    assert counted["representative"] == pytest.approx(0.8 * 72, abs=1)
+
+
+def test_representative_picks_leave_little_doubt_far_from_a_run():
+    rng = stream(7, "representative")
+    u, weight, there = rng.random((300, 3)), rng.random(300), rng.random((10, 3))
+    scale = np.array([1.0, 0.5, 0.05])
+
+    def left(picks: tuple[int, ...]) -> float:
+        runs = np.concatenate([there, u[list(picks)]]) * scale
+        return float(weight @ cdist(u * scale, runs, "sqeuclidean").min(axis=1))
+
+    picks = tuple(representative(u, weight, there, 6, scale).tolist())
+    assert len(set(picks)) == 6
+    best = min(left((k,)) for k in range(300))
+    assert left(picks[:1]) == pytest.approx(best)
+    random = [left(tuple(rng.choice(300, 6, replace=False))) for _ in range(200)]
+    assert left(picks) < min(random)
+    assert len(representative(there, np.ones(10), there, 3, scale)) == 0  # nobody's duplicate
+    assert len(representative(u, np.where(u[:, 0] < 0.5, 1.0, 0.0), u[u[:, 0] < 0.5], 3, scale)) == 0  # no doubt is left
+
+
+def hunting_log(batches: list[tuple[int, list[tuple[float, float]]]]) -> Log:
+    """Return a log of batches (runs that hunted, x and y of each run); critical is y <= 0, one input."""
+    rows, hows = [], []
+    for k, (hunted, runs) in enumerate(batches):
+        hows.append({"iteration": k, HUNTED: hunted})
+        for x, y in runs:
+            rows.append(Record(len(rows), "boundary", k, {"x": x}, 0, "ok", {"y": y}, "", None, 0.0, "", ""))
+    return Log(History(("x",), tuple(rows)), tuple(hows), ())
+
+
+def hunter(budget: int) -> Settings:
+    scenario = testbeds.analytic(lambda x: x[:, 0], inputs={"x": (0.0, 1.0)}, critical=(-math.inf, 0.0), name="line")
+    learner = Learner(scenario, GaussianProcess(), 0)
+    return Settings(scenario, 0, budget, 5, 5, 0.0, 0, learner, None)
+
+
+NEVER, HIT = [(0.2, 1.0), (0.4, 1.0), (0.6, 1.0)], [(0.1, -1.0), (0.2, 1.0), (0.3, 1.0)]
+
+
+def test_a_hunt_ends_when_it_was_in_vain_for_a_fifth_of_the_budget():
+    rare, common = (Belief(lambda u: Prediction.gaussian(u, u), {"critical_fraction": p}, 9, 0.0) for p in (1e-3, 0.1))
+    nothing = hunting_log([(0, NEVER)] + [(2, NEVER)] * 9)
+    assert in_vain(hunter(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
+    assert is_on(hunter(40), rare, nothing)
+    assert not is_on(hunter(40), common, nothing)
+    before = [(0, NEVER), (2, HIT)]
+    spent = [in_vain(hunter(40), hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
+    assert spent == [0, 2, 4, 6, 8, 10]
+    on = [is_on(hunter(40), rare, hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
+    assert on == [True] * 4 + [False] * 2
+    same = hunting_log([*before, (2, NEVER), (2, [(0.15, -1.0), (0.3, 1.0)])])
+    another = hunting_log([*before, (2, NEVER), (2, [(0.3, 1.0), (0.9, -1.0)])])
+    by_doubt = hunting_log([*before, (2, NEVER), (1, [(0.3, 1.0), (0.9, -1.0)])])
+    assert [in_vain(hunter(40), log) for log in (same, another, by_doubt)] == [4, 0, 3]
+
+
+SMALL = """
+import numpy as np
+from sbt.testbeds import analytic
+
+def discs(x):
+    return np.minimum(np.hypot(x[:, 0] - 0.2, x[:, 1] - 0.3), np.hypot(x[:, 0] - 0.8, x[:, 1] - 0.7)) - 0.02
+
+DISCS = analytic(discs, inputs={"a": (0.0, 1.0), "b": (0.0, 1.0)}, critical=(-np.inf, 0.0), name="two small discs")
+"""
+
+
+def test_small_regions_are_hunted_until_all_are_known(tmp_path: Path):
+    (tmp_path / "small.py").write_text(SMALL)
+    run(tmp_path, scenario=f"'{tmp_path / 'small.py'}:DISCS'", budget=100, initial=10, batch=10, seed=4)
+    with Store.read(tmp_path / "store") as store:
+        hows, history = store.iterations(), store.history()
+    hits = history.x[history.y("y") <= 0.0]
+    assert len(np.unique(hits[:, 0] > 0.5)) == 2  # both regions
+    hunted = np.array([how.get(HUNTED, 0) for how in hows])
+    assert hunted[1] > 0
+    assert hunted[-1] == 0
 
 
 def test_stops_where_little_is_expected_on_the_wrong_side(tmp_path: Path):

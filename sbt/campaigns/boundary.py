@@ -25,8 +25,9 @@ _GREEDY = {"u": boundary, "straddle": straddle, "expected_feasibility": expected
 def recipe(settings: Settings) -> Campaign:
     """Return the campaign: even first, then batches from the acquisition's region of interest.
 
-    The acquisition decides how: `mix` (greedy, a_BI at random, space filling), `u`, `straddle` and
-    `expected_feasibility` greedily, any acquisition function by rejection (`boundary`: the paper's).
+    The acquisition decides how: `mix` (a hunt where critical runs are rare, representative of a_BI,
+    greedy, space filling), `u`, `straddle` and `expected_feasibility` greedily, any acquisition function
+    by rejection (`boundary`: the paper's).
 
     The conclusion holds shares of the input space as the metamodel sees them: `critical_fraction`, the
     mean P(critical), `expected_misclassified`, the mean of min(P, 1 - P), and `ambiguous_volume`,

@@ -16,15 +16,13 @@ import numpy as np
 from sbt.acquisition import boundary, even
 from sbt.arrays import Mask, Points, Vector
 from sbt.campaign import Log
+from sbt.campaigns.hunt import HUNTED, SHARE, hunt, is_on
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
-from sbt.history import VALIDATION
 from sbt.learner import Belief
-from sbt.samplers.greedy import diverse, influence, refined
+from sbt.samplers.greedy import diverse, influence, refined, representative
 from sbt.samplers.pool import PoolSequence
-from sbt.samplers.portfolio import propose
 from sbt.samplers.roi import RoiDraw, rejection
-from sbt.samplers.search import Search
 from sbt.samplers.smc import smc
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
@@ -32,11 +30,11 @@ from sbt.seeds import stream
 __all__ = ["Choice", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 
 _POSITION = "next_position"
-_FEW = 2**15  # candidates that the mix looks at by rejection before it turns to particles
+_FEW = 2**14  # candidates that the mix looks at by rejection before it turns to particles
 _CANDIDATES = 4096
-_RANDOM, _FILLING = 0.25, 0.15  # shares of the mix; the rest is chosen greedily
-_HUNTING = (0.35, 0.1)  # share that hunts, in the first and in the second half of the budget
-_RARE = 0.02  # critical share of the space below which a region is easily missed, and hunted
+_FILLING = 0.1  # share of the mix that fills the space, held-out runs included
+_TYPICAL = 0.8  # share of what neither hunts nor fills the space; the rest is chosen greedily
+_DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,22 +84,21 @@ def greedily(settings: Settings, belief: Belief | None, log: Log, n: int) -> Cho
 
 
 def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
-    """Return a batch of parts: greedy, random from a_BI, space filling, and a hunt where critical runs are rare.
+    """Return a batch of parts: a hunt where critical runs are rare, representative, greedy and space-filling runs.
 
-    15 % fill the space, 25 % are drawn from a_BI as in the paper (they insure against a missed mode), the
-    others are chosen one by one by a_BI times the squared distance to the nearest run. Where less than 2 %
-    of the space is believed critical, 35 % (in the second half of the budget 10 %) search for regions apart
-    from those that are known.
+    Half of the batch is representative: of points drawn from a_BI as in the paper those that leave the least
+    doubt far from a run. The other half is chosen one by one by a_BI times the squared distance to the
+    nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
+    less than 1 % of the space is believed critical, half of the batch hunts first (see `hunt`).
     """
     if belief is None:
         return evenly(settings, belief, log, n)
-    filling, random = _rounded(_FILLING * n, log), _rounded(_RANDOM * n, log)
-    filling, random = min(filling, n), min(random, n - min(filling, n))
-    first, fill = _draw(settings, belief, even, log, filling)
-    second, drawn = _draw(settings, belief, boundary, log, random, taken=fill, start=first.next_position, most=_FEW)
-    share = _HUNTING[2 * len(log.history) >= settings.budget]
-    hunted = _hunted(settings, belief, log, min(_rounded(share * n, log), n - filling - random))
-    so_far = np.concatenate([fill, drawn, hunted])
+    looking = hunt(settings, log, _rounded(SHARE * n, log) if is_on(settings, belief, log) else 0)
+    filling = min(_rounded(max(_FILLING - settings.share, 0.0) * n, log), n - len(looking))
+    first, fill = _draw(settings, belief, even, log, filling, taken=looking)
+    so_far = np.concatenate([looking, fill])
+    second, typical = _typical(settings, belief, log, _rounded(_TYPICAL * (n - len(so_far)), log), so_far, first.next_position)
+    so_far = np.concatenate([so_far, typical])
     greedy, looked = _greedy(settings, belief, boundary, log, n - len(so_far), so_far)
     so_far, last = np.concatenate([so_far, greedy]), second
     if len(so_far) < n:  # nothing is in doubt
@@ -109,27 +106,23 @@ def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen
         so_far = np.concatenate([so_far, more])
     how = {
         "method": "mix", "random": second.method, "candidates": second.candidates + looked,
-        "acceptance": second.acceptance, _POSITION: last.next_position, "filling": len(fill), "drawn": len(drawn),
-        "hunted": len(hunted), "greedy": len(greedy),
+        "acceptance": second.acceptance, _POSITION: last.next_position, HUNTED: len(looking), "filling": len(fill),
+        "representative": len(typical), "greedy": len(greedy),
     }  # fmt: skip
     return Chosen(so_far, how)
 
 
-def _hunted(settings: Settings, belief: Belief, log: Log, n: int) -> Points:
-    """Return n points (none where critical runs are not rare) that search for another region, in the inputs' units."""
-    scenario, space, history = settings.scenario, settings.scenario.space, log.history
-    rare = belief.scores["critical_fraction"] < _RARE and scenario.pool is None and settings.learner is not None
-    if not rare or n == 0 or settings.learner is None:
-        return np.empty((0, space.dimension))
-    seen = history.where(history.stage != VALIDATION)
-    search = Search(
-        scenario.requirement.critical, settings.learner.metamodel, space.metamodel_inputs,
-        _admissible(settings) or (lambda u: np.ones(len(u), dtype=bool)),
-    )  # fmt: skip
-    y = np.where(seen.ok, seen.y(scenario.requirement.metric), np.nan)
-    u = np.clip(space.to_unit(seen.x), 0.0, 1.0)
-    picks = propose(search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration)
-    return space.from_unit(np.clip(picks.u, 1e-12, 1 - 1e-12))
+def _typical(
+    settings: Settings, belief: Belief, log: Log, n: int, taken: Points, start: int
+) -> tuple[RoiDraw, Points]:
+    """Return a draw from a_BI, and the n of its points that represent it best beside the runs there are."""
+    space = settings.scenario.space
+    drawn = max(n, min(_DRAWN + 2 * n, _MOST_DRAWN)) if n else 0
+    draw, x = _draw(settings, belief, boundary, log, drawn, taken=taken, start=start, most=_FEW)
+    u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.history.x, taken])))
+    scale = influence(belief.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
+    weight = np.exp(_score(settings, belief, boundary)(u))  # a_BI once more: sharper than it was drawn
+    return draw, x[representative(u, weight, there, n, scale)]
 
 
 def _rounded(wanted: float, log: Log) -> int:

@@ -30,7 +30,7 @@ class CampaignKind:
     stop: Mapping[str, float | int | None] = field(default_factory=dict)
     adaptive: bool = True
     methods: tuple[str, ...] = ()
-    metamodel: Mapping[str, Any] = field(default_factory=lambda: {"kind": "gp"})
+    metamodel: Mapping[str, Any] = field(default_factory=lambda: {"kind": "gp", "nu": 2.5, "input_noise": False})
     most_initial: int | None = None
     batch: int | None = None
 
@@ -46,12 +46,11 @@ CAMPAIGNS: Mapping[str, CampaignKind] = {
         methods=(
             "portfolio", "log_expected_improvement", "probability_of_violation", "lower_confidence_bound", "thompson", "cma_es",
         ),
-        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, most_initial=10, batch=10,
+        most_initial=10, batch=10,
     ),
     "estimation": CampaignKind(
         "probability of a critical scenario under the inputs' distribution", "auto",
         stop={"cov": 0.1}, methods=("auto", "difference", "monte_carlo", "subset"),
-        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False},
     ),
     "coverage": CampaignKind("evenly distributed points: the baseline, and data sets", "even", adaptive=False),
 }

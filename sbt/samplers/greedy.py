@@ -1,7 +1,8 @@
-"""Greedy batches: the best candidates that are also far from every run there is.
+"""Greedy batches: the best candidates that are also far from every run there is, and the most representative.
 
-The score of a candidate is multiplied by its squared distance to the nearest run, measured in the
-inputs' influence on the metamodel's mean: an input without influence separates nothing.
+Distances are measured in the inputs' influence on the metamodel's mean: an input without influence
+separates nothing. `diverse` multiplies the score of a candidate by its squared distance to the nearest
+run, which favours corners; `representative` sums this product over all points that a run would serve.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from sbt.arrays import Points, Vector
 from sbt.metamodels.prediction import Prediction
 
-__all__ = ["diverse", "influence", "refined"]
+__all__ = ["diverse", "influence", "refined", "representative"]
 
 _KEEP, _CHILDREN, _ROUNDS = 60, 16, 3
 _PROBES = 128
@@ -92,4 +94,40 @@ def diverse(u: Points, log_score: Vector, there: Points, n: int, scale: Vector) 
             break
         chosen.append(best)
         nearest = np.minimum(nearest, ((at - at[best]) ** 2).sum(axis=1))
+    return np.array(chosen, dtype=np.int64)
+
+
+def representative(u: Points, weight: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
+    """Return the indices (<= n) of points chosen one by one so that little weight stays far from a run.
+
+    Each choice reduces the weighted sum of squared distances to the nearest run the most: the greedy
+    solution of a weighted k-medoids problem in which the runs there are are centres already.
+
+    Args:
+        u: (m, d) points that are to be represented, and to choose from.
+        weight: (m,) >= 0.
+        there: (k, d) runs that exist already, k >= 1.
+        n: how many to choose.
+        scale: (d,) what a unit of each input counts in the distance.
+
+    Returns:
+        (<= n,) distinct indices; fewer where no point reduces the sum any more.
+
+    Source:
+        Nemhauser, Wolsey and Fisher (1978), doi 10.1007/BF01588971: the greedy choice reaches at least
+        1 - 1/e of the largest possible reduction.
+    """
+    if n == 0:
+        return np.empty(0, dtype=np.int64)
+    at = u * scale
+    between = cdist(at, at, "sqeuclidean")
+    nearest = cKDTree(there * scale).query(at)[0] ** 2
+    chosen: list[int] = []
+    while len(chosen) < n:
+        gain = weight @ np.maximum(nearest[:, None] - between, 0.0)
+        best = int(np.argmax(gain))
+        if gain[best] <= 0.0:
+            break
+        chosen.append(best)
+        nearest = np.minimum(nearest, between[best])
     return np.array(chosen, dtype=np.int64)
