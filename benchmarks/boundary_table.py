@@ -1,8 +1,9 @@
 """Boundary identification on problems of known truth, recorded rows and SUMO: which rule finds it with few runs?
 
     python benchmarks/boundary_table.py [--problems a,b] [--methods mix,boundary,even] [--seeds 20] [--store FOLDER]
+    python benchmarks/boundary_table.py --methods mix --metamodels "gp,auto,auto quick" --first-seed 100 --seeds 8
 
-A cell is a campaign of one problem, method and seed with the product's defaults (10 % of the runs are held out
+A cell is a campaign of one problem, method, metamodel and seed with the product's defaults (10 % of the runs are held out
 while it goes on, and count), whose final metamodel, of all runs, is scored on a reference set that no campaign
 saw: 20,000 uniform points of a testbed, 20,000 pseudo-random SUMO runs, or the rows of the table that were not
 chosen. Finished cells are lines of FOLDER/cells.jsonl: stopped and started again it goes on; reference sets are kept there too.
@@ -39,12 +40,13 @@ BUDGETS = {
 SHOWN = ("precision_at_recall_90", "f1", "average_precision", "calibration_error")
 
 
-def configuration(problem: str, method: str, seed: int, folder: str) -> str:
+def configuration(problem: str, method: str, seed: int, folder: str, metamodel: str = "gp") -> str:
     campaign = "coverage" if method == "even" else "boundary"
+    kind, _, preset = metamodel.partition(" ")
     scenario = f"table:{TABLE}" if problem == "table" else problem
     lines = [
         f"campaign: {campaign}", f"scenario: '{scenario}'", f"seed: {seed}", f"budget: {BUDGETS[problem]}",
-        "metamodel: {kind: gp}", f"acquisition: {{kind: {method}}}", f"store: {folder}",
+        f"metamodel: {{kind: {kind}, preset: {preset or 'null'}}}", f"acquisition: {{kind: {method}}}", f"store: {folder}",
     ]  # fmt: skip
     if problem == "table":
         lines.append('requirement: {metric: "min_dist*", critical: [-1.0e9, 0.0]}')
@@ -72,10 +74,10 @@ def reference(problem: str, settings: Any, folder: Path, n: int) -> tuple[np.nda
     return x[good], y[good]
 
 
-def cell(problem: str, method: str, seed: int, folder: Path, n: int) -> dict[str, Any]:
+def cell(problem: str, method: str, metamodel: str, seed: int, folder: Path, n: int) -> dict[str, Any]:
     """Return the scores of one campaign."""
     with tempfile.TemporaryDirectory() as place:
-        loaded = parse(configuration(problem, method, seed, f"{place}/store"))
+        loaded = parse(configuration(problem, method, seed, f"{place}/store", metamodel))
         start = time.process_time()
         run_campaign(loaded, report=False)
         seconds = time.process_time() - start
@@ -93,7 +95,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problems", default=",".join(BUDGETS))
     parser.add_argument("--methods", default="mix,boundary,even")
+    parser.add_argument("--metamodels", default="gp", help="kinds, each with its preset after a space")
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--reference", type=int, default=20_000)
     parser.add_argument("--store", type=Path, default=Path("runs/boundary_table"))
     args = parser.parse_args()
@@ -102,24 +106,24 @@ def main() -> None:
     done = {}
     if kept.is_file():
         done = {tuple(row["cell"]): row for row in map(json.loads, kept.read_text().splitlines())}
-    wanted = [(p, m, s) for p in args.problems.split(",") for m in args.methods.split(",") for s in range(args.seeds)]
-    for problem, method, seed in wanted:
-        if (problem, method, seed) not in done:
-            row = {"cell": [problem, method, seed], **cell(problem, method, seed, args.store, args.reference)}
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    kinds = [(p, m, k) for p in args.problems.split(",") for m in args.methods.split(",") for k in args.metamodels.split(",")]
+    for problem, method, metamodel, seed in [(*kind, seed) for kind in kinds for seed in seeds]:
+        key = (problem, method, metamodel, seed)
+        if key not in done:
+            row = {"cell": key, **cell(problem, method, metamodel, seed, args.store, args.reference)}
             with kept.open("a") as file:
                 file.write(json.dumps(row) + "\n")
-            done[problem, method, seed] = row
-    print("| problem | runs | base rate | rule | P@90R: median (10 % to 90 %) | F1 | AP | calibration error | CPU s |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for problem in args.problems.split(","):
-        for method in args.methods.split(","):
-            rows = [done[problem, method, s] for s in range(args.seeds)]
-            cells = []
-            for name in SHOWN:
-                low, middle, high = np.quantile([row[name] for row in rows], [0.1, 0.5, 0.9])
-                cells.append(f"{middle:.3f} ({low:.3f} to {high:.3f})" if name in SHOWN[:2] else f"{middle:.3f}")
-            base, cpu = (np.median([row[k] for row in rows]) for k in ("base_rate", "cpu_s"))
-            print(f"| {problem} | {BUDGETS[problem]} | {base:.4f} | {method} | {' | '.join(cells)} | {cpu:.1f} |")
+            done[key] = row
+    print("| problem | runs | base rate | rule | metamodel | P@90R: median (10 to 90 %) | F1 | AP | calibration error | CPU s |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for problem, method, metamodel in kinds:
+        rows, cells = [done[problem, method, metamodel, s] for s in seeds], []
+        for name in SHOWN:
+            low, middle, high = np.quantile([row[name] for row in rows], [0.1, 0.5, 0.9])
+            cells.append(f"{middle:.3f} ({low:.3f} to {high:.3f})" if name in SHOWN[:2] else f"{middle:.3f}")
+        base, cpu = (np.median([row[k] for row in rows]) for k in ("base_rate", "cpu_s"))
+        print(f"| {problem} | {BUDGETS[problem]} | {base:.4f} | {method} | {metamodel} | {' | '.join(cells)} | {cpu:.1f} |")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from sbt.metamodels.ensemble import Ensemble
 from sbt.metamodels.et import ExtraTrees
 from sbt.metamodels.gp import GaussianProcess
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.stacking import Bins, held_out, stacked
 from sbt.metamodels.torch_tools import check_device
 from sbt.problem.requirement import CriticalInterval
 
@@ -68,14 +69,21 @@ class Auto:
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
         """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
+        return self._fit(u, y, rng, None)
+
+    def about(self, critical: CriticalInterval) -> _About:
+        """Return the same settings for runs whose critical interval is known."""
+        return _About(self, critical)
+
+    def _fit(self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None) -> MixturePredictor:
         u, y = check_rows(u, y)
-        models = self._models(len(y))
+        models, bins = self._models(len(y)), None if critical is None else Bins.about(y, critical)
         if len(y) < _FEWEST:
-            weights, held_out = np.full(len(models), 1.0 / len(models)), None
+            weights, scores = np.full(len(models), 1.0 / len(models)), None
         else:
-            held_out = _held_out(models, u, y, self.folds, rng)
-            weights = _stack(held_out, self.prior)
-        choice = _explain(list(models), weights, held_out, len(y), self)
+            scores = held_out(models.values(), u, y, self.folds, rng, bins)
+            weights = stacked(scores, self.prior)
+        choice = _explain(list(models), weights, scores, len(y), self, bins)
         kept = {name: model for name, model in models.items() if choice.weights[name] > 0.0}
         predictors = tuple(model.fit(u, y, rng) for model in kept.values())
         return MixturePredictor(predictors, np.array([choice.weights[name] for name in kept]), choice)
@@ -89,6 +97,18 @@ class Auto:
         if n >= self.ensemble_rows:
             models["ensemble"] = _paced(n, self.device)
         return models
+
+
+@dataclass(frozen=True)
+class _About:
+    """`Auto` that knows what is critical."""
+
+    settings: Auto
+    critical: CriticalInterval
+
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
+        """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
+        return self.settings._fit(u, y, rng, self.critical)
 
 
 def _paced(n: int, device: str) -> Ensemble:
@@ -148,53 +168,21 @@ class MixturePredictor:
         return Prediction.mixture_of([predict(u) for predict in self.predictors], self.weight)
 
 
-def _held_out(models: Mapping[str, Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator) -> Points:
-    """Return (models, n) log densities of each row under models fitted to the other folds."""
-    fold = rng.permutation(len(y)) % folds
-    log_density = np.empty((len(models), len(y)))
-    for i in range(folds):
-        out = fold == i
-        for row, model in zip(log_density, models.values(), strict=True):
-            row[out] = model.fit(u[~out], y[~out], rng)(u[out]).log_density(y[out])
-    return log_density
-
-
-def _stack(log_density: Points, prior: float) -> Vector:
-    """Return the (k,) weights of the mixture of largest likelihood, by expectation maximisation.
-
-    Args:
-        log_density: (k, n) of each row under each model.
-        prior: rows that speak for equal weights.
-
-    >>> _stack(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
-    [1.0, 0.0]
-    """
-    k, n = log_density.shape
-    density = np.exp(log_density - log_density.max(axis=0))
-    weights = np.full(k, 1.0 / k)
-    for _ in range(500):
-        joint = weights[:, None] * density
-        new = ((joint / joint.sum(axis=0)).sum(axis=1) + prior / k) / (n + prior)
-        moved, weights = np.abs(new - weights).max(), new
-        if moved < 1e-6:
-            break
-    return np.asarray(weights / weights.sum())
-
-
-def _explain(names: list[str], weights: Vector, held_out: Points | None, n: int, settings: Auto) -> Choice:
+def _explain(names: list[str], weights: Vector, held: Points | None, n: int, settings: Auto, bins: Bins | None) -> Choice:
     """Return the choice, models with little weight left out."""
     kept = np.where(weights >= _LEAST, weights, 0.0)
     kept /= kept.sum()
     shares = {name: float(w) for name, w in zip(names, kept, strict=True)}
     mixed = ", ".join(f"{100 * w:.0f} % {name}" for name, w in shares.items() if w > 0.0)
-    if held_out is None:
+    if held is None:
         reason = f"{mixed}: {n} rows are too few to compare models (from {_FEWEST} on)"
         return Choice(shares, {}, reason)
     with np.errstate(divide="ignore"):
-        mixture = np.logaddexp.reduce(held_out + np.log(kept)[:, None], axis=0).mean()
-    scores = {name: float(row.mean()) for name, row in zip(names, held_out, strict=True)} | {"mixture": float(mixture)}
+        mixture = np.logaddexp.reduce(held + np.log(kept)[:, None], axis=0).mean()
+    scores = {name: float(row.mean()) for name, row in zip(names, held, strict=True)} | {"mixture": float(mixture)}
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
-    reason = f"{mixed}: mean log likelihood of {n} rows, each predicted from other rows ({settings.folds} folds): {listed}"
+    what = "" if bins is None else f" to fall where they did, of the ranges cut at {', '.join(f'{cut:.3g}' for cut in bins.cuts)}"
+    reason = f"{mixed}: mean log likelihood of {n} rows{what}, each predicted from other rows ({settings.folds} folds): {listed}"
     if "ensemble" not in names:
         reason += f"; the ensemble takes part from {settings.ensemble_rows} rows on"
     if "gp" not in names:

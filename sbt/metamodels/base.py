@@ -18,7 +18,10 @@ from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Metamodel", "Predictor", "Screened", "build", "check_rows", "log_ambiguity_bound", "split_validation", "standardise"]
+__all__ = [
+    "Aimed", "Metamodel", "Predictor", "Screened", "about", "build", "check_rows", "log_ambiguity_bound", "split_validation",
+    "standardise",
+]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
 """A fitted metamodel: (n, d) points -> belief at them. Picklable."""
@@ -54,6 +57,20 @@ class Metamodel(Protocol):
             InputError: n < 2, or values that are not finite.
         """
         ...
+
+
+@runtime_checkable
+class Aimed(Protocol):
+    """Settings of a metamodel that learns otherwise where it knows what is critical."""
+
+    def about(self, critical: CriticalInterval) -> Metamodel:
+        """Return the same settings, told M_c in the unit of the y that it will learn (warped, where y is)."""
+        ...
+
+
+def about(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
+    """Return the metamodel told of M_c where it wants to know, else itself."""
+    return metamodel.about(critical) if isinstance(metamodel, Aimed) else metamodel
 
 
 M = TypeVar("M")

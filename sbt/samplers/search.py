@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from sbt.arrays import Mask, Points, Vector
-from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.base import Metamodel, Predictor, about
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
@@ -107,8 +107,9 @@ class Belief:
 def believe(search: Search, u: Points, y: Vector, rng: np.random.Generator) -> Belief:
     """Return the belief learned from u (n, d) and finite y (n,), n >= 2."""
     warp = Warp.about(y, search.critical)
-    predictor = search.metamodel.fit(search.columns(u), warp.values(y), rng)
-    return Belief(predictor, search.columns, warp, warp.interval(search.critical))
+    critical = warp.interval(search.critical)
+    predictor = about(search.metamodel, critical).fit(search.columns(u), warp.values(y), rng)
+    return Belief(predictor, search.columns, warp, critical)
 
 
 @dataclass(frozen=True, eq=False)
