@@ -51,11 +51,19 @@ class Belief:
 
 @dataclass(frozen=True)
 class Learner:
-    """Fits and scores one metamodel for one scenario; the same history gives the same belief."""
+    """Fits and scores one metamodel for one scenario; the same history gives the same belief.
+
+    Args:
+        scenario: with the campaign's own space and requirement.
+        metamodel: settings.
+        seed: of the campaign.
+        aimed: the critical edge is what is looked for, and the metamodel is told where it is; otherwise all of y counts.
+    """
 
     scenario: LogicalScenario
     metamodel: Metamodel
     seed: int
+    aimed: bool = True
 
     def fit(self, history: History) -> Belief | None:
         """Return the belief after these runs; None with fewer than two to learn from."""
@@ -85,8 +93,9 @@ class Learner:
         space, requirement = self.scenario.space, self.scenario.requirement
         y = training.y(requirement.metric)
         u = space.metamodel_inputs(space.to_unit(training.x))
+        metamodel = about(self.metamodel, requirement.critical) if self.aimed else self.metamodel
         with self._named(len(training)):
-            return about(self.metamodel, requirement.critical).fit(u, y, stream(self.seed, "fit", len(training)))
+            return metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
 
     def unseen(self, history: History) -> tuple[Points, Vector]:
         """Return x (n, d) and y (n,) that no metamodel learned from: held-out runs, or a table's rows not chosen."""

@@ -19,8 +19,8 @@ from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Aimed", "Metamodel", "Predictor", "Screened", "about", "build", "check_rows", "log_ambiguity_bound", "split_validation",
-    "standardise",
+    "Aimed", "Metamodel", "Predictor", "Screened", "about", "build", "check_rows", "functions", "log_ambiguity_bound",
+    "split_validation", "standardise",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -40,6 +40,22 @@ def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterv
     """Return (n,) upper bounds of log a_BI = log(1 - 2 |P(y in M_c) - 0.5|), at least -700."""
     low, high = predictor.probability_bounds(u, critical)
     return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), 1e-304))
+
+
+def functions(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
+    """Return (n, m) draws of y as a function, at u (m, d).
+
+    A predictor with `draws` (a process) draws functions; of a mixture one component stands for a function; a single
+    Gaussian a point is drawn point by point.
+    """
+    joint: Any = getattr(predictor, "draws", None)
+    if joint is not None:
+        return joint(u, n, rng)
+    p = predictor(u)
+    component = rng.choice(len(p.weight), n, p=p.weight)
+    if len(p.weight) >= 5:
+        return p.mean[component]
+    return p.mean[component] + p.std[component] * rng.standard_normal((n, len(u)))
 
 
 class Metamodel(Protocol):

@@ -13,7 +13,9 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Bins", "held_out", "stacked"]
+__all__ = ["Bins", "held_out", "mixture_score", "stacked", "surely_better"]
+
+_SURE = 2.0  # standard errors
 
 
 @dataclass(frozen=True)
@@ -98,3 +100,19 @@ def stacked(log_score: Points, prior: float) -> Vector:
         if moved < 1e-6:
             break
     return np.asarray(weights / weights.sum())
+
+
+def mixture_score(log_score: Points, weights: Vector) -> Vector:
+    """Return the (n,) log scores of the mixture of k models with (k, n) scores and weights >= 0."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.logaddexp.reduce(log_score + np.log(weights)[:, None], axis=0))
+
+
+def surely_better(log_score: Points, weights: Vector) -> bool:
+    """Say whether the mixture is better than the first of the k models by two standard errors of (k, n) scores.
+
+    >>> surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
+    True
+    """
+    gain = mixture_score(log_score, weights) - log_score[0]
+    return float(gain.mean()) > _SURE * float(gain.std()) / len(gain) ** 0.5
