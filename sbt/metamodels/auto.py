@@ -46,6 +46,7 @@ class Auto:
         folds: of the cross-validation, >= 2.
         prior: rows >= 0 that speak for equal weights.
         members: networks of the ensemble, >= 2.
+        pace: share in (0, 1] of the ensemble's steps that are taken.
         ensemble_rows: rows from which on the ensemble takes part, >= 2.
         gp_rows: rows up to which the Gaussian process takes part, >= 2.
         device: auto (CUDA where there is one), cpu or cuda; for the ensemble.
@@ -60,16 +61,19 @@ class Auto:
     folds: int = 3
     prior: float = 5.0
     members: int = 10
+    pace: float = 1.0
     ensemble_rows: int = 100
     gp_rows: int = 4000
     device: str = "cpu"
 
-    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"folds": 2, "members": 5, "ensemble_rows": 150}}
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"folds": 2, "members": 5, "pace": 0.6, "ensemble_rows": 150}}
 
     def __post_init__(self) -> None:
         for name in ("folds", "members", "ensemble_rows", "gp_rows"):
             if not getattr(self, name) >= 2:
                 raise InputError(f"{name} must be >= 2, but got {getattr(self, name)}")
+        if not 0.0 < self.pace <= 1.0:
+            raise InputError(f"pace must be in (0, 1], but got {self.pace}")
         if not self.prior >= 0.0:
             raise InputError(f"prior must be >= 0, but got {self.prior}")
         check_device(self.device)
@@ -102,7 +106,7 @@ class Auto:
             models["gp"] = GaussianProcess()
         models["et"] = ExtraTrees()
         if n >= self.ensemble_rows:
-            models["ensemble"] = _paced(n, self.device, self.members)
+            models["ensemble"] = _paced(n, Ensemble(members=self.members, device=self.device), self.pace)
         return models
 
 
@@ -122,14 +126,14 @@ class _About:
         return self.settings._fit(u, y, rng, self.critical)
 
 
-def _paced(n: int, device: str, members: int = 10) -> Ensemble:
-    """Return an ensemble that takes fewer and larger steps below 1,000 rows: it is fitted once a fold and once more.
+def _paced(n: int, full: Ensemble, pace: float) -> Ensemble:
+    """Return the ensemble with fewer and larger steps below 1,000 rows: it is fitted once a fold and once more.
 
-    >>> _paced(200, "cpu").steps, _paced(500, "cpu").steps, _paced(5000, "cpu").steps
-    (500, 1250, 2500)
+    >>> [_paced(n, Ensemble(), 1.0).steps for n in (200, 500, 5000)]
+    [500, 1250, 2500]
     """
-    full, share = Ensemble(members=members, device=device), min(max(n, 200) / 1000, 1.0)
-    return replace(full, steps=round(share * full.steps), learning_rate=full.learning_rate * min(share**-0.5, 2.0))
+    share = min(max(n, 200) / 1000, 1.0)
+    return replace(full, steps=round(share * pace * full.steps), learning_rate=full.learning_rate * min(share**-0.5, 2.0))
 
 
 @dataclass(frozen=True)
