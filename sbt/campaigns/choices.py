@@ -20,6 +20,7 @@ from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
 from sbt.history import VALIDATION
 from sbt.learner import Belief
+from sbt.metamodels.base import simplest
 from sbt.samplers.greedy import diverse, influence, refined
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.portfolio import propose
@@ -123,7 +124,7 @@ def _hunted(settings: Settings, belief: Belief, log: Log, n: int) -> Points:
         return np.empty((0, space.dimension))
     seen = history.where(history.stage != VALIDATION)
     search = Search(
-        scenario.requirement.critical, settings.learner.metamodel, space.metamodel_inputs,
+        scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
         _admissible(settings) or (lambda u: np.ones(len(u), dtype=bool)),
     )  # fmt: skip
     y = np.where(seen.ok, seen.y(scenario.requirement.metric), np.nan)

@@ -82,6 +82,11 @@ class Auto:
         """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
         return self._fit(u, y, rng, None)
 
+    @property
+    def simplest(self) -> Metamodel:
+        """What is believed where there is no time to compare."""
+        return GaussianProcess()
+
     def about(self, critical: CriticalInterval) -> _About:
         """Return the same settings for runs whose critical interval is known."""
         return _About(self, critical)

@@ -20,7 +20,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
     "Aimed", "Metamodel", "Predictor", "Screened", "about", "build", "check_rows", "functions", "log_ambiguity_bound",
-    "split_validation", "standardise",
+    "simplest", "split_validation", "standardise",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -87,6 +87,12 @@ class Aimed(Protocol):
 def about(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
     """Return the metamodel told of M_c where it wants to know, else itself."""
     return metamodel.about(critical) if isinstance(metamodel, Aimed) else metamodel
+
+
+def simplest(metamodel: Metamodel) -> Metamodel:
+    """Return what a metamodel that compares others falls back on (its attribute `simplest`), else itself."""
+    found: Metamodel = getattr(metamodel, "simplest", metamodel)
+    return found
 
 
 M = TypeVar("M")

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.arrays import Points, Vector
+from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, standardise
 from sbt.metamodels.sparse import SparsePredictor, Training, train
 
@@ -29,7 +30,8 @@ class DeepSigmaPointProcess:
         learning_rate: step of Adam, > 0.
         penalty: weight > 0 of the KL divergence to the prior (Jankowiak et al. recommend 0.05 to 1).
         batch: rows of a minibatch >= 1.
-        patience: epochs >= 1 without an improvement of 0.01 of the validation log likelihood.
+        patience: epochs >= 1 without an improvement of 0.01 of the validation log likelihood; None: all rows train,
+            for `max_epochs`, with a learning rate that falls to 0.
         max_epochs: most epochs >= 1.
         device: auto (CUDA where there is one), cpu or cuda.
 
@@ -47,7 +49,7 @@ class DeepSigmaPointProcess:
     learning_rate: float = 0.01
     penalty: float = 0.05
     batch: int = 1024
-    patience: int = 200
+    patience: int | None = 200
     max_epochs: int = 2000
     device: str = "cpu"
 
@@ -56,6 +58,8 @@ class DeepSigmaPointProcess:
     }
 
     def __post_init__(self) -> None:
+        if not self.penalty > 0.0:
+            raise InputError(f"penalty must be > 0, but got {self.penalty}")
         self._training()
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparsePredictor:
