@@ -12,14 +12,14 @@ import numpy as np
 
 from sbt.acquisition import boundary
 from sbt.metamodels.auto import Auto
-from sbt.metamodels.base import log_ambiguity_bound
+from sbt.metamodels.base import about, build, log_ambiguity_bound
 from sbt.metamodels.gp import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 
-KINDS = {"gp": GaussianProcess(), "auto quick": Auto(ensemble_rows=500, folds=2)}
+KINDS = {"gp": GaussianProcess(), "auto quick": build(Auto, "quick")}
 CRITICAL = 0.003
 
 
@@ -50,7 +50,7 @@ def _line(kind: str, d: int, n: int, samples: int, seed: int) -> None:
     rng = stream(seed, "screening", d, n)
     critical = CriticalInterval(high=float(np.quantile(_metric(rng.random((200_000, d)), rng), CRITICAL)))
     u = SobolSequence(d, seed).points(0, n)
-    predict = KINDS[kind].fit(u, _metric(u, rng), stream(seed, "fit", n))
+    predict = about(KINDS[kind], critical).fit(u, _metric(u, rng), stream(seed, "fit", n))
 
     def score(points: np.ndarray) -> np.ndarray:
         return boundary(predict(points), critical, np.zeros(len(points)))
@@ -59,7 +59,7 @@ def _line(kind: str, d: int, n: int, samples: int, seed: int) -> None:
         bound = (lambda points: log_ambiguity_bound(predict, points, critical)) if screen else None
         start = time.process_time()
         draw = rejection(
-            score, SobolSequence(d, seed), samples, start=n, seed=seed, label=1, max_candidates=2**21, bound=bound
+            score, SobolSequence(d, seed), samples, start=n, seed=seed, label=1, max_candidates=2**21, bound=bound, fill=False,
         )
         return draw, time.process_time() - start
 

@@ -15,7 +15,7 @@ from sbt.arrays import Mask, Points, Vector
 from sbt.errors import SbtError
 from sbt.execution.worker import place_of
 from sbt.history import History
-from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound
+from sbt.metamodels.base import Metamodel, Predictor, Screened, about, log_ambiguity_bound
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.scenario import LogicalScenario
@@ -58,12 +58,14 @@ class Learner:
         scenario: with the campaign's space and requirement.
         metamodel: its settings.
         seed: of the campaign.
+        aimed: the critical edge is what is looked for, and the metamodel is told where it is; otherwise all of y counts.
         last: the last belief by what it was made from: a campaign's conclusion and its report ask for the same.
     """
 
     scenario: LogicalScenario
     metamodel: Metamodel
     seed: int
+    aimed: bool = True
     last: dict[bytes, Belief] = field(default_factory=dict, repr=False, compare=False)
 
     def fit(self, history: History) -> Belief | None:
@@ -98,11 +100,12 @@ class Learner:
 
     def train(self, training: History) -> Predictor:
         """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""
-        space = self.scenario.space
-        y = training.y(self.scenario.requirement.metric)
+        space, requirement = self.scenario.space, self.scenario.requirement
+        y = training.y(requirement.metric)
         u = space.metamodel_inputs(space.to_unit(training.x))
+        metamodel = about(self.metamodel, requirement.critical) if self.aimed else self.metamodel
         with self._named(len(training)):
-            return self.metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
+            return metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
 
     def unseen(self, history: History) -> tuple[Points, Vector]:
         """Return x (n, d) and y (n,) that no metamodel learned from: held-out runs, or a table's rows not chosen."""

@@ -127,8 +127,9 @@ def _predictor(folder: Path, learner: Learner, training: History, settings: str)
 
 def _key(learner: Learner, training: History, settings: str) -> str:
     """Return a key of all that decides a fit: the rows, the settings, the seed, the space, the version."""
-    space = learner.scenario.space
-    told = (settings, learner.seed, repr(space.parameters), [name for name, _ in space.features], version("sumo-sbt"))
+    space, critical = learner.scenario.space, learner.scenario.requirement.critical
+    features = [name for name, _ in space.features]
+    told = (settings, learner.seed, repr(critical), repr(space.parameters), features, version("sumo-sbt"))
     digest = hashlib.blake2b(json.dumps([str(part) for part in told]).encode(), digest_size=16)
     digest.update(np.ascontiguousarray(training.x).tobytes())
     digest.update(training.y(learner.scenario.requirement.metric).tobytes())

@@ -137,9 +137,13 @@ def kept_of(loaded: Loaded, settings: Settings, shard: Shard | None = None) -> d
 
 def settings_of(loaded: Loaded, parts: Assembly) -> Settings:
     """Return what the campaigns are built from."""
+    from sbt.config.campaigns import CAMPAIGNS
+
     config, recorded = loaded.config, parts.scenario.pool is not None
     blind = config.campaign == "estimation" and config.acquisition.kind in _UNLEARNED
-    learner = None if parts.metamodel is None or blind else Learner(parts.scenario, parts.metamodel, config.seed)
+    learner = None
+    if parts.metamodel is not None and not blind:
+        learner = Learner(parts.scenario, parts.metamodel, config.seed, CAMPAIGNS[config.campaign].adaptive)
     return Settings(
         parts.scenario, config.seed, config.budget, config.initial, config.batch,
         config.validation.share if learner is not None and not recorded else 0.0,

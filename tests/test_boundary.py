@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,13 @@ from sbt.cli import app
 from sbt.config.load import parse
 from sbt.history import VALIDATION, History, Record
 from sbt.learner import Belief, Learner
+from sbt.metamodels.auto import Auto
+from sbt.metamodels.base import functions, simplest
 from sbt.metamodels.gp import GaussianProcess
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.recalibrated import Recalibrated
 from sbt.problem.requirement import CriticalInterval
-from sbt.run import run_campaign
+from sbt.run import assembly_of, run_campaign, settings_of
 from sbt.samplers.greedy import diverse, influence, refined, representative
 from sbt.samplers.smc import smc
 from sbt.samplers.surface import crossings
@@ -120,6 +124,50 @@ def run(folder: Path, **keys: Any) -> dict[str, Any]:
     lines = [f"{key}: {value}" for key, value in keys.items()]
     base = ["campaign: boundary", "executor: {kind: serial}", f"store: {folder / 'store'}"]
     return run_campaign(parse("\n".join([*base, *lines])), report=False)
+
+
+@dataclass(frozen=True)
+class Asking:
+    """Wants to know what is critical, and tells."""
+
+    told: list[CriticalInterval] = field(default_factory=list)
+
+    def about(self, critical: CriticalInterval) -> Asking:
+        self.told.append(critical)
+        return self
+
+    def fit(self, u: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> Any:
+        return lambda at: Prediction.gaussian(np.zeros(len(at)), np.ones(len(at)))
+
+
+@pytest.mark.parametrize(("campaign", "times"), [("boundary", 1), ("falsification", 1), ("estimation", 1), ("coverage", 0)])
+def test_campaigns_that_look_for_the_edge_tell_the_metamodel_where_it_is(campaign: str, times: int):
+    loaded = parse(f"campaign: {campaign}\nscenario: 'testbed:cut_in_near_miss:box'\nmetamodel: {{kind: et}}\n")
+    settings, asking = settings_of(loaded, assembly_of(loaded)), Asking()
+    names, metric = settings.scenario.space.names, settings.scenario.requirement.metric
+    runs = [
+        Record(i, "initial", 0, dict(zip(names, x, strict=True)), i, "ok", {metric: float(i)}, "", None, 0.0, "", "")
+        for i, x in enumerate(settings.scenario.space.from_unit(stream(0, "runs").random((3, len(names)))).tolist())
+    ]
+    assert settings.learner is not None
+    learner = replace(settings.learner, metamodel=Recalibrated(asking))
+    learner.train(History(names, tuple(runs)))
+    assert asking.told == [CriticalInterval(0.0, 0.6)] * times
+
+
+def test_what_auto_alone_believes_draws_functions_as_the_process_does():
+    u = stream(0, "rows").random((60, 2))
+    y = np.sin(5 * u[:, 0]) + u[:, 1]
+    mixed = Auto(ensemble_rows=10**6).about(CriticalInterval(high=0.0)).fit(u, y, stream(0, "fit"))
+    assert mixed.choice.weights["gp"] == 1.0
+    line = np.column_stack([np.linspace(0, 1, 200), np.full(200, 0.5)])
+    drawn, own = (functions(p, line, 50, stream(1, "draws")) for p in (mixed, mixed.predictors[0]))
+    np.testing.assert_array_equal(drawn.shape, (50, 200))
+    np.testing.assert_allclose(np.abs(np.diff(drawn)).max(), np.abs(np.diff(own)).max(), rtol=0.3)
+    blind = Auto(ensemble_rows=10**6).fit(u, np.round(y), stream(0, "fit"))
+    assert 0 < blind.choice.weights["et"] < 1
+    assert functions(blind, line, 50, stream(1, "draws")).shape == (50, 200)
+    assert simplest(Auto()) == GaussianProcess()
 
 
 @pytest.mark.parametrize("method", ["mix", "boundary", "u", "straddle", "expected_feasibility"])
@@ -246,7 +294,7 @@ def test_crossings_lie_on_the_boundary():
 
 
 def test_boundary_points_are_exported(tmp_path: Path):
-    run(tmp_path, scenario="'testbed:cut_in_crash:box'", budget=60, initial=30, batch=30)
+    run(tmp_path, scenario="'testbed:cut_in_crash:box'", budget=90, initial=30, batch=30)
     done = CliRunner().invoke(app, ["export", str(tmp_path / "store"), "--format", "boundary"])
     assert done.exit_code == 0, done.output
     rows = np.loadtxt(tmp_path / "store" / "exports" / "boundary.csv", delimiter=",", skiprows=1)

@@ -77,7 +77,7 @@ def test_every_key_has_a_default_but_campaign_and_scenario():
     config = parse(BASE).config
     assert (config.budget, config.initial, config.batch, config.seed) == (500, 50, 50, 0)
     assert config.metamodel is not None
-    assert (config.metamodel.kind, config.metamodel.preset, config.acquisition.kind) == ("gp", None, "mix")
+    assert (config.metamodel.kind, config.metamodel.preset, config.acquisition.kind) == ("auto", "quick", "mix")
     assert config.store == "runs/boundary_plugin"
     assert config.executor.workers >= 1
 

@@ -15,15 +15,18 @@ import pytest
 import torch
 
 from sbt.errors import InputError
-from sbt.metamodels.auto import Auto, _stack
-from sbt.metamodels.base import build
+from sbt.metamodels.auto import Auto
+from sbt.metamodels.base import about, build
 from sbt.metamodels.bnn import BayesianNetwork, _mask
 from sbt.metamodels.dgp import DeepGaussianProcess
 from sbt.metamodels.dspp import DeepSigmaPointProcess
 from sbt.metamodels.ensemble import Ensemble
 from sbt.metamodels.et import ExtraTrees
 from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.recalibrated import Recalibrated
 from sbt.metamodels.scores import scores
+from sbt.metamodels.stacking import Bins, stacked
 from sbt.metamodels.svgp import SparseGaussianProcess
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import device_of, minibatches
@@ -280,13 +283,13 @@ def test_students_widths_follow_the_tails():
 def test_weights_are_those_of_largest_likelihood():
     rng = np.random.default_rng(0)
     log_density = rng.normal(size=(2, 400))
-    weights = _stack(log_density, prior=0.0)
+    weights = stacked(log_density, prior=0.0)
     grid = np.linspace(0.001, 0.999, 999)
     likelihood = [np.logaddexp(log_density[0] + np.log(w), log_density[1] + np.log1p(-w)).sum() for w in grid]
     assert weights[0] == pytest.approx(grid[int(np.argmax(likelihood))], abs=0.01)
-    np.testing.assert_allclose(_stack(log_density, prior=1e9), [0.5, 0.5], atol=1e-3)
+    np.testing.assert_allclose(stacked(log_density, prior=1e9), [0.5, 0.5], atol=1e-3)
     hopeless = np.array([[-1e308, -1e308], [0.0, 0.0]])
-    np.testing.assert_allclose(_stack(hopeless, prior=0.0), [0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(stacked(hopeless, prior=0.0), [0.0, 1.0], atol=1e-6)
 
 
 def test_auto_says_what_it_chose_and_why():
@@ -303,6 +306,31 @@ def test_auto_says_what_it_chose_and_why():
     few = Auto().fit(u[:6], y[:6], np.random.default_rng(0)).choice
     assert few.scores == {}
     assert "too few" in few.reason
+
+
+def test_auto_that_knows_the_critical_interval_looks_at_its_edge():
+    u, critical = np.random.default_rng(1).random((120, 2)), CriticalInterval(high=0.0)
+    y = np.where(u[:, 1] < 0.5, 8.0 * (u[:, 0] - 0.3) + np.sin(6.0 * u[:, 1]), 10.0)  # in half of the space no conflict
+    settings = Auto(ensemble_rows=10**6)
+    blind, aimed = (m.fit(u, y, np.random.default_rng(0)).choice for m in (settings, about(settings, critical)))
+    assert blind.weights["et"] > 0.7  # it knows the plateau best, to the last digit
+    assert aimed.weights["gp"] > 0.5
+    assert "ranges cut at" in aimed.reason
+    assert about(GaussianProcess(), critical) == GaussianProcess()
+    assert about(Recalibrated(settings), critical) == Recalibrated(about(settings, critical))
+
+
+@pytest.mark.parametrize("critical", [CriticalInterval(high=0.0), CriticalInterval(low=1.0), CriticalInterval(-0.5, 0.5)])
+def test_the_ranges_of_a_score_cover_all_values_and_m_c_is_closed(critical):
+    bins, mass = Bins(critical, near=0.25), 0.0
+    for y in [*(bins.cuts - 1e-9), bins.cuts[-1] + 1e-9]:
+        mass += np.exp(bins.log_score(Prediction.gaussian([0.3], [0.7]), np.array([y]))[0])
+    assert mass == pytest.approx(1.0)
+    sure = Prediction.gaussian([0.5 * (max(critical.low, -1.0) + min(critical.high, 2.0))], [0.1])
+    for end in (critical.low, critical.high):
+        if np.isfinite(end):
+            inward = np.clip(sure.mu, end - 1e-9, end + 1e-9)
+            assert bins.log_score(sure, np.array([end])) == pytest.approx(bins.log_score(sure, inward))
 
 
 def test_auto_leaves_the_gp_out_of_many_rows():

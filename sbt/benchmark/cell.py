@@ -61,7 +61,7 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
     if parts.metamodel is None or parts.acquisition is None:
         raise ValueError(f"a cell needs a metamodel and an acquisition, but {cell.name} has none")
     rows = None if scenario.pool is not None else reference_rows(cell.reference, scenario, n)
-    learner = _ReferenceLearner(scenario, parts.metamodel, config.seed, rows=rows)
+    learner = _ReferenceLearner(scenario, parts.metamodel, config.seed, aimed=cell.acquisition != "even", rows=rows)
     acquisition = parts.acquisition if cell.acquisition != "even" else None
     stage = _BenchmarkStage(scenario, learner, acquisition, config.seed, cell.iterations, cell.batch, cell.max_candidates)
 

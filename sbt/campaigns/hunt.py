@@ -14,6 +14,7 @@ from sbt.campaign import Log
 from sbt.campaigns.settings import Settings
 from sbt.history import VALIDATION
 from sbt.learner import Belief
+from sbt.metamodels.base import simplest
 from sbt.samplers.portfolio import propose
 from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
@@ -73,7 +74,7 @@ def hunt(settings: Settings, log: Log, n: int) -> Points:
         return np.empty((0, space.dimension))
     seen = log.history.where(log.history.stage != VALIDATION)
     search = Search(
-        scenario.requirement.critical, settings.learner.metamodel, space.metamodel_inputs,
+        scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
         lambda u: space.feasible(space.from_unit(u)),
     )  # fmt: skip
     y = np.where(seen.ok, seen.y(scenario.requirement.metric), np.nan)

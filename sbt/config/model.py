@@ -303,7 +303,7 @@ class Configuration(_Strict):
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
         default_factory=_metamodel,
-        description="What learns the safety metric; default: boundary auto (quick), others gp, coverage none.",
+        description="What learns the safety metric; default: gp with nu 2.5 and one noise; coverage: none.",
     )
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from sbt.arrays import Points, Vector
-from sbt.metamodels.base import Metamodel
+from sbt.metamodels.base import Metamodel, about
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
@@ -61,7 +61,7 @@ def learned(
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,)."""
     u, warp = coordinates(z), Warp.about(y, critical, quantile=0.5)
     t, inside = warp.values(y), warp.interval(critical)
-    plain = metamodel.fit(u, t, rng)
+    plain = about(metamodel, inside).fit(u, t, rng)
     trend = _trend(u, t)
     if trend is None:
         return lambda points: plain(coordinates(points)).log_probability(inside)

@@ -13,11 +13,12 @@ import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, functions
 from sbt.metamodels.ensemble import Ensemble
 from sbt.metamodels.et import ExtraTrees
 from sbt.metamodels.gp import GaussianProcess
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.stacking import Bins, held_out, mixture_score, stacked, surely_better
 from sbt.metamodels.torch_tools import check_device
 from sbt.problem.requirement import CriticalInterval
 
@@ -32,13 +33,20 @@ class Auto:
     """Settings of the automatic choice.
 
     Each model is scored on rows it was not fitted to (cross-validation); the weights are those of
-    largest likelihood of the mixture there, shrunk a little to equal ones. Then all models are fitted
-    to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
-    every batch, takes about a quarter of the time up to 500 rows: no ensemble, two folds.
+    largest likelihood of the mixture there, shrunk a little to equal ones. Then the models that have a weight are
+    fitted to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
+    every batch, takes about a quarter of the time: a smaller ensemble, two folds.
+
+    A campaign that looks for the critical edge tells where it is (`about`). Then what counts is not the density of y
+    but the probability of the range that it fell into (see `Bins`), and the first model, `gp`, is believed alone unless
+    the mixture is better by two standard errors: rows crowd at the edge, where a mixture that hedges looks better than
+    it is over the space.
 
     Args:
         folds: of the cross-validation, >= 2.
         prior: rows >= 0 that speak for equal weights.
+        members: networks of the ensemble, >= 2.
+        pace: share in (0, 1] of the ensemble's steps that are taken.
         ensemble_rows: rows from which on the ensemble takes part, >= 2.
         gp_rows: rows up to which the Gaussian process takes part, >= 2.
         device: auto (CUDA where there is one), cpu or cuda; for the ensemble.
@@ -52,30 +60,46 @@ class Auto:
 
     folds: int = 3
     prior: float = 5.0
+    members: int = 10
+    pace: float = 1.0
     ensemble_rows: int = 100
     gp_rows: int = 4000
     device: str = "cpu"
 
-    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"folds": 2, "ensemble_rows": 500}}
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"folds": 2, "members": 5, "pace": 0.6, "ensemble_rows": 150}}
 
     def __post_init__(self) -> None:
-        for name in ("folds", "ensemble_rows", "gp_rows"):
+        for name in ("folds", "members", "ensemble_rows", "gp_rows"):
             if not getattr(self, name) >= 2:
                 raise InputError(f"{name} must be >= 2, but got {getattr(self, name)}")
+        if not 0.0 < self.pace <= 1.0:
+            raise InputError(f"pace must be in (0, 1], but got {self.pace}")
         if not self.prior >= 0.0:
             raise InputError(f"prior must be >= 0, but got {self.prior}")
         check_device(self.device)
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
         """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
+        return self._fit(u, y, rng, None)
+
+    @property
+    def simplest(self) -> Metamodel:
+        """What is believed where there is no time to compare."""
+        return GaussianProcess()
+
+    def about(self, critical: CriticalInterval) -> _About:
+        """Return the same settings for runs whose critical interval is known."""
+        return _About(self, critical)
+
+    def _fit(self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None) -> MixturePredictor:
         u, y = check_rows(u, y)
-        models = self._models(len(y))
+        models, bins = self._models(len(y)), None if critical is None else Bins.about(y, critical)
         if len(y) < _FEWEST:
-            weights, held_out = np.full(len(models), 1.0 / len(models)), None
+            weights, scores = np.full(len(models), 1.0 / len(models)), None
         else:
-            held_out = _held_out(models, u, y, self.folds, rng)
-            weights = _stack(held_out, self.prior)
-        choice = _explain(list(models), weights, held_out, len(y), self)
+            scores = held_out(models.values(), u, y, self.folds, rng, bins)
+            weights = stacked(scores, self.prior)
+        choice = _explain(list(models), weights, scores, len(y), self, bins)
         kept = {name: model for name, model in models.items() if choice.weights[name] > 0.0}
         predictors = tuple(model.fit(u, y, rng) for model in kept.values())
         return MixturePredictor(predictors, np.array([choice.weights[name] for name in kept]), choice)
@@ -87,18 +111,34 @@ class Auto:
             models["gp"] = GaussianProcess()
         models["et"] = ExtraTrees()
         if n >= self.ensemble_rows:
-            models["ensemble"] = _paced(n, self.device)
+            models["ensemble"] = _paced(n, Ensemble(members=self.members, device=self.device), self.pace)
         return models
 
 
-def _paced(n: int, device: str) -> Ensemble:
-    """Return an ensemble that takes fewer and larger steps below 1,000 rows: it is fitted once a fold and once more.
+@dataclass(frozen=True)
+class _About:
+    """`Auto` that knows what is critical."""
 
-    >>> _paced(200, "cpu").steps, _paced(500, "cpu").steps, _paced(5000, "cpu").steps
-    (500, 1250, 2500)
+    settings: Auto
+    critical: CriticalInterval
+
+    def about(self, critical: CriticalInterval) -> _About:
+        """Return the same settings for another interval."""
+        return _About(self.settings, critical)
+
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
+        """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
+        return self.settings._fit(u, y, rng, self.critical)
+
+
+def _paced(n: int, full: Ensemble, pace: float) -> Ensemble:
+    """Return the ensemble with fewer and larger steps below 1,000 rows: it is fitted once a fold and once more.
+
+    >>> [_paced(n, Ensemble(), 1.0).steps for n in (200, 500, 5000)]
+    [500, 1250, 2500]
     """
-    full, share = Ensemble(device=device), min(max(n, 200) / 1000, 1.0)
-    return replace(full, steps=round(share * full.steps), learning_rate=full.learning_rate * min(share**-0.5, 2.0))
+    share = min(max(n, 200) / 1000, 1.0)
+    return replace(full, steps=round(share * pace * full.steps), learning_rate=full.learning_rate * min(share**-0.5, 2.0))
 
 
 @dataclass(frozen=True)
@@ -143,58 +183,34 @@ class MixturePredictor:
             low, high = low + weight * ends[0], high + weight * ends[1]
         return low, np.minimum(high, 1.0)
 
+    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, m) draws of y as a function at u (m, d), each from one of the predictors."""
+        counts = rng.multinomial(n, self.weight)
+        return np.concatenate([functions(p, u, k, rng) for p, k in zip(self.predictors, counts.tolist(), strict=True)])
+
     def __call__(self, u: Points) -> Prediction:
         """Return the belief at u (n, d)."""
         return Prediction.mixture_of([predict(u) for predict in self.predictors], self.weight)
 
 
-def _held_out(models: Mapping[str, Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator) -> Points:
-    """Return (models, n) log densities of each row under models fitted to the other folds."""
-    fold = rng.permutation(len(y)) % folds
-    log_density = np.empty((len(models), len(y)))
-    for i in range(folds):
-        out = fold == i
-        for row, model in zip(log_density, models.values(), strict=True):
-            row[out] = model.fit(u[~out], y[~out], rng)(u[out]).log_density(y[out])
-    return log_density
-
-
-def _stack(log_density: Points, prior: float) -> Vector:
-    """Return the (k,) weights of the mixture of largest likelihood, by expectation maximisation.
-
-    Args:
-        log_density: (k, n) of each row under each model.
-        prior: rows that speak for equal weights.
-
-    >>> _stack(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
-    [1.0, 0.0]
-    """
-    k, n = log_density.shape
-    density = np.exp(log_density - log_density.max(axis=0))
-    weights = np.full(k, 1.0 / k)
-    for _ in range(500):
-        joint = weights[:, None] * density
-        new = ((joint / joint.sum(axis=0)).sum(axis=1) + prior / k) / (n + prior)
-        moved, weights = np.abs(new - weights).max(), new
-        if moved < 1e-6:
-            break
-    return np.asarray(weights / weights.sum())
-
-
-def _explain(names: list[str], weights: Vector, held_out: Points | None, n: int, settings: Auto) -> Choice:
+def _explain(names: list[str], weights: Vector, held: Points | None, n: int, settings: Auto, bins: Bins | None) -> Choice:
     """Return the choice, models with little weight left out."""
     kept = np.where(weights >= _LEAST, weights, 0.0)
     kept /= kept.sum()
-    shares = {name: float(w) for name, w in zip(names, kept, strict=True)}
+    alone = held is not None and bins is not None and not surely_better(held, kept)
+    chosen = np.eye(len(names))[0] if alone else kept
+    shares = {name: float(w) for name, w in zip(names, chosen, strict=True)}
     mixed = ", ".join(f"{100 * w:.0f} % {name}" for name, w in shares.items() if w > 0.0)
-    if held_out is None:
+    if held is None:
         reason = f"{mixed}: {n} rows are too few to compare models (from {_FEWEST} on)"
         return Choice(shares, {}, reason)
-    with np.errstate(divide="ignore"):
-        mixture = np.logaddexp.reduce(held_out + np.log(kept)[:, None], axis=0).mean()
-    scores = {name: float(row.mean()) for name, row in zip(names, held_out, strict=True)} | {"mixture": float(mixture)}
+    scores = {name: float(row.mean()) for name, row in zip(names, held, strict=True)}
+    scores["mixture"] = float(mixture_score(held, kept).mean())
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
-    reason = f"{mixed}: mean log likelihood of {n} rows, each predicted from other rows ({settings.folds} folds): {listed}"
+    what = "" if bins is None else f" to fall where they did, of the ranges cut at {', '.join(f'{cut:.3g}' for cut in bins.cuts)}"
+    reason = f"{mixed}: mean log likelihood of {n} rows{what}, each predicted from other rows ({settings.folds} folds): {listed}"
+    if alone and len(names) > 1:
+        reason += f" (not better than {names[0]} by two standard errors)"
     if "ensemble" not in names:
         reason += f"; the ensemble takes part from {settings.ensemble_rows} rows on"
     if "gp" not in names:

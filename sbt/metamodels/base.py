@@ -18,7 +18,10 @@ from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Metamodel", "Predictor", "Screened", "build", "check_rows", "log_ambiguity_bound", "split_validation", "standardise"]
+__all__ = [
+    "Aimed", "Metamodel", "Predictor", "Screened", "about", "build", "check_rows", "functions", "log_ambiguity_bound",
+    "simplest", "split_validation", "standardise",
+]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
 """A fitted metamodel: (n, d) points -> belief at them. Picklable."""
@@ -39,6 +42,22 @@ def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterv
     return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), 1e-304))
 
 
+def functions(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
+    """Return (n, m) draws of y as a function, at u (m, d).
+
+    A predictor with `draws` (a process) draws functions; of a mixture one component stands for a function; a single
+    Gaussian a point is drawn point by point.
+    """
+    joint: Any = getattr(predictor, "draws", None)
+    if joint is not None:
+        return joint(u, n, rng)
+    p = predictor(u)
+    component = rng.choice(len(p.weight), n, p=p.weight)
+    if len(p.weight) >= 5:
+        return p.mean[component]
+    return p.mean[component] + p.std[component] * rng.standard_normal((n, len(u)))
+
+
 class Metamodel(Protocol):
     """Settings of a metamodel; a frozen dataclass, optionally with `PRESETS`."""
 
@@ -54,6 +73,26 @@ class Metamodel(Protocol):
             InputError: n < 2, or values that are not finite.
         """
         ...
+
+
+@runtime_checkable
+class Aimed(Protocol):
+    """Settings of a metamodel that learns otherwise where it knows what is critical."""
+
+    def about(self, critical: CriticalInterval) -> Metamodel:
+        """Return the same settings, told M_c in the unit of the y that it will learn (warped, where y is)."""
+        ...
+
+
+def about(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
+    """Return the metamodel told of M_c where it wants to know, else itself."""
+    return metamodel.about(critical) if isinstance(metamodel, Aimed) else metamodel
+
+
+def simplest(metamodel: Metamodel) -> Metamodel:
+    """Return what a metamodel that compares others falls back on (its attribute `simplest`), else itself."""
+    found: Metamodel = getattr(metamodel, "simplest", metamodel)
+    return found
 
 
 M = TypeVar("M")

@@ -9,12 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.arrays import Points, Vector
+from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, standardise
 from sbt.metamodels.sparse import SparsePredictor, Training, train
 
 __all__ = ["DeepSigmaPointProcess"]
-
-_PENALTY = 0.05  # weight of the KL divergence, as Jankowiak et al. (2020) recommend
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,10 @@ class DeepSigmaPointProcess:
         inducing: most inducing points of a process, >= 1.
         sites: quadrature sites >= 1, the Gaussians of the mixture (the paper's "mixture components").
         learning_rate: step of Adam, > 0.
+        penalty: weight > 0 of the KL divergence to the prior (Jankowiak et al. recommend 0.05 to 1).
         batch: rows of a minibatch >= 1.
-        patience: epochs >= 1 without an improvement of 0.01 of the validation log likelihood.
+        patience: epochs >= 1 without an improvement of 0.01 of the validation log likelihood; None: all rows train,
+            for `max_epochs`, with a learning rate that falls to 0.
         max_epochs: most epochs >= 1.
         device: auto (CUDA where there is one), cpu or cuda.
 
@@ -46,8 +47,9 @@ class DeepSigmaPointProcess:
     inducing: int = 100
     sites: int = 9
     learning_rate: float = 0.01
+    penalty: float = 0.05
     batch: int = 1024
-    patience: int = 200
+    patience: int | None = 200
     max_epochs: int = 2000
     device: str = "cpu"
 
@@ -56,6 +58,8 @@ class DeepSigmaPointProcess:
     }
 
     def __post_init__(self) -> None:
+        if not self.penalty > 0.0:
+            raise InputError(f"penalty must be > 0, but got {self.penalty}")
         self._training()
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparsePredictor:
@@ -67,6 +71,6 @@ class DeepSigmaPointProcess:
     def _training(self) -> Training:
         return Training(
             deep=True, kernel=self.kernel, inducing=self.inducing, sites=self.sites, objective="predictive",
-            penalty=_PENALTY, learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
+            penalty=self.penalty, learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
             max_epochs=self.max_epochs, device=self.device,
         )  # fmt: skip

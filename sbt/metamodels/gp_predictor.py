@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr
@@ -22,9 +21,9 @@ from sbt.problem.requirement import CriticalInterval
 __all__ = ["GaussianProcessPredictor", "Hyperparameters", "NoiseSpread", "cholesky", "matern", "relative"]
 
 _CHUNK = 512  # points predicted at once
-_QUICK = 256  # points bounded at once: what is in between stays in the cache
-_BLOCK = 128  # rows summed in single precision
-_MARGIN = 3e-5  # of a mean in single precision: 128 roundings of 6e-8 in a sum, a few in each term
+_QUICK = 128  # points bounded at once: what is in between stays in the cache
+_ROUNDED = 1e-6  # of a correlation in single precision: at most a dozen roundings of 6e-8
+_CANCELLED = 2e-15  # of a squared distance, relative to the squares that it is the difference of: a few roundings
 _LOG_CHI2 = 1.27036  # -E[log chi^2_1]: what the mean of log z^2 lacks to the log of the mean of z^2
 
 
@@ -83,8 +82,8 @@ class GaussianProcessPredictor:
         rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # a small noise need not be known
         at = np.full(len(u), most) if rough or self.spread is None else self.spread(u)
         mean = self.shift + self.scale * quick
-        margin = self.scale * _MARGIN * scale * float(np.abs(self.alpha).sum())
-        latent = scale * (1.0 - np.maximum(nearest - 1e-6, 0.0) ** 2 * scale / (scale + noise * most))
+        margin = self.scale * self._off * scale * float(np.abs(self.alpha).sum())
+        latent = scale * (1.0 - np.maximum(nearest - self._off, 0.0) ** 2 * scale / (scale + noise * most))
         sigma = 1.000001 * self.scale * np.sqrt(latent + noise * at)
         outside = np.maximum(np.maximum(critical.low - mean, mean - critical.high) - margin, 0.0)  # at least so far off
         below, above = mean - critical.low - margin, critical.high - mean - margin
@@ -93,35 +92,46 @@ class GaussianProcessPredictor:
         for width in self.widths:
             std = width * sigma
             high += np.where(outside > 0.0, ndtr(-outside / std), 1.0) / len(self.widths)
-            low += np.where(inside, np.maximum(1.0 - ndtr(-below / std) - ndtr(-above / std), 0.0), 0.0) / len(self.widths)
+            if inside.any():  # rarely
+                i, at_least = inside, np.zeros(len(u))
+                at_least[i] = np.maximum(1.0 - ndtr(-below[i] / std[i]) - ndtr(-above[i] / std[i]), 0.0)
+                low += at_least / len(self.widths)
         return low * (1.0 - 1e-9), np.minimum(high * (1.0 + 1e-9), 1.0)
 
     def _quick(self, u: Points) -> tuple[Vector, Vector]:
-        """Return (m,) means, standardised, and (m,) correlations with the nearest row, in single precision.
+        """Return (m,) means, standardised, and (m,) correlations with the nearest row.
 
-        Means are off by at most `_MARGIN` times the output scale and the sum of |alpha|.
+        Correlations are in single precision and off by at most `_off`; sums are in double precision.
         """
         across, weights = self._prepared
         b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
         squares = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)]) @ across  # (m, n)
-        r = np.sqrt(np.maximum(squares, 0.0, out=squares), dtype=np.float32, casting="same_kind")
-        correlation = np.exp(-r)
+        r = squares.astype(np.float32)
+        np.sqrt(np.abs(r, out=r), out=r)  # what rounding left below 0 is as good above it
+        correlation = np.negative(r)
+        np.exp(correlation, out=correlation)
         if self.hyper.nu == 1.5:
             r += np.float32(1.0)
             correlation *= r
         elif self.hyper.nu == 2.5:
             correlation *= r * r / np.float32(3.0) + r + np.float32(1.0)
-        mean = np.full(len(u), self.centre)
-        for i in range(0, len(weights), _BLOCK):  # short sums lose few digits
-            mean += correlation[:, i : i + _BLOCK] @ weights[i : i + _BLOCK]
-        return mean, correlation.max(axis=1).astype(np.float64)
+        return self.centre + correlation @ weights, correlation.max(axis=1).astype(np.float64)
 
     @cached_property
-    def _prepared(self) -> tuple[Points, NDArray[np.float32]]:
+    def _off(self) -> float:
+        """No correlation that `_quick` finds in the unit cube is farther off.
+
+        Squared distances are differences of squares; nu 0.5 has a slope at distance 0, where their root is worst.
+        """
+        cancelled = _CANCELLED * 8.0 * self.hyper.nu * float((self.hyper.lengthscale**-2.0).sum())
+        return _ROUNDED + (math.sqrt(cancelled) if self.hyper.nu == 0.5 else cancelled)
+
+    @cached_property
+    def _prepared(self) -> tuple[Points, Vector]:
         """Return what squared distances of points and rows are made from, (d + 2, n), and (n,) weights."""
         a = self.u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
         across = np.column_stack([-2.0 * a, (a**2).sum(axis=1), np.ones(len(a))]).T
-        return np.ascontiguousarray(across), (self.hyper.outputscale * self.alpha).astype(np.float32)
+        return np.ascontiguousarray(across), self.hyper.outputscale * self.alpha
 
     def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m.

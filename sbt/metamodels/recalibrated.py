@@ -6,13 +6,14 @@ where sigma was wide on purpose (see docs/metamodels.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sbt.arrays import Points, Vector
-from sbt.metamodels.base import Metamodel, Predictor, check_rows, split_validation
+from sbt.metamodels.base import Metamodel, Predictor, about, check_rows, split_validation
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Recalibrated", "RecalibratedPredictor"]
 
@@ -36,6 +37,10 @@ class Recalibrated:
     """
 
     metamodel: Metamodel
+
+    def about(self, critical: CriticalInterval) -> Recalibrated:
+        """Return the same, the metamodel told of M_c."""
+        return replace(self, metamodel=about(self.metamodel, critical))
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> RecalibratedPredictor:
         """Return the predictor learned from u (n, d) and y (n,); see `Metamodel.fit`."""

@@ -119,7 +119,7 @@ def rejection(
     position, end, size, scored = start, start + max_candidates, min(_FIRST_CHUNK, chunk), 0
     while len(accepted) < n and position < end:
         stop = min(position + size, end)
-        seen, uniform, gumbel = _seen(score, sobol, position, stop, seed, label, accept_filter, bound)
+        seen, uniform, gumbel = _seen(score, sobol, position, stop, seed, label, accept_filter, bound, fill)
         hit = uniform < np.exp(seen.key)
         last = _index_of(hit, n - len(accepted))
         if last is not None:  # the batch is full: what comes after belongs to the next draw
@@ -127,7 +127,8 @@ def rejection(
             stop = int(seen.positions[-1]) + 1
         scored += len(seen)
         accepted = accepted.joined(seen.at(hit))
-        rejected = rejected.joined(seen.ranked_by(seen.key + gumbel).at(~hit)).best(n)
+        if fill:
+            rejected = rejected.joined(seen.ranked_by(seen.key + gumbel).at(~hit)).best(n)
         position, size = stop, min(2 * size, chunk)
     if len(accepted) == n:
         share = n / max(scored, 1)
@@ -191,8 +192,11 @@ def _seen(
     label: int | str,
     accept_filter: Callable[[Points], Mask] | None,
     bound: Callable[[Points], Vector] | None,
+    fill: bool,
 ) -> tuple[_Candidates, Vector, Vector]:
     """Return the admissible candidates at the positions, checked log scores as key, uniforms and Gumbel numbers.
+
+    The Gumbel numbers are 0 where they are not needed, without `fill`.
 
     The key is -inf where the bound already tells that the candidate is rejected.
     """
@@ -200,7 +204,7 @@ def _seen(
     if accept_filter is not None:
         admissible = np.asarray(accept_filter(u), dtype=bool)
         u, positions = u[admissible], positions[admissible]
-    uniform, gumbel = _randomness(positions, seed, label)
+    uniform, gumbel = _randomness(positions, seed, label, fill)
     log_score = np.full(len(u), -np.inf)
     possible = np.ones(len(u), dtype=bool) if bound is None or len(u) == 0 else uniform < np.exp(bound(u))
     if possible.any():
@@ -219,13 +223,15 @@ def _checked(found: Vector, n: int) -> Vector:
     return log_score
 
 
-def _randomness(positions: Positions, seed: int, label: int | str) -> tuple[Vector, Vector]:
-    """Return (m,) uniforms in [0, 1) and (m,) standard Gumbel numbers that belong to the positions."""
+def _randomness(positions: Positions, seed: int, label: int | str, gumbel: bool) -> tuple[Vector, Vector]:
+    """Return (m,) uniforms in [0, 1) and (m,) standard Gumbel numbers (or zeros) that belong to the positions."""
     blocks, inverse = np.unique(positions // _BLOCK, return_inverse=True)
     streams = [stream(seed, "rejection", label, int(block)) for block in blocks]
     uniform = np.array([s.random(_BLOCK) for s in streams]).reshape(-1, _BLOCK)
-    exponential = np.array([s.standard_exponential(_BLOCK) for s in streams]).reshape(-1, _BLOCK)
     at = (inverse, positions % _BLOCK)
+    if not gumbel:
+        return uniform[at], np.zeros(len(positions))
+    exponential = np.array([s.standard_exponential(_BLOCK) for s in streams]).reshape(-1, _BLOCK)
     return uniform[at], -np.log(np.maximum(exponential[at], 1e-300))
 
 

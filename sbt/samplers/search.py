@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from sbt.arrays import Mask, Points, Vector
-from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.base import Metamodel, Predictor, about, functions
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
@@ -89,26 +88,16 @@ class Belief:
         return np.exp(self.log_probability(u))
 
     def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, m) draws of the warped metric as a function, at u (m, d).
-
-        A process draws functions; of a mixture one component stands for a function; a single Gaussian a
-        point is drawn point by point.
-        """
-        joint: Any = getattr(self.predictor, "draws", None)
-        if joint is not None:
-            return joint(self.columns(u), n, rng)
-        p = self(u)
-        component = rng.choice(len(p.weight), n, p=p.weight)
-        if len(p.weight) >= 5:
-            return p.mean[component]
-        return p.mean[component] + p.std[component] * rng.standard_normal((n, len(u)))
+        """Return (n, m) draws of the warped metric as a function, at u (m, d)."""
+        return functions(self.predictor, self.columns(u), n, rng)
 
 
 def believe(search: Search, u: Points, y: Vector, rng: np.random.Generator) -> Belief:
     """Return the belief learned from u (n, d) and finite y (n,), n >= 2."""
     warp = Warp.about(y, search.critical)
-    predictor = search.metamodel.fit(search.columns(u), warp.values(y), rng)
-    return Belief(predictor, search.columns, warp, warp.interval(search.critical))
+    critical = warp.interval(search.critical)
+    predictor = about(search.metamodel, critical).fit(search.columns(u), warp.values(y), rng)
+    return Belief(predictor, search.columns, warp, critical)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,118 @@
+"""What the models of a mixture are worth: scores on rows they had not seen, and the weights of the best mixture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.arrays import Points, Vector
+from sbt.metamodels.base import Metamodel
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.warp import Warp
+from sbt.problem.requirement import CriticalInterval
+
+__all__ = ["Bins", "held_out", "mixture_score", "stacked", "surely_better"]
+
+_SURE = 2.0  # standard errors
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Ranges of y that a score tells apart: on which side of the critical edge a run fell, and whether near it.
+
+    The density of y, summed over all runs, says little about the edge: a model that knows the plateau of the runs
+    without a conflict to a thousandth wins there, whatever it believes about the few that matter. The probability of
+    a range has no such spikes.
+
+    Args:
+        critical: M_c, in the unit of y.
+        near: distance > 0 from an end of M_c that counts as near.
+
+    Source:
+        The logarithmic score of a categorical outcome, which is proper: Gneiting & Raftery (2007), section 3.
+    """
+
+    critical: CriticalInterval
+    near: float
+
+    @classmethod
+    def about(cls, y: Vector, critical: CriticalInterval) -> Bins:
+        """Return the ranges for runs y (n,): the quarter of them that is nearest to the edge is near."""
+        return cls(critical, Warp.about(y, critical).scale)
+
+    @property
+    def cuts(self) -> Vector:
+        """(m,) increasing ends of the ranges; the first and the last range reach to infinity.
+
+        >>> Bins(CriticalInterval(0.0, 5.0), near=1.0).cuts.tolist()
+        [-1.0, 0.0, 1.0, 4.0, 5.0, 6.0]
+        """
+        ends = [end for end in (self.critical.low, self.critical.high) if np.isfinite(end)]
+        return np.unique([end + step for end in ends for step in (-self.near, 0.0, self.near)])
+
+    def log_score(self, belief: Prediction, y: Vector) -> Vector:
+        """Return (n,) log probabilities of the ranges that y (n,) fell into; M_c is closed."""
+        ends, score = np.array([-np.inf, *self.cuts, np.inf]), np.empty(len(y))
+        fell = np.searchsorted(self.cuts, y, side="right") - (y == self.critical.high)
+        for k in np.unique(fell):
+            mine = fell == k
+            score[mine] = belief.take(mine).log_probability(CriticalInterval(float(ends[k]), float(ends[k + 1])))[0]
+        return score
+
+
+def held_out(
+    models: Iterable[Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator, bins: Bins | None
+) -> Points:
+    """Return (k, n) log scores of each row under k models fitted to the other folds: of its bin, or its log density."""
+    fold, chosen = rng.permutation(len(y)) % folds, list(models)
+    score = np.empty((len(chosen), len(y)))
+    for i in range(folds):
+        out = fold == i
+        for row, model in zip(score, chosen, strict=True):
+            belief = model.fit(u[~out], y[~out], rng)(u[out])
+            row[out] = belief.log_density(y[out]) if bins is None else bins.log_score(belief, y[out])
+    return score
+
+
+def stacked(log_score: Points, prior: float) -> Vector:
+    """Return the (k,) weights of the mixture of largest likelihood, by expectation maximisation.
+
+    Args:
+        log_score: (k, n) of each row under each model; -inf where a model excludes what happened.
+        prior: rows that speak for equal weights.
+
+    Source:
+        Yao et al. (2018), Using stacking to average Bayesian predictive distributions.
+
+    >>> stacked(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
+    [1.0, 0.0]
+    """
+    k = len(log_score)
+    log_score = np.maximum(log_score, -1e300)
+    density = np.exp(log_score - log_score.max(axis=0))
+    n, weights = log_score.shape[1], np.full(k, 1.0 / k)
+    for _ in range(500):
+        joint = weights[:, None] * density
+        new = ((joint / joint.sum(axis=0)).sum(axis=1) + prior / k) / (n + prior)
+        moved, weights = np.abs(new - weights).max(), new
+        if moved < 1e-6:
+            break
+    return np.asarray(weights / weights.sum())
+
+
+def mixture_score(log_score: Points, weights: Vector) -> Vector:
+    """Return the (n,) log scores of the mixture of k models with (k, n) scores and weights >= 0."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.logaddexp.reduce(log_score + np.log(weights)[:, None], axis=0))
+
+
+def surely_better(log_score: Points, weights: Vector) -> bool:
+    """Say whether the mixture is better than the first of the k models by two standard errors of (k, n) scores.
+
+    >>> surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
+    True
+    """
+    gain = mixture_score(log_score, weights) - log_score[0]
+    return float(gain.mean()) > _SURE * float(gain.std()) / len(gain) ** 0.5
