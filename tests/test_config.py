@@ -73,11 +73,14 @@ def errors(text: str, *overrides: str, folder: Path | None = None, assembled: bo
     return list(caught.value.errors)
 
 
+PROCESS = {"nu": 2.5, "input_noise": False}
+
+
 def test_every_key_has_a_default_but_campaign_and_scenario():
     config = parse(BASE).config
     assert (config.budget, config.initial, config.batch, config.seed) == (500, 50, 50, 0)
     assert config.metamodel is not None
-    assert (config.metamodel.kind, config.metamodel.preset, config.acquisition.kind) == ("auto", "quick", "mix")
+    assert (config.metamodel.kind, config.metamodel.settings, config.acquisition.kind) == ("gp", PROCESS, "mix")
     assert config.store == "runs/boundary_plugin"
     assert config.executor.workers >= 1
 
@@ -86,7 +89,9 @@ def test_coverage_learns_nothing_unless_asked():
     text = "campaign: coverage\nscenario: cut_in\n"
     assert parse(text).config.metamodel is None
     assert parse(text).config.acquisition.kind == "even"
-    assert parse(text + "metamodel: {kind: et}\n").config.metamodel is not None
+    asked = parse(text + "metamodel: {}\n").config.metamodel
+    assert asked is not None
+    assert asked.kind == "auto"
 
 
 @pytest.mark.parametrize(("budget", "initial"), [(1, 1), (9, 9), (40, 10), (500, 50), (2000, 200)])

@@ -144,6 +144,7 @@ class Choice(_Strict):
 class MetamodelChoice(Choice):
     """The metamodel; further keys are its settings, and `recalibrate: true` scales its sigma on held-out rows."""
 
+    kind: Name = Field(default="auto", description="An installed name, or file.py:NAME.")
     preset: Name | None = Field(
         default=None, description="Named settings of the metamodel, such as paper; further keys override it."
     )
