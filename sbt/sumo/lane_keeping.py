@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 from sbt.sumo.actors import Action, Obstacle, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, SingleTrack
@@ -59,7 +60,7 @@ class MarkingSensor:
         noise = self._noise * self._rng.standard_normal(len(self._points))
         eye = np.array([own.x, own.y])
         east, north = self._x - own.x, self._y - own.y
-        near = np.flatnonzero((east * east + north * north < self._reach**2) & (east * own.cos + north * own.sin > 0.0))
+        (near,) = ((east * east + north * north < self._reach**2) & (east * own.cos + north * own.sin > 0.0)).nonzero()
         around = tuple([o for o, radius in self._obstacles if self._may_hide(own, o.pose[0] - own.x, o.pose[1] - own.y, radius)])
         if around:
             if around not in self._boxes:
@@ -78,7 +79,7 @@ class MarkingSensor:
         terms[0], terms[1], terms[2], terms[3] = 1.0, x, square, square * x
         weighted = terms / (1.0 + square / self._reach**2)
         normal = weighted @ terms.T + self._KNOWN
-        self._fit = np.linalg.solve(normal, weighted @ y + self._MEMORY * self._fit)
+        _, _, self._fit, _ = dgesv(normal, weighted @ y + self._MEMORY * self._fit)  # numpy's solve, without its checks
         return self._fit
 
     def _may_hide(self, own: State, east: float, north: float, radius: float) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Protocol
 
@@ -10,8 +11,8 @@ import numpy as np
 from sbt.arrays import Mask
 
 __all__ = ["Boxes", "outline"]
-
-_NEVER = 1e-300
+_ALL = (0.0, 0.0, -1.0)
+"""A line with every point beyond it."""
 
 
 class _Rectangle(Protocol):
@@ -32,11 +33,7 @@ class Boxes:
     """
 
     def __init__(self, rectangles: Iterable[tuple[float, float, float, float, float]]):
-        table = np.array(list(rectangles), dtype=np.float64).reshape(-1, 5)
-        cos, sin = np.cos(table[:, 2]), np.sin(table[:, 2])
-        self._centre = table[:, None, :2]  # (m, 1, 2)
-        self._axes = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], -1)  # (m, 2, 2): world to box
-        self._half = 0.5 * table[:, None, 3:]  # (m, 1, 2)
+        self._boxes = [(x, y, math.cos(a), math.sin(a), 0.5 * length, 0.5 * width) for x, y, a, length, width in rectangles]
 
     @classmethod
     def of(cls, states: Iterable[_Rectangle]) -> Boxes:
@@ -51,24 +48,44 @@ class Boxes:
             points: (n, 2) x, y (m).
 
         Returns:
-            (n,) True where the segment from eye to point passes through a rectangle.
-
-        Source:
-            slab test of a segment and a box, Ericson (2005), Real-Time Collision Detection, 5.3.3.
+            (n,) True where the segment from eye to point passes through a rectangle: between the lines of sight that
+            touch it, and beyond those of its sides that face the eye.
 
         >>> wall = Boxes([(5.0, 0.0, 0.0, 1.0, 4.0)])
         >>> wall.hides(np.zeros(2), np.array([[10.0, 0.0], [3.0, 0.0], [10.0, 8.0]])).tolist()
         [True, False, False]
         """
-        start = (eye - self._centre) @ self._axes  # (m, 1, 2)
-        along = (points - eye) @ self._axes  # (m, n, 2)
-        along = np.where(along == 0.0, _NEVER, along)
-        first, last = (-self._half - start) / along, (self._half - start) / along
-        near, far = np.minimum(first, last), np.maximum(first, last)
-        enter = np.maximum(near[..., 0], near[..., 1])  # (m, n); faster than a reduction over two
-        leave = np.minimum(far[..., 0], far[..., 1])
-        hit = (enter < leave) & (leave > 0.0) & (enter < 1.0)
-        return np.asarray(hit.any(axis=0))
+        if not self._boxes:
+            return np.zeros(len(points), dtype=bool)
+        x, y = eye.tolist()
+        lines = np.array([_shadow(x, y, *box) for box in self._boxes])  # (m, 4, 3)
+        beyond = lines[:, :, :2] @ (points - eye).T > lines[:, :, 2:]  # (m, 4, n)
+        return np.asarray(beyond.all(axis=1).any(axis=0))
+
+
+def _shadow(
+    x: float, y: float, middle_x: float, middle_y: float, cos: float, sin: float, ahead: float, left: float
+) -> tuple[tuple[float, float, float], ...]:
+    """Return the four lines, each (a, b, c), that bound a box's shadow: a dx + b dy > c, (dx, dy) from the eye at x, y.
+
+    Reckoned in the box's frame, mirrored so that the eye is in its first quarter.
+    """
+    dx, dy = x - middle_x, y - middle_y
+    u, v = cos * dx + sin * dy, cos * dy - sin * dx
+    along, across = math.copysign(1.0, u), math.copysign(1.0, v)
+    u, v = abs(u), abs(v)
+    faces_u, faces_v = u > ahead, v > left  # the sides that face the eye
+    if not (faces_u or faces_v):
+        return (_ALL,) * 4
+    upper = (-ahead if faces_v else ahead) - u, left - v  # from the eye to the corners that the lines of sight touch
+    lower = ahead - u, (-left if faces_u else left) - v
+    bounds = (
+        (-upper[1], upper[0], 0.0),
+        (lower[1], -lower[0], 0.0),
+        (-1.0, 0.0, u - ahead) if faces_u else _ALL,
+        (0.0, -1.0, v - left) if faces_v else _ALL,
+    )
+    return tuple((a * along * cos - b * across * sin, a * along * sin + b * across * cos, c) for a, b, c in bounds)
 
 
 def outline(state: _Rectangle, per_side: int = 5) -> np.ndarray:
