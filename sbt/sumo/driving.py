@@ -21,6 +21,8 @@ __all__ = ["Drive"]
 
 _FASTEST = 1e4
 _COLUMNS = 5
+_SLACK = 1e-6
+"""Rectangles so near to each other (m) are left to the exact test."""
 _ROW = struct.Struct(f"={_COLUMNS}d")
 """x, y, heading, speed, acceleration: floats in a list would take four times the memory and the time to read them back"""
 
@@ -137,7 +139,10 @@ def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: flo
                 continue
             acceleration, speed, lane, pose = action
             if acceleration is not None:
-                speed = _reached(own.speed, acceleration, speed, dt)
+                reached = own.speed + acceleration * dt
+                if speed is not None:  # the aim at which it ends
+                    reached = max(reached, speed) if acceleration < 0 else min(reached, speed)
+                speed = 0.0 if reached < 0.0 else reached
             if speed is not None:
                 if not -_FASTEST < speed < _FASTEST:
                     raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
@@ -161,14 +166,6 @@ def _change_lane(sumo: Any, actor: Actor, name: str, lane: int) -> None:
             f"but gave {lane}",
         )  # fmt: skip
     sumo.vehicle.changeLane(name, int(lane), 3600.0)
-
-
-def _reached(speed: float, acceleration: float, aim: float | None, dt: float) -> float:
-    """Return the speed after a step of this acceleration, which ends at the aim."""
-    reached = speed + acceleration * dt
-    if aim is not None:
-        reached = max(reached, aim) if acceleration < 0 else min(reached, aim)
-    return 0.0 if reached < 0.0 else reached
 
 
 def _observer(
@@ -226,22 +223,28 @@ def _table(rows: bytearray, first: int, last: int, actors: int) -> np.ndarray:
 def _contact(states: list[State], solid: list[int], rows: bytearray, dt: float) -> Callable[[int], bool]:
     """Return what says whether the first actor, the ego, touched another rectangle in the step to row k.
 
-    Exact only when near: the others are too far away for it, however they are turned.
+    Exact only when near: the others are too far away for it, however they are turned, or one side of ego's is between them.
     """
     ego, near = states[0], 2.0 * max(s.length for s in states)
     width, place = _ROW.size * len(states), struct.Struct("=2d").unpack_from
-    others = [(s, j, _ROW.size * j, 0.5 * (math.hypot(ego.length, ego.width) + math.hypot(s.length, s.width)))
-              for j, s in ((j, states[j]) for j in solid)]  # fmt: skip
+    others = [(s, j, _ROW.size * j) for j, s in ((j, states[j]) for j in solid)]
+    length, breadth = 0.5 * ego.length + _SLACK, 0.5 * ego.width + _SLACK
 
     def touching(k: int) -> bool:
         x, y, speed = ego.x, ego.y, ego.speed
-        for other, j, column, radii in others:
+        for other, j, column in others:
             dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
             if -reach < dx < reach and -reach < dy < reach:
                 (x_0, y_0), (u_0, v_0) = place(rows, max(k - 1, 0) * width), place(rows, max(k - 1, 0) * width + column)
-                dx_0, dy_0 = u_0 - x_0, v_0 - y_0
-                circles = radii + 1.5 * max(abs(dx - dx_0), abs(dy - dy_0))  # about both, and what they moved
-                if min(dx * dx + dy * dy, dx_0 * dx_0 + dy_0 * dy_0) > circles * circles:
+                cos, sin, dx_0, dy_0 = ego.cos, ego.sin, u_0 - x_0, v_0 - y_0
+                turn_cos, turn_sin = abs(other.cos * cos + other.sin * sin), abs(other.sin * cos - other.cos * sin)
+                along = length + 0.5 * (other.length * turn_cos + other.width * turn_sin)
+                ahead, ahead_0 = dx * cos + dy * sin, dx_0 * cos + dy_0 * sin
+                if (ahead > along and ahead_0 > along) or (ahead < -along and ahead_0 < -along):
+                    continue
+                across = breadth + 0.5 * (other.length * turn_sin + other.width * turn_cos)
+                left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
+                if (left > across and left_0 > across) or (left < -across and left_0 < -across):
                     continue
                 step = _table(rows, max(k - 1, 0), k + 1, len(states))
                 if contact_index(_track(step, 0, ego), _track(step, j, other)) is not None:

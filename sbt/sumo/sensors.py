@@ -87,7 +87,7 @@ class RangeSensor:
         self._period, self._reach, self._margin = period, reach, margin
         self._track = Track(smoothing) if smoothing > 0.0 else None
         self._noise = (gap_noise, speed_noise)
-        self._buffer: list[tuple[float, float]] = []
+        self._buffer: list[list[float]] = []
         self._next = 0
         self._held: Target | None = None
 
@@ -119,9 +119,8 @@ class RangeSensor:
             self._held = held = (gap if gap > 0.0 else 0.0, closing)
         return held
 
-    def _draw(self, tick: int) -> tuple[float, float]:
+    def _draw(self, tick: int) -> list[float]:
         """Return the noise of one tick: the same whatever was in the path before."""
         while tick >= len(self._buffer):
-            noise = self._rng.standard_normal((_BLOCK, 2)) * self._noise
-            self._buffer += [(a, b) for a, b in noise.tolist()]
+            self._buffer += (self._rng.standard_normal((_BLOCK, 2)) * self._noise).tolist()
         return self._buffer[tick]
