@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -139,10 +138,7 @@ def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: flo
                 continue
             acceleration, speed, lane, pose = action
             if acceleration is not None:
-                reached = own.speed + acceleration * dt
-                if speed is not None:  # the aim at which it ends
-                    reached = max(reached, speed) if acceleration < 0 else min(reached, speed)
-                speed = 0.0 if reached < 0.0 else reached
+                speed = _reached(own.speed, acceleration, speed, dt)
             if speed is not None:
                 if not -_FASTEST < speed < _FASTEST:
                     raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
@@ -166,6 +162,14 @@ def _change_lane(sumo: Any, actor: Actor, name: str, lane: int) -> None:
             f"but gave {lane}",
         )  # fmt: skip
     sumo.vehicle.changeLane(name, int(lane), 3600.0)
+
+
+def _reached(speed: float, acceleration: float, aim: float | None, dt: float) -> float:
+    """Return the speed after a step of this acceleration, which ends at the aim."""
+    reached = speed + acceleration * dt
+    if aim is not None:
+        reached = max(reached, aim) if acceleration < 0 else min(reached, aim)
+    return 0.0 if reached < 0.0 else reached
 
 
 def _observer(
