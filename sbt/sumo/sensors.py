@@ -8,12 +8,14 @@ import numpy as np
 
 from sbt.sumo.actors import State
 
-__all__ = ["RangeSensor", "Target", "Track"]
+__all__ = ["PERIOD", "RangeSensor", "Target", "Track"]
 
 
 Target = tuple[float, float]
 """The nearest road user ahead in the path, as measured: gap from bumper to bumper (m), rate at which it shrinks (m/s)."""
 
+PERIOD = 0.05
+"""Of the radar's measurements (s)."""
 _BLOCK = 128
 
 
@@ -80,7 +82,7 @@ class RangeSensor:
     """
 
     def __init__(
-        self, rng: np.random.Generator, *, period: float = 0.05, reach: float = 200.0, margin: float = 0.85,
+        self, rng: np.random.Generator, *, period: float = PERIOD, reach: float = 200.0, margin: float = 0.85,
         gap_noise: float = 0.25, speed_noise: float = 0.15, smoothing: float = 0.0,
     ):  # fmt: skip
         self._rng = rng
