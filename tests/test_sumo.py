@@ -362,7 +362,7 @@ def test_the_clock_of_the_radar_does_not_show_where_it_has_no_noise():
     work = [({**values, "d_t": float(d_t)}, 1) for d_t in np.linspace(0.8, 1.4, 121)]
     y = np.array([quiet.measure(trace)["ttc_min"] for trace in quiet.simulate.simulate_many(work)])
     assert np.ptp(y) > 0.5
-    assert np.diff(y).min() > -0.04, "a hundredth of a second more room must not bring ego a quarter of a second closer"
+    assert np.diff(y).min() > -0.04, "a little more room must not bring ego nearer to a collision"
 
 
 def test_a_track_follows_hard_braking_without_a_lag_and_smooths_the_noise():

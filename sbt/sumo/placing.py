@@ -50,7 +50,7 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
                 sumo.person.appendWaitingStage(name, _FOREVER)
         else:
             route = here.route(tuple([prefix + edge for edge in actor.route]))
-            add(name, route, type_name(actor), "now", str(actor.lane), repr(actor.position), repr(actor.speed))
+            add(name, route, type_name(actor), "now", str(actor.lane), repr(float(actor.position)), repr(float(actor.speed)))
             here.inserted(name)
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(name, 32)
