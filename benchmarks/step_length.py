@@ -104,8 +104,8 @@ def main() -> None:
     for a, b in ((0.1, args.reference), (0.05, args.reference), (0.025, args.reference), (0.1, 0.05), (0.05, 0.025)):
         print(f"| {a:g} against {b:g} | " + " | ".join(f"{value:.4f}" for value in changes(a, b)) + " |")
     median, mean, _, below, sides = changes(0.05, 0.025)
-    print(f"\n| {args.scenario} | {args.points} x {args.seeds} | {np.median(noise):.4f} | {noise.mean():.4f} | {median:.4f} | {mean:.4f} "
-          f"| {100 * below:.0f} % | {round(sides * own.size)} of {own.size} |")
+    print(f"\n| {args.scenario} | {args.points} x {args.seeds} | {np.median(noise):.4f} | {noise.mean():.4f} | {median:.4f} "
+          f"| {mean:.4f} | {100 * below:.0f} % | {round(sides * own.size)} of {own.size} |")
 
 
 if __name__ == "__main__":
