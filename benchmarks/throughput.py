@@ -24,6 +24,7 @@ from types import SimpleNamespace
 from scipy.stats import qmc
 
 from sbt import plugins
+from sbt.execution.local import settle
 from sbt.execution.protocol import CHUNK
 from sbt.execution.worker import run_jobs
 from sbt.plugins import load
@@ -93,7 +94,7 @@ def measure(rows: dict[str, tuple[Callable[[], None], int]], repeats: int) -> di
     for run, _ in rows.values():
         run()
     gc.collect()
-    gc.freeze()  # as a worker does
+    settle()  # as a worker does
     for _ in range(repeats):
         for name, (run, n) in rows.items():
             clock = time.perf_counter if "subprocess" in name else time.process_time

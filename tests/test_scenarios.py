@@ -270,6 +270,9 @@ def test_boxes_hide_what_shapely_says() -> None:
         union = shapely.union_all([shapely.Polygon(c) for c in corners])
         expected = [shapely.LineString([eye, p]).intersection(union).length > 0 for p in points]
         assert Boxes(boxes).hides(eye, points).tolist() == expected
+        lengths = [sum(shapely.LineString([eye, p]).intersection(shapely.Polygon(c)).length for c in corners) for p in points]
+        assert np.abs(Boxes(boxes).depth(eye, points) - lengths).max() < 1e-9
+    assert Boxes([]).depth(eye, points).tolist() == [0.0] * 40
 
 
 def test_outline_lies_on_the_sides() -> None:
@@ -288,6 +291,20 @@ def test_marking_sensor_finds_the_lane() -> None:
     fits = np.array([sensor(own) for _ in range(200)])[100:]
     assert np.abs(fits[:, 0].mean()) < 0.05
     assert 2 * fits[:, 2].mean() == pytest.approx(1 / 40, rel=0.2)
+
+
+def test_what_the_marking_sensor_sees_changes_continuously() -> None:
+    """Points come into sight one by one: each fades in, or the metric would jump as an input moves a little."""
+    bar = Obstacle("bar", (14.0, 1.0, 0.3), 10.0, 3.0)
+    s = np.arange(0.0, 60.0, 1.0)
+    left, right = np.stack([s, 0 * s + 1.75], 1), np.stack([s, 0 * s - 1.75], 1)
+    own, found = State("ego", 5.0, 1.8), []
+    for own.x in np.arange(5.0, 22.0, 0.004):  # past the bar, and through its edge
+        sensor = MarkingSensor(np.random.Generator(np.random.PCG64(3)), left, right, lane=3.5, obstacles=(bar,), noise=0.2)
+        found.append([*sensor(own), *sensor.seen])
+    table = np.array(found)
+    assert np.ptp(table[:, 4]) > 5.0, "the bar hides much of the left marking for a while"
+    assert np.all(np.abs(np.diff(table, axis=0)).max(axis=0) < 0.02 * np.ptp(table, axis=0))
 
 
 def test_profiles_integrate_their_speed() -> None:

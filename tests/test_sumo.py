@@ -336,8 +336,9 @@ def test_ego_brakes_within_its_limits_and_never_drives_backwards():
     assert -9.0 - 1e-6 <= hardest < -6.0  # aeb_braking is reached, and not exceeded
 
 
-def _median_ttc(scenario: LogicalScenario, values: Mapping[str, float], seeds: int = 5) -> float:
-    return float(np.median([scenario.measure(simulated(scenario, values, s))["ttc_min"] for s in range(seeds)]))
+def _median_ttc(scenario: LogicalScenario, values: Mapping[str, float], seeds: int = 40) -> float:
+    traces = scenario.simulate.simulate_many([(values, seed) for seed in range(seeds)])
+    return float(np.median([scenario.measure(trace)["ttc_min"] for trace in traces]))
 
 
 def test_more_room_or_less_speed_makes_no_cut_in_worse():
@@ -353,6 +354,15 @@ def test_harsher_braking_ahead_makes_nothing_safer():
         y = [_median_ttc(BRAKING, {**values, "a_co": a}) for a in (-1.0, -3.0, -5.0, -7.0, -10.0)]
         assert (np.diff(y) <= 0.05).all(), (values, y)
         assert y[-1] < y[0]
+
+
+def test_the_clock_of_the_radar_does_not_show_where_it_has_no_noise():
+    quiet = BRAKING.configured(ego={"kind": "acc_aeb", "gap_noise": 0.0, "speed_noise": 0.0})
+    values = {"a_co": -6.0, "v_co_min_frac": 0.3, "v_co": 110.0, "v_ego": 110.0}
+    work = [({**values, "d_t": float(d_t)}, 1) for d_t in np.linspace(0.8, 1.4, 121)]
+    y = np.array([quiet.measure(trace)["ttc_min"] for trace in quiet.simulate.simulate_many(work)])
+    assert np.ptp(y) > 0.5
+    assert np.diff(y).min() > -0.04, "a little more room must not bring ego nearer to a collision"
 
 
 def test_a_track_follows_hard_braking_without_a_lag_and_smooths_the_noise():

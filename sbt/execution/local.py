@@ -212,12 +212,18 @@ def _end_with(parent: int) -> None:
     threading.Thread(target=watch, name="sbt-driver-watch", daemon=True).start()
 
 
+def settle() -> None:
+    """Let the garbage collector look seldom: what is loaded by now stays, and runs make next to no cycles."""
+    gc.freeze()
+    gc.set_threshold(20_000)
+
+
 def _prepare(spec: ScenarioSpec, folder: str, workers: int) -> None:
     """Load the scenario in a worker, and wait until every worker does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
     _end_with(os.getppid())
     spec.resolve().prepare()
-    gc.freeze()  # what is loaded by now stays: the collector need not look through it again and again
+    settle()
     _mark(folder, ())
     deadline = time.monotonic() + 20.0
     while len(os.listdir(folder)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)

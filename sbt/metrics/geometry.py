@@ -106,8 +106,8 @@ def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
     """Return the first instant at which, or in the step before which, the rectangles touch; None: never."""
     dx, dy = b.x - a.x, b.y - a.y
     reach = 0.5 * (math.hypot(a.length, a.width) + math.hypot(b.length, b.width))
-    moved = max(float(np.abs(np.diff(dx)).max(initial=0.0)), float(np.abs(np.diff(dy)).max(initial=0.0)))
-    near = np.flatnonzero(dx * dx + dy * dy <= (reach + 1.5 * moved) ** 2)  # circles: the exact test only there
+    moved = max(float(np.abs(d[1:] - d[:-1]).max(initial=0.0)) for d in (dx, dy))
+    (near,) = (dx * dx + dy * dy <= (reach + 1.5 * moved) ** 2).nonzero()  # circles: the exact test only there
     if near.size == 0:
         return None
     first, last = max(int(near[0]) - 1, 0), int(near[-1]) + 1

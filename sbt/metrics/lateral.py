@@ -13,6 +13,9 @@ from sbt.problem.trace import Trace
 
 __all__ = ["Curve", "lateral_metrics"]
 
+_CELL = 16
+"""Stored points of a curve that are looked at together."""
+
 
 class Curve:
     """A plane curve whose curvature is piecewise linear: straights, arcs and the clothoids between them.
@@ -52,14 +55,32 @@ class Curve:
 
     def project(self, x: float, y: float) -> tuple[float, float, float]:
         """Return where a point is: s of the nearest point (m), distance to the left (m), heading there (rad)."""
-        k = int(np.argmin((self.x - x) ** 2 + (self.y - y) ** 2))
-        heading = float(self.heading[k])
-        dx, dy = x - float(self.x[k]), y - float(self.y[k])
+        s, left, heading = self._seen_from(np.array([np.argmin((self.x - x) ** 2 + (self.y - y) ** 2)]), x, y)
+        return float(s[0]), float(left[0]), float(heading[0])
+
+    def project_all(self, x: Vector, y: Vector) -> tuple[Vector, Vector, Vector]:
+        """Return what `project` says of (n,) points, (n,) each, without looking at the whole curve for each of them."""
+        middle = np.arange(_CELL // 2, len(self.s) + _CELL // 2, _CELL)  # of cells of points; the last one may be short
+        spots = np.minimum(middle, len(self.s) - 1)
+        far = np.hypot(self.x[spots] - x[:, None], self.y[spots] - y[:, None])  # (n, cells)
+        reach = _CELL * float(self.s[1])  # no point of a cell is further from its middle than half of this
+        row, cell = np.nonzero(far <= far.min(axis=1, keepdims=True) + reach)
+        points = np.minimum(middle[cell, None] + np.arange(-(_CELL // 2), _CELL // 2), len(self.s) - 1)  # (pairs, _CELL)
+        square = (self.x[points] - x[row, None]) ** 2 + (self.y[points] - y[row, None]) ** 2
+        best = square.argmin(axis=1)[:, None]
+        found, least = np.take_along_axis(points, best, 1)[:, 0], np.take_along_axis(square, best, 1)[:, 0]
+        order = np.lexsort((least, row))
+        _, first = np.unique(row[order], return_index=True)
+        return self._seen_from(found[order[first]], x, y)
+
+    def _seen_from(self, k: np.ndarray, x: Vector | float, y: Vector | float) -> tuple[Vector, Vector, Vector]:
+        """Return s (m), distance to the left (m) and heading (rad) of points near the stored points k, (n,) each."""
+        heading, bend = self.heading[k], self.curvature[k]
+        dx, dy = x - self.x[k], y - self.y[k]
         cos, sin = np.cos(heading), np.sin(heading)
-        along, left = float(dx * cos + dy * sin), float(dy * cos - dx * sin)
-        bend = float(self.curvature[k])
-        along /= 1.0 - bend * left  # the nearest point lies on an arc through point k
-        return float(self.s[k]) + along, left - 0.5 * bend * along**2, heading + bend * along
+        along, left = dx * cos + dy * sin, dy * cos - dx * sin
+        along = along / (1.0 - bend * left)  # the nearest point lies on an arc through point k
+        return self.s[k] + along, left - 0.5 * bend * along**2, heading + bend * along
 
 
 def _integral(values: Vector, step: float) -> Vector:
@@ -71,8 +92,7 @@ def _integral(values: Vector, step: float) -> Vector:
 def _errors(trace: Trace, curve: Curve, ego: str) -> tuple[Vector, Vector]:
     """Return the (t,) distance to the left of the curve (m) and the heading relative to it (degrees)."""
     actor = trace.actor(ego)
-    places = [curve.project(x, y) for x, y in zip(actor.x.tolist(), actor.y.tolist(), strict=True)]
-    _, left, heading = np.array(places).T
+    _, left, heading = curve.project_all(actor.x, actor.y)
     angle = (actor.heading - heading + np.pi) % (2 * np.pi) - np.pi
     return left, np.degrees(angle)
 

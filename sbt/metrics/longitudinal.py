@@ -100,9 +100,11 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
 
 def time_to_collision(e: Encounter) -> Vector:
     """Return the (t,) TTC along ego's heading (s); it means something where the other is in the path."""
-    ratio = e.gap / np.where(e.closing > 0, e.closing, np.inf)
-    ttc = np.where(e.closing > 0, np.minimum(ratio, HORIZON), HORIZON)
-    ttc = np.where(e.beside, np.where(e.closing > 0, np.maximum(ratio, BESIDE), BESIDE), ttc)
+    closes = e.closing > 0
+    ratio = e.gap / np.where(closes, e.closing, np.inf)
+    ttc = np.where(closes, np.minimum(ratio, HORIZON), HORIZON)
+    if e.beside.any():
+        ttc = np.where(e.beside, np.where(closes, np.maximum(ratio, BESIDE), BESIDE), ttc)
     if e.contact is not None and e.rear_end:
         ttc[e.contact] = 0.0
     return ttc

@@ -57,8 +57,8 @@ def window(trace: Trace, ratio: float) -> tuple[np.ndarray, tuple[float, float]]
     apart = [float(np.hypot(trace.x[:, k] - ego.x, trace.y[:, k] - ego.y).min()) for k in range(1, len(trace.actors))]
     nearest = min(apart, default=0.0)
     half = min(max(nearest + 20.0, 30.0), _NEAR)
-    ahead = 0.4 * half
-    follow = np.stack([ego.x + ahead * np.cos(ego.heading), ego.y + ahead * np.sin(ego.heading)], axis=1)
+    ahead = 0.4 * half  # less where ego drives up or down, or it would leave a wide view
+    follow = np.stack([ego.x + ahead * np.cos(ego.heading), ego.y + ahead / ratio * np.sin(ego.heading)], axis=1)
     return follow, (half, half / ratio)
 
 

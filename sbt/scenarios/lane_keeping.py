@@ -54,7 +54,7 @@ BAR = (20.0, 4.0)
 BARS = ((52.0, 2.0), (92.0, -2.0), (150.0, 2.0), (262.0, -2.0))
 """Where the middle of each bar is: distance after the start along the road, and to the left of the middle of the
 lane (m), just beyond the marking. There it turns with its input: along the road it lies beside it and over its edge,
-else across it. It hides, but bars nobody's way."""
+else across it. It hides what lies behind a metre of it, but bars nobody's way."""
 END = 20.0
 """The run ends so far before the end of the road (m)."""
 LOST = 6.0
@@ -99,7 +99,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     signals = {}
     if isinstance(driver, LaneKeeping):
         sensor = driver.sensor
-        signals = {"seen_left": lambda: float(sensor.seen[0]), "seen_right": lambda: float(sensor.seen[1])}
+        signals = {"seen_left": lambda: sensor.seen[0], "seen_right": lambda: sensor.seen[1]}
     return Scene((Actor("ego", ("road",), 0, BEFORE, speed, driver, CAR, pose),), until_over(), hidden_by, signals)
 
 

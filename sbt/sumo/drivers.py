@@ -10,7 +10,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.sumo.actors import KEEP, Action, Pose, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, Gust
-from sbt.sumo.sensors import RangeSensor, Target
+from sbt.sumo.sensors import PERIOD, RangeSensor, Target
 
 __all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stand", "Walk"]
 
@@ -24,8 +24,10 @@ class AccAeb:
     ACC holds the set speed, or follows with a constant time gap (gap and closing-speed feedback, the
     form of Milanes and Shladover (2014), doi 10.1016/j.trc.2014.09.001), within comfort limits. AEB
     brakes fully once the target is closer than a driver could still stop from: when the time to
-    collision falls below closing / (2 aeb_braking) + aeb_reserve; it holds until nothing closes in. The demand
-    passes a dead time and a first-order lag before it becomes acceleration.
+    collision falls below closing / (2 aeb_braking) + aeb_reserve; it holds until nothing closes in. Its first demand
+    counts for the share of the radar's period, half of it before the measurement and half after, in which it is due:
+    the clock of the radar does not show in how the vehicle brakes. The demand passes a dead time and a first-order
+    lag before it becomes acceleration.
 
     Args:
         rng: source of the sensor noise.
@@ -72,11 +74,12 @@ class AccAeb:
         self._lag = FirstOrderLag(lag).__call__
         self._lag_2 = FirstOrderLag(lag_2).__call__ if lag_2 > 0 else None
         self._last = self._reached = 0.0
-        self._braking = False
+        self._due = 0.0
+        self._target: Target | None = None
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the acceleration over the next step: the mean of the lag's output at its ends."""
-        demand = self._delay(t, self._demand(own.speed, self._sensor(t, own, others)))
+        demand = self._delay(t, self._demand(own, self._sensor(t, own, others)))
         before, dt = self._reached, t - self._last
         after = self._lag(demand, dt)
         if self._lag_2 is not None:
@@ -84,28 +87,34 @@ class AccAeb:
         self._reached, self._last = after, t
         return _as_action((0.5 * (before + after), None, None, None))
 
-    def _demand(self, speed: float, target: Target | None) -> float:
-        """Return the acceleration that ACC and AEB ask for; AEB brakes on until nothing closes in."""
-        demand = 0.4 * (self._set_speed - speed)
-        if target is None:
-            self._braking = False
-        else:
+    def _demand(self, own: State, target: Target | None) -> float:
+        """Return the acceleration that ACC and AEB ask for."""
+        demand, due = 0.4 * (self._set_speed - own.speed), 0.0
+        if target is not None:
             gap, closing = target
-            if closing <= 0:
-                self._braking = False
-            elif gap < self._aeb_distance or (
-                self._aeb_reserve is not None  # the gap from which it can only just stop, and the reserve
-                and gap < closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve)
-            ):
-                self._braking = True
-            if self._braking:
-                return -self._aeb_braking
-            follow = 0.1 * (gap - self._distance_min - self._time_gap * speed) - 0.6 * closing
+            if closing > 0.0:
+                due = self._emergency(gap, closing, target is not self._target, own.step)
+            follow = 0.1 * (gap - self._distance_min - self._time_gap * own.speed) - 0.6 * closing
             if follow < demand:
                 demand = follow
+        self._due, self._target = due, target
         if demand < -self._acc_braking:
-            return -self._acc_braking
-        return demand if demand < self._acc_accel else self._acc_accel
+            demand = -self._acc_braking
+        elif demand > self._acc_accel:
+            demand = self._acc_accel
+        return demand - due * (demand + self._aeb_braking) if due else demand
+
+    def _emergency(self, gap: float, closing: float, new: bool, step: float) -> float:
+        """Return AEB's share of the demand: from its second measurement on 1, until nothing closes in."""
+        if self._due:
+            return 1.0 if new else self._due
+        limit = self._aeb_distance
+        if self._aeb_reserve is not None:  # the gap from which it can only just stop, and the reserve
+            limit = max(limit, closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve))
+        period = max(step, PERIOD)
+        window = 0.0 if self._target is None else 0.5 * period  # nothing can be due of a target before it is seen
+        since = (limit - gap) / closing + window
+        return min(since / period, 1.0) if since > 0.0 else 0.0
 
 
 class LaneChange:

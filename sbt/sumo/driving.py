@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -21,6 +20,8 @@ __all__ = ["Drive"]
 
 _FASTEST = 1e4
 _COLUMNS = 5
+_SLACK = 1e-6
+"""Rectangles so near to each other (m) are left to the exact test."""
 _ROW = struct.Struct(f"={_COLUMNS}d")
 """x, y, heading, speed, acceleration: floats in a list would take four times the memory and the time to read them back"""
 
@@ -226,22 +227,28 @@ def _table(rows: bytearray, first: int, last: int, actors: int) -> np.ndarray:
 def _contact(states: list[State], solid: list[int], rows: bytearray, dt: float) -> Callable[[int], bool]:
     """Return what says whether the first actor, the ego, touched another rectangle in the step to row k.
 
-    Exact only when near: the others are too far away for it, however they are turned.
+    Exact only when near: the others are too far away for it, however they are turned, or one side of ego's is between them.
     """
     ego, near = states[0], 2.0 * max(s.length for s in states)
     width, place = _ROW.size * len(states), struct.Struct("=2d").unpack_from
-    others = [(s, j, _ROW.size * j, 0.5 * (math.hypot(ego.length, ego.width) + math.hypot(s.length, s.width)))
-              for j, s in ((j, states[j]) for j in solid)]  # fmt: skip
+    others = [(s, j, _ROW.size * j) for j, s in ((j, states[j]) for j in solid)]
+    length, breadth = 0.5 * ego.length + _SLACK, 0.5 * ego.width + _SLACK
 
     def touching(k: int) -> bool:
         x, y, speed = ego.x, ego.y, ego.speed
-        for other, j, column, radii in others:
+        for other, j, column in others:
             dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
             if -reach < dx < reach and -reach < dy < reach:
                 (x_0, y_0), (u_0, v_0) = place(rows, max(k - 1, 0) * width), place(rows, max(k - 1, 0) * width + column)
-                dx_0, dy_0 = u_0 - x_0, v_0 - y_0
-                circles = radii + 1.5 * max(abs(dx - dx_0), abs(dy - dy_0))  # about both, and what they moved
-                if min(dx * dx + dy * dy, dx_0 * dx_0 + dy_0 * dy_0) > circles * circles:
+                cos, sin, dx_0, dy_0 = ego.cos, ego.sin, u_0 - x_0, v_0 - y_0
+                turn_cos, turn_sin = abs(other.cos * cos + other.sin * sin), abs(other.sin * cos - other.cos * sin)
+                along = length + 0.5 * (other.length * turn_cos + other.width * turn_sin)
+                ahead, ahead_0 = dx * cos + dy * sin, dx_0 * cos + dy_0 * sin
+                if (ahead > along and ahead_0 > along) or (ahead < -along and ahead_0 < -along):
+                    continue
+                across = breadth + 0.5 * (other.length * turn_sin + other.width * turn_cos)
+                left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
+                if (left > across and left_0 > across) or (left < -across and left_0 < -across):
                     continue
                 step = _table(rows, max(k - 1, 0), k + 1, len(states))
                 if contact_index(_track(step, 0, ego), _track(step, j, other)) is not None:

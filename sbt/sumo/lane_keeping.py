@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 from sbt.sumo.actors import Action, Obstacle, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, SingleTrack
@@ -14,6 +15,11 @@ __all__ = ["LaneKeeping", "MarkingSensor"]
 
 _TICK = 0.05
 """Period of the camera (s)."""
+_EDGE = 1.0
+"""Over so much of an obstacle, or so near to the end of what the camera reaches, a point fades (m): about the distance
+of two points, so that the fit changes continuously where points come into sight one by one."""
+_SLOTS = 64
+"""Numbers of noise a frame and marking: every 64th point has the same, and they are not seen together."""
 
 
 class MarkingSensor:
@@ -22,6 +28,8 @@ class MarkingSensor:
     The lane's middle ahead is a cubic in the vehicle's frame, y = c0 + c1 x + c2 x^2 + c3 x^3: offset,
     direction, half the curvature, a sixth of its rate. Every tick a least-squares fit to the points seen
     is drawn a little to the last one, so that it goes on from what it knew where few or none are seen.
+    A point has full weight in plain sight, less where a corner of an obstacle or the end of the reach is
+    within a metre, and none behind a metre of obstacle: what is seen changes continuously as the vehicle moves.
 
     Args:
         rng: source of the noise.
@@ -32,7 +40,7 @@ class MarkingSensor:
         noise: standard deviation of a point across (m).
 
     Attributes:
-        seen: how many points of the left and of the right marking were seen last.
+        seen: how many points of the left and of the right marking were seen last, those half seen as a half.
     """
 
     _MEMORY = np.array([1.5, 60.0, 6e3, 6e6])
@@ -49,36 +57,38 @@ class MarkingSensor:
         self._points = np.concatenate([left, right])
         self._x, self._y = np.ascontiguousarray(self._points.T)
         self._side = np.concatenate([np.full(len(left), 0.5 * lane), np.full(len(right), -0.5 * lane)])
+        self._slot = np.concatenate([np.arange(len(left)) % _SLOTS, _SLOTS + np.arange(len(right)) % _SLOTS])
         self._obstacles = [(o, math.hypot(0.5 * o.length, 0.5 * o.width)) for o in obstacles]
         self._boxes: dict[tuple[Obstacle, ...], Boxes] = {}
         self._fit = np.zeros(4)
-        self.seen = (0, 0)
+        self.seen = (0.0, 0.0)
 
     def __call__(self, own: State) -> np.ndarray:
         """Return the (4,) coefficients of the lane's middle in the vehicle's frame."""
-        noise = self._noise * self._rng.standard_normal(len(self._points))
+        noise = self._noise * self._rng.standard_normal(2 * _SLOTS)
         eye = np.array([own.x, own.y])
         east, north = self._x - own.x, self._y - own.y
-        near = np.flatnonzero((east * east + north * north < self._reach**2) & (east * own.cos + north * own.sin > 0.0))
+        (near,) = ((east * east + north * north < self._reach**2) & (east * own.cos + north * own.sin > 0.0)).nonzero()
+        side, east, north = self._side[near], east[near], north[near]
+        x = east * own.cos + north * own.sin
+        y = north * own.cos - east * own.sin
+        seen = np.minimum(np.minimum(x, self._reach - np.sqrt(x * x + y * y)) / _EDGE, 1.0)
         around = tuple([o for o, radius in self._obstacles if self._may_hide(own, o.pose[0] - own.x, o.pose[1] - own.y, radius)])
         if around:
             if around not in self._boxes:
                 self._boxes[around] = Boxes((*o.pose, o.length, o.width) for o in around)
-            near = near[~self._boxes[around].hides(eye, self._points[near])]
-        side = self._side[near]
-        self.seen = (int(np.count_nonzero(side > 0)), int(np.count_nonzero(side < 0)))
-        east, north = east[near], north[near]
-        x = east * own.cos + north * own.sin
-        y = north * own.cos - east * own.sin + noise[near]
+            seen *= np.maximum(1.0 - self._boxes[around].depth(eye, self._points[near]) / _EDGE, 0.0)
+        self.seen = (float(seen[side > 0].sum()), float(seen[side < 0].sum()))
+        y += noise[self._slot[near]]
         _, c1, c2, c3 = self._fit
         turn = np.arctan(c1 + x * (2.0 * c2 + 3.0 * c3 * x))  # from a marking to the middle, across the lane as known
         x, y = x + side * np.sin(turn), y - side * np.cos(turn)
         square = x * x
         terms = np.empty((4, len(x)))
         terms[0], terms[1], terms[2], terms[3] = 1.0, x, square, square * x
-        weighted = terms / (1.0 + square / self._reach**2)
+        weighted = terms * (seen / (1.0 + square / self._reach**2))
         normal = weighted @ terms.T + self._KNOWN
-        self._fit = np.linalg.solve(normal, weighted @ y + self._MEMORY * self._fit)
+        _, _, self._fit, _ = dgesv(normal, weighted @ y + self._MEMORY * self._fit)  # numpy's solve, without its checks
         return self._fit
 
     def _may_hide(self, own: State, east: float, north: float, radius: float) -> bool:

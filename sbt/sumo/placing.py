@@ -38,6 +38,7 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
         prefix: of the network's copy that it goes to; of names and edges.
     """
     here = session()
+    add, set_speed = direct(sumo, "vehicle", "add"), direct(sumo, "vehicle", "setSpeed")
     for actor in scene.actors:
         name = prefix + actor.name
         if actor.person:
@@ -48,16 +49,14 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
             else:
                 sumo.person.appendWaitingStage(name, _FOREVER)
         else:
-            sumo.vehicle.add(
-                name, here.route(tuple(prefix + edge for edge in actor.route)), typeID=type_name(actor), depart="now",
-                departLane=str(actor.lane), departPos=repr(actor.position), departSpeed=repr(actor.speed),
-            )  # fmt: skip
+            route = here.route(tuple([prefix + edge for edge in actor.route]))
+            add(name, route, type_name(actor), "now", str(actor.lane), repr(float(actor.position)), repr(float(actor.speed)))
             here.inserted(name)
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(name, 32)
                 if not actor.lane_changes:
                     sumo.vehicle.setLaneChangeMode(name, 0)
-                sumo.vehicle.setSpeed(name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
+                set_speed(name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
         if actor.pose is not None:
             mover(sumo, actor, prefix)(actor.pose)
     for obstacle in scene.obstacles:

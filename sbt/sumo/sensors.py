@@ -8,12 +8,14 @@ import numpy as np
 
 from sbt.sumo.actors import State
 
-__all__ = ["RangeSensor", "Target", "Track"]
+__all__ = ["PERIOD", "RangeSensor", "Target", "Track"]
 
 
 Target = tuple[float, float]
 """The nearest road user ahead in the path, as measured: gap from bumper to bumper (m), rate at which it shrinks (m/s)."""
 
+PERIOD = 0.05
+"""Of the radar's measurements (s)."""
 _BLOCK = 128
 
 
@@ -80,14 +82,14 @@ class RangeSensor:
     """
 
     def __init__(
-        self, rng: np.random.Generator, *, period: float = 0.05, reach: float = 200.0, margin: float = 0.85,
+        self, rng: np.random.Generator, *, period: float = PERIOD, reach: float = 200.0, margin: float = 0.85,
         gap_noise: float = 0.25, speed_noise: float = 0.15, smoothing: float = 0.0,
     ):  # fmt: skip
         self._rng = rng
         self._period, self._reach, self._margin = period, reach, margin
         self._track = Track(smoothing) if smoothing > 0.0 else None
         self._noise = (gap_noise, speed_noise)
-        self._buffer: list[tuple[float, float]] = []
+        self._buffer: list[list[float]] = []
         self._next = 0
         self._held: Target | None = None
 
@@ -119,9 +121,8 @@ class RangeSensor:
             self._held = held = (gap if gap > 0.0 else 0.0, closing)
         return held
 
-    def _draw(self, tick: int) -> tuple[float, float]:
+    def _draw(self, tick: int) -> list[float]:
         """Return the noise of one tick: the same whatever was in the path before."""
         while tick >= len(self._buffer):
-            noise = self._rng.standard_normal((_BLOCK, 2)) * self._noise
-            self._buffer += [(a, b) for a, b in noise.tolist()]
+            self._buffer += (self._rng.standard_normal((_BLOCK, 2)) * self._noise).tolist()
         return self._buffer[tick]

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Protocol
 
 import numpy as np
 
-from sbt.arrays import Mask
+from sbt.arrays import Mask, Vector
 
 __all__ = ["Boxes", "outline"]
-
 _NEVER = 1e-300
+"""Keeps a line of sight along a side from a division by zero."""
 
 
 class _Rectangle(Protocol):
@@ -32,11 +33,12 @@ class Boxes:
     """
 
     def __init__(self, rectangles: Iterable[tuple[float, float, float, float, float]]):
-        table = np.array(list(rectangles), dtype=np.float64).reshape(-1, 5)
-        cos, sin = np.cos(table[:, 2]), np.sin(table[:, 2])
-        self._centre = table[:, None, :2]  # (m, 1, 2)
-        self._axes = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], -1)  # (m, 2, 2): world to box
-        self._half = 0.5 * table[:, None, 3:]  # (m, 1, 2)
+        boxes = [(x, y, math.cos(a), math.sin(a), 0.5 * length, 0.5 * width) for x, y, a, length, width in rectangles]
+        axes = [(cos, sin) for _, _, cos, sin, _, _ in boxes] + [(-sin, cos) for _, _, cos, sin, _, _ in boxes]
+        self._axes = np.array(axes).reshape(-1, 2)  # (2 m, 2): along every box, then across
+        middle = [(x, y) for x, y, *_ in boxes] * 2
+        self._middle = np.array([x * u + y * v for (x, y), (u, v) in zip(middle, axes, strict=True)])
+        self._half = np.array([box[4] for box in boxes] + [box[5] for box in boxes])[:, None]
 
     @classmethod
     def of(cls, states: Iterable[_Rectangle]) -> Boxes:
@@ -44,31 +46,34 @@ class Boxes:
         return cls((s.x, s.y, s.heading, s.length, s.width) for s in states)
 
     def hides(self, eye: np.ndarray, points: np.ndarray) -> Mask:
-        """Return which points cannot be seen from `eye`.
+        """Return which points cannot be seen from `eye`: whose line of sight passes through a rectangle.
+
+        >>> wall = Boxes([(5.0, 0.0, 0.0, 1.0, 4.0)])
+        >>> wall.hides(np.zeros(2), np.array([[10.0, 0.0], [3.0, 0.0], [10.0, 8.0]])).tolist()
+        [True, False, False]
+        """
+        return np.asarray(self.depth(eye, points) > 0.0)
+
+    def depth(self, eye: np.ndarray, points: np.ndarray) -> Vector:
+        """Return how much of the line of sight to each point lies inside rectangles.
 
         Args:
             eye: (2,) x, y of the sensor (m).
             points: (n, 2) x, y (m).
 
         Returns:
-            (n,) True where the segment from eye to point passes through a rectangle.
+            (n,) metres, summed over the rectangles; continuous in the eye, the points and the rectangles.
 
         Source:
             slab test of a segment and a box, Ericson (2005), Real-Time Collision Detection, 5.3.3.
-
-        >>> wall = Boxes([(5.0, 0.0, 0.0, 1.0, 4.0)])
-        >>> wall.hides(np.zeros(2), np.array([[10.0, 0.0], [3.0, 0.0], [10.0, 8.0]])).tolist()
-        [True, False, False]
         """
-        start = (eye - self._centre) @ self._axes  # (m, 1, 2)
-        along = (points - eye) @ self._axes  # (m, n, 2)
-        along = np.where(along == 0.0, _NEVER, along)
-        first, last = (-self._half - start) / along, (self._half - start) / along
-        near, far = np.minimum(first, last), np.maximum(first, last)
-        enter = np.maximum(near[..., 0], near[..., 1])  # (m, n); faster than a reduction over two
-        leave = np.minimum(far[..., 0], far[..., 1])
-        hit = (enter < leave) & (leave > 0.0) & (enter < 1.0)
-        return np.asarray(hit.any(axis=0))
+        ways = (points - eye).T
+        pace = 1.0 / (self._axes @ ways + _NEVER)  # (2 m, n): in each box's frame, along and across it
+        middle, reach = pace * (self._middle - self._axes @ eye)[:, None], np.abs(pace) * self._half
+        enter, leave, m = middle - reach, middle + reach, len(self._half) // 2
+        inside = np.minimum(np.minimum(leave[:m], leave[m:]), 1.0) - np.maximum(np.maximum(enter[:m], enter[m:]), 0.0)
+        shares = np.maximum(inside, 0.0)
+        return np.asarray((shares[0] if m == 1 else shares.sum(axis=0)) * np.hypot(*ways))
 
 
 def outline(state: _Rectangle, per_side: int = 5) -> np.ndarray:
