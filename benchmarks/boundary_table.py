@@ -58,7 +58,8 @@ def configuration(problem: str, method: str, seed: int, folder: Path) -> str:
     scenario = f"table:{folder / 'table'}" if problem == "table" else problem
     lines = [
         f"campaign: {campaign}", f"scenario: '{scenario}'", f"seed: {seed}", f"budget: {BUDGETS[problem]}",
-        "metamodel: {kind: gp, nu: 2.5, input_noise: false}", f"acquisition: {{kind: {method}}}", f"store: {folder / 'store'}", "executor: {kind: serial}",
+        "metamodel: {kind: gp, nu: 2.5, input_noise: false}", f"acquisition: {{kind: {method}}}",
+        f"store: {folder / 'store'}", "executor: {kind: serial}",
     ]  # fmt: skip
     if problem == "table":
         lines.append('requirement: {metric: "min_dist*", critical: [-1.0e9, 0.0]}')
