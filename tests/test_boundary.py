@@ -294,7 +294,7 @@ def test_crossings_lie_on_the_boundary():
 
 
 def test_boundary_points_are_exported(tmp_path: Path):
-    run(tmp_path, scenario="'testbed:cut_in_crash:box'", budget=90, initial=30, batch=30)
+    run(tmp_path, scenario="'testbed:cut_in_crash:box'", budget=60, initial=30, batch=30)
     done = CliRunner().invoke(app, ["export", str(tmp_path / "store"), "--format", "boundary"])
     assert done.exit_code == 0, done.output
     rows = np.loadtxt(tmp_path / "store" / "exports" / "boundary.csv", delimiter=",", skiprows=1)
