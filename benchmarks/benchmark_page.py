@@ -135,7 +135,7 @@ def _best(results: Results, acquisition: str, key: str, sign: float = 1.0) -> st
         found = {m: v for m, v in found.items() if math.isfinite(v)}
         if len(found) > 1:
             best = max(found, key=lambda m: sign * found[m])
-            told.append(f"{scenario}: {best} ({found[best]:.2f} of {len(found)})")
+            told.append(f"{scenario}: {best} ({found[best]:.2f} among {len(found)})")
     return "; ".join(told) or "not measured yet"
 
 
