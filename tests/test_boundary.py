@@ -155,6 +155,23 @@ def test_campaigns_that_look_for_the_edge_tell_the_metamodel_where_it_is(campaig
     assert asking.told == [CriticalInterval(0.0, 0.6)] * times
 
 
+def test_a_bound_spares_scores_and_changes_no_particle():
+    asked: list[int] = []
+
+    def score(u: np.ndarray) -> np.ndarray:
+        asked.append(len(u))
+        return -200.0 * ((u - 0.3) ** 2).sum(axis=1)
+
+    plain = smc(score, 3, stream(1, "smc"), particles=256, start=512)
+    without = sum(asked)
+    asked.clear()
+    spared = smc(score, 3, stream(1, "smc"), particles=256, start=512, bound=lambda u: -190.0 * ((u - 0.3) ** 2).sum(axis=1))
+    assert plain is not None
+    assert spared is not None
+    np.testing.assert_array_equal(plain.u, spared.u)
+    assert sum(asked) < 0.7 * without
+
+
 def test_what_auto_alone_believes_draws_functions_as_the_process_does():
     u = stream(0, "rows").random((60, 2))
     y = np.sin(5 * u[:, 0]) + u[:, 1]

@@ -86,8 +86,8 @@ def greedily(settings: Settings, belief: Belief | None, log: Log, n: int) -> Cho
 def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
     """Return a batch of parts: a hunt where critical runs are rare, representative, greedy and space-filling runs.
 
-    Half of the batch is representative: of points drawn from a_BI as in the paper those that leave the least
-    doubt far from a run. The other half is chosen one by one by a_BI times the squared distance to the
+    Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
+    least doubt far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
     nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
     less than 1 % of the space is believed critical, half of the batch hunts first (see `hunt`).
     """
@@ -184,7 +184,7 @@ def _draw(
         accept_filter=_admissible(settings), bound=bound, fill=False,
     )  # fmt: skip
     if draw.method == "short" and acquisition is not even:
-        draw = _particles(settings, score, draw, label, n)
+        draw = _particles(settings, score, bound, draw, label, n)
         if draw.method == "short":  # the score is -inf wherever one looks
             return _draw(settings, belief, even, log, n, taken=taken, start=begin)
     if len(draw.u) < n:
@@ -192,7 +192,10 @@ def _draw(
     return draw, scenario.space.from_unit(draw.u)
 
 
-def _particles(settings: Settings, score: Callable[[Points], Vector], draw: RoiDraw, label: str, n: int) -> RoiDraw:
+def _particles(
+    settings: Settings, score: Callable[[Points], Vector], bound: Callable[[Points], Vector] | None, draw: RoiDraw, label: str,
+    n: int,
+) -> RoiDraw:  # fmt: skip
     """Return the draw with points of a sequential Monte Carlo sampler instead of picks among the rejected."""
     rng, admissible = stream(settings.seed, "smc", label), _admissible(settings)
 
@@ -200,7 +203,7 @@ def _particles(settings: Settings, score: Callable[[Points], Vector], draw: RoiD
         value = score(u)
         return value if admissible is None else np.where(admissible(u), value, -np.inf)
 
-    found = smc(inside, settings.scenario.space.dimension, rng, particles=max(1024, 4 * n), start=max(4096, 4 * n))
+    found = smc(inside, settings.scenario.space.dimension, rng, particles=max(1024, 2 * n), start=max(4096, 2 * n), bound=bound)
     if found is None:
         return draw
     distinct = np.unique(found.u, axis=0, return_index=True)[1]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import blas, lapack, solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
@@ -149,9 +149,9 @@ class GaussianProcessPredictor:
 
     def _moments(self, u: Points) -> tuple[Vector, Vector]:
         """Return (m,) mean and (m,) variance without noise, standardised."""
-        cross = self.hyper.covariance(self.u, u)  # (n, m)
+        cross = self.hyper.covariance(u, self.u).T  # (n, m), column by column as BLAS wants it: nothing is copied
         mean = self.centre + self.alpha @ cross
-        half = solve_triangular(self.factor, cross, lower=True, overwrite_b=True, check_finite=False)
+        half = blas.dtrsm(1.0, self.factor, cross, lower=1, overwrite_b=1)
         variance = self.hyper.outputscale - np.einsum("nm,nm->m", half, half)
         return mean, np.maximum(variance, 1e-10 * self.hyper.outputscale)
 

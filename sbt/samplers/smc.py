@@ -42,8 +42,9 @@ class SmcDraw:
 
 
 def smc(
-    score: Callable[[Points], Vector], dimension: int, rng: np.random.Generator, *, particles: int = 1024, start: int = 4096
-) -> SmcDraw | None:
+    score: Callable[[Points], Vector], dimension: int, rng: np.random.Generator, *, particles: int = 1024, start: int = 4096,
+    bound: Callable[[Points], Vector] | None = None,
+) -> SmcDraw | None:  # fmt: skip
     """Draw particles with a density proportional to exp(score(u)) on the unit cube.
 
     Args:
@@ -52,6 +53,7 @@ def smc(
         rng: the only source of randomness.
         particles: how many.
         start: uniform points the first level is resampled from, at least as many.
+        bound: quick upper bounds of the scores: a move that they rule out is rejected without its score.
 
     Returns:
         The particles; None where no uniform point has a score above -inf.
@@ -76,7 +78,7 @@ def smc(
         log_mean += float(logsumexp(log_weight) - np.log(len(log_weight)))
         keep = _systematic(np.exp(log_weight - logsumexp(log_weight)), particles, rng)
         u, log_score, temper, levels = u[keep], log_score[keep], temper + step, levels + 1
-        u, log_score, scale = _move(score, u, log_score, temper, scale, rng)
+        u, log_score, scale = _move(score, bound, u, log_score, temper, scale, rng)
     return SmcDraw(u, log_score, log_mean, levels)
 
 
@@ -112,8 +114,9 @@ def _systematic(weight: Vector, n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _move(
-    score: Callable[[Points], Vector], u: Points, log_score: Vector, temper: float, scale: float, rng: np.random.Generator
-) -> tuple[Points, Vector, float]:
+    score: Callable[[Points], Vector], bound: Callable[[Points], Vector] | None, u: Points, log_score: Vector, temper: float,
+    scale: float, rng: np.random.Generator,
+) -> tuple[Points, Vector, float]:  # fmt: skip
     """Return the particles after a few Metropolis steps at this temperature, and the scale adapted to them.
 
     The proposal is a difference of two other particles (it has their shape) plus a little of its own,
@@ -124,9 +127,12 @@ def _move(
         a, b = rng.permutation(n), rng.permutation(n)
         jump = scale * (u[a] - u[b]) + 0.02 * scale * rng.standard_normal((n, d))
         proposed = _reflected(u + jump)
-        new = _checked(score, proposed)
-        gain = np.where(np.isneginf(new), -np.inf, temper * (new - np.where(np.isneginf(log_score), -1e300, log_score)))
-        accepted = np.log(rng.random(n)) < gain
+        least = np.log(rng.random(n)) / temper + np.where(np.isneginf(log_score), -1e300, log_score)  # to be accepted
+        hopeful = np.ones(n, dtype=bool) if bound is None else bound(proposed) > least
+        new = np.full(n, -np.inf)
+        if hopeful.any():
+            new[hopeful] = _checked(score, proposed[hopeful])
+        accepted = new > least
         u = np.where(accepted[:, None], proposed, u)
         log_score = np.where(accepted, new, log_score)
         scale = float(np.clip(scale * np.exp(accepted.mean() - _TARGET_ACCEPTANCE), 0.01, 1.5))
