@@ -89,6 +89,7 @@ def test_coverage_learns_nothing_unless_asked():
     text = "campaign: coverage\nscenario: cut_in\n"
     assert parse(text).config.metamodel is None
     assert parse(text).config.acquisition.kind == "even"
+    assert parse(text + "metamodel: {kind: et}\n").config.metamodel is not None
     asked = parse(text + "metamodel: {}\n").config.metamodel
     assert asked is not None
     assert asked.kind == "auto"
