@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import blas, lapack, solve_triangular
@@ -77,7 +78,11 @@ class GaussianProcessPredictor:
         scale, noise = self.hyper.outputscale, self.hyper.noise
         most = 1.0 if self.spread is None else self.spread.most
         with single_threaded():
-            chunks = [self._quick(u[i : i + _QUICK]) for i in range(0, max(len(u), 1), _QUICK)]
+            b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
+            scaled = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)])
+            shape = (min(_QUICK, len(u)), len(self.u))
+            room = np.empty(shape), np.empty(shape, np.float32), np.empty(shape, np.float32)
+            chunks = [self._quick(scaled[i : i + _QUICK], room) for i in range(0, max(len(u), 1), _QUICK)]
         quick, nearest = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
         rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # a small noise need not be known
         at = np.full(len(u), most) if rough or self.spread is None else self.spread(u)
@@ -98,18 +103,18 @@ class GaussianProcessPredictor:
                 low += at_least / len(self.widths)
         return low * (1.0 - 1e-9), np.minimum(high * (1.0 + 1e-9), 1.0)
 
-    def _quick(self, u: Points) -> tuple[Vector, Vector]:
-        """Return (m,) means, standardised, and (m,) correlations with the nearest row.
+    def _quick(self, scaled: Points, room: tuple[Points, Any, Any]) -> tuple[Vector, Vector]:
+        """Return (m,) means, standardised, and (m,) correlations with the nearest row, of scaled points (m, d + 2).
 
-        Correlations are in single precision and off by at most `_off`; sums are in double precision.
+        Correlations are in single precision and off by at most `_off`; sums are in double precision. All
+        is computed in `room`, three arrays (at least m, n): new ones for every chunk cost a sixth more.
         """
         across, weights = self._prepared
-        b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
-        squares = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)]) @ across  # (m, n)
-        r = squares.astype(np.float32)
+        squares, r, correlation = (part[: len(scaled)] for part in room)
+        np.dot(scaled, across, out=squares)
+        np.copyto(r, squares, casting="same_kind")
         np.sqrt(np.abs(r, out=r), out=r)  # what rounding left below 0 is as good above it
-        correlation = np.negative(r)
-        np.exp(correlation, out=correlation)
+        np.exp(np.negative(r, out=correlation), out=correlation)
         if self.hyper.nu == 1.5:
             r += np.float32(1.0)
             correlation *= r

@@ -6,9 +6,9 @@ between the old ones. A position never changes its point, however the sequence i
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 from scipy.stats import qmc
@@ -21,11 +21,12 @@ __all__ = ["SobolSequence"]
 
 _BITS = 32  # the most that SciPy's fast_forward takes; 4.3e9 positions
 _HALF_CELL = 0.5 * 2.0**-_BITS
+_LOCK = Lock()
 
 
 @dataclass(frozen=True)
 class SobolSequence:
-    """The scrambled Sobol sequence that belongs to a seed; a value without state.
+    """The scrambled Sobol sequence that belongs to a seed; the same points whoever reads it.
 
     Args:
         dimension: number of coordinates d >= 1.
@@ -68,16 +69,20 @@ class SobolSequence:
             raise InputError(f"positions must be 0 <= start <= stop <= 2**32, but got [{start}, {stop})")
         if start == stop:
             return np.empty((0, self.dimension))
-        engine = copy.deepcopy(_engine(self.dimension, self.seed))
-        if start > 0:
-            engine.fast_forward(start)
-            return np.asarray(engine.random(stop - start)) + _HALF_CELL
-        first = engine.random(1)  # alone: SciPy warns of a first block that is no power of two
-        rest = engine.random(stop - 1) if stop > 1 else np.empty((0, self.dimension))
-        return np.concatenate([first, rest]) + _HALF_CELL
+        engine = _engine(self.dimension, self.seed)
+        with _LOCK:
+            if engine.num_generated > start:
+                engine.reset()
+            if engine.num_generated < start:
+                engine.fast_forward(start - engine.num_generated)
+            if start > 0:
+                return np.asarray(engine.random(stop - start)) + _HALF_CELL
+            first = engine.random(1)  # alone: SciPy warns of a first block that is no power of two
+            rest = engine.random(stop - 1) if stop > 1 else np.empty((0, self.dimension))
+            return np.concatenate([first, rest]) + _HALF_CELL
 
 
 @lru_cache(maxsize=8)
 def _engine(dimension: int, seed: int) -> qmc.Sobol:
-    """Return the engine at position 0; it is copied, never advanced."""
+    """Return the engine, wherever it is: the next points mostly follow those it gave last."""
     return qmc.Sobol(dimension, scramble=True, bits=_BITS, rng=stream(seed, "sobol", dimension))
