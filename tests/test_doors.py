@@ -102,7 +102,7 @@ def test_placeholders_become_numbers_and_the_start_is_the_one_asked_for(study):
 def test_what_is_recorded_follows_the_motion(study):
     _, trace = simulated(study(), gap=60.0, v_lead=10.0)
     for name in trace.actors:
-        actor = part(trace.actor(name), 0, int(trace.present[:, trace.actors.index(name)].sum()))  # who leaves stays away
+        actor = part(trace.actor(name), slice(int(trace.present[:, trace.actors.index(name)].sum())))  # who leaves stays away
         moved = np.hypot(np.diff(actor.x), np.diff(actor.y))
         forward = np.abs(np.diff(actor.y)) < 0.1  # SUMO changes lanes in a jump
         assert moved[forward] == pytest.approx(actor.speed[1:][forward] * 0.1, abs=1e-6)

@@ -5,12 +5,13 @@ All of them speak of two rectangles that may turn, and count a contact between t
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from sbt.arrays import Vector
-from sbt.metrics.geometry import contact_index, part, rectangle_distance, time_to_contact
+from sbt.metrics.geometry import contact_index, contact_share, part, rectangle_distance, time_to_contact
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
@@ -125,35 +126,41 @@ def time_behind(
     if inside.size < 2 or not _paths_near(a, b):
         return horizon
     first, n = int(inside[0]), int(inside[-1]) + 1 - int(inside[0])
-    a, b = part(a, first, first + n), part(b, first, len(b.x))
+    a, b = part(a, slice(first, first + n)), part(b, slice(first, None))
     step = float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
-    for k in range(_smallest_shift(a, b), min(len(b.x) - 1, int(horizon / step)) + 1):
-        if _meet(*_behind(a, b, k)):
-            apart, touching = k - 1.0, float(k)
-            for _ in range(_HALVINGS):
-                middle = 0.5 * (apart + touching)
-                apart, touching = (apart, middle) if _meet(*_behind(a, b, middle)) else (middle, touching)
-            return min(horizon, step * touching)
-    return horizon
+    k = _first_shift(a, b, min(len(b.x) - 1, math.ceil(horizon / step)))
+    if k is None:
+        return horizon
+    apart, touching = k - 1.0, float(k)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (apart + touching)
+        apart, touching = (apart, middle) if _meet(*_behind(a, b, middle)) else (middle, touching)
+    return min(horizon, step * touching)
 
 
 def _behind(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:
     """Return the first n instants of a, and b so many steps later, as far as it is recorded."""
-    padded = part(b, 0, min(len(b.x), len(a.x) + int(shift) + 1))
+    padded = part(b, slice(len(a.x) + int(shift) + 1))
     _, there = _shifted(padded, padded, shift)
     n = min(len(a.x), len(there.x))
-    return part(a, 0, n), part(there, 0, n)
+    return part(a, slice(n)), part(there, slice(n))
 
 
-def _smallest_shift(a: ActorTrace, b: ActorTrace) -> int:
-    """Return a number of steps below which b cannot come where a was: by circles around both, and how far they move."""
+def _first_shift(a: ActorTrace, b: ActorTrace, most: int) -> int | None:
+    """Return in how many steps, 1 to `most`, b first touches where a was; None: not by then.
+
+    Circles tell which instants of both to look at, and how far they move in a step.
+    """
     moved = sum(float(np.hypot(np.diff(c.x), np.diff(c.y)).max(initial=0.0)) for c in (a, b))
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + moved
     near = (b.x[None, :] - a.x[:, None]) ** 2 + (b.y[None, :] - a.y[:, None]) ** 2 <= reach**2  # (t, t)
-    first, second = np.nonzero(near)
-    shifts = second - first
-    shifts = shifts[shifts >= 0]
-    return max(int(shifts.min()) - 1, 1) if shifts.size else len(a.x)
+    i, j = np.nonzero(near)
+    soon = (j > i) & (j - i <= most)
+    i, j = i[soon], j[soon]
+    start = np.maximum(i - 1, 0)  # no step leads to the first instant
+    there = start + j - i
+    hits = np.isfinite(contact_share(part(a, i), part(b, j), b.x[there] - a.x[start], b.y[there] - a.y[start]))
+    return int((j - i)[hits].min()) if hits.any() else None
 
 
 def _halved(a: ActorTrace, b: ActorTrace, sign: int, k: int) -> float:
@@ -179,10 +186,10 @@ def _shifted(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, Ac
         return earlier, later
     whole, share = int(shift), shift - int(shift)
     n = len(a.x) - whole - (share > 0)
-    here, there = part(a, 0, n), part(b, whole, whole + n)
+    here, there = part(a, slice(n)), part(b, slice(whole, whole + n))
     if share == 0:
         return here, there
-    after = part(b, whole + 1, whole + 1 + n)
+    after = part(b, slice(whole + 1, whole + 1 + n))
     turn = after.heading - there.heading
     return here, replace(
         there,

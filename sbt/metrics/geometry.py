@@ -110,14 +110,14 @@ def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
     (near,) = (dx * dx + dy * dy <= (reach + 1.5 * moved) ** 2).nonzero()  # circles: the exact test only there
     if near.size == 0:
         return None
-    first, last = max(int(near[0]) - 1, 0), int(near[-1]) + 1
-    hits = np.flatnonzero(np.isfinite(swept_contact(part(a, first, last), part(b, first, last))))
+    first = max(int(near[0]) - 1, 0)
+    i = slice(first, int(near[-1]) + 1)
+    hits = np.flatnonzero(np.isfinite(swept_contact(part(a, i), part(b, i))))
     return first + int(hits[0]) if hits.size else None
 
 
-def part(actor: ActorTrace, first: int, last: int) -> ActorTrace:
-    """Return the instants first to last - 1 of an actor."""
-    i = slice(first, last)
+def part(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:
+    """Return the instants i of an actor."""
     return ActorTrace(actor.x[i], actor.y[i], actor.heading[i], actor.speed[i], actor.acceleration[i], actor.length, actor.width)
 
 

@@ -53,8 +53,14 @@ def time_left(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float, flo
         horizon: the value where nobody comes there by then (s); run so long after the last conflict.
         zone: x, y and radius of a circle (m): only where ego was in it counts; None: everywhere.
     """
+    def function(trace: Trace) -> float:
+        least = horizon
+        for other in trace.actors:  # what came before need not be looked for again
+            least = least if other == ego else time_behind(trace, ego, other, least, zone)
+        return least
+
     return Metric(
-        "pet_ego_first", _over_all(lambda t, a, b: time_behind(t, a, b, horizon, zone), ego, min, horizon), "s", "low", horizon,
+        "pet_ego_first", function, "s", "low", horizon,
         "smallest time between ego leaving a spot and anyone else reaching it",
         "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions",
     )  # fmt: skip
