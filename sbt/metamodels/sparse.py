@@ -28,6 +28,7 @@ KERNELS = ("rq", "matern_0.5", "matern_1.5", "matern_2.5")
 _NOISE_FLOOR = 1e-4  # variance relative to that of y
 _JITTER = 1e-6
 _CHUNK = 4096  # pairs of point and site predicted at once
+_QUIET = 1e-3  # variance of a hidden process at first, predictive objective: from 1 on it drowns the inputs and stays there
 _DRAWS = 10  # of the hidden layer, a training step; GPyTorch's default
 _Array = NDArray[np.float64]
 
@@ -177,7 +178,9 @@ class _Model:
     def build(cls, how: Training, u: Points, rng: np.random.Generator) -> _Model:
         device, d = device_of(how.device), u.shape[1]
         at = _centre(u[rng.permutation(len(u))[: how.inducing]]).numpy()
-        layers = tuple(_as_tensors(_initial(at, h), device) for h in ((d, 1) if how.deep else (1,)))
+        quiet = _QUIET if how.objective == "predictive" else 1.0
+        shapes = ((d, quiet), (1, 1.0)) if how.deep else ((1, 1.0),)
+        layers = tuple(_as_tensors(_initial(at, h, variance), device) for h, variance in shapes)
         shape = (how.sites, d if how.deep else 1)
         sites = torch.from_numpy(rng.standard_normal(shape)).to(device)
         log_weight = torch.zeros(how.sites, dtype=torch.float64, device=device)
@@ -207,13 +210,13 @@ class _Model:
         }
 
 
-def _initial(at: _Array, h: int) -> SparseLayer:
-    """Return h processes with inducing points at (m, d); where h = d > 1 their mean is the identity."""
+def _initial(at: _Array, h: int, variance: float) -> SparseLayer:
+    """Return h processes of a variance with inducing points at (m, d); where h = d > 1 their mean is the identity."""
     m, d = at.shape
     return SparseLayer(
         inducing=np.repeat(at[None], h, axis=0),
         log_lengthscale=np.full((h, 1, d), 0.5 * math.log(d)),
-        log_outputscale=np.zeros(h),
+        log_outputscale=np.full(h, math.log(variance)),
         log_shape=np.zeros(h),
         slope=np.eye(d) if h == d > 1 else np.zeros((d, h)),
         offset=np.zeros(h),
