@@ -7,6 +7,7 @@ which points are drawn.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -71,7 +72,7 @@ def rejection(
     start: int,
     seed: int,
     label: int | str,
-    chunk: int = 4096,
+    chunk: int = 16384,
     max_candidates: int = 2**19,
     accept_filter: Callable[[Points], Mask] | None = None,
     bound: Callable[[Points], Vector] | None = None,
@@ -129,13 +130,21 @@ def rejection(
         accepted = accepted.joined(seen.at(hit))
         if fill:
             rejected = rejected.joined(seen.ranked_by(seen.key + gumbel).at(~hit)).best(n)
-        position, size = stop, min(2 * size, chunk)
+        position, size = stop, min(_next_size(n, len(accepted), scored, size), chunk)
     if len(accepted) == n:
         share = n / max(scored, 1)
         return RoiDraw(accepted.u, accepted.positions, position, scored, "rejection", share)
     if not fill:
         return RoiDraw(accepted.u, accepted.positions, position, scored, "short", len(accepted) / max(scored, 1))
     return _fall_back(accepted, rejected, n, scored, position)
+
+
+def _next_size(n: int, accepted: int, scored: int, size: int) -> int:
+    """Return how many candidates to look at next: what the missing points will probably take, at most twice as many as last."""
+    if accepted == 0:
+        return 2 * size
+    missing = n - accepted
+    return min(2 * size, max(math.ceil((missing + math.sqrt(missing)) * scored / accepted), _FIRST_CHUNK))
 
 
 @dataclass(frozen=True, eq=False)
