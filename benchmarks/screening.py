@@ -1,6 +1,6 @@
 """Sampling from a_BI where few scenarios are critical: plain rejection against the exact screen, as a markdown table.
 
-OMP_NUM_THREADS=1 python benchmarks/screening.py --rows 500 --inputs 8 18 --samples 100
+OMP_NUM_THREADS=1 python benchmarks/screening.py --rows 500 --inputs 8 18 --samples 200
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Time the exact screen of a_BI.")
     parser.add_argument("--rows", nargs="+", type=int, default=[500])
     parser.add_argument("--inputs", nargs="+", type=int, default=[8, 18])
-    parser.add_argument("--samples", type=int, default=100)
+    parser.add_argument("--samples", type=int, default=200)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
