@@ -27,6 +27,7 @@ __all__ = ["KERNELS", "SparseLayer", "SparsePredictor", "Training", "train"]
 KERNELS = ("rq", "matern_0.5", "matern_1.5", "matern_2.5")
 _NOISE_FLOOR = 1e-4  # variance relative to that of y
 _JITTER = 1e-6
+_DIGITS = 10  # of z: training would amplify the last bits, which depend on the unit of y
 _CHUNK = 4096  # pairs of point and site predicted at once
 _QUIET = 1e-3  # variance of a hidden process at first, predictive objective: from 1 on it drowns the inputs and stays there
 _DRAWS = 10  # of the hidden layer, a training step; GPyTorch's default
@@ -154,6 +155,7 @@ class SparsePredictor:
 
 def train(how: Training, u: Points, z: Vector, shift: float, scale: float, rng: np.random.Generator) -> SparsePredictor:
     """Return the process trained on u (n, d) and standardised z (n,); y = shift + scale z."""
+    z = z.round(_DIGITS)
     if how.patience is None:
         validation = training = slice(0, len(z))
     else:
