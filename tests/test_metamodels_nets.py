@@ -38,7 +38,7 @@ JAYWALKING = Path(__file__).resolve().parents[2] / "shared" / "data" / "dsiod_ja
 QUICK = {
     "ensemble": Ensemble(members=3, layers=2, width=24, steps=80, learning_rate=0.02, decay=20.0),
     "bnn": BayesianNetwork(widths=(32, 32), max_steps=80, samples=10, learning_rate=0.02),
-    "dgp": DeepGaussianProcess(inducing=15, samples=5, max_epochs=12, learning_rate=0.1),
+    "dgp": DeepGaussianProcess(members=1, inducing=15, samples=5, max_epochs=12, learning_rate=0.1),
     "dspp": DeepSigmaPointProcess(members=1, inducing=15, max_epochs=25, learning_rate=0.1),
     "svgp": SparseGaussianProcess(inducing=30, steps=30, learning_rate=0.1),
     "gp student": GaussianProcess(student_t=True),

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.arrays import Points, Vector
-from sbt.metamodels.base import check_rows, standardise
-from sbt.metamodels.sparse import SparsePredictor, Training, train
+from sbt.metamodels.sparse import SparseMixture, Training, check_members, train_members
 
 __all__ = ["DeepGaussianProcess"]
 
@@ -19,13 +18,14 @@ __all__ = ["DeepGaussianProcess"]
 class DeepGaussianProcess:
     """Settings of a deep Gaussian process (DGP): one hidden process per input, then one for y.
 
-    Prediction is a mixture of `samples` draws of the hidden layer. The last 80 % of the rows train it;
-    the first 20 % stop it. The paper's 9 "mixture components" belong to a deep sigma-point process: `dspp`.
+    Prediction is a mixture of `samples` draws of the hidden layer. Several are trained and mixed, each stopped by
+    another fifth of the rows. The paper's 9 "mixture components" belong to a deep sigma-point process: `dspp`.
 
     Args:
+        members: processes, 1 to 5; 1: the first 20 % of the rows stop it, as in the paper.
         kernel: rq (rational quadratic), matern_0.5, matern_1.5 or matern_2.5; one length scale per input.
         inducing: most inducing points of a process, >= 1.
-        samples: draws of the hidden layer >= 1, the Gaussians of the mixture.
+        samples: draws of the hidden layer >= 1, the Gaussians of a process.
         learning_rate: step of Adam, > 0.
         batch: rows of a minibatch >= 1.
         patience: epochs >= 1 without an improvement of 0.01 of the validation log likelihood.
@@ -39,27 +39,27 @@ class DeepGaussianProcess:
         Salimbeni & Deisenroth (2017); preset: Winkelmann et al. (2022), table of hyperparameters.
     """
 
+    members: int = 3
     kernel: str = "rq"
     inducing: int = 100
-    samples: int = 50
+    samples: int = 20
     learning_rate: float = 0.01
     batch: int = 1024
-    patience: int = 200
+    patience: int = 50
     max_epochs: int = 2000
     device: str = "cpu"
 
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "paper": {"kernel": "rq", "inducing": 100, "samples": 50, "learning_rate": 0.01, "patience": 200}
+        "paper": {"members": 1, "kernel": "rq", "inducing": 100, "samples": 50, "learning_rate": 0.01, "patience": 200}
     }
 
     def __post_init__(self) -> None:
+        check_members(self.members)
         self._training()
 
-    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparsePredictor:
-        """Return the process trained on u (n, d) and y (n,); see `Metamodel.fit`."""
-        u, y = check_rows(u, y)
-        z, shift, scale = standardise(y)
-        return train(self._training(), u, z, shift, scale, rng)
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
+        """Return the processes trained on u (n, d) and y (n,); see `Metamodel.fit`."""
+        return train_members(self._training(), self.members, u, y, rng)
 
     def _training(self) -> Training:
         return Training(

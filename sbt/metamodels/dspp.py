@@ -10,11 +10,9 @@ import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.metamodels.base import check_rows, split_validation, standardise
-from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.sparse import SparsePredictor, Training, train
+from sbt.metamodels.sparse import SparseMixture, Training, check_members, train_members
 
-__all__ = ["DeepSigmaPointPredictor", "DeepSigmaPointProcess"]
+__all__ = ["DeepSigmaPointProcess"]
 
 
 @dataclass(frozen=True)
@@ -63,19 +61,14 @@ class DeepSigmaPointProcess:
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        if not 1 <= self.members <= 5:
-            raise InputError(f"members must be 1 to 5, but got {self.members}")
+        check_members(self.members)
         if not self.penalty > 0.0:
             raise InputError(f"penalty must be > 0, but got {self.penalty}")
         self._training()
 
-    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> DeepSigmaPointPredictor:
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
         """Return the processes trained on u (n, d) and y (n,); see `Metamodel.fit`."""
-        u, y = check_rows(u, y)
-        z, shift, scale = standardise(y)
-        fifth = split_validation(len(y))[0].stop
-        turned = [np.roll(np.arange(len(y)), -i * fifth) for i in range(self.members)]  # another fifth is the first
-        return DeepSigmaPointPredictor(tuple(train(self._training(), u[i], z[i], shift, scale, rng) for i in turned))
+        return train_members(self._training(), self.members, u, y, rng)
 
     def _training(self) -> Training:
         return Training(
@@ -83,15 +76,3 @@ class DeepSigmaPointProcess:
             penalty=self.penalty, learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
             max_epochs=self.max_epochs, device=self.device,
         )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class DeepSigmaPointPredictor:
-    """Trained processes, equally likely."""
-
-    processes: tuple[SparsePredictor, ...]
-
-    def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
-        k = len(self.processes)
-        return Prediction.mixture_of([process(u) for process in self.processes], np.full(k, 1.0 / k))

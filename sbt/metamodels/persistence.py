@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.errors import InputError
-from sbt.metamodels import auto, bnn, dspp, ensemble, et, gp_predictor, recalibrated, sparse
+from sbt.metamodels import auto, bnn, ensemble, et, gp_predictor, recalibrated, sparse
 from sbt.metamodels.base import Predictor
 
 __all__ = ["FORMAT", "load", "read_info", "save"]
@@ -33,7 +33,6 @@ _KINDS: dict[str, Any] = {
         auto.Choice,
         auto.MixturePredictor,
         bnn.BayesianNetworkPredictor,
-        dspp.DeepSigmaPointPredictor,
         ensemble.EnsemblePredictor,
         et.ForestPredictor,
         gp_predictor.GaussianProcessPredictor,
@@ -41,6 +40,7 @@ _KINDS: dict[str, Any] = {
         gp_predictor.NoiseSpread,
         recalibrated.RecalibratedPredictor,
         sparse.SparseLayer,
+        sparse.SparseMixture,
         sparse.SparsePredictor,
     )
 }

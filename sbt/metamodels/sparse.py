@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.metamodels.base import split_validation
+from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import check_device, device_of, minibatches, single_threaded
 
-__all__ = ["KERNELS", "SparseLayer", "SparsePredictor", "Training", "train"]
+__all__ = ["KERNELS", "SparseLayer", "SparseMixture", "SparsePredictor", "Training", "check_members", "train", "train_members"]
 
 KERNELS = ("rq", "matern_0.5", "matern_1.5", "matern_2.5")
 _NOISE_FLOOR = 1e-4  # variance relative to that of y
@@ -151,6 +151,33 @@ class SparsePredictor:
             weight=self.weight,
             noise=np.full(n, self.scale * math.sqrt(self.noise)),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class SparseMixture:
+    """Trained processes, equally likely."""
+
+    processes: tuple[SparsePredictor, ...]
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the belief at u (n, d)."""
+        k = len(self.processes)
+        return Prediction.mixture_of([process(u) for process in self.processes], np.full(k, 1.0 / k))
+
+
+def check_members(members: int) -> None:
+    """Raise InputError where there are more members than fifths of the rows, or none."""
+    if not 1 <= members <= 5:
+        raise InputError(f"members must be 1 to 5, but got {members}")
+
+
+def train_members(how: Training, members: int, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
+    """Return processes trained on u (n, d) and y (n,), each stopped by another fifth of the rows; the first by the first."""
+    u, y = check_rows(u, y)
+    z, shift, scale = standardise(y)
+    fifth = split_validation(len(y))[0].stop
+    turned = [np.roll(np.arange(len(y)), -i * fifth) for i in range(members)]
+    return SparseMixture(tuple(train(how, u[i], z[i], shift, scale, rng) for i in turned))
 
 
 def train(how: Training, u: Points, z: Vector, shift: float, scale: float, rng: np.random.Generator) -> SparsePredictor:
