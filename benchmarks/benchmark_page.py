@@ -61,7 +61,7 @@ def _head(loaded: LoadedBenchmark, results: Results, config: Path) -> str:
 The experiment of Winkelmann et al. (2022), section VI, on this package's scenarios: metamodels learn from even (Sobol)
 samples, or from samples drawn in proportion to a_BI after an even first batch, and are scored on random reference runs that
 none of them learned from. Written by `benchmarks/benchmark_page.py` from the results of `{config.name}`, **{state} cells done**.
-Iterations x runs: {entries}; seeds {", ".join(map(str, loaded.config.seeds))}. What is reduced against the paper
+Iterations x runs: {entries}. Cells done: {_seeds(results)}. What is reduced against the paper
 stands at the top of the configuration; {_few(loaded)}
 
 ```
@@ -127,6 +127,15 @@ def _findings(results: Results) -> str:
     return "\n".join(lines)
 
 
+def _seeds(results: Results) -> str:
+    """Return how many cells of each seed are done."""
+    told = []
+    for seed in sorted({cell.seed for cell in results.cells}):
+        done = [is_done(cell) for cell in results.cells if cell.seed == seed]
+        told.append(f"{sum(done)} of {len(done)} of seed {seed}")
+    return ", ".join(told)
+
+
 def _best(results: Results, acquisition: str, key: str, sign: float = 1.0) -> str:
     """Return the best metamodel of every scenario where at least two are there."""
     told = []
@@ -144,15 +153,22 @@ def _least_ece(results: Results) -> str:
 
 
 def _gains(results: Results, key: str, better: object) -> str:
-    """Return in how many pairs of scenario and metamodel a_BI is better than even samples."""
-    won, pairs, changes = 0, 0, []
+    """Return in how many pairs of scenario and metamodel a_BI is better than even samples, and where in the fewer."""
+    won, pairs, changes, seldom = 0, 0, [], []
     for scenario in results.scenarios:
+        here = 0, 0
         for metamodel in results.metamodels:
             new, old = (_last(results, scenario, metamodel, a, key) for a in ("boundary", "even"))
             if math.isfinite(new) and math.isfinite(old):
-                pairs, won = pairs + 1, won + bool(better(new, old))  # type: ignore[operator]
+                here = here[0] + bool(better(new, old)), here[1] + 1  # type: ignore[operator]
                 changes.append(new - old)
-    return f"in {won} of {pairs} pairs; median change {np.median(changes):+.3f}" if pairs else "not measured yet"
+        won, pairs = won + here[0], pairs + here[1]
+        if 2 * here[0] < here[1]:
+            seldom.append(f"{scenario} {here[0]} of {here[1]}")
+    if not pairs:
+        return "not measured yet"
+    rare = f"; in fewer than half: {', '.join(seldom)}" if seldom else ""
+    return f"in {won} of {pairs} pairs; median change {np.median(changes):+.3f}{rare}"
 
 
 def _worst_against_best(results: Results) -> str:
