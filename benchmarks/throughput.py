@@ -1,7 +1,7 @@
 """How many concrete scenarios a second: isolation levels, SUMO started anew, traci, every scenario, one and two workers.
 
     python benchmarks/throughput.py [--runs 256] [--repeats 5]        the ways to SUMO, for cut_in
-    python benchmarks/throughput.py --every [--seconds 6]             every scenario, isolation and step
+    python benchmarks/throughput.py --every [--seconds 6]             every scenario (or --only NAME ...), isolation and step
 
 Every row runs the same Sobol points of the same scenario with the same controller and step; only the
 way to SUMO differs. Rows take turns and the table gives the median of the repeats, because machines
@@ -121,12 +121,12 @@ def campaign_rate(name: str, workers: int, n: int, step: float | None = None) ->
         return n / result["seconds"]["simulate"]
 
 
-def every(repeats: int, seconds: float) -> None:
+def every(names: list[str], repeats: int, seconds: float) -> None:
     """Print the rate of every built-in scenario at its isolation levels and two steps, and of campaigns."""
     print("| scenario | step (s) | simulated s a run | fresh | reuse | replicas | ms a simulated s, default | times cut_in |")
     print("|---|---|---|---|---|---|---|---|")
     cut_in: dict[float, float] = {}
-    for name in sorted(plugins.names("scenarios"), key=lambda n: (n != "cut_in", n)):
+    for name in sorted({"cut_in", *names}, key=lambda n: (n != "cut_in", n)):
         for step in STEPS:
             scenario = load("scenarios", name).configured(step_length=step)
             if not scenario.isolations:
@@ -163,15 +163,17 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--every", action="store_true", help="every built-in scenario, isolation level and step")
     parser.add_argument("--seconds", type=float, default=6.0, help="time for a row of --every")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="scenarios of --every; default: all built-in ones")
+    parser.add_argument("--only-campaigns", action="store_true", help="of --every, only the rows of whole campaigns")
     parser.add_argument("--sumo", default=shutil.which("sumo"), help="the sumo program for the traci row")
     parser.add_argument("--no-campaign", action="store_true", help="leave out the rows of whole campaigns")
     args = parser.parse_args()
     if args.every:
-        every(args.repeats, args.seconds)
+        names = args.only or sorted(n for n in plugins.names("scenarios") if load("scenarios", n).isolations)
+        if not args.only_campaigns:
+            every(names, args.repeats, args.seconds)
         if not args.no_campaign:
-            campaigns(
-                sorted(n for n in plugins.names("scenarios") if load("scenarios", n).isolations), args.repeats, args.seconds
-            )
+            campaigns(names, args.repeats, args.seconds)
         return
     scenario = load("scenarios", args.scenario)
     values = points(scenario, args.runs)
