@@ -139,7 +139,7 @@ def _traffic(results: Results) -> str:
         return ""
     return (
         f"\n\nIn {', '.join(there)} SUMO's own traffic is drawn from the run's seed. "
-        "In two of them the inputs explain no more than a fifth of the metric's variance (see their [pages](scenarios.md)). "
+        "In three of them the inputs explain no more than a fifth of the metric's variance (see their [pages](scenarios.md)). "
         "So few runs teach no metamodel there which run will be critical "
         f"(average precision at most {max(precision):.2f}), a_BI has no edge to follow, and even samples are as good."
     )
