@@ -208,8 +208,8 @@ class _Model:
         device, d = device_of(how.device), u.shape[1]
         at = _centre(u[rng.permutation(len(u))[: how.inducing]]).numpy()
         quiet = _QUIET if how.objective == "predictive" else 1.0
-        shapes = ((d, quiet), (1, 1.0)) if how.deep else ((1, 1.0),)
-        layers = tuple(_as_tensors(_initial(at, h, variance), device) for h, variance in shapes)
+        initial = (_hidden(at, quiet), _last(at)) if how.deep else (_last(at),)
+        layers = tuple(_as_tensors(layer, device) for layer in initial)
         shape = (how.sites, d if how.deep else 1)
         sites = torch.from_numpy(rng.standard_normal(shape)).to(device)
         log_weight = torch.zeros(how.sites, dtype=torch.float64, device=device)
@@ -239,18 +239,33 @@ class _Model:
         }
 
 
-def _initial(at: _Array, h: int, variance: float) -> SparseLayer:
-    """Return h processes of a variance with inducing points at (m, d); where h = d > 1 their mean is the identity."""
+def _last(at: _Array) -> SparseLayer:
+    """Return the process of y before training, with inducing points at (m, d)."""
     m, d = at.shape
     return SparseLayer(
-        inducing=np.repeat(at[None], h, axis=0),
-        log_lengthscale=np.full((h, 1, d), 0.5 * math.log(d)),
-        log_outputscale=np.full(h, math.log(variance)),
-        log_shape=np.zeros(h),
-        slope=np.eye(d) if h == d > 1 else np.zeros((d, h)),
-        offset=np.zeros(h),
-        mean=np.zeros((h, m)),
-        root=np.repeat((0.1 if h > 1 else 1.0) * np.eye(m)[None], h, axis=0),
+        inducing=at[None].copy(),
+        log_lengthscale=np.full((1, 1, d), 0.5 * math.log(d)),
+        log_outputscale=np.zeros(1),
+        log_shape=np.zeros(1),
+        slope=np.zeros((d, 1)),
+        offset=np.zeros(1),
+        mean=np.zeros((1, m)),
+        root=np.eye(m)[None],
+    )
+
+
+def _hidden(at: _Array, variance: float) -> SparseLayer:
+    """Return a process for each of d inputs before training, whose mean is that input."""
+    m, d = at.shape
+    return SparseLayer(
+        inducing=np.repeat(at[None], d, axis=0),
+        log_lengthscale=np.full((d, 1, d), 0.5 * math.log(d)),
+        log_outputscale=np.full(d, math.log(variance)),
+        log_shape=np.zeros(d),
+        slope=np.eye(d),
+        offset=np.zeros(d),
+        mean=np.zeros((d, m)),
+        root=np.repeat(0.1 * np.eye(m)[None], d, axis=0),
     )
 
 
