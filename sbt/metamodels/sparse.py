@@ -208,7 +208,8 @@ class _Model:
         device, d = device_of(how.device), u.shape[1]
         at = _centre(u[rng.permutation(len(u))[: how.inducing]]).numpy()
         quiet = _QUIET if how.objective == "predictive" else 1.0
-        initial = (_hidden(at, quiet), _last(at)) if how.deep else (_last(at),)
+        hidden, last = _initial(at, quiet, np.eye(d), 0.1), _initial(at, 1.0, np.zeros((d, 1)), 1.0)
+        initial = (hidden, last) if how.deep else (last,)
         layers = tuple(_as_tensors(layer, device) for layer in initial)
         shape = (how.sites, d if how.deep else 1)
         sites = torch.from_numpy(rng.standard_normal(shape)).to(device)
@@ -239,33 +240,18 @@ class _Model:
         }
 
 
-def _last(at: _Array) -> SparseLayer:
-    """Return the process of y before training, with inducing points at (m, d)."""
-    m, d = at.shape
+def _initial(at: _Array, variance: float, slope: _Array, spread: float) -> SparseLayer:
+    """Return processes before training: inducing points at (m, d), mean slope (d, h), variational root `spread`."""
+    (m, d), h = at.shape, slope.shape[1]
     return SparseLayer(
-        inducing=at[None].copy(),
-        log_lengthscale=np.full((1, 1, d), 0.5 * math.log(d)),
-        log_outputscale=np.zeros(1),
-        log_shape=np.zeros(1),
-        slope=np.zeros((d, 1)),
-        offset=np.zeros(1),
-        mean=np.zeros((1, m)),
-        root=np.eye(m)[None],
-    )
-
-
-def _hidden(at: _Array, variance: float) -> SparseLayer:
-    """Return a process for each of d inputs before training, whose mean is that input."""
-    m, d = at.shape
-    return SparseLayer(
-        inducing=np.repeat(at[None], d, axis=0),
-        log_lengthscale=np.full((d, 1, d), 0.5 * math.log(d)),
-        log_outputscale=np.full(d, math.log(variance)),
-        log_shape=np.zeros(d),
-        slope=np.eye(d),
-        offset=np.zeros(d),
-        mean=np.zeros((d, m)),
-        root=np.repeat(0.1 * np.eye(m)[None], d, axis=0),
+        inducing=np.repeat(at[None], h, axis=0),
+        log_lengthscale=np.full((h, 1, d), 0.5 * math.log(d)),
+        log_outputscale=np.full(h, math.log(variance)),
+        log_shape=np.zeros(h),
+        slope=slope,
+        offset=np.zeros(h),
+        mean=np.zeros((h, m)),
+        root=np.repeat(spread * np.eye(m)[None], h, axis=0),
     )
 
 
