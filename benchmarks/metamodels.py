@@ -2,12 +2,14 @@
 
 OMP_NUM_THREADS=1 python benchmarks/metamodels.py --rows 50 200 500 --inputs 2 7
 OMP_NUM_THREADS=1 python benchmarks/metamodels.py --jaywalking FOLDER --rows 200 500 1000 --seeds 5
+OMP_NUM_THREADS=1 python benchmarks/metamodels.py --store FOLDER --rows 1000 10000 --seeds 2
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,9 @@ from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.scores import scores
 from sbt.plugins import load, names
 from sbt.problem.requirement import CriticalInterval
+from sbt.run import assembly_of, loaded_from, settings_of
 from sbt.seeds import stream
+from sbt.store import Store
 
 FAST = ("et", "et paper", "gp", "gp paper", "ensemble", "auto")
 SCORES = {
@@ -42,16 +46,25 @@ def main() -> None:
     parser.add_argument("--rows", nargs="+", type=int, default=[50, 200, 500], help="numbers of rows n")
     parser.add_argument("--inputs", nargs="+", type=int, default=[2, 7], help="numbers of inputs d (timing only)")
     parser.add_argument("--points", type=int, default=8192, help="points predicted at a time")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="of the metamodels that have one")
     parser.add_argument("--repeat", type=int, default=3, help="the median of so many is shown (timing only)")
     parser.add_argument("--jaywalking", type=Path, help="folder of the recorded runs: scores on all rows not learned from")
+    parser.add_argument("--store", type=Path, help="folder of a campaign, best of evenly spread runs: the same with its runs")
     parser.add_argument("--seeds", type=int, default=3, help="random splits, the mean is shown")
     parser.add_argument("--first-seed", type=int, default=100)
     args = parser.parse_args()
-    chosen = {kind: kinds[kind] for kind in args.kinds}
+    chosen = {kind: _on(kinds[kind], args.device) for kind in args.kinds}
     if args.jaywalking is not None:
-        _print_quality(chosen, args)
+        _print_quality(chosen, *_read_jaywalking(args.jaywalking), CriticalInterval(high=0.0), args)
+    elif args.store is not None:
+        _print_quality(chosen, *_read_store(args.store), args)
     else:
         _print_times(chosen, args)
+
+
+def _on(metamodel: Metamodel, device: str) -> Metamodel:
+    """Return the metamodel on a device, where it has one."""
+    return replace(metamodel, device=device) if hasattr(metamodel, "device") else metamodel
 
 
 def _print_times(kinds: dict[str, Metamodel], args: argparse.Namespace) -> None:
@@ -69,8 +82,9 @@ def _print_times(kinds: dict[str, Metamodel], args: argparse.Namespace) -> None:
                 print(f"| {kind} | {d} | {n} | {fit_s:.2f} | {args.points / predict_s:,.0f} |", flush=True)
 
 
-def _print_quality(kinds: dict[str, Metamodel], args: argparse.Namespace) -> None:
-    u, y = _read_jaywalking(args.jaywalking)
+def _print_quality(
+    kinds: dict[str, Metamodel], u: np.ndarray, y: np.ndarray, critical: CriticalInterval, args: argparse.Namespace
+) -> None:
     print(f"Mean of {args.seeds} random splits (seeds {args.first_seed} to {args.first_seed + args.seeds - 1}); CPU seconds.\n")
     print(f"| n | metamodel | {' | '.join(SCORES.values())} | fit [s] | predictions/s |")
     print(f"|{'---|' * (len(SCORES) + 4)}")
@@ -82,7 +96,7 @@ def _print_quality(kinds: dict[str, Metamodel], args: argparse.Namespace) -> Non
                 train, test = order[:n], order[n:]
                 asked = np.resize(u[test], (args.points, u.shape[1]))
                 predictor, fit_s, predict_s = _run(metamodel, u[train], y[train], asked, seed)
-                found = scores(predictor(u[test]), y[test], CriticalInterval(high=0.0))
+                found = scores(predictor(u[test]), y[test], critical)
                 table.append([*(found[key] for key in SCORES), fit_s, args.points / predict_s])
             *quality, fit_s, speed = np.mean(table, axis=0)
             cells = " | ".join(f"{value:.3f}" for value in quality)
@@ -90,12 +104,13 @@ def _print_quality(kinds: dict[str, Metamodel], args: argparse.Namespace) -> Non
 
 
 def _run(metamodel: Metamodel, u: np.ndarray, y: np.ndarray, asked: np.ndarray, seed: int):
-    """Return a predictor and the CPU seconds of its fit and of its predictions at `asked`."""
-    start = time.process_time()
+    """Return a predictor and the seconds of its fit and of its predictions at `asked`; with a device, of the clock."""
+    clock = time.process_time if getattr(metamodel, "device", "cpu") == "cpu" else time.perf_counter
+    start = clock()
     predictor = metamodel.fit(u, y, stream(0, "fit", seed))
-    fitted = time.process_time()
+    fitted = clock()
     predictor(asked)
-    return predictor, fitted - start, time.process_time() - fitted
+    return predictor, fitted - start, clock() - fitted
 
 
 def _read_jaywalking(folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -107,6 +122,14 @@ def _read_jaywalking(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     table = pd.read_parquet(folder / "quasi_random.parquet")  # needs the extra "parquet"
     u = np.stack([(table[name] - i["min"]) / (i["max"] - i["min"]) for name, i in inputs.items()], axis=1)
     return u, table["min_dist*"].to_numpy()
+
+
+def _read_store(folder: Path) -> tuple[np.ndarray, np.ndarray, CriticalInterval]:
+    """Return the finished runs of a campaign: inputs in the unit cube, the metric, what is critical."""
+    with Store.read(folder) as store:
+        scenario, runs = settings_of(loaded_from(store), assembly_of(loaded_from(store))).scenario, store.history().finished
+    u = scenario.space.metamodel_inputs(scenario.space.to_unit(runs.x))
+    return u, runs.y(scenario.requirement.metric), scenario.requirement.critical
 
 
 def _time_to_collision(u: np.ndarray, rng: np.random.Generator) -> np.ndarray:

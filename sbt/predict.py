@@ -24,6 +24,7 @@ from sbt.history import History
 from sbt.learner import Learner
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.persistence import load, read_info, save
+from sbt.metamodels.torch_tools import device_of
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
 from sbt.run import assembly_of, loaded_from, settings_of
@@ -68,7 +69,7 @@ class Table:
         return [dict(zip(names, map(float, row), strict=True)) for row in values]
 
 
-def predict_rows(folder: Path, inputs: Path) -> Table:
+def predict_rows(folder: Path, inputs: Path, device: str | None = None) -> Table:
     """Return what a campaign's metamodel believes about the rows of a CSV file.
 
     It learns from all runs that finished well. The campaign's validation scores are those of the same
@@ -77,6 +78,7 @@ def predict_rows(folder: Path, inputs: Path) -> Table:
     Args:
         folder: of a store.
         inputs: CSV with a column for each input, named as the input or as in exports (`x.<input>`).
+        device: auto, cpu or cuda, where a metamodel that was kept predicts; None: where it was fitted.
 
     Raises:
         InputError: the campaign has no metamodel or fewer than two runs to learn from, or the file is
@@ -94,7 +96,7 @@ def predict_rows(folder: Path, inputs: Path) -> Table:
     training = history.finished
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
-    predictor, source = _predictor(folder, learner, training, json.dumps(choice.model_dump(mode="json"), sort_keys=True))
+    predictor, source = _predictor(folder, learner, training, json.dumps(choice.model_dump(mode="json"), sort_keys=True), device)
     u = space.metamodel_inputs(space.to_unit(x))
     parts = []
     for k in range(0, len(u), _CHUNK):
@@ -105,13 +107,15 @@ def predict_rows(folder: Path, inputs: Path) -> Table:
     return Table(space.names, x, columns, requirement.metric, choice.kind, len(training), source, ignored)
 
 
-def _predictor(folder: Path, learner: Learner, training: History, settings: str) -> tuple[Predictor, str]:
+def _predictor(folder: Path, learner: Learner, training: History, settings: str, device: str | None) -> tuple[Predictor, str]:
     """Return the fitted metamodel, from the file beside the store where that has learned from the same runs."""
     path, key = folder / MODEL, _key(learner, training, settings)
+    if device is not None:
+        device_of(device)  # refuses one that is not there
     if path.is_file():
         try:
             if read_info(path).get("key") == key:
-                return load(path), "loaded"
+                return load(path, device), "loaded"
         except InputError:  # damaged or of another version: it is only a copy, and is made again
             pass
     predictor = learner.train(training)
@@ -122,7 +126,7 @@ def _predictor(folder: Path, learner: Learner, training: History, settings: str)
         save(predictor, path, info)
     except (InputError, OSError) as error:  # somebody's own metamodel, or a folder that may only be read
         return predictor, f"fitted, not kept: {error}"
-    return predictor, "fitted"
+    return predictor if device is None else load(path, device), "fitted"
 
 
 def _key(learner: Learner, training: History, settings: str) -> str:

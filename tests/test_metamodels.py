@@ -17,7 +17,8 @@ import torch
 from sbt.errors import InputError
 from sbt.metamodels.base import build, split_validation, standardise
 from sbt.metamodels.et import ExtraTrees
-from sbt.metamodels.gp import GaussianProcess, matern
+from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.gp_algebra import Hyperparameters, matern
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.requirement import CriticalInterval
@@ -184,12 +185,11 @@ def test_gradient_is_that_of_the_objective():
     from scipy.optimize import approx_fprime
 
     from sbt.metamodels.gp import _Model
-    from sbt.metamodels.gp_predictor import Hyperparameters
 
     u, y = rows(30, noise=0.1)
     z, spread = standardise(y)[0], np.linspace(0.5, 2.0, 30)
     for priors in (True, False):
-        model = _Model.build(1.5, 3, priors=priors)
+        model = _Model.build(1.5, 3, torch.device("cpu"), priors=priors)
         model.assign(Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
         parameters = model.parameters()
 
@@ -206,11 +206,10 @@ def test_gradient_is_that_of_the_objective():
 
 def test_likelihood_is_gpytorchs():
     from sbt.metamodels.gp import _Model
-    from sbt.metamodels.gp_predictor import Hyperparameters
 
     u, y = rows(30, noise=0.1)
     z = standardise(y)[0]
-    model = _Model.build(1.5, 3, priors=False)
+    model = _Model.build(1.5, 3, torch.device("cpu"), priors=False)
     model.assign(Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.3, 0.05))
     value = model.backward(torch.from_numpy(u), z, np.ones(30))
     covariance = model.kernel(torch.from_numpy(u)).to_dense().detach() + 0.05 * torch.eye(30)

@@ -13,6 +13,7 @@ import gpytorch
 import numpy as np
 import pytest
 import torch
+from pretended_cuda import pretended_cuda
 
 from sbt.errors import InputError
 from sbt.metamodels.auto import Auto
@@ -134,8 +135,60 @@ def test_impossible_settings_are_refused(kind, settings):
         build(kind, settings=settings)
 
 
+ON_DEVICES = {
+    **QUICK,
+    "gp": GaussianProcess(),
+    "gp paper": build(GaussianProcess, "paper", settings={"max_epochs": 20}),
+    "auto": Auto(ensemble_rows=10**6),
+}
+
+
+@pytest.mark.parametrize("name", ON_DEVICES)
+def test_everything_moves_to_the_device(name, monkeypatch):
+    """What the CPU computes for a pretended CUDA device is what it computes for itself."""
+    (u, y), asked = rows(40), rows(30, seed=3)[0]
+    metamodel, critical = ON_DEVICES[name], CriticalInterval(high=0.0)
+    here = metamodel.fit(u, y, np.random.default_rng(0))
+    with pretended_cuda(monkeypatch) as marks:
+        there = dataclasses.replace(metamodel, device="cuda").fit(u, y, np.random.default_rng(0))
+        fitted = marks.marked
+        belief = there(asked)
+        assert 0 < fitted < marks.marked  # both the fit and the prediction were there
+        np.testing.assert_allclose(belief.mean, here(asked).mean, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(belief.std, here(asked).std, rtol=1e-6)
+        if name.startswith("gp"):
+            draws = [p.draws(asked, 3, np.random.default_rng(1)) for p in (here, there)]
+            np.testing.assert_allclose(*draws, rtol=1e-6, atol=1e-6)
+            bounds = [p.probability_bounds(asked, critical) for p in (here, there)]
+            np.testing.assert_allclose(*bounds, rtol=1e-6, atol=1e-9)
+
+
+def test_a_pretended_device_refuses_what_cuda_refuses(monkeypatch):
+    with pretended_cuda(monkeypatch):
+        a, b = torch.ones(3).to("cuda"), torch.ones(3)
+        assert a.device == (a + 1.0).device == torch.zeros(2, device="cuda").device == torch.device("cuda")
+        with pytest.raises(RuntimeError, match="same device"):
+            a * b
+        with pytest.raises(TypeError, match="numpy"):
+            a.sum().numpy()
+        assert (a.cpu() * b).device == torch.device("cpu")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("name", ON_DEVICES)
+def test_cuda_believes_what_the_cpu_believes_and_repeats_it(name):
+    (u, y), asked = rows(60), rows(30, seed=3)[0]
+    here, there = ON_DEVICES[name], dataclasses.replace(ON_DEVICES[name], device="cuda")
+    first, again = (there.fit(u, y, np.random.default_rng(0))(asked) for _ in range(2))
+    np.testing.assert_array_equal(first.mean, again.mean)
+    np.testing.assert_array_equal(first.std, again.std)
+    own = here.fit(u, y, np.random.default_rng(0))(asked)
+    alike = 1e-6 if name.startswith("gp") else 0.3  # networks take another way, or other random numbers
+    assert np.sqrt(np.mean((first.mu - own.mu) ** 2)) < alike * y.std()
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-@pytest.mark.parametrize("name", ["ensemble", "bnn", "dgp", "dspp", "svgp"])
+@pytest.mark.parametrize("name", ["ensemble", "bnn", "dgp", "dspp", "svgp", "gp student"])
 def test_device_that_is_not_there_is_refused(name):
     u, y = rows(20)
     with pytest.raises(InputError, match="cuda"):

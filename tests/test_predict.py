@@ -8,6 +8,8 @@ import re
 
 import numpy as np
 import pytest
+import torch
+from pretended_cuda import pretended_cuda
 from typer.testing import CliRunner
 
 from sbt.cli import app
@@ -64,6 +66,20 @@ def test_it_is_fitted_once_for_the_same_rows(store, campaign):
     (store / MODEL).write_bytes(b"damaged")
     again = predicted(store)
     assert (again["source"], again["rows"]) == ("fitted", third["rows"])
+
+
+def test_it_predicts_on_the_device_that_is_asked_for(store, monkeypatch):
+    here = predicted(store)["rows"]
+    with pretended_cuda(monkeypatch) as marks:
+        done = invoke("predict", store, "--inputs", store.parent / "rows.csv", "--json", "--device", "cuda")
+    assert marks.marked > 0
+    assert json.loads(done.stdout)["source"] == "loaded"
+    for a, b in zip(here, json.loads(done.stdout)["rows"], strict=True):
+        assert a == pytest.approx(b, rel=1e-6, abs=1e-9)
+    if not torch.cuda.is_available():
+        refused = invoke("predict", store, "--inputs", store.parent / "rows.csv", "--device", "cuda")
+        assert refused.exit_code == 2
+        assert "cuda" in refused.output
 
 
 def test_text_goes_to_stdout_or_to_a_file(store, tmp_path):

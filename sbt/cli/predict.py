@@ -22,6 +22,7 @@ def predict(
     *,
     inputs: Annotated[Path, typer.Option("--inputs", metavar="FILE.csv", help="A column for each input, a row each.")],
     output: Annotated[Path | None, typer.Option("--output", metavar="FILE.csv", help="Write here; default: print.")] = None,
+    device: Annotated[str | None, typer.Option("--device", help="auto, cpu or cuda; default: where it was fitted.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Say what the campaign's metamodel believes about concrete scenarios: mean, sigma, P(critical)."""
@@ -29,7 +30,7 @@ def predict(
         _with_store(folder)
         from sbt.predict import predict_rows
 
-        table = predict_rows(folder, inputs)
+        table = predict_rows(folder, inputs, device)
     rows = table.rows()
     if table.ignored:
         print(f"not inputs, ignored: {', '.join(table.ignored)}", file=sys.stderr)

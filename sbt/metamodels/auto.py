@@ -49,7 +49,7 @@ class Auto:
         pace: share in (0, 1] of the ensemble's steps that are taken.
         ensemble_rows: rows from which on the ensemble takes part, >= 2.
         gp_rows: rows up to which the Gaussian process takes part, >= 2.
-        device: auto (CUDA where there is one), cpu or cuda; for the ensemble.
+        device: auto (CUDA where there is one), cpu or cuda; for the Gaussian process and the ensemble.
 
     Raises:
         InputError: a value outside its range; at the fit, a device that is not there.
@@ -85,7 +85,7 @@ class Auto:
     @property
     def simplest(self) -> Metamodel:
         """What is believed where there is no time to compare."""
-        return GaussianProcess()
+        return GaussianProcess(device=self.device)
 
     def about(self, critical: CriticalInterval) -> _About:
         """Return the same settings for runs whose critical interval is known."""
@@ -108,7 +108,7 @@ class Auto:
         """Return the models that take part with n rows."""
         models: dict[str, Metamodel] = {}
         if n <= self.gp_rows:
-            models["gp"] = GaussianProcess()
+            models["gp"] = GaussianProcess(device=self.device)
         models["et"] = ExtraTrees()
         if n >= self.ensemble_rows:
             models["ensemble"] = _paced(n, Ensemble(members=self.members, device=self.device), self.pace)

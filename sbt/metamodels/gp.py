@@ -2,7 +2,7 @@
 
 GPyTorch provides the kernel, its constraints, priors and gradients. The exact marginal likelihood is
 written out here: one Cholesky factor serves its value, its gradient and the leave-one-out residuals,
-and nothing turns to conjugate gradients above 800 rows. The fitted predictor is plain NumPy.
+and nothing turns to conjugate gradients above 800 rows.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ import numpy as np
 import torch
 from gpytorch.constraints import GreaterThan, Positive
 from gpytorch.priors import LogNormalPrior
-from scipy.linalg import cho_solve, lapack
 from scipy.optimize import minimize
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.et import ExtraTrees
-from sbt.metamodels.gp_predictor import GaussianProcessPredictor, Hyperparameters, NoiseSpread, cholesky, matern, relative
+from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, diagonal, host, like, native, placed, solve, solve_right
+from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative
 from sbt.metamodels.tails import student_widths
-from sbt.metamodels.torch_tools import single_threaded
+from sbt.metamodels.torch_tools import check_device, device_of, single_threaded
 
-__all__ = ["GaussianProcess", "GaussianProcessPredictor", "matern"]
+__all__ = ["GaussianProcess", "GaussianProcessPredictor"]
 
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter
 _NOISE_FLOOR = 1e-4  # variance relative to that of y: keeps the covariance well conditioned
@@ -55,9 +55,10 @@ class GaussianProcess:
         learning_rate: step of Adam, > 0.
         patience: epochs without an improvement of 0.01 of the mean validation log likelihood, >= 1.
         max_epochs: most epochs of Adam, >= 1.
+        device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
-        InputError: a value outside its range.
+        InputError: a value outside its range; at the fit, a device that is not there.
 
     Source:
         Rasmussen & Williams (2006), algorithm 2.1, eqs. (5.9), (5.10)-(5.12); priors: Hvarfner et al.
@@ -72,6 +73,7 @@ class GaussianProcess:
     learning_rate: float = 0.1
     patience: int = 200
     max_epochs: int = 2000
+    device: str = "cpu"
 
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"nu": 0.5, "input_noise": False, "priors": False, "learning_rate": 0.1, "patience": 200}
@@ -87,6 +89,7 @@ class GaussianProcess:
             )
         if not self.learning_rate > 0.0:
             raise InputError(f"learning_rate must be > 0, but got {self.learning_rate}")
+        check_device(self.device)
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> GaussianProcessPredictor:
         """Return the process conditioned on u (n, d) and y (n,); see `Metamodel.fit`."""
@@ -96,29 +99,31 @@ class GaussianProcess:
 
     def _fit(self, u: Points, y: Vector, rng: np.random.Generator) -> GaussianProcessPredictor:
         z, shift, scale = standardise(y)
+        device = device_of(self.device)
         if not self.priors:
             validation, training = split_validation(len(z))
             hyper = _fit_early_stopped(self, u[training], z[training], u[validation], z[validation])
             return _condition(self, hyper, u[training], z[training], np.ones(len(z))[training], None, shift, scale)
         rows = rng.permutation(len(z))[: self.fit_rows]
-        hyper = _fit_posterior(self.nu, u[rows], z[rows], np.ones(len(rows)), None)
+        hyper = _fit_posterior(self.nu, u[rows], z[rows], np.ones(len(rows)), None, device)
         if not self.input_noise or len(z) < _FEWEST_FOR_NOISE:
             return _condition(self, hyper, u, z, np.ones(len(z)), None, shift, scale)
-        spread, at_rows = _fit_noise_spread(hyper, u, z, rng)
-        hyper = _fit_posterior(self.nu, u[rows], z[rows], at_rows[rows], hyper)
+        spread, at_rows = _fit_noise_spread(hyper, u, z, rng, device)
+        hyper = _fit_posterior(self.nu, u[rows], z[rows], at_rows[rows], hyper, device)
         return _condition(self, hyper, u, z, at_rows, spread, shift, scale)
 
 
-def _fit_noise_spread(hyper: Hyperparameters, u: Points, z: Vector, rng: np.random.Generator) -> tuple[NoiseSpread, Vector]:
+def _fit_noise_spread(
+    hyper: Hyperparameters, u: Points, z: Vector, rng: np.random.Generator, device: torch.device
+) -> tuple[NoiseSpread, Vector]:
     """Return how the noise depends on the input, and (n,) its values at the rows.
 
     A regression on the log of squared leave-one-out residuals, relative to their variance. The values at
     the rows are cross-fitted: a row's own residual says nothing about its noise, or the process would
     trust the rows it happens to fit.
     """
-    solved = _solve(cholesky(hyper.covariance(u, u), np.full(len(z), hyper.noise)), z)
-    variance = 1.0 / np.diag(solved.inverse)
-    log_ratio = np.log((solved.alpha * variance) ** 2 / variance + 1e-4)
+    residual, variance = _leave_one_out(_factor(hyper, u, np.full(len(z), hyper.noise), device), z)
+    log_ratio = np.log(residual**2 / variance + 1e-4)
     fold = rng.permutation(len(z)) % _FOLDS
     at_rows, forests = np.zeros(len(z)), []
     for i in range(_FOLDS):
@@ -127,6 +132,19 @@ def _fit_noise_spread(hyper: Hyperparameters, u: Points, z: Vector, rng: np.rand
         at_rows[~rest] = forest.mu(u[~rest])
         forests.append(forest)
     return NoiseSpread(tuple(forests)), relative(at_rows)
+
+
+def _factor(hyper: Hyperparameters, u: Points, noise: Vector, device: torch.device) -> Matrix:
+    """Return the (n, n) lower Cholesky factor of the covariance of rows with that noise variance."""
+    rows = placed(u, device)
+    return cholesky(hyper.covariance(rows, rows), noise)
+
+
+def _leave_one_out(factor: Matrix, z: Vector) -> tuple[Vector, Vector]:
+    """Return (n,) residuals of each row, predicted from the others, and (n,) variances of those predictions."""
+    solved = solve(factor, z)
+    variance = 1.0 / host(diagonal(solved.inverse))
+    return host(solved.alpha) * variance, variance
 
 
 def _condition(
@@ -140,35 +158,15 @@ def _condition(
     scale: float,
 ) -> GaussianProcessPredictor:
     """Return the predictor conditioned on all rows; `at_rows` is the relative noise variance there."""
-    factor = cholesky(hyper.covariance(u, u), hyper.noise * at_rows)
-    by_one, by_z = cho_solve((factor, True), np.stack([np.ones(len(z)), z], axis=1)).T
+    factor = _factor(hyper, u, hyper.noise * at_rows, device_of(settings.device))
+    by_one, by_z = solve_right(factor, np.stack([np.ones(len(z)), z], axis=1)).T
     centre = float(by_one @ z / by_one.sum())
     widths = np.ones(1)
     if settings.student_t:
-        solved = _solve(factor, z)
-        widths = student_widths(solved.alpha / np.sqrt(np.diag(solved.inverse)))
-    return GaussianProcessPredictor(hyper, u, factor, by_z - centre * by_one, centre, spread, shift, scale, widths)
-
-
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """What the gradient and the leave-one-out residuals need of a factored covariance."""
-
-    inverse: Points  # (n, n)
-    alpha: Vector  # (n,) inverse (z - its generalised least-squares mean)
-    log_likelihood: float
-
-
-def _solve(factor: Points, z: Vector) -> _Solved:
-    """Return the inverse of the covariance whose factor this is, and the likelihood of z."""
-    lower = np.tril(lapack.dpotri(factor, lower=1)[0])
-    inverse = lower + np.tril(lower, -1).T
-    row_sums = inverse.sum(axis=1)
-    centre = float(row_sums @ z / row_sums.sum())
-    alpha = inverse @ z - centre * row_sums
-    log_det = 2.0 * float(np.log(np.diag(factor)).sum())
-    fit = float((z - centre) @ alpha)
-    return _Solved(inverse, alpha, -0.5 * (fit + log_det + len(z) * math.log(2.0 * math.pi)))
+        residual, variance = _leave_one_out(factor, z)
+        widths = student_widths(residual / np.sqrt(variance))
+    alpha = by_z - centre * by_one
+    return GaussianProcessPredictor(hyper, u, host(factor), alpha, centre, spread, shift, scale, widths, settings.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,8 +177,8 @@ class _Model:
     likelihood: gpytorch.likelihoods.GaussianLikelihood
 
     @classmethod
-    def build(cls, nu: float, dimension: int, *, priors: bool) -> _Model:
-        """Return a model; with priors the output scale is fixed at 1, the variance of standardised y."""
+    def build(cls, nu: float, dimension: int, device: torch.device, *, priors: bool) -> _Model:
+        """Return a model on the device; with priors the output scale is fixed at 1, the variance of standardised y."""
         log = {"transform": torch.exp, "inv_transform": torch.log}
         scale_prior = LogNormalPrior(math.sqrt(2.0) + 0.5 * math.log(dimension), math.sqrt(3.0))
         base = gpytorch.kernels.MaternKernel(
@@ -195,7 +193,7 @@ class _Model:
             noise_prior=LogNormalPrior(-4.0, 1.0) if priors else None,
             noise_constraint=GreaterThan(_NOISE_FLOOR, **log),
         )
-        return cls(kernel.double(), likelihood.double())
+        return cls(kernel.double().to(device), likelihood.double().to(device))
 
     def parameters(self) -> list[torch.nn.Parameter]:
         both = (*self.kernel.parameters(), *self.likelihood.parameters())
@@ -203,16 +201,17 @@ class _Model:
 
     def assign(self, hyper: Hyperparameters) -> None:
         """Set the parameters to the given values."""
-        self.kernel.base_kernel.lengthscale = torch.from_numpy(hyper.lengthscale)
-        self.kernel.outputscale = torch.tensor(hyper.outputscale, dtype=torch.float64)
+        device = self.likelihood.noise.device
         noise = max(hyper.noise, 1.001 * _NOISE_FLOOR)
-        self.likelihood.noise = torch.tensor([noise], dtype=torch.float64)
+        self.kernel.base_kernel.lengthscale = torch.from_numpy(hyper.lengthscale).to(device)
+        self.kernel.outputscale = torch.tensor(hyper.outputscale, dtype=torch.float64, device=device)
+        self.likelihood.noise = torch.tensor([noise], dtype=torch.float64, device=device)
 
     def hyperparameters(self) -> Hyperparameters:
         base = self.kernel.base_kernel
         return Hyperparameters(
             nu=float(base.nu),
-            lengthscale=base.lengthscale.detach().numpy().ravel().copy(),
+            lengthscale=base.lengthscale.detach().cpu().numpy().ravel().copy(),
             outputscale=float(self.kernel.outputscale.detach()),
             noise=float(self.likelihood.noise.detach()),
         )
@@ -225,8 +224,9 @@ class _Model:
         """
         n = len(z)
         latent, noise = self.kernel.forward(x, x), self.likelihood.noise
-        solved = _solve(cholesky(latent.detach().numpy().copy(), noise.item() * spread), z)
-        slope = (0.5 / n) * (solved.inverse - np.outer(solved.alpha, solved.alpha))
+        solved = solve(cholesky(native(latent.detach().clone(memory_format=torch.contiguous_format)), noise.item() * spread), z)
+        slope = (0.5 / n) * (solved.inverse - solved.alpha[:, None] * solved.alpha)
+        by_noise = torch.full_like(noise, float(diagonal(slope) @ like(spread, slope)))
         penalties = [
             -prior.log_prob(value_of(module)).sum() / n
             for part in (self.kernel, self.likelihood)
@@ -236,29 +236,31 @@ class _Model:
             parameter.grad = None
         torch.autograd.backward(
             [latent, noise, *penalties],
-            [torch.from_numpy(slope), torch.tensor([np.diag(slope) @ spread]), *map(torch.ones_like, penalties)],
+            [torch.as_tensor(slope), by_noise, *map(torch.ones_like, penalties)],
         )
         return sum((p.item() for p in penalties), -solved.log_likelihood / n)
 
 
-def _fit_posterior(nu: float, u: Points, z: Vector, spread: Vector, start: Hyperparameters | None) -> Hyperparameters:
+def _fit_posterior(
+    nu: float, u: Points, z: Vector, spread: Vector, start: Hyperparameters | None, device: torch.device
+) -> Hyperparameters:
     """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
-    model = _Model.build(nu, u.shape[1], priors=True)
+    model = _Model.build(nu, u.shape[1], device, priors=True)
     first = np.full(u.shape[1], 0.3 * math.sqrt(u.shape[1]))
     model.assign(start if start is not None else Hyperparameters(nu, first, 1.0, 0.02))
-    x, parameters = torch.from_numpy(u), model.parameters()
+    x, parameters = torch.from_numpy(u).to(device), model.parameters()
 
     def loss(vector: Vector) -> tuple[float, Vector]:
-        torch.nn.utils.vector_to_parameters(torch.from_numpy(vector), parameters)
+        torch.nn.utils.vector_to_parameters(torch.from_numpy(vector).to(device), parameters)
         value = model.backward(x, z, spread)
-        return value, np.concatenate([p.grad.numpy().ravel() for p in parameters if p.grad is not None])
+        return value, np.concatenate([p.grad.cpu().numpy().ravel() for p in parameters if p.grad is not None])
 
-    initial = torch.nn.utils.parameters_to_vector(parameters).detach().numpy().copy()
+    initial = torch.nn.utils.parameters_to_vector(parameters).detach().cpu().numpy().copy()
     found = minimize(
         loss, initial, jac=True, method="L-BFGS-B", bounds=[_BOUNDS] * len(initial),
         options={"maxiter": 100, "ftol": 1e-6},
     )  # fmt: skip
-    torch.nn.utils.vector_to_parameters(torch.from_numpy(found.x), parameters)
+    torch.nn.utils.vector_to_parameters(torch.from_numpy(found.x).to(device), parameters)
     return model.hyperparameters()
 
 
@@ -266,11 +268,12 @@ def _fit_early_stopped(
     settings: GaussianProcess, u: Points, z: Vector, u_held_out: Points, z_held_out: Vector
 ) -> Hyperparameters:
     """Return the hyperparameters of largest validation likelihood on Adam's way, the paper's rule."""
-    model = _Model.build(settings.nu, u.shape[1], priors=False)
+    device = device_of(settings.device)
+    model = _Model.build(settings.nu, u.shape[1], device, priors=False)
     half = math.log(2.0)  # GPyTorch's initial value of every positive parameter: softplus(0)
     model.assign(Hyperparameters(settings.nu, np.full(u.shape[1], half), half, half))
     adam = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
-    x, ones = torch.from_numpy(u), np.ones(len(z))
+    x, ones = torch.from_numpy(u).to(device), np.ones(len(z))
     best, best_value, since = model.hyperparameters(), -math.inf, 0
     for _ in range(settings.max_epochs):
         model.backward(x, z, ones)

@@ -1,4 +1,4 @@
-"""A fitted Gaussian process: plain NumPy, exact moments, and quick bounds of P(y in M_c)."""
+"""A fitted Gaussian process: exact moments, on a device, and quick bounds of P(y in M_c) in plain NumPy."""
 
 from __future__ import annotations
 
@@ -8,18 +8,16 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import blas, lapack, solve_triangular
-from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
 from sbt.arrays import Points, Vector
-from sbt.errors import InputError
 from sbt.metamodels.et import ForestPredictor
+from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, host, like, placed, squared_columns, triangular
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.torch_tools import single_threaded
+from sbt.metamodels.torch_tools import device_of, single_threaded
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["GaussianProcessPredictor", "Hyperparameters", "NoiseSpread", "cholesky", "matern", "relative"]
+__all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative"]
 
 _CHUNK = 512  # points predicted at once
 _QUICK = 128  # points bounded at once: what is in between stays in the cache
@@ -42,6 +40,7 @@ class GaussianProcessPredictor:
         shift: y = shift + scale z.
         scale: see `shift`.
         widths: (k,) factors on sigma, equally likely: one factor of 1, or more for heavy tails.
+        device: auto, cpu or cuda; where moments and draws are computed.
     """
 
     hyper: Hyperparameters
@@ -53,6 +52,7 @@ class GaussianProcessPredictor:
     shift: float
     scale: float
     widths: Vector
+    device: str = "cpu"
 
     def __call__(self, u: Points) -> Prediction:
         """Return the belief at u (n, d)."""
@@ -146,65 +146,29 @@ class GaussianProcessPredictor:
         Source:
             Rasmussen & Williams (2006), eq. (2.24) and appendix A.2.
         """
+        rows, factor, alpha = self._placed
         with single_threaded():
-            cross = self.hyper.covariance(self.u, u)  # (rows, m)
-            mean = self.centre + self.alpha @ cross
-            half = solve_triangular(self.factor, cross, lower=True, overwrite_b=True, check_finite=False)
-            latent = self.hyper.covariance(u, u) - half.T @ half
-            root = cholesky(latent, np.full(len(u), 1e-8 * self.hyper.outputscale))
+            at = like(u, rows)
+            cross = self.hyper.covariance(rows, at)  # (rows, m)
+            mean = self.centre + host(alpha @ cross)
+            half = triangular(factor, cross)
+            latent = self.hyper.covariance(at, at) - half.T @ half
+            root = host(cholesky(latent, np.full(len(u), 1e-8 * self.hyper.outputscale)))
             return self.shift + self.scale * (mean + rng.standard_normal((n, len(u))) @ root.T)
 
     def _moments(self, u: Points) -> tuple[Vector, Vector]:
         """Return (m,) mean and (m,) variance without noise, standardised."""
-        cross = self.hyper.covariance(u, self.u).T  # (n, m), column by column as BLAS wants it: nothing is copied
-        mean = self.centre + self.alpha @ cross
-        half = blas.dtrsm(1.0, self.factor, cross, lower=1, overwrite_b=1)
-        variance = self.hyper.outputscale - np.einsum("nm,nm->m", half, half)
+        rows, factor, alpha = self._placed
+        cross = self.hyper.covariance(like(u, rows), rows).T  # (n, m), column by column as BLAS wants it: nothing is copied
+        mean = self.centre + host(alpha @ cross)
+        variance = self.hyper.outputscale - squared_columns(triangular(factor, cross))
         return mean, np.maximum(variance, 1e-10 * self.hyper.outputscale)
 
-
-def cholesky(covariance: Points, noise: Vector) -> Points:
-    """Return the (n, n) lower Cholesky factor of covariance + diag(noise); writes on `covariance`.
-
-    Where rounding made the sum indefinite, growing jitter is added to the diagonal.
-    """
-    diagonal = np.diag(covariance) + noise
-    for jitter in (0.0, 1e-8, 1e-6, 1e-4, 1e-2):
-        np.fill_diagonal(covariance, diagonal + jitter)
-        factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
-        if info == 0:
-            return np.asarray(factor)
-    raise InputError("the covariance of a Gaussian process must be positive definite, but is not, with jitter 0.01")
-
-
-def matern(distance: Points, nu: float) -> Points:
-    """Return the Matern correlation at scaled distances >= 0, for nu 0.5, 1.5 or 2.5.
-
-    Source:
-        Rasmussen & Williams (2006), eq. (4.17).
-    """
-    r = math.sqrt(2.0 * nu) * distance
-    correlation = np.negative(r)
-    np.exp(correlation, out=correlation)
-    if nu > 0.5:  # in place: these arrays are large
-        square = r * r / 3.0 if nu == 2.5 else None
-        r += 1.0
-        correlation *= r if square is None else np.add(r, square, out=r)
-    return correlation
-
-
-@dataclass(frozen=True, eq=False)
-class Hyperparameters:
-    """Kernel and noise variance, for standardised y."""
-
-    nu: float
-    lengthscale: Vector  # (d,)
-    outputscale: float
-    noise: float
-
-    def covariance(self, a: Points, b: Points) -> Points:
-        """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
-        return self.outputscale * matern(cdist(a / self.lengthscale, b / self.lengthscale), self.nu)
+    @cached_property
+    def _placed(self) -> tuple[Matrix, Matrix, Matrix]:
+        """Return rows, factor and alpha on the device."""
+        device = device_of(self.device)
+        return placed(self.u, device), placed(self.factor, device), placed(self.alpha, device)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.errors import InputError
-from sbt.metamodels import auto, bnn, ensemble, et, gp_predictor, recalibrated, sparse
+from sbt.metamodels import auto, bnn, ensemble, et, gp_algebra, gp_predictor, recalibrated, sparse
 from sbt.metamodels.base import Predictor
+from sbt.metamodels.torch_tools import device_of
 
 __all__ = ["FORMAT", "load", "read_info", "save"]
 
@@ -35,8 +36,8 @@ _KINDS: dict[str, Any] = {
         bnn.BayesianNetworkPredictor,
         ensemble.EnsemblePredictor,
         et.ForestPredictor,
+        gp_algebra.Hyperparameters,
         gp_predictor.GaussianProcessPredictor,
-        gp_predictor.Hyperparameters,
         gp_predictor.NoiseSpread,
         recalibrated.RecalibratedPredictor,
         sparse.SparseLayer,
@@ -73,16 +74,22 @@ def save(predictor: Predictor, path: Path | str, info: Mapping[str, Any] | None 
     part.replace(target)
 
 
-def load(path: Path | str) -> Predictor:
-    """Return the predictor of a file; it predicts the same bits as the one that was saved.
+def load(path: Path | str, device: str | None = None) -> Predictor:
+    """Return the predictor of a file; on the same device it predicts the same bits as the one that was saved.
+
+    Args:
+        path: what `save` wrote.
+        device: auto, cpu or cuda, where it shall predict; None: where it was fitted.
 
     Raises:
-        InputError: no such file, not a saved model, damaged, or of another version.
+        InputError: no such file, not a saved model, damaged, of another version, or no such device.
     """
+    if device is not None:
+        device_of(device)  # refuses one that is not there
     head, file = _open(path)
     with file:
         try:
-            predictor = _decode(head["predictor"], file)
+            predictor = _decode(head["predictor"], file, device)
         except (KeyError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{path} must be an undamaged saved model, but got {type(error).__name__}: {error}") from error
     if not callable(predictor):
@@ -143,20 +150,22 @@ def _encode(value: Any, arrays: list[NDArray[Any]]) -> Any:
     raise InputError(f"only predictors of sbt's own metamodels can be saved, but got a {type(value).__qualname__}")
 
 
-def _decode(value: Any, file: zipfile.ZipFile) -> Any:
-    """Return the value that `_encode` was given."""
+def _decode(value: Any, file: zipfile.ZipFile, device: str | None) -> Any:
+    """Return the value that `_encode` was given, but with this device."""
     if not isinstance(value, dict):
         return value
     if "array" in value:
         return np.load(io.BytesIO(file.read(f"{int(value['array'])}.npy")), allow_pickle=False)
     if "tuple" in value:
-        return tuple(_decode(v, file) for v in value["tuple"])
+        return tuple(_decode(v, file, device) for v in value["tuple"])
     if "map" in value:
-        return {k: _decode(v, file) for k, v in value["map"].items()}
+        return {k: _decode(v, file, device) for k, v in value["map"].items()}
     if "tree" in value:
-        return _tree(**{k: _decode(v, file) for k, v in value["tree"].items()})
-    kind = _KINDS[value["kind"]]
-    return kind(**{k: _decode(v, file) for k, v in value["fields"].items()})
+        return _tree(**{k: _decode(v, file, device) for k, v in value["tree"].items()})
+    fields = {k: _decode(v, file, device) for k, v in value["fields"].items()}
+    if device is not None and "device" in fields:
+        fields["device"] = device
+    return _KINDS[value["kind"]](**fields)
 
 
 def _tree(

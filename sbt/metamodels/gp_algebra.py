@@ -1,0 +1,155 @@
+"""Linear algebra of a Gaussian process: NumPy and LAPACK on the CPU, PyTorch on a CUDA device; float64 on both.
+
+A matrix is an array on the CPU and a tensor elsewhere; what is computed from it is of its kind.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import blas, cho_solve, lapack
+from scipy.spatial.distance import cdist
+
+from sbt.arrays import Points, Vector
+from sbt.errors import InputError
+
+__all__ = [
+    "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "like", "matern", "native", "placed",
+    "solve", "solve_right", "squared_columns", "triangular",
+]  # fmt: skip
+
+Matrix = Any
+"""float64: a NumPy array on the CPU, a tensor on another device."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hyperparameters:
+    """Kernel and noise variance, for standardised y."""
+
+    nu: float
+    lengthscale: Vector  # (d,)
+    outputscale: float
+    noise: float
+
+    def covariance(self, a: Matrix, b: Matrix) -> Matrix:
+        """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
+        lengthscale = like(self.lengthscale, a)
+        if isinstance(a, torch.Tensor):
+            distance: Matrix = torch.cdist(a / lengthscale, b / lengthscale, compute_mode="donot_use_mm_for_euclid_dist")
+        else:
+            distance = cdist(a / lengthscale, b / lengthscale)
+        return self.outputscale * matern(distance, self.nu)
+
+
+def matern(distance: Matrix, nu: float) -> Matrix:
+    """Return the Matern correlation at scaled distances >= 0, for nu 0.5, 1.5 or 2.5.
+
+    Source:
+        Rasmussen & Williams (2006), eq. (4.17).
+    """
+    r = math.sqrt(2.0 * nu) * distance
+    correlation = -r
+    if isinstance(r, torch.Tensor):
+        correlation.exp_()
+    else:
+        np.exp(correlation, out=correlation)
+    if nu > 0.5:  # in place: these matrices are large
+        square = r * r / 3.0 if nu == 2.5 else None
+        r += 1.0
+        if square is not None:
+            r += square
+        correlation *= r
+    return correlation
+
+
+def cholesky(covariance: Matrix, noise: Vector) -> Matrix:
+    """Return the (n, n) lower Cholesky factor of covariance + diag(noise); writes on `covariance`.
+
+    Where rounding made the sum indefinite, growing jitter is added to the diagonal.
+    """
+    total = host(diagonal(covariance)) + noise
+    for jitter in (0.0, 1e-8, 1e-6, 1e-4, 1e-2):
+        if isinstance(covariance, torch.Tensor):
+            covariance.diagonal().copy_(like(total + jitter, covariance))
+            factor, info = torch.linalg.cholesky_ex(covariance)
+        else:
+            np.fill_diagonal(covariance, total + jitter)
+            factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
+        if int(info) == 0:
+            return factor
+    raise InputError("the covariance of a Gaussian process must be positive definite, but is not, with jitter 0.01")
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What the gradient and the leave-one-out residuals need of a factored covariance."""
+
+    inverse: Matrix  # (n, n)
+    alpha: Matrix  # (n,) inverse (z - its generalised least-squares mean)
+    log_likelihood: float
+
+
+def solve(factor: Matrix, z: Vector) -> Solved:
+    """Return the inverse of the covariance whose factor this is, and the likelihood of z (n,)."""
+    if isinstance(factor, torch.Tensor):
+        inverse: Matrix = torch.cholesky_inverse(factor)
+    else:
+        lower = np.tril(lapack.dpotri(factor, lower=1)[0])
+        inverse = lower + np.tril(lower, -1).T
+    right = like(z, factor)
+    row_sums = inverse.sum(axis=1)
+    centre = float(row_sums @ right / row_sums.sum())
+    alpha = inverse @ right - centre * row_sums
+    log_det = 2.0 * float(np.log(host(diagonal(factor))).sum())
+    fit = float((right - centre) @ alpha)
+    return Solved(inverse, alpha, -0.5 * (fit + log_det + len(z) * math.log(2.0 * math.pi)))
+
+
+def solve_right(factor: Matrix, right: Points) -> Points:
+    """Return the inverse of the covariance whose factor this is, times `right` (n, k)."""
+    if isinstance(factor, torch.Tensor):
+        return host(torch.cholesky_solve(like(right, factor), factor))
+    return np.asarray(cho_solve((factor, True), right))
+
+
+def triangular(factor: Matrix, right: Matrix) -> Matrix:
+    """Return the inverse of the lower factor (n, n) times `right` (n, m); may write on `right`."""
+    if isinstance(factor, torch.Tensor):
+        return torch.linalg.solve_triangular(factor, right, upper=False)
+    return blas.dtrsm(1.0, factor, right, lower=1, overwrite_b=1)
+
+
+def squared_columns(matrix: Matrix) -> Vector:
+    """Return the (m,) squared norms of the columns of a matrix (n, m)."""
+    if isinstance(matrix, torch.Tensor):
+        return host(matrix.square().sum(dim=0))
+    return np.asarray(np.einsum("nm,nm->m", matrix, matrix))
+
+
+def diagonal(matrix: Matrix) -> Matrix:
+    """Return the diagonal, a view."""
+    return matrix.diagonal() if isinstance(matrix, torch.Tensor) else np.diag(matrix)
+
+
+def placed(array: Points, device: torch.device) -> Matrix:
+    """Return an array as a matrix on the device: itself on the CPU."""
+    return array if device.type == "cpu" else torch.from_numpy(array).to(device)
+
+
+def like(array: Points, matrix: Matrix) -> Matrix:
+    """Return an array as a matrix where `matrix` is."""
+    return placed(array, matrix.device) if isinstance(matrix, torch.Tensor) else array
+
+
+def native(tensor: torch.Tensor) -> Matrix:
+    """Return a tensor as a matrix: an array that shares its memory on the CPU."""
+    return tensor.numpy() if tensor.device.type == "cpu" else tensor
+
+
+def host(matrix: Matrix) -> Points:
+    """Return a matrix as an array: itself on the CPU."""
+    return np.asarray(matrix.cpu().numpy()) if isinstance(matrix, torch.Tensor) else matrix
