@@ -1,4 +1,7 @@
-"""The store of a campaign: one folder, one SQLite file, one writer, one durable commit a run.
+"""The store of a campaign: one folder, one SQLite file, one writer, one commit a run.
+
+A process that is killed loses no run that was committed. Nor does a power cut lose a plan, a fit or a conclusion, but it
+may take the runs of the last tenth of a second with it: runs wait for the disk together. They are planned, and run again.
 
 What is in the file is all that a campaign knows: `run` again reads it back and goes on to the
 identical result. Any number of processes may read while the driver writes.
@@ -9,6 +12,7 @@ from __future__ import annotations
 import fcntl
 import json
 import sqlite3
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -23,6 +27,8 @@ __all__ = ["DATABASE", "PlannedRun", "Store"]
 
 DATABASE = "campaign.sqlite"
 _VERSION = 1
+_TOGETHER = 0.1
+"""Seconds within which runs wait for the disk once."""
 _SCHEMA = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE runs (
@@ -59,6 +65,8 @@ class Store:
         self.folder = folder
         self._db = connection
         self._lock = lock
+        self._may_hurry, self._waits = False, True  # commits need not wait for the disk, and do
+        self._waited = -_TOGETHER  # when a run last did, on the monotonic clock
 
     @classmethod
     def open(cls, folder: Path, configuration: Mapping[str, Any], *, durable: bool = True) -> Store:
@@ -67,7 +75,7 @@ class Store:
         Args:
             folder: made where there is none.
             configuration: what must not change between a campaign and its resumption.
-            durable: every commit reaches the disk; False where the whole file can be written again.
+            durable: commits reach the disk; False where the whole file can be written again.
         """
         folder = Path(folder)
         with _reported(folder):
@@ -78,8 +86,9 @@ class Store:
             except BlockingIOError:
                 raise StoreError(f"a store takes one writer, but another process is writing {folder}") from None
             db = sqlite3.connect(folder / DATABASE, isolation_level=None)
-            _set_journal(db, durable=durable)
+            mode = _set_journal(db, durable=durable)
             store = cls(folder, db, lock)
+            store._may_hurry = durable and mode == "wal"
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
                 with store._transaction():
                     for statement in _SCHEMA.strip().split(";\n"):
@@ -128,8 +137,12 @@ class Store:
             raise StoreError(f"{self.folder}: this version reads stores of version {_VERSION}, but got version {version}")
 
     @contextmanager
-    def _transaction(self) -> Iterator[None]:
+    def _transaction(self, *, waits: bool = True) -> Iterator[None]:
+        """Return a transaction that waits for the disk at its end, and there takes along those before that did not."""
         with _reported(self.folder):
+            if self._may_hurry and waits != self._waits:
+                self._db.execute(f"PRAGMA synchronous = {'FULL' if waits else 'NORMAL'}")
+                self._waits = waits
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -194,8 +207,11 @@ class Store:
             self._db.execute("INSERT INTO iterations VALUES (?, ?, ?)", (iteration, stage, _dump(dict(proposal))))
 
     def append(self, outcome: Outcome, versions: str = "") -> None:
-        """Write one run's outcome durably."""
-        with self._transaction():
+        """Write one run's outcome."""
+        now = time.monotonic()
+        waits = now - self._waited >= _TOGETHER
+        self._waited = now if waits else self._waited
+        with self._transaction(waits=waits):
             self._db.execute(
                 "UPDATE runs SET status = ?, metrics = ?, reason = ?, seconds = ?, collisions = ?, versions = ? WHERE idx = ?",
                 (str(outcome.status), _dump(dict(outcome.metrics)), outcome.reason, outcome.seconds,
@@ -262,12 +278,13 @@ def _connected(path: Path) -> sqlite3.Connection:
     return db
 
 
-def _set_journal(db: sqlite3.Connection, *, durable: bool) -> None:
-    """Use WAL, or the DELETE journal where the file system cannot."""
+def _set_journal(db: sqlite3.Connection, *, durable: bool) -> str:
+    """Use WAL, or the DELETE journal where the file system cannot; return which."""
     mode = db.execute("PRAGMA journal_mode = WAL").fetchone()[0]
     if mode != "wal":
         db.execute("PRAGMA journal_mode = DELETE")
     db.execute(f"PRAGMA synchronous = {'FULL' if durable else 'OFF'}")
+    return str(mode)
 
 
 @contextmanager

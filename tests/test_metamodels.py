@@ -42,7 +42,7 @@ def rows(n: int, d: int = 3, seed: int = 0, noise: float = 0.0) -> tuple[np.ndar
 
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_metamodels_obey_their_contract(name):
-    check_metamodel(BUILT_IN[name], dimensions=(1, 2, 7) if name != "gp paper" else (2,))
+    check_metamodel(BUILT_IN[name], dimensions=(1, 2, 7, 20))
 
 
 @dataclasses.dataclass(frozen=True)

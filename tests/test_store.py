@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -141,10 +142,30 @@ def test_what_was_acknowledged_survives_a_kill(tmp_path: Path):
         assert [r.metrics["y"] for r in history.records] == [k / 3 for k in range(len(history))]
 
 
-def test_every_commit_is_synchronous(tmp_path: Path):
-    with planned(tmp_path) as store:
-        assert store._db.execute("PRAGMA synchronous").fetchone() == (2,)
-        assert store._db.execute("PRAGMA journal_mode").fetchone()[0] in ("wal", "delete")
+def test_runs_wait_for_the_disk_together_and_plans_always(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """In WAL mode a commit at level FULL (2) waits for the disk and takes along the earlier ones at NORMAL (1)."""
+    clock = SimpleNamespace(monotonic=lambda: clock.now, now=0.0)
+    monkeypatch.setattr("sbt.store.time", clock)
+
+    def level() -> int:
+        return int(store._db.execute("PRAGMA synchronous").fetchone()[0])
+
+    with planned(tmp_path / "s") as store:
+        assert level() == 2
+        levels = []
+        for k in (0, 1, 2):
+            store.append(outcome(k))
+            levels.append(level())
+            with Store.read(tmp_path / "s") as reader:
+                assert len(reader.history()) == k + 1  # committed, for every other process
+        assert levels == [2, 1, 1]
+        clock.now = 0.1
+        store.append(outcome(3))
+        assert level() == 2
+        store.append(outcome(4))
+        assert level() == 1
+        store.add_fit(5, 1, {})
+        assert level() == 2
 
 
 def test_one_writer_any_number_of_readers(tmp_path: Path):

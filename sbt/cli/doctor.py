@@ -166,7 +166,7 @@ def _file_system(place: Path) -> str:
 
 
 def _sqlite(folder: Path) -> Check:
-    """Return how long a durable commit takes there: each run of a campaign pays it."""
+    """Return how long a commit takes there that waits for the disk: a running campaign pays it ten times a second."""
     place = _existing(folder)
     if not os.access(place, os.W_OK):
         return Check("sqlite", "broken", f"{place} cannot be written", "choose another folder with --store")
@@ -180,7 +180,7 @@ def _sqlite(folder: Path) -> Check:
             db.execute("INSERT INTO t VALUES (?)", (k,))
         took = (time.perf_counter() - start) / _COMMITS * 1e3
         db.close()
-    detail = f"{sqlite3.sqlite_version}, journal {mode}, {took:.2f} ms a durable commit"
+    detail = f"{sqlite3.sqlite_version}, journal {mode}, {took:.2f} ms a commit to the disk"
     if took > _SLOW_COMMIT_MS:
         return Check("sqlite", "warning", detail, "slow disk: keep the store elsewhere (--store)")
     return Check("sqlite", "ok", detail)

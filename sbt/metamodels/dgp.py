@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.arrays import Points, Vector
-from sbt.metamodels.sparse import SparseMixture, Training, check_members, train_members
+from sbt.metamodels.sparse import SparseMixture, Training, train
 
 __all__ = ["DeepGaussianProcess"]
 
@@ -54,16 +54,15 @@ class DeepGaussianProcess:
     }
 
     def __post_init__(self) -> None:
-        check_members(self.members)
         self._training()
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
         """Return the processes trained on u (n, d) and y (n,); see `Metamodel.fit`."""
-        return train_members(self._training(), self.members, u, y, rng)
+        return train(self._training(), u, y, rng)
 
     def _training(self) -> Training:
         return Training(
             deep=True, kernel=self.kernel, inducing=self.inducing, sites=self.samples, objective="elbo",
             penalty=1.0, learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
-            max_epochs=self.max_epochs, device=self.device,
+            max_epochs=self.max_epochs, device=self.device, members=self.members,
         )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.metamodels.sparse import SparseMixture, Training, check_members, train_members
+from sbt.metamodels.sparse import SparseMixture, Training, train
 
 __all__ = ["DeepSigmaPointProcess"]
 
@@ -61,18 +61,17 @@ class DeepSigmaPointProcess:
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        check_members(self.members)
         if not self.penalty > 0.0:
             raise InputError(f"penalty must be > 0, but got {self.penalty}")
         self._training()
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
         """Return the processes trained on u (n, d) and y (n,); see `Metamodel.fit`."""
-        return train_members(self._training(), self.members, u, y, rng)
+        return train(self._training(), u, y, rng)
 
     def _training(self) -> Training:
         return Training(
             deep=True, kernel=self.kernel, inducing=self.inducing, sites=self.sites, objective="predictive",
             penalty=self.penalty, learning_rate=self.learning_rate, batch=self.batch, patience=self.patience,
-            max_epochs=self.max_epochs, device=self.device,
+            max_epochs=self.max_epochs, device=self.device, members=self.members,
         )  # fmt: skip

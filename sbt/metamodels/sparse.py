@@ -22,7 +22,7 @@ from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import check_device, device_of, minibatches, single_threaded
 
-__all__ = ["KERNELS", "SparseLayer", "SparseMixture", "SparsePredictor", "Training", "check_members", "train", "train_members"]
+__all__ = ["KERNELS", "SparseLayer", "SparseMixture", "SparsePredictor", "Training", "train"]
 
 KERNELS = ("rq", "matern_0.5", "matern_1.5", "matern_2.5")
 _NOISE_FLOOR = 1e-4  # variance relative to that of y
@@ -51,6 +51,7 @@ class Training:
             validation, all rows train for `max_epochs`.
         max_epochs: most epochs >= 1.
         device: auto, cpu or cuda.
+        members: processes that are mixed, 1 to 5, each stopped by another fifth of the rows, the first by the first.
 
     Raises:
         InputError: a value outside its range.
@@ -67,8 +68,11 @@ class Training:
     patience: int | None
     max_epochs: int
     device: str
+    members: int = 1
 
     def __post_init__(self) -> None:
+        if not 1 <= self.members <= 5:
+            raise InputError(f"members must be 1 to 5, but got {self.members}")
         if self.kernel not in KERNELS:
             raise InputError(f"kernel must be one of {', '.join(KERNELS)}, but got {self.kernel!r}")
         if self.objective not in ("elbo", "predictive"):
@@ -165,32 +169,23 @@ class SparseMixture:
         return Prediction.mixture_of([process(u) for process in self.processes], np.full(k, 1.0 / k))
 
 
-def check_members(members: int) -> None:
-    """Raise InputError where there are more members than fifths of the rows, or none."""
-    if not 1 <= members <= 5:
-        raise InputError(f"members must be 1 to 5, but got {members}")
-
-
-def train_members(how: Training, members: int, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
-    """Return processes trained on u (n, d) and y (n,), each stopped by another fifth of the rows; the first by the first."""
+def train(how: Training, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
+    """Return processes trained on u (n, d) and y (n,); see `Metamodel.fit`."""
     u, y = check_rows(u, y)
     z, shift, scale = standardise(y)
-    fifth = split_validation(len(y))[0].stop
-    turned = [np.roll(np.arange(len(y)), -i * fifth) for i in range(members)]
-    return SparseMixture(tuple(train(how, u[i], z[i], shift, scale, rng) for i in turned))
-
-
-def train(how: Training, u: Points, z: Vector, shift: float, scale: float, rng: np.random.Generator) -> SparsePredictor:
-    """Return the process trained on u (n, d) and standardised z (n,); y = shift + scale z."""
-    z = z.round(_DIGITS)
-    if how.patience is None:
-        validation = training = slice(0, len(z))
-    else:
-        validation, training = split_validation(len(z))
+    fifth, z = split_validation(len(y))[0].stop, z.round(_DIGITS)
+    turned = [np.roll(np.arange(len(y)), -i * fifth) for i in range(how.members)]
     with single_threaded():
-        model = _Model.build(how, u[training], rng)
-        state = _optimise(model, how, (u[training], z[training]), (u[validation], z[validation]), rng)
-    return SparsePredictor(shift=shift, scale=scale, **state)
+        return SparseMixture(tuple(SparsePredictor(shift=shift, scale=scale, **_train(how, u[i], z[i], rng)) for i in turned))
+
+
+def _train(how: Training, u: Points, z: Vector, rng: np.random.Generator) -> dict[str, Any]:
+    """Return the state of one process trained on u (n, d) and standardised z (n,)."""
+    validation = training = slice(0, len(z))
+    if how.patience is not None:
+        validation, training = split_validation(len(z))
+    model = _Model.build(how, u[training], rng)
+    return _optimise(model, how, (u[training], z[training]), (u[validation], z[validation]), rng)
 
 
 @dataclass(frozen=True, eq=False)

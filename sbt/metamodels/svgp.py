@@ -9,8 +9,7 @@ import numpy as np
 
 from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.metamodels.base import check_rows, standardise
-from sbt.metamodels.sparse import SparsePredictor, Training, train
+from sbt.metamodels.sparse import SparseMixture, Training, train
 
 __all__ = ["SparseGaussianProcess"]
 
@@ -53,11 +52,9 @@ class SparseGaussianProcess:
             raise InputError(f"steps must be >= 1, but got {self.steps}")
         self._training(2)
 
-    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparsePredictor:
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> SparseMixture:
         """Return the process trained on u (n, d) and y (n,); see `Metamodel.fit`."""
-        u, y = check_rows(u, y)
-        z, shift, scale = standardise(y)
-        return train(self._training(len(z)), u, z, shift, scale, rng)
+        return train(self._training(len(y)), u, y, rng)
 
     def _steps(self, n: int) -> float:
         return self.steps * min(max(n / _ROWS, 0.2), 1.0)
