@@ -169,6 +169,8 @@ def main() -> None:
     parser.add_argument("--reference", type=int, default=5_000)
     parser.add_argument("--store", type=Path, default=Path("runs/boundary_table"))
     args = parser.parse_args()
+    if unknown := set(args.problems.split(",")) - set(BUDGETS):
+        parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join(BUDGETS)}")
     args.store.mkdir(parents=True, exist_ok=True)
     kept = args.store / "cells.jsonl"
     done = {}

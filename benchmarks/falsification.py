@@ -118,6 +118,8 @@ def main() -> None:
     parser.add_argument("--only", default=",".join([*CASES, "modes", "cost"]))
     parser.add_argument("--samplers", default="portfolio,random,sobol,cma_es,tpe")
     args = parser.parse_args()
+    if unknown := set(args.only.split(",")) - {*CASES, "modes", "cost"}:
+        parser.error(f"--only: {', '.join(sorted(unknown))} is none of {', '.join((*CASES, 'modes', 'cost'))}")
     for case in args.only.split(","):
         if case == "modes":
             both_modes(args)

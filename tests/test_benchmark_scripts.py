@@ -1,0 +1,44 @@
+"""Every script in `benchmarks/` runs, here at its smallest; the numbers of one that has rotted could not be made again."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+SMALLEST = {
+    "boundary.py": "--scenario cut_in --seeds 1 --budget 30 --batch 10 --reference 200",
+    "cut_in_plane.py": "--size 4 --out {folder}/plane.png",
+    "metamodels.py": "--kinds et --rows 20 --inputs 2 --points 64 --repeat 1",
+    "overhead.py": "--runs 32",
+    "proposals.py": "--runs 30 --repeats 1",
+    "screening.py": "--rows 50 --inputs 4 --samples 4 --kinds gp",
+    "slice_teeth.py": "--scenario following --points 2 --values 4",
+    "step_length.py": "--scenario cut_in --points 16 --seeds 2 --reference 0.025",
+    "throughput.py": "--scenario cut_in --runs 4 --repeats 1 --no-campaign",
+    "warm_start.py": "{folder}/store --seeds 2 --batch 10 --batches 2",
+    "boundary_table.py": "--problems testbed:borehole_1e-3:box --methods even --seeds 1 --reference 500 --store {folder}/table",
+    "estimation.py": "--problems gayton_hat@200 --seeds 1 --table {folder}/table.jsonl",
+    "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
+}
+LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
+
+
+def test_every_script_is_known():
+    assert {path.name for path in BENCHMARKS.glob("*.py")} == set(SMALLEST) | LONG
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SMALLEST)
+def test_it_runs(script, tmp_path, campaign):
+    if script == "warm_start.py":
+        campaign(campaign="coverage", budget=100, store=str(tmp_path / "store"))
+    arguments = SMALLEST[script].format(folder=tmp_path).split()
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / script, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "|" in done.stdout or list(tmp_path.glob("plane*"))
