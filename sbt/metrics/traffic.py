@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
+from sbt.arrays import Vector
 from sbt.metrics.conflict import distance, time_behind
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
 from sbt.metrics.paths import HORIZON as CONFLICT
@@ -31,9 +34,18 @@ def _over_all(pairwise: Pairwise, ego: str, worst: Callable[[list[float]], float
 
 def nearest_ttc(ego: str = "ego") -> Metric:
     """Return the smallest time to collision with anyone along the paths driven (s): 0 for a collision, 5 without a conflict."""
+
+    def over_time(trace: Trace) -> Vector:
+        times = np.full(len(trace.time), CONFLICT)
+        for other in trace.actors:
+            if other != ego:
+                np.minimum(times, ttc_on_paths(trace, ego, other), out=times)
+        return times
+
     return Metric(
-        "ttc_path_min", _over_all(lambda t, a, b: float(ttc_on_paths(t, a, b).min()), ego, min, CONFLICT), "s", "low", CONFLICT,
+        "ttc_path_min", lambda trace: float(over_time(trace).min()), "s", "low", CONFLICT,
         "smallest time until ego and anyone else would touch on the paths they drive at their present speeds",
+        over_time=over_time,
     )  # fmt: skip
 
 

@@ -83,6 +83,8 @@ class Metric:
         description: one sentence.
         source: reference of the definition.
         alone: it measures the ego alone, whoever else is there.
+        over_time: trace to (t,) values whose worst is the metric; for one that knows, of an instant, what came after it, and
+            that therefore cannot be told from the trace up to there.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Metric:
     description: str = ""
     source: str = ""
     alone: bool = False
+    over_time: Callable[[Trace], Vector] | None = None
 
     def __call__(self, trace: Trace) -> float:
         """Return the metric of a trace.

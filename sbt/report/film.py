@@ -35,6 +35,8 @@ _COLORS = 48
 def metric_so_far(trace: Trace, metric: Metric, instants: Sequence[int]) -> Vector:
     """Return the metric of the run up to each of these instants, nan where it says nothing yet.
 
+    One that looks ahead on the paths that were driven knows them to their end.
+
     >>> import numpy as np
     >>> from sbt.problem.trace import Trace
     >>> x = np.array([[0.0], [3.0], [1.0]])
@@ -42,6 +44,9 @@ def metric_so_far(trace: Trace, metric: Metric, instants: Sequence[int]) -> Vect
     >>> metric_so_far(run, Metric("furthest", lambda t: float(t.x.max())), [0, 1, 2]).tolist()
     [0.0, 3.0, 3.0]
     """
+    if metric.over_time is not None:
+        worst = np.minimum if metric.direction == "low" else np.maximum
+        return np.asarray(worst.accumulate(metric.over_time(trace))[list(instants)])
     values = []
     for k in instants:
         try:
