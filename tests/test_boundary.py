@@ -184,7 +184,7 @@ def test_what_auto_alone_believes_draws_functions_as_the_process_does():
     blind = Auto(ensemble_rows=10**6).fit(u, np.round(y), stream(0, "fit"))
     assert 0 < blind.choice.weights["et"] < 1
     assert functions(blind, line, 50, stream(1, "draws")).shape == (50, 200)
-    assert simplest(Auto()) == GaussianProcess()
+    assert simplest(Auto()) == GaussianProcess(nu=2.5, input_noise=False)
 
 
 @pytest.mark.parametrize("method", ["mix", "boundary", "u", "straddle", "expected_feasibility"])

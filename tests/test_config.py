@@ -73,14 +73,11 @@ def errors(text: str, *overrides: str, folder: Path | None = None, assembled: bo
     return list(caught.value.errors)
 
 
-PROCESS = {"nu": 2.5, "input_noise": False}
-
-
 def test_every_key_has_a_default_but_campaign_and_scenario():
     config = parse(BASE).config
     assert (config.budget, config.initial, config.batch, config.seed) == (500, 50, 50, 0)
     assert config.metamodel is not None
-    assert (config.metamodel.kind, config.metamodel.settings, config.acquisition.kind) == ("gp", PROCESS, "mix")
+    assert (config.metamodel.kind, config.metamodel.preset, config.acquisition.kind) == ("auto", "quick", "mix")
     assert config.store == "runs/boundary_plugin"
     assert config.executor.workers >= 1
 

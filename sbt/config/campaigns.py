@@ -39,6 +39,7 @@ CAMPAIGNS: Mapping[str, CampaignKind] = {
     "boundary": CampaignKind(
         "identify where critical meets uncritical", "mix", stop={"stable": None, "misclassified": None},
         methods=("mix", "u", "straddle", "expected_feasibility"),
+        metamodel={"kind": "auto", "preset": "quick"},
     ),
     "falsification": CampaignKind(
         "find critical concrete scenarios, and distinct failure modes", "portfolio",

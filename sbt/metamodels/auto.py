@@ -35,12 +35,12 @@ class Auto:
     Each model is scored on rows it was not fitted to (cross-validation); the weights are those of
     largest likelihood of the mixture there, shrunk a little to equal ones. Then the models that have a weight are
     fitted to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
-    every batch, takes about a quarter of the time: a smaller ensemble, two folds.
+    every batch, takes about a quarter of the time: a smaller ensemble, two folds of at most 400 rows, and none below 300.
 
     A campaign that looks for the critical edge tells where it is (`about`). Then what counts is not the density of y
-    but the probability of the range that it fell into (see `Bins`), and the first model, `gp`, is believed alone unless
-    the mixture is better by two standard errors: rows crowd at the edge, where a mixture that hedges looks better than
-    it is over the space.
+    but the probability of the range that it fell into (see `Bins`), and the first model, `gp` with nu 2.5 and one noise, is
+    believed alone unless the mixture is better by three standard errors: rows crowd at the edge, where a mixture that
+    hedges looks better than it is over the space.
 
     Args:
         folds: of the cross-validation, >= 2.
@@ -49,6 +49,7 @@ class Auto:
         pace: share in (0, 1] of the ensemble's steps that are taken.
         ensemble_rows: rows from which on the ensemble takes part, >= 2.
         gp_rows: rows up to which the Gaussian process takes part, >= 2.
+        compare_rows: most rows that the models are compared on, >= 10; chosen by the rng.
         device: auto (CUDA where there is one), cpu or cuda; for the Gaussian process and the ensemble.
 
     Raises:
@@ -64,14 +65,19 @@ class Auto:
     pace: float = 1.0
     ensemble_rows: int = 100
     gp_rows: int = 4000
+    compare_rows: int = 4000
     device: str = "cpu"
 
-    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"folds": 2, "members": 5, "pace": 0.6, "ensemble_rows": 150}}
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {"folds": 2, "members": 5, "pace": 0.6, "ensemble_rows": 300, "compare_rows": 400}
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         for name in ("folds", "members", "ensemble_rows", "gp_rows"):
             if not getattr(self, name) >= 2:
                 raise InputError(f"{name} must be >= 2, but got {getattr(self, name)}")
+        if not self.compare_rows >= _FEWEST:
+            raise InputError(f"compare_rows must be >= {_FEWEST}, but got {self.compare_rows}")
         if not 0.0 < self.pace <= 1.0:
             raise InputError(f"pace must be in (0, 1], but got {self.pace}")
         if not self.prior >= 0.0:
@@ -84,8 +90,8 @@ class Auto:
 
     @property
     def simplest(self) -> Metamodel:
-        """What is believed where there is no time to compare."""
-        return GaussianProcess(device=self.device)
+        """What is believed about the critical edge where there is no time to compare."""
+        return GaussianProcess(nu=2.5, input_noise=False, device=self.device)
 
     def about(self, critical: CriticalInterval) -> _About:
         """Return the same settings for runs whose critical interval is known."""
@@ -93,25 +99,27 @@ class Auto:
 
     def _fit(self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None) -> MixturePredictor:
         u, y = check_rows(u, y)
-        models, bins = self._models(len(y)), None if critical is None else Bins.about(y, critical)
-        if len(y) < _FEWEST:
+        n, bins, aimed = len(y), None if critical is None else Bins.about(y, critical), critical is not None
+        models, compared = self._models(n, n, aimed=aimed), min(n, self.compare_rows)
+        if n < _FEWEST:
             weights, scores = np.full(len(models), 1.0 / len(models)), None
         else:
-            scores = held_out(models.values(), u, y, self.folds, rng, bins)
+            rows = rng.permutation(n)[:compared] if compared < n else slice(None)
+            scores = held_out(self._models(n, compared, aimed=aimed).values(), u[rows], y[rows], self.folds, rng, bins)
             weights = stacked(scores, self.prior)
-        choice = _explain(list(models), weights, scores, len(y), self, bins)
+        choice = _explain(list(models), weights, scores, compared, self, bins)
         kept = {name: model for name, model in models.items() if choice.weights[name] > 0.0}
         predictors = tuple(model.fit(u, y, rng) for model in kept.values())
         return MixturePredictor(predictors, np.array([choice.weights[name] for name in kept]), choice)
 
-    def _models(self, n: int) -> dict[str, Metamodel]:
-        """Return the models that take part with n rows."""
+    def _models(self, n: int, learned: int, *, aimed: bool) -> dict[str, Metamodel]:
+        """Return the models that take part with n rows, to be fitted to `learned` of them."""
         models: dict[str, Metamodel] = {}
         if n <= self.gp_rows:
-            models["gp"] = GaussianProcess(device=self.device)
+            models["gp"] = self.simplest if aimed else GaussianProcess(device=self.device)
         models["et"] = ExtraTrees()
         if n >= self.ensemble_rows:
-            models["ensemble"] = _paced(n, Ensemble(members=self.members, device=self.device), self.pace)
+            models["ensemble"] = _paced(learned, Ensemble(members=self.members, device=self.device), self.pace)
         return models
 
 
@@ -210,7 +218,7 @@ def _explain(names: list[str], weights: Vector, held: Points | None, n: int, set
     what = "" if bins is None else f" to fall where they did, of the ranges cut at {', '.join(f'{cut:.3g}' for cut in bins.cuts)}"
     reason = f"{mixed}: mean log likelihood of {n} rows{what}, each predicted from other rows ({settings.folds} folds): {listed}"
     if alone and len(names) > 1:
-        reason += f" (not better than {names[0]} by two standard errors)"
+        reason += f" (not better than {names[0]} by three standard errors)"
     if "ensemble" not in names:
         reason += f"; the ensemble takes part from {settings.ensemble_rows} rows on"
     if "gp" not in names:

@@ -15,7 +15,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Bins", "held_out", "mixture_score", "stacked", "surely_better"]
 
-_SURE = 2.0  # standard errors
+_SURE = 3.0  # standard errors
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def mixture_score(log_score: Points, weights: Vector) -> Vector:
 
 
 def surely_better(log_score: Points, weights: Vector) -> bool:
-    """Say whether the mixture is better than the first of the k models by two standard errors of (k, n) scores.
+    """Say whether the mixture is better than the first of the k models by three standard errors of (k, n) scores.
 
     >>> surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
     True
