@@ -126,6 +126,7 @@ def test_papers_settings_are_those_of_its_table():
         (SparseGaussianProcess, {"steps": 0}),
         (Auto, {"folds": 1}),
         (Auto, {"prior": -1.0}),
+        (Auto, {"compare_rows": 9}),
     ],
 )
 def test_impossible_settings_are_refused(kind, settings):
@@ -390,6 +391,14 @@ def test_auto_leaves_the_gp_out_of_many_rows():
     choice = Auto(gp_rows=50, ensemble_rows=10**6).fit(u, y, np.random.default_rng(0)).choice
     assert choice.weights == {"et": 1.0}
     assert "gp takes part up to 50" in choice.reason
+
+
+def test_auto_compares_on_some_rows_and_learns_from_all():
+    u, y = rows(200)
+    found = Auto(compare_rows=40, ensemble_rows=10**6).fit(u, y, np.random.default_rng(0))
+    assert "of 40 rows" in found.choice.reason
+    gp = next(p for p, name in zip(found.predictors, found.choice.weights, strict=False) if name == "gp")
+    assert len(gp.u) == 200
 
 
 @pytest.mark.slow
