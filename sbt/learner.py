@@ -37,7 +37,8 @@ class Belief:
         scores: on held-out runs, empty without them; plus `sides`, the classification of 4,096
             fixed Sobol points as hexadecimal bits, and over these points `critical_fraction`, the mean
             P(critical), `expected_misclassified`, the mean of the smaller of P and 1 - P, and
-            `ambiguous_volume`, the share with P between 0.05 and 0.95.
+            `ambiguous_volume`, the share with P between 0.05 and 0.95; of a metamodel that chose among others
+            `believed`, what it chose and why, and `weights`, the share of each.
         runs: rows it learned from.
         seconds: the fit took.
         log_ambiguity_bound: (n, d) points -> (n,) quick upper bounds of log a_BI; None: the metamodel has none.
@@ -96,7 +97,9 @@ class Learner:
             def bound(points: Points) -> Vector:
                 return log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
 
-        return Belief(predict, self._scores(predict, history), len(training), seconds, bound)
+        chosen = getattr(getattr(predictor, "predictor", predictor), "choice", None)  # also of a recalibrated one
+        told = {} if chosen is None else {"believed": chosen.reason, "weights": dict(chosen.weights)}
+        return Belief(predict, self._scores(predict, history) | told, len(training), seconds, bound)
 
     def train(self, training: History) -> Predictor:
         """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""

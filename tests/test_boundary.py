@@ -321,3 +321,17 @@ def test_boundary_points_are_exported(tmp_path: Path):
     assert len(rows) > 100
     assert 0.25 < critical[0].mean() < 0.75  # half on either side, where 14 % are critical
     assert critical[1].mean() < 0.2
+
+
+@pytest.mark.parametrize("recalibrate", [False, True])
+def test_auto_says_in_the_campaign_what_it_believed(campaign, tmp_path, recalibrate):
+    metamodel = {"kind": "auto", "preset": "quick", "recalibrate": recalibrate}
+    result = campaign(campaign="boundary", budget=40, metamodel=metamodel, store=str(tmp_path / "s"), report=True)
+    found = result["conclusion"]
+    assert set(found["weights"]) == {"gp", "et"}
+    assert sum(found["weights"].values()) == pytest.approx(1.0)
+    assert all((f" % {name}" in found["believed"].split(":")[0]) == (weight > 0) for name, weight in found["weights"].items())
+    page = (tmp_path / "s" / "report.html").read_text()
+    assert f"What the metamodel chose to believe: {found['believed'][:20]}" in page
+    with Store.read(tmp_path / "s") as store:
+        assert all("believed" in fit for fit in store.fits())

@@ -18,7 +18,7 @@ from sbt.samplers.surface import crossings
 __all__ = ["boundary_points", "recipe", "validation_of"]
 
 _VOLUMES = ("critical_fraction", "expected_misclassified", "ambiguous_volume")
-_INTERNAL = ("sides", *_VOLUMES)
+_INTERNAL = ("sides", "believed", "weights", *_VOLUMES)
 _GREEDY = {"u": boundary, "straddle": straddle, "expected_feasibility": expected_feasibility}
 
 
@@ -51,6 +51,7 @@ def recipe(settings: Settings) -> Campaign:
         if belief is not None:
             conclusion |= {name: belief.scores[name] for name in _VOLUMES}
             conclusion["validation"] = validation_of(belief.scores)
+            conclusion |= {name: belief.scores[name] for name in ("believed", "weights") if name in belief.scores}
         conclusion["held_out_fraction"] = critical_share(held_out, settings.scenario)
         return conclusion, fit_of(belief)
 

@@ -15,7 +15,7 @@ from sbt.history import History, Record
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
-from sbt.report.words import NOTHING, SCORES, law_words, number, share
+from sbt.report.words import NOTHING, SCORES, law_words, number, share, shares_in_words
 
 __all__ = [
     "Cell",
@@ -107,6 +107,7 @@ def iteration_table(
         {fit["iteration"]: fit for fit in fits},
     )
     scored = [key for key in _LIST_SCORES if any(fit.get(key) is not None for fit in fits)]
+    chosen = ["believed"] if any(fit.get("weights") for fit in fits) else []
     rows = []
     for batch in iterations:
         mine, fit = history.iteration == batch["iteration"], by_iteration.get(batch["iteration"], {})
@@ -114,7 +115,8 @@ def iteration_table(
         rows.append((
             Cell.of(batch["iteration"]), Cell(str(batch["stage"])), Cell.of(int(mine.sum())),
             Cell.of(int((mine & critical).sum())), Cell.of(int((mine & ~history.ok).sum())),
-            *(Cell.of(fit.get(key), 3) for key in scored), Cell(_listed(how)),
+            *(Cell.of(fit.get(key), 3) for key in scored),
+            *(Cell(shares_in_words(fit.get("weights") or {}), fit.get(key, "")) for key in chosen), Cell(_listed(how)),
         ))  # fmt: skip
     columns = (
         "iteration",
@@ -123,6 +125,7 @@ def iteration_table(
         "critical",
         "failed",
         *(SCORES[key] for key in scored),
+        *chosen,
         "how it was chosen",
     )
     return Table(columns, tuple(rows), "Scores are those of the metamodel that chose the batch." if scored else "")

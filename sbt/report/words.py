@@ -122,6 +122,16 @@ def share(value: float) -> str:
     return f"{100 * value:.3g}\N{NO-BREAK SPACE}%"
 
 
+def shares_in_words(weights: Mapping[str, float]) -> str:
+    """Return how much of a mixture each part is, the largest first.
+
+    >>> shares_in_words({"gp": 0.25, "et": 0.75, "ensemble": 0.0}).replace("\N{NO-BREAK SPACE}", " ")
+    '75 % et, 25 % gp'
+    """
+    kept = sorted(((-weight, name) for name, weight in weights.items() if weight > 0.0))
+    return ", ".join(f"{100 * -weight:.0f}\N{NO-BREAK SPACE}% {name}" for weight, name in kept)
+
+
 def requirement_words(requirement: Requirement, unit: str) -> str:
     """Return when a run is critical."""
     low, high, name, tail = (
@@ -228,6 +238,8 @@ def _fraction(found: Findings) -> list[str]:
         )
     if measured is not result and result.get("critical_fraction") is not None:
         said.append(f"The metamodel takes {share(result['critical_fraction'])} of the parameter space to be critical.")
+    if result.get("believed"):
+        said.append(f"What the metamodel chose to believe: {result['believed']}.")
     return said
 
 
