@@ -48,6 +48,7 @@ def examine(folder: Path) -> list[Check]:
         ("netconvert", _netconvert),
         ("sumo_nets", _nets),
         ("cores", _cores),
+        ("cuda", _cuda),
         ("disk", lambda: _disk(folder)),
         ("sqlite", lambda: _sqlite(folder)),
     )]  # fmt: skip
@@ -130,6 +131,16 @@ def _nets() -> Check:
 def _cores() -> Check:
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Check("cores", "ok", f"{usable} usable of {os.cpu_count()}")
+
+
+def _cuda() -> Check:
+    """Return whether `device: cuda` can be asked for; nothing needs it."""
+    import torch
+
+    if torch.cuda.is_available():
+        return Check("cuda", "ok", f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}")
+    build = "a PyTorch for the CPU only" if torch.version.cuda is None else f"a PyTorch for CUDA {torch.version.cuda}"
+    return Check("cuda", "ok", f"no device, {build}: metamodels compute on the CPU")
 
 
 def _existing(folder: Path) -> Path:
