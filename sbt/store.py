@@ -1,7 +1,7 @@
 """The store of a campaign: one folder, one SQLite file, one writer, one commit a run.
 
-A process that is killed loses no run that was committed. Nor does a power cut lose a plan, a fit or a conclusion, but it
-may take the runs of the last tenth of a second with it: runs wait for the disk together. They are planned, and run again.
+A process that is killed loses no run that was committed. Nor does a power cut lose a plan, a fit or a conclusion, but it may
+take a tenth of a second's worth of runs with it, since runs wait for the disk together. They are planned, and run again.
 
 What is in the file is all that a campaign knows: `run` again reads it back and goes on to the
 identical result. Any number of processes may read while the driver writes.
