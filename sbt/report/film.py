@@ -146,9 +146,9 @@ def _draw_metric(axes: Any, trace: Trace, metric: Metric, requirement: Requireme
     time = trace.time[instants]
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    edges = [
-        e for e in (requirement.critical.low, requirement.critical.high) if np.isfinite(e) and abs(e - low) < 3 * (high - low) + 2
-    ]
+    both = (requirement.critical.low, requirement.critical.high)
+    ends = sorted((e for e in both if np.isfinite(e)), key=lambda e: abs(e - low))
+    edges = [e for e in ends if abs(e - low) < 3 * (high - low) + 2] or ends[:1]  # always the nearest
     low, high = min([low, *edges]), max([high, *edges])
     margin = 0.1 * (high - low) + 1e-3
     axes.set_ylim(low - margin, high + margin)
