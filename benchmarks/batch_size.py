@@ -18,11 +18,11 @@ import numpy as np
 
 from sbt import testbeds
 from sbt.config.load import parse
-from sbt.learner import chunked
+from sbt.loop.learner import chunked
 from sbt.metamodels.scores import scores
-from sbt.run import assembly_of, run_campaign, settings_of
 from sbt.seeds import stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 SIZES = (2, 5, 10, 20, 40)
 SEARCHES = ("hartmann6_1e-3", "needle_d4_1e-3")

@@ -23,12 +23,12 @@ from scipy.spatial import cKDTree
 
 from sbt.config.load import parse
 from sbt.execution.local import LocalExecutor
-from sbt.history import VALIDATION, History, Record
-from sbt.learner import Learner
+from sbt.loop.learner import Learner
 from sbt.problem.outcome import Job
-from sbt.run import assembly_of, run_campaign, settings_of
 from sbt.seeds import run_seed, stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.store.history import VALIDATION, History, Record
+from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 METRICS = ("precision_at_recall_90", "average_precision", "f1", "log_likelihood_critical", "calibration_error")
 

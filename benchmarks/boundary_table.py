@@ -31,16 +31,16 @@ import numpy as np
 import pandas as pd
 
 from sbt import testbeds
-from sbt.arrays import Mask, Points, Vector
 from sbt.campaigns.settings import Settings
 from sbt.config.load import parse
 from sbt.execution.local import LocalExecutor
-from sbt.learner import chunked
+from sbt.loop.learner import chunked
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Job
-from sbt.run import assembly_of, run_campaign, settings_of
 from sbt.seeds import run_seed, stream
-from sbt.store import Store
-from sbt.tables import from_folder
+from sbt.store.database import Store
+from sbt.store.tables import from_folder
+from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 TABLE = Path(__file__).parents[2] / "shared" / "data" / "dsiod_jaywalking"
 APART = 600  # rows

@@ -23,8 +23,8 @@ from scipy.integrate import quad
 from scipy.stats import gamma, norm
 
 from sbt.config.load import parse
-from sbt.run import run_campaign
 from sbt.testbeds import truth
+from sbt.workflows.running import run_campaign
 
 
 def _truncated() -> float:

@@ -22,13 +22,13 @@ from scipy.optimize import minimize
 from sbt.benchmark.compare import compare, table
 from sbt.campaigns.falsification import CONFIRM
 from sbt.config.load import parse
-from sbt.metamodels.gp import GaussianProcess
-from sbt.run import run_campaign
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.samplers.portfolio import propose
 from sbt.samplers.search import Search
 from sbt.seeds import stream
-from sbt.store import Store
+from sbt.store.database import Store
 from sbt.testbeds import find, values
+from sbt.workflows.running import run_campaign
 
 CASES = {
     "hartmann6_1e-3": ("testbed:hartmann6_1e-3", None, (45, 65)),

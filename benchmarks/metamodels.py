@@ -18,9 +18,9 @@ from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.scores import scores
 from sbt.plugins import load, names
 from sbt.problem.requirement import CriticalInterval
-from sbt.run import assembly_of, loaded_from, settings_of
 from sbt.seeds import stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.workflows.running import assembly_of, loaded_from, settings_of
 
 FAST = ("et", "et paper", "gp", "gp paper", "ensemble", "auto")
 SCORES = {

@@ -22,9 +22,9 @@ from scipy.stats import qmc
 
 from sbt.config.load import parse
 from sbt.plugins import load
-from sbt.run import run_campaign
 from sbt.sumo import simulation
 from sbt.sumo.driving import Drive
+from sbt.workflows.running import run_campaign
 
 EMPTY = """
 from sbt.problem.parameter import Parameter

@@ -21,7 +21,7 @@ from sbt.campaigns.falsification import SearchStage
 from sbt.campaigns.parts import BatchStage
 from sbt.campaigns.sequential import SequentialStage
 from sbt.config.load import parse
-from sbt.run import run_campaign
+from sbt.workflows.running import run_campaign
 
 STAGES = {"boundary": BatchStage, "falsification": SearchStage, "estimation": SequentialStage}
 

@@ -10,10 +10,10 @@ import time
 
 import numpy as np
 
-from sbt.acquisition import boundary
-from sbt.metamodels.auto import Auto
+from sbt.acquisitions import boundary
+from sbt.metamodels.automatic import Auto
 from sbt.metamodels.base import about, build, log_ambiguity_bound
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.sobol import SobolSequence

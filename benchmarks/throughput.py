@@ -109,7 +109,7 @@ def campaign_rate(name: str, workers: int, n: int, step: float | None = None) ->
     import tempfile
 
     from sbt.config.load import parse
-    from sbt.run import run_campaign
+    from sbt.workflows.running import run_campaign
 
     with tempfile.TemporaryDirectory() as folder:
         text = (

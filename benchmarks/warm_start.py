@@ -15,10 +15,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from sbt.metamodels import gp
+from sbt.metamodels import gaussian_process as gp
 from sbt.metamodels.scores import scores
-from sbt.run import assembly_of, loaded_from, settings_of
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.workflows.running import assembly_of, loaded_from, settings_of
 
 KEYS = ("log_likelihood", "average_precision", "log_likelihood_critical")
 _fit_posterior = gp._fit_posterior

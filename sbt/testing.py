@@ -14,16 +14,16 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.acquisition import Acquisition
-from sbt.arrays import Points, Vector
+from sbt.acquisitions import Acquisition
 from sbt.errors import SbtError
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
-from sbt.scenario_check import check_scenario
 from sbt.seeds import stream
+from sbt.workflows.checking import check_scenario
 
 __all__ = ["ContractError", "check_acquisition", "check_metamodel", "check_metric", "check_sampler", "check_scenario"]
 

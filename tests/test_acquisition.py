@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbt.acquisition import boundary, even, importance
+from sbt.acquisitions import boundary, even, importance
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
 from sbt.testing import ContractError, check_acquisition

@@ -22,29 +22,25 @@ PACKAGE = ROOT / "sbt"
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 FLOORS = (
-    ("sbt", "errors", "arrays", "seeds", "plugins"),
+    ("sbt", "errors", "seeds", "plugins"),
     ("problem",),
     ("metrics",),
-    ("sumo", "metamodels"),
-    ("testbeds",),
-    ("scenarios", "acquisition", "samplers", "estimators"),
-    ("execution", "history", "store"),
-    ("learner", "campaign", "tables"),
-    ("campaigns", "scenario_check"),
-    ("config", "run", "replay"),
-    ("report", "benchmark", "export", "testing", "predict", "paired", "merge"),
-    ("cli", "__main__"),
+    ("sumo", "metamodels", "testbeds"),
+    ("scenarios", "acquisitions", "samplers", "estimators"),
+    ("execution", "store"),
+    ("loop",),
+    ("campaigns",),
+    ("config",),
+    ("report",),
+    ("workflows",),
+    ("benchmark", "testing"),
+    ("cli",),
+    ("__main__",),
 )
 """Rooms from the ground up; those on one floor do not know each other unless stated in NEIGHBOURS."""
-NEIGHBOURS = {
-    "execution": set(), "store": {"history"}, "campaign": {"learner"}, "samplers": {"acquisition"},
-    "plugins": {"errors"}, "arrays": {"errors"}, "seeds": set(), "errors": set(), "sbt": set(),
-    "run": {"config", "replay"}, "replay": {"config", "run"}, "__main__": {"cli"}, "testing": {"report"}, "benchmark": {"report"},
-}  # fmt: skip
+NEIGHBOURS = {"samplers": {"acquisitions"}, "plugins": {"errors"}}
 LATE = {
     "metrics": {"sumo"},  # reading recorded FCD needs the networks' geometry
-    "run": {"report"},  # a campaign ends with its report
-    "config": {"cli"},
 }
 """Imports inside functions that may look up: only when they are needed."""
 BELONGS = {
@@ -179,7 +175,7 @@ def loaded_by(code: str) -> set[str]:
 def test_nothing_heavy_is_loaded_early():
     assert loaded_by("import sbt") & set(HEAVY) == set()
     assert loaded_by("import sbt.cli") & set(HEAVY) == set()
-    of_the_loop = loaded_by("import sbt.run, sbt.config.assemble, sbt.store, sbt.execution.local")
+    of_the_loop = loaded_by("import sbt.workflows.running, sbt.config.assemble, sbt.store.database, sbt.execution.local")
     assert of_the_loop & {"torch", "gpytorch", "libsumo", "pandas", "sklearn", "matplotlib"} == set()
 
 

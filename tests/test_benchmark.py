@@ -18,7 +18,7 @@ from sbt.benchmark.table import COLUMNS, read_table, rows_of, write_table
 from sbt.cli import app
 from sbt.config.benchmark import LoadedBenchmark, load_benchmark
 from sbt.config.source import ConfigError
-from sbt.store import Store
+from sbt.store.database import Store
 
 ROOT = Path(__file__).resolve().parent.parent
 TINY = """

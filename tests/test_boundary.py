@@ -13,26 +13,26 @@ from scipy.spatial.distance import cdist
 from typer.testing import CliRunner
 
 from sbt import testbeds
-from sbt.acquisition import expected_feasibility, straddle
-from sbt.campaign import Log
+from sbt.acquisitions import expected_feasibility, straddle
 from sbt.campaigns.hunt import HUNTED, in_vain, is_on
 from sbt.campaigns.settings import Settings
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.history import VALIDATION, History, Record
-from sbt.learner import Belief, Learner
-from sbt.metamodels.auto import Auto
+from sbt.loop.learner import Belief, Learner
+from sbt.loop.stages import Log
+from sbt.metamodels.automatic import Auto
 from sbt.metamodels.base import functions, simplest
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.recalibrated import Recalibrated
 from sbt.problem.requirement import CriticalInterval
-from sbt.run import assembly_of, run_campaign, settings_of
 from sbt.samplers.greedy import diverse, influence, refined, representative
 from sbt.samplers.smc import smc
 from sbt.samplers.surface import crossings
 from sbt.seeds import stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.store.history import VALIDATION, History, Record
+from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 
 def test_particles_have_the_density_of_the_score():

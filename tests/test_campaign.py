@@ -22,10 +22,10 @@ from typer.testing import CliRunner
 from sbt.campaigns.parts import clopper_pearson
 from sbt.cli import app
 from sbt.errors import InputError, SbtError
-from sbt.history import VALIDATION
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import run_seed, stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.store.history import VALIDATION
 
 Run = Callable[..., dict[str, Any]]
 Rows = Callable[..., dict[str, list[Any]]]
@@ -273,7 +273,7 @@ def test_runs_concentrate_on_the_boundary(campaign: Run):
 
 def test_progress_counts_what_was_run(configured: Callable[..., Path]):
     from sbt.config.load import load
-    from sbt.run import run_campaign
+    from sbt.workflows.running import run_campaign
 
     seen: list[Any] = []
     run_campaign(load(configured("c", "SOME_FAIL", budget=40)), progress=seen.append, report=False)

@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from sbt import run as sbt_run
-from sbt.campaign import Progress
 from sbt.cli import app, console
 from sbt.errors import InputError, StoreError
+from sbt.loop.stages import Progress
 from sbt.problem.outcome import Outcome, Status
-from sbt.store import PlannedRun, Store
+from sbt.store.database import PlannedRun, Store
+from sbt.workflows import running as sbt_run
 
 SBT = [sys.executable, "-m", "sbt"]
 PLUGIN = """

@@ -14,7 +14,7 @@ import pytest
 from sbt.config.assemble import acquisition_of, assemble, metamodel_of, scenario_of, spec_of
 from sbt.config.load import ConfigError, dump, fingerprint, load, parse, resolve, resumed, schema
 from sbt.config.model import CAMPAIGNS, EXECUTORS
-from sbt.metamodels.et import ExtraTrees
+from sbt.metamodels.extra_trees import ExtraTrees
 
 BASE = "campaign: boundary\nscenario: plugin.py:SCENARIO\n"
 PLUGIN = """

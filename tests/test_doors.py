@@ -24,9 +24,9 @@ from sbt.config.load import load
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.geometry import part
-from sbt.run import run_campaign
 from sbt.sumo.files import options_of_command
 from sbt.sumo.template import template
+from sbt.workflows.running import run_campaign
 
 pytestmark = pytest.mark.sumo
 

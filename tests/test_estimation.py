@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sbt.campaign import Log
 from sbt.campaigns.counting import counted_batches
 from sbt.campaigns.gate import Limits, decided
 from sbt.cli import app
 from sbt.config.load import ConfigError, load, parse
 from sbt.errors import InputError
-from sbt.run import assembly_of, run_campaign, settings_of
-from sbt.store import Store
+from sbt.loop.stages import Log
+from sbt.store.database import Store
 from sbt.testbeds import truth
+from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 Run = Callable[..., dict[str, Any]]
 NEAREST = {"kind": "analytic.py:Nearest"}

@@ -17,17 +17,17 @@ from sbt.benchmark.compare import compare, table
 from sbt.campaigns.falsification import CONFIRM, METHODS
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.history import VALIDATION
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
-from sbt.run import run_campaign
 from sbt.samplers import portfolio
 from sbt.samplers.criteria import log_expected_improvement
 from sbt.samplers.search import DEFLATION, Search, believe, deflated
 from sbt.seeds import stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.store.history import VALIDATION
 from sbt.testbeds import values
+from sbt.workflows.running import run_campaign
 
 CASES = '''
 from dataclasses import replace

@@ -16,8 +16,8 @@ import torch
 
 from sbt.errors import InputError
 from sbt.metamodels.base import build, split_validation, standardise
-from sbt.metamodels.et import ExtraTrees
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.gp_algebra import Hyperparameters, matern
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
@@ -131,13 +131,13 @@ def test_global_random_states_are_neither_used_nor_changed(name):
     np.testing.assert_array_equal(first.mean, second.mean)
 
 
-@pytest.mark.parametrize("kind", ["sbt.metamodels.gp:GaussianProcess", "sbt.metamodels.et:ExtraTrees"])
+@pytest.mark.parametrize("kind", ["sbt.metamodels.gaussian_process:GaussianProcess", "sbt.metamodels.extra_trees:ExtraTrees"])
 def test_bits_do_not_depend_on_the_number_of_threads(kind):
     module, name = kind.split(":")
     code = f"""
 import hashlib, numpy as np
 from {module} import {name}
-from sbt.acquisition import boundary
+from sbt.acquisitions import boundary
 from sbt.problem.requirement import CriticalInterval
 u = np.random.default_rng(0).random((400, 5)); y = np.sin(9 * u[:, 0]) + u[:, 1] * u[:, 2]
 belief = {name}().fit(u[:200], y[:200], np.random.default_rng(1))(u)
@@ -189,7 +189,7 @@ def test_kernel_is_gpytorchs(nu):
 def test_gradient_is_that_of_the_objective():
     from scipy.optimize import approx_fprime
 
-    from sbt.metamodels.gp import _Model
+    from sbt.metamodels.gaussian_process import _Model
 
     u, y = rows(30, noise=0.1)
     z, spread = standardise(y)[0], np.linspace(0.5, 2.0, 30)
@@ -210,7 +210,7 @@ def test_gradient_is_that_of_the_objective():
 
 
 def test_likelihood_is_gpytorchs():
-    from sbt.metamodels.gp import _Model
+    from sbt.metamodels.gaussian_process import _Model
 
     u, y = rows(30, noise=0.1)
     z = standardise(y)[0]

@@ -16,19 +16,19 @@ import torch
 from pretended_cuda import pretended_cuda
 
 from sbt.errors import InputError
-from sbt.metamodels.auto import Auto
+from sbt.metamodels.automatic import Auto
 from sbt.metamodels.base import about, build
-from sbt.metamodels.bnn import BayesianNetwork, _mask
-from sbt.metamodels.dgp import DeepGaussianProcess
-from sbt.metamodels.dspp import DeepSigmaPointProcess
-from sbt.metamodels.ensemble import Ensemble
-from sbt.metamodels.et import ExtraTrees
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.bayesian_network import BayesianNetwork, _mask
+from sbt.metamodels.deep_ensemble import Ensemble
+from sbt.metamodels.deep_gp import DeepGaussianProcess
+from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.recalibrated import Recalibrated
 from sbt.metamodels.scores import scores
+from sbt.metamodels.sigma_point import DeepSigmaPointProcess
+from sbt.metamodels.sparse_gp import SparseGaussianProcess
 from sbt.metamodels.stacking import Bins, stacked
-from sbt.metamodels.svgp import SparseGaussianProcess
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import device_of, minibatches
 from sbt.plugins import load, names
@@ -212,9 +212,9 @@ def test_global_random_states_are_neither_used_nor_changed(name):
 def test_bits_do_not_depend_on_the_number_of_threads():
     code = """
 import hashlib, numpy as np
-from sbt.metamodels.bnn import BayesianNetwork
-from sbt.metamodels.dspp import DeepSigmaPointProcess
-from sbt.metamodels.ensemble import Ensemble
+from sbt.metamodels.bayesian_network import BayesianNetwork
+from sbt.metamodels.sigma_point import DeepSigmaPointProcess
+from sbt.metamodels.deep_ensemble import Ensemble
 u = np.random.default_rng(0).random((300, 5)); y = np.sin(9 * u[:, 0]) + u[:, 1] * u[:, 2]
 for kind in (Ensemble(steps=20), BayesianNetwork(widths=(256, 256), max_steps=10), DeepSigmaPointProcess(max_epochs=2)):
     belief = kind.fit(u[:150], y[:150], np.random.default_rng(1))(u)

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from sbt.cli import app
-from sbt.paired import Pairs
 from sbt.seeds import stream
+from sbt.workflows.paired import Pairs
 
 
 def test_the_interval_of_the_difference_covers():

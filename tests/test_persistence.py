@@ -11,15 +11,15 @@ import pytest
 
 from sbt.errors import InputError
 from sbt.metamodels import persistence
-from sbt.metamodels.auto import Auto, Choice, MixturePredictor
-from sbt.metamodels.bnn import BayesianNetwork
-from sbt.metamodels.dgp import DeepGaussianProcess
-from sbt.metamodels.dspp import DeepSigmaPointProcess
-from sbt.metamodels.ensemble import Ensemble
-from sbt.metamodels.et import ExtraTrees
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.automatic import Auto, Choice, MixturePredictor
+from sbt.metamodels.bayesian_network import BayesianNetwork
+from sbt.metamodels.deep_ensemble import Ensemble
+from sbt.metamodels.deep_gp import DeepGaussianProcess
+from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.persistence import load, read_info, save
-from sbt.metamodels.svgp import SparseGaussianProcess
+from sbt.metamodels.sigma_point import DeepSigmaPointProcess
+from sbt.metamodels.sparse_gp import SparseGaussianProcess
 from sbt.plugins import names
 
 KINDS = {

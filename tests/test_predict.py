@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.errors import InputError
-from sbt.predict import MODEL, read_inputs
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
-from sbt.run import assembly_of, loaded_from, settings_of
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.workflows.prediction import MODEL, read_inputs
+from sbt.workflows.running import assembly_of, loaded_from, settings_of
 
 ROWS = "b,note,x.a\n0.5,middle,0.5\n0.1,corner,0.9\n"
 

@@ -9,7 +9,7 @@ import pytest
 
 from sbt.config.assemble import metamodel_of
 from sbt.config.load import ConfigError, parse
-from sbt.metamodels.et import ExtraTrees
+from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.persistence import load, save
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.recalibrated import Recalibrated

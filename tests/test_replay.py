@@ -19,10 +19,10 @@ from sbt.plugins import load, names
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.report.film import metric_so_far
-from sbt.run import replay, run_campaign
 from sbt.sumo import window
 from sbt.sumo.nets import lanes
 from sbt.sumo.session import libsumo, session
+from sbt.workflows.running import replay, run_campaign
 
 pytestmark = pytest.mark.sumo
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sbt.history import VALIDATION
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.distribution import Distribution
 from sbt.problem.outcome import Outcome, Status
@@ -26,7 +25,8 @@ from sbt.report.html import write_report
 from sbt.report.projection import influence, influence_from_runs, most_telling_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words, warnings_for
-from sbt.store import PlannedRun, Store
+from sbt.store.database import PlannedRun, Store
+from sbt.store.history import VALIDATION
 
 CRITICAL = CriticalInterval(-5.0, 0.5)
 SECTIONS = ("conclusion", "figures", "inputs", "iterations", "critical", "failed", "reproduce", "references")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sbt.acquisition import even
+from sbt.acquisitions import even
 from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbt.acquisition import boundary
-from sbt.metamodels.auto import Auto
+from sbt.acquisitions import boundary
+from sbt.metamodels.automatic import Auto
 from sbt.metamodels.base import log_ambiguity_bound
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.roi import rejection
 from sbt.samplers.sobol import SobolSequence

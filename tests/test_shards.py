@@ -16,13 +16,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from sbt.campaign import Shard
 from sbt.cli import app
 from sbt.config.load import load
 from sbt.errors import InputError
-from sbt.merge import merge
-from sbt.run import replay, run_campaign
-from sbt.store import Store
+from sbt.loop.stages import Shard
+from sbt.store.database import Store
+from sbt.workflows.merging import merge
+from sbt.workflows.running import replay, run_campaign
 
 Run = Callable[..., dict[str, Any]]
 Rows = Callable[[Path | str], dict[str, list[Any]]]
@@ -151,7 +151,7 @@ def test_a_merge_that_fails_leaves_nothing(configured: Configured, tmp_path: Pat
     def stop(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sbt.merge.result_of", stop)
+    monkeypatch.setattr("sbt.workflows.merging.result_of", stop)
     with pytest.raises(KeyboardInterrupt):
         merge(folders, into)
     assert list(into.iterdir()) == []
@@ -160,16 +160,16 @@ def test_a_merge_that_fails_leaves_nothing(configured: Configured, tmp_path: Pat
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-import sbt.merge
-left, move = int(sys.argv[1]), sbt.merge._move
+import sbt.workflows.merging
+left, move = int(sys.argv[1]), sbt.workflows.merging._move
 def moved(*paths):
     global left
     if left == 0:
         os.kill(os.getpid(), signal.SIGKILL)
     left -= 1
     move(*paths)
-sbt.merge._move = moved
-sbt.merge.merge([Path(p) for p in sys.argv[3:]], Path(sys.argv[2]))
+sbt.workflows.merging._move = moved
+sbt.workflows.merging.merge([Path(p) for p in sys.argv[3:]], Path(sys.argv[2]))
 """
 
 

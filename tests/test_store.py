@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from sbt.errors import StoreError
-from sbt.history import VALIDATION, History
 from sbt.problem.outcome import Outcome, Status
-from sbt.store import DATABASE, PlannedRun, Store
+from sbt.store.database import DATABASE, PlannedRun, Store
+from sbt.store.history import VALIDATION, History
 
 CONFIGURATION = {"names": ["a", "b"], "seed": 3}
 BATCH = [PlannedRun("initial", {"a": 0.1 * k, "b": 1 / 3}, -0.5 if k % 2 else None) for k in range(5)]
@@ -110,7 +110,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from sbt.problem.outcome import Outcome, Status
-from sbt.store import PlannedRun, Store
+from sbt.store.database import PlannedRun, Store
 
 store = Store.open(Path(sys.argv[1]), {"names": ["a"]})
 store.plan(0, "s", [PlannedRun("s", {"a": k / 7}) for k in range(100000)], range(100000), {})
@@ -145,7 +145,7 @@ def test_what_was_acknowledged_survives_a_kill(tmp_path: Path):
 def test_runs_wait_for_the_disk_together_and_plans_always(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """In WAL mode a commit at level FULL (2) waits for the disk and takes along the earlier ones at NORMAL (1)."""
     clock = SimpleNamespace(monotonic=lambda: clock.now, now=0.0)
-    monkeypatch.setattr("sbt.store.time", clock)
+    monkeypatch.setattr("sbt.store.database.time", clock)
 
     def level() -> int:
         return int(store._db.execute("PRAGMA synchronous").fetchone()[0])
@@ -237,7 +237,7 @@ def full(folder: Path, monkeypatch: pytest.MonkeyPatch, pages: int) -> None:
         db.execute(f"PRAGMA max_page_count = {pages}")
         return db
 
-    monkeypatch.setattr("sbt.store.sqlite3.connect", limited)
+    monkeypatch.setattr("sbt.store.database.sqlite3.connect", limited)
 
 
 def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -12,10 +12,10 @@ from sbt.cli import app
 from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.plugins import load
-from sbt.run import run_campaign
 from sbt.samplers.pool import PoolSequence
 from sbt.seeds import stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.workflows.running import run_campaign
 
 CONFIG = """
 title: "Disc"

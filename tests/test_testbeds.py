@@ -23,10 +23,10 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.plugins import load
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
-from sbt.run import run_campaign
-from sbt.scenario_check import check_scenario
 from sbt.seeds import stream
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.workflows.checking import check_scenario
+from sbt.workflows.running import run_campaign
 
 ORACLE = Path(__file__).resolve().parents[2] / "shared" / "data" / "reference_problems.py"
 NAMES = testbeds.names()

@@ -22,11 +22,11 @@ from sbt.plugins import load
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.samplers.sobol import SobolSequence
-from sbt.scenario_check import check_scenario
 from sbt.sumo import session as sessions
 from sbt.sumo.ego import Ego
 from sbt.sumo.models import CAR_FOLLOWING, checked
 from sbt.sumo.traffic import SHORTEST, Column, automated
+from sbt.workflows.checking import check_scenario
 
 NETS = Path(__file__).resolve().parent.parent / "sumo_nets"
 NAMES = ("crossing_pedestrian", "highway_merge", "roundabout_entry", "unprotected_left_turn")

@@ -11,23 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from sbt.acquisition import Acquisition, boundary
-from sbt.arrays import Points, Vector
+from sbt.acquisitions import Acquisition, boundary
 from sbt.benchmark.keeping import opened
 from sbt.benchmark.reference import reference_rows
-from sbt.campaign import Batch, Campaign, Fit, Log, Progress, run_stages
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
 from sbt.errors import SbtError
 from sbt.execution.protocol import SerialExecutor
-from sbt.history import History
-from sbt.learner import Belief, Learner
+from sbt.loop.learner import Belief, Learner
+from sbt.loop.stages import Batch, Campaign, Fit, Log, Progress, run_stages
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.sobol import SobolSequence
-from sbt.store import PlannedRun, Store
+from sbt.store.database import PlannedRun, Store
+from sbt.store.history import History
 
 __all__ = ["PREDICTIONS", "is_done", "run_cell"]
 

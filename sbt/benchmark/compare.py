@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from sbt.arrays import Points, Vector
 from sbt.benchmark.outside import OUTSIDE
 from sbt.campaigns.falsification import CONFIRM, METHODS
 from sbt.config.load import Loaded
 from sbt.errors import InputError
 from sbt.execution.protocol import SerialExecutor
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Status
-from sbt.run import assembly_of, run_campaign
 from sbt.samplers.search import DEFLATION
 from sbt.seeds import run_seed
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.workflows.running import assembly_of, run_campaign
 
 __all__ = ["SAMPLERS", "Cell", "compare", "table"]
 

@@ -11,9 +11,9 @@ from typing import Any
 from sbt.benchmark.cell import is_done, run_cell
 from sbt.benchmark.reference import make_reference
 from sbt.benchmark.table import write_table
-from sbt.campaign import Progress
 from sbt.config.benchmark import LoadedBenchmark
 from sbt.execution.tasks import each
+from sbt.loop.stages import Progress
 
 __all__ = ["TABLE", "Listener", "run_benchmark"]
 

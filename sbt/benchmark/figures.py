@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.benchmark.cell import PREDICTIONS
 from sbt.benchmark.panels import plot_reliability_of_recall, plot_residual_risk
 from sbt.benchmark.table import read_table
 from sbt.config.benchmark import Cell, LoadedBenchmark
 from sbt.metamodels.scores import precision_recall
+from sbt.problem.arrays import Vector
 from sbt.report.style import figure_style, new_figure
 
 if TYPE_CHECKING:

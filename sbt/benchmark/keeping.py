@@ -7,7 +7,7 @@ from pathlib import Path
 from sbt.config.load import Loaded, differences, dump, fingerprint
 from sbt.errors import InputError
 from sbt.problem.scenario import LogicalScenario
-from sbt.store import Store
+from sbt.store.database import Store
 
 __all__ = ["opened"]
 

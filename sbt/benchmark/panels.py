@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import log_ndtr
 
-from sbt.arrays import Mask, Vector
+from sbt.problem.arrays import Mask, Vector
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

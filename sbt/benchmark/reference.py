@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.benchmark.keeping import opened
-from sbt.campaign import Batch, Campaign, Log, Progress, run_stages
 from sbt.config.assemble import assemble
 from sbt.config.load import Loaded
 from sbt.errors import InputError
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
-from sbt.history import VALIDATION
+from sbt.loop.stages import Batch, Campaign, Log, Progress, run_stages
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.seeds import stream
-from sbt.store import PlannedRun, Store
+from sbt.store.database import PlannedRun, Store
+from sbt.store.history import VALIDATION
 
 __all__ = ["make_reference", "reference_rows"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sbt.config.benchmark import Cell
-from sbt.store import Store
+from sbt.store.database import Store
 
 __all__ = ["COLUMNS", "read_table", "rows_of", "write_table"]
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from sbt.acquisition import boundary, expected_feasibility, straddle
-from sbt.arrays import Points
-from sbt.campaign import Campaign, Fit, Log
+from sbt.acquisitions import boundary, expected_feasibility, straddle
 from sbt.campaigns.choices import Choice, from_roi, greedily, mixed
 from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
 from sbt.errors import InputError
-from sbt.history import VALIDATION, History
+from sbt.loop.stages import Campaign, Fit, Log
+from sbt.problem.arrays import Points
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
+from sbt.store.history import VALIDATION, History
 
 __all__ = ["boundary_points", "recipe", "validation_of"]
 

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from sbt.acquisition import boundary, even
-from sbt.arrays import Mask, Points, Vector
-from sbt.campaign import Log
+from sbt.acquisitions import boundary, even
 from sbt.campaigns.hunt import HUNTED, SHARE, hunt, is_on
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
-from sbt.learner import Belief
+from sbt.loop.learner import Belief
+from sbt.loop.stages import Log
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.greedy import diverse, influence, refined, representative
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Vector
-from sbt.campaign import Log
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
 from sbt.estimators.intervals import Counted
+from sbt.loop.stages import Log
+from sbt.problem.arrays import Vector
 
 __all__ = ["DRAWN", "Seen", "counted_batches", "drawn_shares"]
 

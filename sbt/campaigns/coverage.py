@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sbt.campaign import Campaign, Fit, Log
 from sbt.campaigns.boundary import validation_of
 from sbt.campaigns.choices import evenly
 from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
+from sbt.loop.stages import Campaign, Fit, Log
 
 __all__ = ["recipe"]
 

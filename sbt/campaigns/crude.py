@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
-from sbt.campaign import Batch, Log
 from sbt.campaigns.parts import Settings
 from sbt.estimators.monte_carlo import Share
 from sbt.estimators.subset import Repeat
+from sbt.loop.stages import Batch, Log
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
-from sbt.store import PlannedRun
+from sbt.store.database import PlannedRun
 
 __all__ = ["MonteCarloStage", "SubsetStage", "law_share", "repeats_of"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from sbt.campaign import Campaign, Fit, Log, Stage
 from sbt.campaigns.counting import Seen, counted_batches, drawn_shares
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, law_share, repeats_of
 from sbt.campaigns.gate import Limits, decided
@@ -14,6 +13,7 @@ from sbt.campaigns.sequential import FEWEST_BATCHES, SequentialStage
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEWEST_HITS, Counted, combined, few_hits_bound
 from sbt.estimators.subset import spread_of
+from sbt.loop.stages import Campaign, Fit, Log, Stage
 
 __all__ = ["recipe"]
 

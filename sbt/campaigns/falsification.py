@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from sbt.arrays import Points, Vector
-from sbt.campaign import Batch, Campaign, Fit, Log
 from sbt.campaigns.boundary import validation_of
 from sbt.campaigns.modes import Mode, described, modes_of
 from sbt.campaigns.parts import Settings, clopper_pearson, fit_of, held_out_runs, named_inputs
 from sbt.errors import InputError
-from sbt.history import VALIDATION, History
+from sbt.loop.stages import Batch, Campaign, Fit, Log
+from sbt.problem.arrays import Points, Vector
 from sbt.samplers import evolution, portfolio
 from sbt.samplers.criteria import CRITERIA, propose_by
 from sbt.samplers.roi import rejection
 from sbt.samplers.search import Picks, Search, believe
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
-from sbt.store import PlannedRun
+from sbt.store.database import PlannedRun
+from sbt.store.history import VALIDATION, History
 
 __all__ = ["CONFIRM", "METHODS", "recipe"]
 

@@ -9,15 +9,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from sbt.arrays import Points
-from sbt.campaign import Log
 from sbt.campaigns.settings import Settings
-from sbt.history import VALIDATION
-from sbt.learner import Belief
+from sbt.loop.learner import Belief
+from sbt.loop.stages import Log
 from sbt.metamodels.base import simplest
+from sbt.problem.arrays import Points
 from sbt.samplers.portfolio import propose
 from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
+from sbt.store.history import VALIDATION
 
 __all__ = ["HUNTED", "SHARE", "hunt", "in_vain", "is_on"]
 

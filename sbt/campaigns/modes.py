@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sbt.arrays import Points, Vector
-from sbt.history import History
-from sbt.metrics.conflict_type import NAME as CONFLICT_TYPE
-from sbt.metrics.conflict_type import conflict_type_in_words
+from sbt.metrics.encounter import NAME as CONFLICT_TYPE
+from sbt.metrics.encounter import conflict_type_in_words
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import Belief
+from sbt.store.history import History
 
 __all__ = ["Mode", "connected", "described", "modes_of"]
 

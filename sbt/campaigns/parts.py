@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from scipy.special import betaincinv
 
-from sbt.arrays import Points, Vector
-from sbt.campaign import Batch, Fit, Log
 from sbt.campaigns.choices import Choice, evenly
 from sbt.campaigns.settings import Settings
-from sbt.history import VALIDATION, History
-from sbt.learner import Belief, changed_share
+from sbt.loop.learner import Belief, changed_share
+from sbt.loop.stages import Batch, Fit, Log
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
-from sbt.store import PlannedRun
+from sbt.store.database import PlannedRun
+from sbt.store.history import VALIDATION, History
 
 __all__ = [
     "BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of", "held_out_runs", "named_inputs",

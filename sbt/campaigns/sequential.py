@@ -16,8 +16,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr, ndtri
 from threadpoolctl import threadpool_limits
 
-from sbt.arrays import Mask, Points, Vector
-from sbt.campaign import Batch, Log
 from sbt.campaigns.counting import DRAWN, counted_batches
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
@@ -25,13 +23,15 @@ from sbt.estimators.importance import BLIND, SHARES, Plan, chosen, planned
 from sbt.estimators.intervals import combined
 from sbt.estimators.mixture import Mixture, fitted, log_normal, particles, wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability, learned
-from sbt.history import History
+from sbt.loop.stages import Batch, Log
 from sbt.metamodels.base import Metamodel
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers import portfolio
 from sbt.samplers.search import Search
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
-from sbt.store import PlannedRun
+from sbt.store.database import PlannedRun
+from sbt.store.history import History
 
 __all__ = ["FEWEST_BATCHES", "SequentialStage"]
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sbt.arrays import Vector
-from sbt.history import History
-from sbt.learner import Learner
+from sbt.loop.learner import Learner
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import LogicalScenario
+from sbt.store.history import History
 
 __all__ = ["Acquisition", "Settings"]
 

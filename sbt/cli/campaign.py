@@ -16,7 +16,7 @@ from sbt.errors import InputError
 
 if TYPE_CHECKING:
     from sbt.config.load import Loaded
-    from sbt.store import Store
+    from sbt.store.database import Store
 
 __all__ = ["export", "merge", "report", "run", "status"]
 
@@ -59,7 +59,7 @@ def run(
             from sbt.config.load import load
 
             loaded = load(config, overrides)
-            from sbt.run import run_campaign  # after the configuration, which is wrong more often
+            from sbt.workflows.running import run_campaign  # after the configuration, which is wrong more often
 
             if shard is None:
                 result = run_campaign(loaded, progress=show)
@@ -72,8 +72,8 @@ def run(
 
 def _run_shard(loaded: Loaded, text: str, show: ProgressDisplay, *, own_folder: bool) -> dict[str, Any]:
     """Run one shard, in a folder inside the campaign's where the user names none."""
-    from sbt.campaign import Shard
-    from sbt.run import run_campaign
+    from sbt.loop.stages import Shard
+    from sbt.workflows.running import run_campaign
 
     shard = Shard.parse(text)
     if own_folder:
@@ -92,7 +92,7 @@ def merge(
 ) -> None:
     """Join the stores of shards (run --shard) into the one that a run without shards would have written."""
     with clean_stdout():
-        from sbt.merge import merge as merged
+        from sbt.workflows.merging import merge as merged
 
         result = merged([_with_store(folder) for folder in folders], into)
     _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
@@ -180,7 +180,7 @@ def status(
 
 def _status(folder: Path) -> dict[str, Any]:
     """Return counts, iteration, last validation and conclusion."""
-    from sbt.store import Store
+    from sbt.store.database import Store
 
     with clean_stdout(), Store.read(_with_store(folder)) as store:
         iterations, fits = store.iterations(), store.fits()
@@ -208,7 +208,7 @@ def _status_lines(found: Mapping[str, Any]) -> list[str]:
 def report(folder: Folder) -> None:
     """Write the report of a campaign again."""
     with clean_stdout():
-        from sbt.run import rebuild_report
+        from sbt.workflows.running import rebuild_report
 
         path = rebuild_report(_with_store(folder))
     print(path)
@@ -225,7 +225,7 @@ def export(
     """Write the runs of a campaign as a table."""
     import importlib.util
 
-    from sbt.store import Store
+    from sbt.store.database import Store
 
     forms = {"csv": _as_csv, "parquet": _as_parquet, "dsiod": _as_data_set, "boundary": _as_boundary}
     if form not in forms:
@@ -254,7 +254,7 @@ def _as_boundary(store: Store) -> Path:
     import pandas as pd
 
     from sbt.campaigns.boundary import boundary_points
-    from sbt.run import assembly_of, loaded_from, settings_of
+    from sbt.workflows.running import assembly_of, loaded_from, settings_of
 
     loaded = loaded_from(store)
     settings = settings_of(loaded, assembly_of(loaded))
@@ -273,8 +273,8 @@ def _written(path: Path, write: Callable[[Path], None]) -> Path:
 
 def _as_data_set(store: Store) -> Path:
     """Write the runs in the layout of the public data set, which `table:FOLDER` reads."""
-    from sbt.run import assembly_of, loaded_from
-    from sbt.tables import to_folder
+    from sbt.store.tables import to_folder
+    from sbt.workflows.running import assembly_of, loaded_from
 
     scenario = assembly_of(loaded_from(store)).scenario
     return to_folder(store.history(), scenario, store.folder / "exports" / "dsiod")

@@ -28,7 +28,7 @@ def compare_ego(
     folder = store if store is not None else Path("runs") / f"compare_{first.stem}_{second.stem}"
     try:
         with clean_stdout(), ProgressDisplay(silent=as_json) as show:
-            from sbt.paired import compare_egos
+            from sbt.workflows.paired import compare_egos
 
             result = compare_egos(first, second, store=folder, runs=runs, progress=show)
     except KeyboardInterrupt:

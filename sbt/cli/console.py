@@ -20,7 +20,7 @@ import typer
 from sbt.errors import InputError, SbtError
 
 if TYPE_CHECKING:
-    from sbt.campaign import Progress
+    from sbt.loop.stages import Progress
 
 __all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "print_json", "verb"]
 

@@ -28,7 +28,7 @@ def predict(
     """Say what the campaign's metamodel believes about concrete scenarios: mean, sigma, P(critical)."""
     with clean_stdout():
         _with_store(folder)
-        from sbt.predict import predict_rows
+        from sbt.workflows.prediction import predict_rows
 
         table = predict_rows(folder, inputs, device)
     rows = table.rows()

@@ -13,9 +13,9 @@ from sbt.cli.console import Exit, clean_stdout, fail, print_json
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
-    from sbt.history import Record
     from sbt.problem.scenario import LogicalScenario
     from sbt.problem.trace import Trace
+    from sbt.store.history import Record
 
 __all__ = ["replay"]
 
@@ -34,7 +34,7 @@ def replay(
 ) -> None:
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
-        from sbt.run import replay as execute
+        from sbt.workflows.running import replay as execute
 
         record, outcome, states, scenario = execute(folder, run)
         if gui or gif or export or trace:

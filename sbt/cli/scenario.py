@@ -127,7 +127,7 @@ def check(
 ) -> None:
     """Try out the contract of a scenario: corners run, same seed same trace, also elsewhere and reused."""
     with clean_stdout():
-        from sbt.scenario_check import check_scenario
+        from sbt.workflows.checking import check_scenario
 
         _check_choices(None, None, isolation)
         spec, scenario = _target(target, isolation)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sbt.acquisition import Acquisition, even
+from sbt.acquisitions import Acquisition, even
 from sbt.config.load import Loaded
 from sbt.config.model import CAMPAIGNS, Choice
 from sbt.config.source import Key, Problems, must_be_one_of

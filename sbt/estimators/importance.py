@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["SHARES", "Draws", "Plan", "chosen", "planned"]
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import betaincinv, stdtrit
 
-from sbt.arrays import Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Vector
 
 __all__ = ["Combined", "Counted", "binomial_upper", "combined", "few_hits_bound", "undetected_mass"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammainccinv, logsumexp
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["Mixture", "Normals", "fitted", "log_normal", "particles", "wide_scales"]
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["LEVEL_SHARE", "Repeat", "Spread", "spread_of"]
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.arrays import Points, Vector
 from sbt.metamodels.base import Metamodel, about
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sbt.errors import InputError, PluginError
-from sbt.metrics.conflict_type import conflict_type
+from sbt.metrics.encounter import conflict_type
 from sbt.plugins import load
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario, Metric

@@ -13,9 +13,9 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [

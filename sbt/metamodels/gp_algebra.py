@@ -14,8 +14,8 @@ import torch
 from scipy.linalg import blas, cho_solve, lapack
 from scipy.spatial.distance import cdist
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Points, Vector
 
 __all__ = [
     "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "like", "matern", "native", "placed",

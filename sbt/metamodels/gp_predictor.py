@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.arrays import Points, Vector
-from sbt.metamodels.et import ForestPredictor
+from sbt.metamodels.extra_trees import ForestPredictor
 from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, host, like, placed, squared_columns, triangular
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import device_of, single_threaded
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative"]

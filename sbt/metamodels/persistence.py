@@ -18,7 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.errors import InputError
-from sbt.metamodels import auto, bnn, ensemble, et, gp_algebra, gp_predictor, recalibrated, sparse
+from sbt.metamodels import automatic as auto
+from sbt.metamodels import bayesian_network as bnn
+from sbt.metamodels import deep_ensemble as ensemble
+from sbt.metamodels import extra_trees as et
+from sbt.metamodels import gp_algebra, gp_predictor, recalibrated, sparse
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
 

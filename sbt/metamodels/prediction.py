@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfcx, log_ndtr, ndtr, ndtri
 
-from sbt.arrays import Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Prediction"]

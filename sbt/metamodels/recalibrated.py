@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.metamodels.base import Metamodel, Predictor, about, check_rows, split_validation
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Recalibrated", "RecalibratedPredictor"]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from sbt.arrays import Mask, Vector
 from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["precision_recall", "reliability", "scores"]

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import check_device, device_of, minibatches, single_threaded
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["KERNELS", "SparseLayer", "SparseMixture", "SparsePredictor", "Training", "train"]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.metamodels.base import Metamodel
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Bins", "held_out", "mixture_score", "stacked", "surely_better"]

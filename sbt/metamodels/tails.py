@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammaincinv
 
-from sbt.arrays import Vector
+from sbt.problem.arrays import Vector
 
 __all__ = ["student_widths"]
 

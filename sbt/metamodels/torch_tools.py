@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from sbt.arrays import Points
 from sbt.errors import InputError
+from sbt.problem.arrays import Points
 
 __all__ = ["DEVICES", "centred", "check_device", "device_of", "minibatches", "single_threaded"]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Vector
+from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Warp"]

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.metrics.longitudinal import DRAC_LIMIT, HORIZON, Encounter, encounter
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sbt.arrays import Vector
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 

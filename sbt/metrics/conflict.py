@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.metrics.geometry import contact_index, contact_share, part, rectangle_distance, time_to_contact
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 

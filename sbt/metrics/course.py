@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sbt.arrays import Points, Vector, as_points
+from sbt.problem.arrays import Points, Vector, as_points
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 

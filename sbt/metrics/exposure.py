@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sbt.arrays import Mask, Vector
 from sbt.metrics.longitudinal import encounter, first_contact, time_to_collision
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sbt.arrays import Vector
 from sbt.errors import InputError
 from sbt.metrics.longitudinal import FAR, HORIZON, d_min, ttc_min
 from sbt.plugins import load, names
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sbt.arrays import Vector
+from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace
 
 __all__ = [

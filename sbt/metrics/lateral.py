@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from sbt.arrays import Vector
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

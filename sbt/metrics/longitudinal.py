@@ -15,8 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from sbt.arrays import Mask, Vector
 from sbt.metrics.geometry import contact_index
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

@@ -12,10 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.errors import InputError
 from sbt.metrics.longitudinal import FAR, HORIZON
 from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, signal
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.metrics.geometry import contact_share
 from sbt.metrics.longitudinal import first_contact
+from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["HORIZON", "ttc_on_paths"]

@@ -15,10 +15,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from sbt.arrays import Mask, Vector
 from sbt.errors import InputError
 from sbt.metrics.exposure import integral
 from sbt.metrics.longitudinal import FAR
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

@@ -32,13 +32,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.errors import InputError
 from sbt.metrics.braking import btn, drac, mdrac, mttc
 from sbt.metrics.comfort import jerk
 from sbt.metrics.conflict import distance, ttc_2d
 from sbt.metrics.longitudinal import FAR, HORIZON, encounter, time_to_collision
 from sbt.metrics.rss import lateral_margin, longitudinal_margin
+from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["ACTOR_SIGNALS", "PAIR_SIGNALS", "check_signal", "signal"]

@@ -31,11 +31,11 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.arrays import Vector
 from sbt.errors import RunError
 from sbt.metrics.others import worst_signal
 from sbt.metrics.signals import check_signal, signal
 from sbt.metrics.stl_grammar import Binary, Number, Signal, Term, Unary, parse
+from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace

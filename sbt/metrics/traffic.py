@@ -9,11 +9,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.metrics.conflict import distance, time_behind
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
 from sbt.metrics.paths import HORIZON as CONFLICT
 from sbt.metrics.paths import ttc_on_paths
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Vector
 
 __all__ = ["KINDS", "Distribution", "TruncatedLaw"]
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import log_ndtr, logsumexp, ndtr
 
-from sbt.arrays import Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Vector
 
 __all__ = ["KernelDensity", "kernel_density", "silverman"]
 

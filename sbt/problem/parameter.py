@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbt.arrays import Mask, Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.distribution import Distribution, TruncatedLaw
 
 __all__ = ["TAIL", "Parameter"]

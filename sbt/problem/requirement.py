@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Mask, Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Mask, Vector
 
 __all__ = ["CriticalInterval", "Requirement"]
 

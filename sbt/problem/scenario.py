@@ -10,8 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.arrays import Mask, Points, Vector
 from sbt.errors import InputError, RunError
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.stats import qmc
 
-from sbt.arrays import Mask, Points, Vector, as_points
 from sbt.errors import InputError
+from sbt.problem.arrays import Mask, Points, Vector, as_points
 from sbt.problem.parameter import Parameter
 
 __all__ = ["ParameterSpace"]

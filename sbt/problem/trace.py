@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.arrays import Vector
 from sbt.errors import RunError
+from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 
 __all__ = ["ActorTrace", "Trace"]

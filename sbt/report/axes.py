@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sbt.arrays import Vector
+from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.report.style import CRITICAL, REGION
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import betaincinv
 
-from sbt.arrays import Mask, Vector
-from sbt.history import History
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.requirement import Requirement
 from sbt.report.axes import reach, shade
 from sbt.report.style import CRITICAL, MODEL, UNCRITICAL, label
+from sbt.store.history import History
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbt.arrays import Mask, Vector
-from sbt.history import VALIDATION, History
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.report.axes import padded, reach, shade
 from sbt.report.projection import Plane
 from sbt.report.style import CRITICAL, FAILED, HELD_OUT, MODEL, UNCRITICAL, label
+from sbt.store.history import VALIDATION, History
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbt.arrays import Vector
 from sbt.errors import RunError
+from sbt.problem.arrays import Vector
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace

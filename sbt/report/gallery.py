@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Vector
-from sbt.history import VALIDATION
+from sbt.problem.arrays import Vector
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.convergence import drawing_of_convergence
@@ -17,6 +16,7 @@ from sbt.report.modes import drawing_of_modes
 from sbt.report.projection import Predict, log_probability, most_telling_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words
+from sbt.store.history import VALIDATION
 
 __all__ = ["Drawing", "draw"]
 

@@ -17,7 +17,7 @@ from sbt.report.modes import mode_table
 from sbt.report.projection import Predict, influence, influence_from_runs
 from sbt.report.tables import critical_table, failed_table, input_table, iteration_table
 from sbt.report.words import NOTHING, SCORES, Findings, conclusion_sentences, number, requirement_words, warnings_for
-from sbt.store import Store
+from sbt.store.database import Store
 
 __all__ = ["REPORT", "write_report"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Vector
+from sbt.problem.arrays import Vector
 from sbt.problem.space import ParameterSpace
 from sbt.report.style import new_figure, to_svg
 from sbt.report.tables import Cell, Table

@@ -11,13 +11,13 @@ from itertools import combinations
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
-from sbt.history import History
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.samplers.sobol import SobolSequence
+from sbt.store.history import History
 
 __all__ = [
     "Plane",

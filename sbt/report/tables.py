@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Vector
-from sbt.history import History, Record
+from sbt.problem.arrays import Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.words import NOTHING, SCORES, law_words, number, share, shares_in_words
+from sbt.store.history import History, Record
 
 __all__ = [
     "Cell",

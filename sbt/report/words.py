@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from sbt.history import PLANNED, VALIDATION, History
 from sbt.problem.distribution import Distribution
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.curves import binomial_interval
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.store.history import PLANNED, VALIDATION, History
 
 __all__ = [
     "NOTHING",

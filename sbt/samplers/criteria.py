@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.special import erfcx, log_ndtr
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.samplers.search import Belief, Picks, Search, believe, fill, known, refined, repelled
 
 __all__ = [

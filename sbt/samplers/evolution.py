@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Points, Vector
 from sbt.samplers.search import Picks
 from sbt.seeds import stream
 

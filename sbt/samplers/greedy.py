@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from sbt.arrays import Points, Vector
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["diverse", "influence", "refined", "representative"]
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.arrays import Mask, Points
+from sbt.problem.arrays import Mask, Points
 from sbt.seeds import stream
 
 __all__ = ["PoolSequence"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.arrays import Mask, Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.search import Belief, Picks, Search, believe, fill, known, refined, repelled
 
 __all__ = ["Region", "propose", "regions"]

@@ -15,8 +15,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.arrays import Mask, Points, Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.seeds import stream
 
 __all__ = ["Positions", "RoiDraw", "Sequence", "rejection"]

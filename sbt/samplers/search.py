@@ -15,10 +15,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.arrays import Mask, Points, Vector
 from sbt.metamodels.base import Metamodel, Predictor, about, functions
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["SmcDraw", "smc"]
 

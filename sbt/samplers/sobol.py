@@ -13,8 +13,8 @@ from threading import Lock
 import numpy as np
 from scipy.stats import qmc
 
-from sbt.arrays import Points
 from sbt.errors import InputError
+from sbt.problem.arrays import Points
 from sbt.seeds import stream
 
 __all__ = ["SobolSequence"]

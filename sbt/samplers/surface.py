@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["crossings"]
 

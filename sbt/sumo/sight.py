@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sbt.arrays import Mask, Vector
+from sbt.problem.arrays import Mask, Vector
 
 __all__ = ["Boxes", "outline"]
 _NEVER = 1e-300

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sbt.arrays import Points, Vector, as_points, as_vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Points, Vector, as_points, as_vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.testbeds import reliability, search, traffic
 from sbt.testbeds.problem import Problem, Truth, analytic, noisy

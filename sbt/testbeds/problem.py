@@ -10,8 +10,8 @@ from functools import partial
 
 import numpy as np
 
-from sbt.arrays import Points, Vector, as_points, as_vector
 from sbt.errors import InputError
+from sbt.problem.arrays import Points, Vector, as_points, as_vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement

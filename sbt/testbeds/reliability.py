@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from scipy.special import gammaincc, ndtr
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval

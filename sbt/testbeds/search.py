@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gamma
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.testbeds.problem import Function, Problem, Truth, parameters_of
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import InputError, RunError
-from sbt.history import History
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario, Pool
 from sbt.problem.space import ParameterSpace
+from sbt.store.history import History
 
 __all__ = ["from_folder", "to_folder"]
 

@@ -12,10 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["ExtraTrees", "ForestPredictor"]
 

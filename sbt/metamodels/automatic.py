@@ -11,15 +11,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, functions
-from sbt.metamodels.ensemble import Ensemble
-from sbt.metamodels.et import ExtraTrees
-from sbt.metamodels.gp import GaussianProcess
+from sbt.metamodels.deep_ensemble import Ensemble
+from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins, held_out, mixture_score, stacked, surely_better
 from sbt.metamodels.torch_tools import check_device
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Auto", "Choice", "MixturePredictor"]

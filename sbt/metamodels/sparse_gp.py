@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.sparse import SparseMixture, Training, train
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["SparseGaussianProcess"]
 

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from sbt.errors import StoreError
-from sbt.history import PLANNED, History, Record
 from sbt.problem.outcome import Job, Outcome
+from sbt.store.history import PLANNED, History, Record
 
 __all__ = ["DATABASE", "PlannedRun", "Store"]
 

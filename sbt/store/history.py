@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbt.arrays import Mask, Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Status
 
 if TYPE_CHECKING:

@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
-from sbt.history import History
-from sbt.learner import Learner
+from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.persistence import load, read_info, save
 from sbt.metamodels.torch_tools import device_of
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
-from sbt.run import assembly_of, loaded_from, settings_of
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.store.history import History
+from sbt.workflows.running import assembly_of, loaded_from, settings_of
 
 __all__ = ["MODEL", "Table", "predict_rows", "read_inputs"]
 

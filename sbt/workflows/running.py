@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sbt import plugins
-from sbt.campaign import Campaign, Progress, Shard, check_shard, run_shard, run_stages
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
 from sbt.execution.dask import DaskExecutor
@@ -16,12 +15,13 @@ from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job, versions
-from sbt.history import History, Record
-from sbt.learner import Learner
+from sbt.loop.learner import Learner
+from sbt.loop.stages import Campaign, Progress, Shard, check_shard, run_shard, run_stages
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
-from sbt.store import Store
+from sbt.store.database import Store
+from sbt.store.history import History, Record
 
 if TYPE_CHECKING:
     from sbt.config.assemble import Assembly
@@ -49,7 +49,7 @@ def run_campaign(
         loaded: a checked configuration.
         progress: called after every run.
         report: write `report.html` in the end.
-        shard: run only its share of the runs, into a store that `sbt.merge` joins with the others'; no report.
+        shard: run only its share of the runs, into a store that `sbt.workflows.merging` joins with the others'; no report.
 
     Returns:
         What `run --json` prints: campaign, scenario, store, runs, ok, failed, critical, iterations,

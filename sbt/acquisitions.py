@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.arrays import Vector
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Acquisition", "boundary", "even", "expected_feasibility", "importance", "straddle"]

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from scipy.special import betaincinv
 
-from sbt.arrays import Mask
-from sbt.campaign import Progress
 from sbt.config.load import load
 from sbt.errors import InputError
 from sbt.estimators.monte_carlo import Share
-from sbt.history import History
-from sbt.run import run_campaign, scenario_of_run
-from sbt.store import Store
+from sbt.loop.stages import Progress
+from sbt.problem.arrays import Mask
+from sbt.store.database import Store
+from sbt.store.history import History
+from sbt.workflows.running import run_campaign, scenario_of_run
 
 __all__ = ["Pairs", "compare_egos"]
 

@@ -19,14 +19,14 @@ from gpytorch.constraints import GreaterThan, Positive
 from gpytorch.priors import LogNormalPrior
 from scipy.optimize import minimize
 
-from sbt.arrays import Points, Vector
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
-from sbt.metamodels.et import ExtraTrees
+from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, diagonal, host, like, native, placed, solve, solve_right
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import check_device, device_of, single_threaded
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["GaussianProcess", "GaussianProcessPredictor"]
 

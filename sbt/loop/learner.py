@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from sbt.arrays import Mask, Points, Vector
 from sbt.errors import SbtError
 from sbt.execution.worker import place_of
-from sbt.history import History
 from sbt.metamodels.base import Metamodel, Predictor, Screened, about, log_ambiguity_bound
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
+from sbt.store.history import History
 
 __all__ = ["Belief", "Learner", "changed_share", "chunked"]
 

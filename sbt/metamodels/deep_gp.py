@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sbt.arrays import Points, Vector
 from sbt.metamodels.sparse import SparseMixture, Training, train
+from sbt.problem.arrays import Points, Vector
 
 __all__ = ["DeepGaussianProcess"]
 

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from sbt import plugins
-from sbt.campaign import Campaign, Shard, run_stages
 from sbt.errors import InputError
-from sbt.history import Record
+from sbt.loop.stages import Campaign, Shard, run_stages
 from sbt.problem.outcome import Job, Outcome, Status
-from sbt.run import (
+from sbt.store.database import DATABASE, Store
+from sbt.store.history import Record
+from sbt.workflows.running import (
     RESOLVED,
     assembly_of,
     keep_configuration,
@@ -29,7 +30,6 @@ from sbt.run import (
     settings_of,
     whole_budget,
 )  # fmt: skip
-from sbt.store import DATABASE, Store
 
 if TYPE_CHECKING:
     from sbt.config.load import Loaded

@@ -13,11 +13,11 @@ from typing import Any, Protocol
 
 from sbt.errors import InputError
 from sbt.execution.protocol import Executor
-from sbt.history import PLANNED, History, Record
 from sbt.problem.outcome import Status
 from sbt.problem.requirement import Requirement
 from sbt.seeds import run_seed
-from sbt.store import PlannedRun, Store
+from sbt.store.database import PlannedRun, Store
+from sbt.store.history import PLANNED, History, Record
 
 __all__ = ["Batch", "Campaign", "Fit", "Log", "Progress", "Shard", "Stage", "check_shard", "run_shard", "run_stages"]
 

@@ -1,0 +1,1 @@
+"""The loop that every campaign runs in, and the metamodel that it fits."""

@@ -1,0 +1,1 @@
+"""What a user can ask for as a whole: run, merge, predict, compare, check."""
