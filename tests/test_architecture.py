@@ -22,7 +22,7 @@ PACKAGE = ROOT / "sbt"
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 FLOORS = (
-    ("sbt", "errors", "seeds", "plugins"),
+    ("sbt", "errors", "files", "seeds", "plugins"),
     ("problem",),
     ("metrics",),
     ("sumo", "metamodels", "testbeds"),

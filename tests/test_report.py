@@ -358,15 +358,6 @@ def test_star_and_base_rate():
     assert any("base rate 0.5" in text.get_text() for text in ax.get_legend().get_texts())
 
 
-def test_binomial_interval_against_scipy():
-    from scipy.stats import binomtest
-
-    low, high = curves.binomial_interval(np.array([0, 3, 20]), np.array([20, 20, 20]))
-    for k, hits in enumerate((0, 3, 20)):
-        truth = binomtest(hits, 20).proportion_ci(0.95, method="exact")
-        assert (low[k], high[k]) == pytest.approx((truth.low, truth.high), abs=1e-9)
-
-
 def test_svgs_of_a_page_share_no_id():
     with figure_style():
         texts = []

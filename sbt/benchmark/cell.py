@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
 from sbt.errors import SbtError
 from sbt.execution.protocol import SerialExecutor
+from sbt.files import write_atomically
 from sbt.loop.learner import Belief, Learner
 from sbt.loop.stages import Batch, Campaign, Fit, Log, Progress, run_stages
 from sbt.problem.arrays import Points, Vector
@@ -223,9 +225,7 @@ def _keep_predictions(folder: Path, learner: _ReferenceLearner, belief: Belief, 
         log_p, log_not = part.log_probability(critical)
         columns.append(np.stack([part.mu, part.sigma, np.exp(log_p), log_p - log_not]))
     mu, sigma, p, odds = np.concatenate(columns, axis=1)
-    temporary = folder / ("part." + PREDICTIONS)
     ends = [critical.low, critical.high]
-    np.savez_compressed(
-        temporary, y=y, mu=mu, sigma=sigma, p=p, odds=odds, critical=critical.contains(y), requirement=ends
-    )
-    temporary.replace(folder / PREDICTIONS)
+    content = io.BytesIO()
+    np.savez_compressed(content, y=y, mu=mu, sigma=sigma, p=p, odds=odds, critical=critical.contains(y), requirement=ends)
+    write_atomically(folder / PREDICTIONS, content.getvalue())

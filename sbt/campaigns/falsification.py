@@ -12,8 +12,9 @@ from scipy.spatial.distance import cdist
 
 from sbt.campaigns.boundary import validation_of
 from sbt.campaigns.modes import Mode, described, modes_of
-from sbt.campaigns.parts import Settings, clopper_pearson, fit_of, held_out_runs, named_inputs
+from sbt.campaigns.parts import Settings, fit_of, held_out_runs, named_inputs
 from sbt.errors import InputError
+from sbt.estimators.binomial import upper
 from sbt.loop.stages import Batch, Campaign, Fit, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.samplers import evolution, portfolio
@@ -295,11 +296,11 @@ def _bound(runs: History) -> dict[str, Any]:
     filling = runs.where(np.isin(runs.stage, _FILLING))
     n, failed = len(filling), int((~filling.ok).sum())
     drawn = int((filling.stage == VALIDATION).sum())
-    high = 1.0 - 0.05 ** (1.0 / n) if n else 1.0
+    high, with_failed = (float(upper(k, n, 0.95)) for k in (0, failed))
     return {
         "box_fraction": high, "confidence": 0.95, "space_filling_runs": n, "random_runs": drawn,
-        "box_fraction_random_runs": 1.0 - 0.05 ** (1.0 / drawn) if drawn else None, "failed_runs": failed,
-        "box_fraction_failed_as_critical": high if failed == 0 else clopper_pearson(failed, n, 0.9)[1],
+        "box_fraction_random_runs": float(upper(0, drawn, 0.95)) if drawn else None, "failed_runs": failed,
+        "box_fraction_failed_as_critical": with_failed,
     }  # fmt: skip
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,6 +25,7 @@ from pydantic import (
 )
 
 from sbt.config.campaigns import CAMPAIGNS, CampaignKind
+from sbt.errors import did_you_mean
 from sbt.problem.expression import Expression
 from sbt.problem.requirement import CriticalInterval
 
@@ -46,9 +46,7 @@ def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
     def check(value: str) -> str:
         if value in choices:
             return value
-        near = get_close_matches(value, choices, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{hint}")
+        raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{did_you_mean(value, choices)}")
 
     return check
 

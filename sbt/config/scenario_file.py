@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, law_of
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
@@ -138,11 +137,9 @@ class _Builder:
     def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> OwnEgo | None:
         if files is not None and self._model.simulate is None and files.vehicle(entry.id) is None:
             names = files.names()
-            near = get_close_matches(entry.id, names, 1)
-            hint = f" (did you mean '{near[0]}'?)" if near else ""
             known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
             rule = f"the ego must be a vehicle, trip or flow of the files ({known})"
-            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{hint}")
+            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{did_you_mean(entry.id, names)}")
         kind = entry.kind
         if kind is None:
             if entry.settings:
