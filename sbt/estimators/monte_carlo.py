@@ -8,11 +8,11 @@ from scipy.special import betaincinv
 
 from sbt.estimators.intervals import binomial_upper
 
-__all__ = ["Share"]
+__all__ = ["Proportion"]
 
 
 @dataclass(frozen=True)
-class Share:
+class Proportion:
     """Hits of n independent draws, with failed runs that may be either.
 
     Args:
