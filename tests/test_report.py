@@ -22,7 +22,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.html import write_report
-from sbt.report.projection import influence, influence_from_runs, most_telling_pairs, probability_plane
+from sbt.report.projection import influence_from_runs, influence_on_probability, most_telling_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words, warnings_for
 from sbt.store.database import PlannedRun, Store
@@ -307,8 +307,8 @@ def test_requirement_in_words():
 
 
 def test_influence_finds_what_matters(tmp_path):
-    assert influence(predict, CRITICAL, 4).argmax() == 1
-    assert np.all(influence(lambda u: predict(u * 0 + 0.5), CRITICAL, 4) == 0)
+    assert influence_on_probability(predict, CRITICAL, 4).argmax() == 1
+    assert np.all(influence_on_probability(lambda u: predict(u * 0 + 0.5), CRITICAL, 4) == 0)
     scenario = scenario_of(4)
     with fill(tmp_path, scenario, 400, 0) as store:
         order = influence_from_runs(store.history(), scenario.requirement)
