@@ -173,7 +173,7 @@ def test_hostile_text_stays_text(tmp_path):
     evil = "<script>alert(1)</script>\n</style><img src=http://x.invalid/a onerror=alert(2)> ${x} {{ 7*7 }}"
     space = ParameterSpace((Parameter("a", 0, 1, "$<b>&\\frac"), Parameter("b", 0, 1, "--><script>", description=evil)))
     scenario = LogicalScenario(
-        "evil", space, Requirement("m", CRITICAL.low, CRITICAL.high), description=evil, evaluate=lambda v, s: {}, metric_names=("m",)
+        "evil", space, Requirement("m", CRITICAL.low, CRITICAL.high), description=evil, evaluate=lambda v, s: {},
     )
     configuration = {"names": ["a", "b"], "scenario": "my; rm -rf <x>.yaml", "campaign": evil}
     with Store.open(tmp_path, configuration) as store:

@@ -216,8 +216,8 @@ class LogicalScenario:
         for key, value in values.items():
             object.__setattr__(self, key, value)
         if requirement.metric not in self.measured:
-            near = did_you_mean(requirement.metric, self.measured)
-            raise InputError(f"requirement.metric must be one of {', '.join(self.measured)}, but got '{requirement.metric}'{near}")
+            known, hint = ", ".join(self.measured), did_you_mean(requirement.metric, self.measured)
+            raise InputError(f"requirement.metric must be one of {known}, but got '{requirement.metric}'{hint}")
 
     @property
     def measured(self) -> tuple[str, ...]:
