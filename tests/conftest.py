@@ -118,7 +118,7 @@ def awkward(values, seed):
 
 
 def scenario(evaluate, space=SQUARE):
-    requirement = Requirement("y", CriticalInterval(high=0.0))
+    requirement = Requirement("y", high=0.0)
     return LogicalScenario(evaluate.__name__, space, requirement, evaluate=evaluate, metric_names=("y", "noise"))
 
 

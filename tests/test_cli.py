@@ -61,7 +61,7 @@ def elsewhere(values, seed):
 
 def scenario(evaluate):
     space = ParameterSpace((Parameter("speed", 0.0, 10.0, "m/s"), Parameter("gap", 1.0, 5.0, "m")))
-    requirement = Requirement("margin", CriticalInterval(high=0.0))
+    requirement = Requirement("margin", high=0.0)
     return LogicalScenario("plane", space, requirement, evaluate=evaluate, metric_names=("margin",))
 
 

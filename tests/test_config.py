@@ -26,7 +26,7 @@ from sbt.problem.requirement import CriticalInterval, Requirement
 SCENARIO = LogicalScenario(
     name="plane",
     space=ParameterSpace((Parameter("speed", 0.0, 10.0, "m/s"), Parameter("gap", 1.0, 5.0, "m"), Parameter("n", 0, 4, kind="integer"))),
-    requirement=Requirement("margin", CriticalInterval(high=0.0)),
+    requirement=Requirement("margin", high=0.0),
     evaluate=lambda values, seed: {"margin": values["gap"] - values["speed"] / 2, "other": 1.0},
     metric_names=("margin", "other"),
 )

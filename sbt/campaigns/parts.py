@@ -13,7 +13,7 @@ import numpy as np
 from sbt.campaigns.choices import Choice, evenly
 from sbt.campaigns.settings import Settings
 from sbt.estimators.binomial import interval
-from sbt.loop.learner import Belief, changed_share
+from sbt.loop.learner import FittedMetamodel, changed_share
 from sbt.loop.stages import Batch, Fit, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
@@ -114,7 +114,7 @@ def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
     return {name: float(value) for name, value in zip(scenario.space.names, row, strict=True)}
 
 
-def fit_of(belief: Belief | None) -> Fit | None:
+def fit_of(belief: FittedMetamodel | None) -> Fit | None:
     """Return what the store keeps of a belief."""
     return None if belief is None else Fit({**belief.scores, "learned": belief.runs}, belief.seconds)
 

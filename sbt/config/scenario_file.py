@@ -16,7 +16,7 @@ from sbt.config.space import SpaceChanges, configured_space, law_of
 from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
@@ -83,7 +83,7 @@ class _Builder:
         problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
         return LogicalScenario(
-            name, space or ParameterSpace(()), requirement or Requirement("", CriticalInterval(high=0.0)), simulation, metrics,
+            name, space or ParameterSpace(()), requirement or Requirement("", high=0.0), simulation, metrics,
             model.description, roles=Roles(model.ego.id, None),
         )  # fmt: skip
 
@@ -170,13 +170,13 @@ class _Builder:
         wanted, problems = self._model.requirement, self._problems
         names = [m.name for m in metrics]
         if wanted.stl is not None:
-            return Requirement("stl", CriticalInterval(*(wanted.critical or (-math.inf, 0.0))))
+            return Requirement("stl", *(wanted.critical or (-math.inf, 0.0)))
         if wanted.metric is None or wanted.critical is None:
             problems.add(("requirement",), "a requirement must have a metric and critical: [low, high]")
             return None
         if wanted.metric not in names and len(names) == len(self._model.metrics):
             problems.add(("requirement", "metric"), must_be_one_of("a metric", wanted.metric, names))
-        return Requirement(wanted.metric, CriticalInterval(*wanted.critical))
+        return Requirement(wanted.metric, *wanted.critical)
 
     def _check_inputs(self, files: SumoFiles) -> None:
         """Compare placeholders and inputs."""

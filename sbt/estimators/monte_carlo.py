@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from sbt.estimators.binomial import lower, upper
 
-__all__ = ["Share"]
+__all__ = ["Proportion"]
 
 
 @dataclass(frozen=True)
-class Share:
+class Proportion:
     """Hits of n independent draws, with failed runs that may be either.
 
     Args:

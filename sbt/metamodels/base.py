@@ -18,8 +18,8 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Aimed", "Metamodel", "Predictor", "Screened", "about", "build", "check_rows", "functions", "log_ambiguity_bound",
-    "simplest", "split_validation", "standardise",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "log_ambiguity_bound", "sample_paths", "simplest",
+    "split_validation", "standardise", "with_target",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -41,13 +41,13 @@ def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterv
     return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), 1e-304))
 
 
-def functions(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
+def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
     """Return (n, m) draws of y as a function, at u (m, d).
 
-    A predictor with `draws` (a process) draws functions; of a mixture one component stands for a function; a single
+    A predictor with `sample_paths` (a process) draws functions; of a mixture one component stands for a function; a single
     Gaussian a point is drawn point by point.
     """
-    joint: Any = getattr(predictor, "draws", None)
+    joint: Any = getattr(predictor, "sample_paths", None)
     if joint is not None:
         return joint(u, n, rng)
     p = predictor(u)
@@ -75,17 +75,17 @@ class Metamodel(Protocol):
 
 
 @runtime_checkable
-class Aimed(Protocol):
+class TargetAware(Protocol):
     """Settings of a metamodel that learns otherwise where it knows what is critical."""
 
-    def about(self, critical: CriticalInterval) -> Metamodel:
+    def with_target(self, critical: CriticalInterval) -> Metamodel:
         """Return the same settings, told M_c in the unit of the y that it will learn (warped, where y is)."""
         ...
 
 
-def about(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
+def with_target(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
     """Return the metamodel told of M_c where it wants to know, else itself."""
-    return metamodel.about(critical) if isinstance(metamodel, Aimed) else metamodel
+    return metamodel.with_target(critical) if isinstance(metamodel, TargetAware) else metamodel
 
 
 def simplest(metamodel: Metamodel) -> Metamodel:

@@ -29,14 +29,14 @@ from sbt.metamodels.torch_tools import device_of
 
 __all__ = ["FORMAT", "load", "read_info", "save"]
 
-FORMAT = 1
+FORMAT = 2
 """Version of the file; a file of another version is refused."""
 
 _HEAD = "model.json"
 _KINDS: dict[str, Any] = {
     kind.__name__.lstrip("_"): kind
     for kind in (
-        auto.Choice,
+        auto.ModelComparison,
         auto.MixturePredictor,
         bnn.BayesianNetworkPredictor,
         ensemble.EnsemblePredictor,

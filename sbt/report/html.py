@@ -13,7 +13,7 @@ from sbt.files import write_atomically
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
 from sbt.report.modes import mode_table
-from sbt.report.projection import Predict, influence, influence_from_runs
+from sbt.report.projection import Predict, influence_from_runs, influence_on_probability
 from sbt.report.tables import critical_table, failed_table, input_table, iteration_table
 from sbt.report.words import NOTHING, SCORES, Findings, conclusion_sentences, number, requirement_words, warnings_for
 from sbt.store.database import Store
@@ -37,7 +37,8 @@ def write_report(store: Store, scenario: LogicalScenario, predict: Predict | Non
     """
     target = Path(folder) if folder is not None else store.folder
     found, fits = Findings.of(store, scenario), store.fits()
-    weights = None if predict is None else influence(predict, scenario.requirement.critical, scenario.space.dimension)
+    critical, d = scenario.requirement.critical, scenario.space.dimension
+    weights = None if predict is None else influence_on_probability(predict, critical, d)
     order = weights if weights is not None and weights.any() else influence_from_runs(found.history, scenario.requirement)
     drawings = draw(found, scenario.space, fits, predict, order)
     for drawing in drawings:

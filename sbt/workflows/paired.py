@@ -16,7 +16,7 @@ import numpy as np
 from sbt.config.load import load
 from sbt.errors import InputError
 from sbt.estimators.binomial import interval
-from sbt.estimators.monte_carlo import Share
+from sbt.estimators.monte_carlo import Proportion
 from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask
 from sbt.store.database import Store
@@ -117,7 +117,7 @@ def _result(first: History, second: History, requirement: Any) -> dict[str, Any]
     critical = [requirement.critical.contains(h.y(requirement.metric)) for h in (first, second)]
     pairs = Pairs(critical[0], critical[1], ~first.ok, ~second.ok)
     low, high = pairs.difference()
-    shares = [Share(len(h), int(c.sum()), int((~h.ok).sum())) for h, c in zip((first, second), critical, strict=True)]
+    shares = [Proportion(len(h), int(c.sum()), int((~h.ok).sum())) for h, c in zip((first, second), critical, strict=True)]
     tail = 0.5 * (1.0 + _CONFIDENCE)
     return {
         "pairs": len(first), "confidence": _CONFIDENCE,
