@@ -267,6 +267,17 @@ def test_schema_describes_every_key():
     assert all("description" in key for model in models for key in model["properties"].values())
 
 
+@pytest.mark.parametrize("campaign", CAMPAIGNS)
+@pytest.mark.parametrize("key", ["metamodel", "acquisition"])
+def test_schema_says_the_defaults_of_each_campaign(campaign: str, key: str):
+    default = parse(f"campaign: {campaign}\nscenario: cut_in\n").config.model_dump(exclude_none=True).get(key)
+    described = schema()["properties"][key]["description"]
+    written = f"{campaign}: none" if default is None else f"{campaign}: {default['kind']}"
+    if key == "metamodel" and default is not None:
+        written = f"{campaign}: {{" + ", ".join(f"{k}: {json.dumps(v)}" for k, v in default.items()).replace('"', "") + "}"
+    assert written in described
+
+
 def test_a_full_configuration_is_assembled(folder: Path):
     loaded = parse(BASE + FULL, name="f.yaml", folder=folder)
     made = assemble(loaded)

@@ -99,6 +99,16 @@ def test_placeholders_become_numbers_and_the_start_is_the_one_asked_for(study):
     assert "${" in (path.parent / CARS).read_text(), "the user's files stay as they are"
 
 
+def test_numpy_scalars_are_numbers_in_files_and_loops(study):
+    loop = "import numpy as np\ndef simulate(sumo, values, rng):\n    assert {type(v) for v in values.values()} == {float}\n"
+    loop += "    while True:\n        sumo.simulation.step()\n        sumo.vehicle.setSpeed('lead', np.float32(3.5))\n"
+    path = study({YAML: [("sumo: my.sumocfg", "sumo: my.sumocfg\nsimulate: mine.py:simulate")], "mine.py": [("", loop)]})
+    scenario, trace = simulated(path, gap=60.0, v_lead=12.0)
+    assert trace.actor("lead").speed[-1] == 3.5
+    for number in (np.float64, np.float32, np.int64):
+        assert trace.identical(scenario.simulate({"gap": number(60), "v_lead": number(12)}, np.int64(0)))
+
+
 def test_what_is_recorded_follows_the_motion(study):
     _, trace = simulated(study(), gap=60.0, v_lead=10.0)
     for name in trace.actors:

@@ -13,7 +13,8 @@ import pytest
 
 from sbt.errors import InputError, RunError
 from sbt.metrics.lateral import Curve
-from sbt.plugins import load
+from sbt.plugins import load, names
+from sbt.problem.parameter import Parameter
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.scenarios import jaywalking, lane_keeping
@@ -24,6 +25,7 @@ from sbt.sumo.lane_keeping import MarkingSensor
 from sbt.sumo.sight import Boxes, outline
 
 NAMES = ("following", "jaywalking", "lane_keeping", "parking")
+BUILT_IN = names("scenarios")
 NETS = Path(__file__).resolve().parent.parent / "sumo_nets"
 DIMENSIONS = {"following": 13, "jaywalking": 7, "lane_keeping": 15, "parking": 20}
 CRITICAL = {
@@ -92,6 +94,28 @@ def test_same_seed_same_bits_fresh_and_reused(name: str) -> None:
         assert first[k].identical(fresh.simulate(values, k))
     other = reused.simulate(jobs[0][1], 99)
     assert name == "parking" or not first[0].identical(other), "sensors are noisy: another seed, another run"
+
+
+def whole(parameter: Parameter) -> np.integer | np.bool_ | np.float32:
+    """A whole number in the range of a parameter, as NumPy has it: a boolean where 1 is one of them, a float where none is."""
+    if parameter.low <= 1 <= parameter.high:
+        return np.bool_(True)
+    inside = math.ceil(parameter.low)
+    return np.int64(inside) if inside <= parameter.high else np.float32(parameter.centre)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_numpy_scalars_and_plain_numbers_give_the_identical_trace(name: str) -> None:
+    scenario = load("scenarios", name)
+    [point] = sobol(scenario, 1)
+    for typed in (
+        {name: np.float64(value) for name, value in point.items()},
+        {name: np.float32(value) for name, value in point.items()},
+        {p.name: whole(p) for p in scenario.space.parameters},
+    ):
+        plain = {name: float(value) for name, value in typed.items()}
+        assert scenario.simulate(typed, np.int64(5)).identical(scenario.simulate(plain, 5))
 
 
 @pytest.mark.sumo

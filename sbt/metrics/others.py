@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.metrics.cache import per_trace
 from sbt.metrics.longitudinal import FAR, HORIZON
 from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, signal
 from sbt.problem.arrays import Vector
@@ -29,7 +29,7 @@ _WITHOUT = {
 _HIGH = ("drac", "mdrac", "btn")
 
 
-@lru_cache(maxsize=512)
+@per_trace
 def stretches(trace: Trace, ego: str, other: str) -> tuple[tuple[slice, Trace], ...]:
     """Return the instants and the trace (actors `ego` and `co`) of every stretch in which both are there.
 

@@ -152,7 +152,7 @@ class Roles:
 
 @dataclass(frozen=True, init=False)
 class LogicalScenario:
-    """A parametrized traffic situation and its requirement (`sbt.Scenario`).
+    """A parametrized traffic situation and its requirement.
 
     Args:
         name: as written in configurations.

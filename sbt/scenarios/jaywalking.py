@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
 
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.metrics.cache import per_trace
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
@@ -134,7 +134,7 @@ def until_over() -> Until:
     return over
 
 
-@lru_cache(maxsize=8)
+@per_trace
 def distances(trace: Trace) -> tuple[float, float | None]:
     """Return the smallest distance of ego's rectangle and the child's circle, and ego's speed at the contact.
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.metrics.cache import per_trace
 from sbt.metrics.geometry import contact_index, rectangle_distance, swept_contact
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
@@ -83,6 +84,7 @@ def until_over(end: float) -> Until:
     return over
 
 
+@per_trace
 def _impact(trace: Trace) -> tuple[float, float] | None:
     """Return the speeds of ego and co 1 when they touch (km/h), None without a collision."""
     ego, co = trace.actor("ego"), trace.actor("co_1")

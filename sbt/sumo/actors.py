@@ -160,8 +160,8 @@ class Obstacle:
     @property
     def corners(self) -> tuple[tuple[float, float], ...]:
         """Four (x, y), counter-clockwise from the front left."""
-        x, y, heading = self.pose
-        cos, sin, a, b = math.cos(heading), math.sin(heading), 0.5 * self.length, 0.5 * self.width
+        x, y, heading = map(float, self.pose)
+        cos, sin, a, b = math.cos(heading), math.sin(heading), 0.5 * float(self.length), 0.5 * float(self.width)
         return tuple((x + u * cos - v * sin, y + u * sin + v * cos) for u, v in ((a, b), (-a, b), (-a, -b), (a, -b)))
 
 

@@ -60,7 +60,7 @@ class AccAeb:
         for name, value in given.items():
             if name == "aeb_reserve" and value is None:
                 continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= 0:
+            if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating) or not value >= 0:
                 raise InputError(f"ego.{name} must be a number >= 0, but got {value!r}")
         self._set_speed = set_speed
         self._time_gap, self._distance_min = time_gap, distance_min

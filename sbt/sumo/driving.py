@@ -42,8 +42,8 @@ class Drive:
     """
 
     def __init__(self, sumo: Any, scene: Scene, dt: float, duration: float, prefix: str = ""):
-        self._scene, self._dt = scene, dt
-        self._last = round(duration / dt)
+        self._scene, self._dt = scene, float(dt)
+        self._last = round(duration / self._dt)
         self._rows = bytearray((self._last + 1) * len(scene.actors) * _ROW.size)
         self._heard: list[tuple[float, ...]] = []
         self._reported: list[str] = []
@@ -53,9 +53,9 @@ class Drive:
     def _bound(self, sumo: Any, prefix: str) -> tuple[Callable[[], bool], Callable[[], int]]:
         """Return `advance`, for which everything is bound beforehand because it runs at every step, and `instants`."""
         scene, rows, dt, heard, last = self._scene, self._rows, self._dt, self._heard, self._last
-        states = [State(a.name, a.type.length, a.type.width, dt) for a in scene.actors]
+        states = [State(a.name, float(a.type.length), float(a.type.width), dt) for a in scene.actors]
         for actor, state in zip(scene.actors, states, strict=True):
-            state.steered = None if actor.pose is None else actor.speed
+            state.steered = None if actor.pose is None else float(actor.speed)
         by_name = {s.name: s for s in states}
         until, probes = scene.until, tuple(scene.signals.values())
         observe = _observer(sumo, scene.actors, states, dt, prefix, rows)
@@ -128,7 +128,7 @@ def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: flo
     def put(own: State, name: str, action: Action, speed: float | None) -> None:
         if action.pose is None:
             raise RunError(Status.FAILED, f"{own.name} moves by pose, but its controller gave {action}")
-        own.steered = own.speed if speed is None else speed
+        own.steered = own.speed if speed is None else float(speed)
         movers[name](action.pose)
 
     def control(t: float) -> None:
@@ -143,7 +143,7 @@ def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: flo
                 if not -_FASTEST < speed < _FASTEST:
                     raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
                 if not actor.person:
-                    set_speed(name, speed)
+                    set_speed(name, float(speed))
             if lane is not None:
                 _change_lane(sumo, actor, name, lane)
             if pose is not None or own.steered is not None:

@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 from sbt.errors import InputError
+from sbt.sumo.formatting import format_number
 from sbt.sumo.template import Hole, Template, Vehicle, fill, holes, template
 
 __all__ = ["OWN", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
@@ -131,7 +132,7 @@ class SumoFiles:
             if paths
         }
         given = {k: fill(v, values, self.places.get(k, "")) for k, v in self.options.items()}
-        chosen = {} if step_length is None else {"step-length": repr(step_length)}
+        chosen = {} if step_length is None else {"step-length": format_number(step_length)}
         options = {**_DEFAULTS, **given, **chosen, **OWN, **written}
         options.pop("seed", None)
         return Launch(tuple(part for name, value in options.items() for part in (f"--{name}", value)))

@@ -10,7 +10,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from sbt.errors import InputError, did_you_mean
+from sbt.sumo.formatting import format_number
 
 __all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "attributes_of", "checked", "unit_of"]
 
@@ -101,7 +104,9 @@ def checked(settings: Mapping[str, Any]) -> dict[str, str]:
             raise InputError(f"{rule}, but got '{name}'{of}")
         if not _finite(value):
             raise InputError(f"ego.{name} must be a finite number, but got {value!r}")
-    return {"carFollowModel": model, "laneChangeModel": lane_change} | {name: str(value) for name, value in given.items()}
+    return {"carFollowModel": model, "laneChangeModel": lane_change} | {
+        name: value if isinstance(value, str) else format_number(value) for name, value in given.items()
+    }
 
 
 def _of(key: str, table: Mapping[str, Mapping[str, str]], name: str) -> Mapping[str, str]:
@@ -112,6 +117,6 @@ def _of(key: str, table: Mapping[str, Mapping[str, str]], name: str) -> Mapping[
 
 def _finite(value: Any) -> bool:
     try:
-        return not isinstance(value, bool) and math.isfinite(float(value))
+        return not isinstance(value, bool | np.bool_) and math.isfinite(float(value))
     except (TypeError, ValueError):
         return False

@@ -14,6 +14,7 @@ from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import State
 from sbt.sumo.ego import SUMO, Ego
+from sbt.sumo.formatting import plain
 from sbt.sumo.models import checked
 
 __all__ = ["EGO_TYPE", "OwnEgo", "Pilot"]
@@ -95,9 +96,9 @@ class OwnEgo:
             if speed is not None:
                 if not -_FASTEST < speed < _FASTEST:
                     raise RunError(Status.FAILED, f"the controller of '{self.id}' must give finite numbers, but gave {action}")
-                sumo.vehicle.setSpeed(self.id, speed)
+                sumo.vehicle.setSpeed(self.id, float(speed))
             if action.lane is not None:
-                sumo.vehicle.changeLane(self.id, action.lane, 3600.0)
+                sumo.vehicle.changeLane(self.id, plain(action.lane), 3600.0)
 
         return pilot
 

@@ -10,6 +10,7 @@ from typing import Any
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import Actor, Pose, Scene
+from sbt.sumo.formatting import format_number
 from sbt.sumo.session import ABSENT, direct, session
 
 __all__ = ["insert", "mover", "type_name", "verify"]
@@ -26,7 +27,7 @@ _END = -1.0
 def type_name(actor: Actor) -> str:
     """Return an id for the actor's type that is the same in every run."""
     extra = zlib.crc32(repr(actor.type.attributes).encode()) if actor.type.attributes else 0
-    return f"type_{actor.type.length!r}_{actor.type.width!r}_{extra:x}"
+    return f"type_{format_number(actor.type.length)}_{format_number(actor.type.width)}_{extra:x}"
 
 
 def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
@@ -40,23 +41,23 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
     here = session()
     add, set_speed = direct(sumo, "vehicle", "add"), direct(sumo, "vehicle", "setSpeed")
     for actor in scene.actors:
-        name = prefix + actor.name
+        name, position, speed = prefix + actor.name, float(actor.position), float(actor.speed)
         if actor.person:
-            sumo.person.add(name, prefix + actor.route[0], actor.position, typeID=type_name(actor))
+            sumo.person.add(name, prefix + actor.route[0], position, typeID=type_name(actor))
             here.inserted(name, "person")
             if actor.pose is None:
-                sumo.person.appendWalkingStage(name, [prefix + edge for edge in actor.route], _END, speed=actor.speed)
+                sumo.person.appendWalkingStage(name, [prefix + edge for edge in actor.route], _END, speed=speed)
             else:
                 sumo.person.appendWaitingStage(name, _FOREVER)
         else:
             route = here.route(tuple([prefix + edge for edge in actor.route]))
-            add(name, route, type_name(actor), "now", str(actor.lane), repr(float(actor.position)), repr(float(actor.speed)))
+            add(name, route, type_name(actor), "now", str(actor.lane), repr(position), repr(speed))
             here.inserted(name)
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(name, 32)
                 if not actor.lane_changes:
                     sumo.vehicle.setLaneChangeMode(name, 0)
-                set_speed(name, actor.speed)  # until its driver says otherwise; SUMO would accelerate
+                set_speed(name, speed)  # until its driver says otherwise; SUMO would accelerate
         if actor.pose is not None:
             mover(sumo, actor, prefix)(actor.pose)
     for obstacle in scene.obstacles:
@@ -75,7 +76,7 @@ def mover(sumo: Any, actor: Actor, prefix: str = "") -> Callable[[Pose], None]:
     lane = () if actor.person else (-1,)
 
     def place(pose: Pose) -> None:
-        x, y, heading = pose
+        x, y, heading = map(float, pose)
         front_x, front_y = x + half * math.cos(heading), y + half * math.sin(heading)
         if not (math.isfinite(front_x) and math.isfinite(front_y)):
             raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave pose {pose}")
@@ -107,21 +108,21 @@ def verify(sumo: Any, scene: Scene, prefix: str = "") -> None:
 def _realised(domain: Any, actor: Actor, name: str, position: Any) -> dict[str, tuple[float, float, str]]:
     """Return what was asked of an actor, what SUMO made of it, and the unit."""
     if actor.pose is not None:
-        x, y, heading = actor.pose
+        x, y, heading = map(float, actor.pose)
         half = _front(actor)
         return {
             "x": (x + half * math.cos(heading), position[0], "m"),
             "y": (y + half * math.sin(heading), position[1], "m"),
         }
     if actor.person:  # SUMO chooses the pavement and lets it walk in the step that inserts it
-        return {"position": (actor.position, position, "m")}
+        return {"position": (float(actor.position), position, "m")}
     return {
-        "position": (actor.position, position, "m"),
-        "speed": (actor.speed, domain.getSpeed(name), "m/s"),
+        "position": (float(actor.position), position, "m"),
+        "speed": (float(actor.speed), domain.getSpeed(name), "m/s"),
         "lane": (actor.lane, domain.getLaneIndex(name), ""),
     }
 
 
 def _front(actor: Actor) -> float:
     """Return how far ahead of the centre SUMO's position of the actor is: a vehicle's is its front bumper."""
-    return 0.0 if actor.person else 0.5 * actor.type.length
+    return 0.0 if actor.person else 0.5 * float(actor.type.length)

@@ -33,6 +33,7 @@ from sbt.seeds import stream
 from sbt.sumo.asked import Asked, asked_of, number_or_none
 from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
+from sbt.sumo.formatting import plain, plain_values
 from sbt.sumo.session import session
 from sbt.sumo.watch import Over, Watch, Watching
 
@@ -146,6 +147,7 @@ class OwnSimulation:
 
     def _run(self, values: Mapping[str, float], seed: int, opened: Opened) -> Trace:
         handed: Handed | None = None
+        values = plain_values(values)
         try:
             with ExitStack() as stack:
                 stack.enter_context(contextlib.chdir(self.folder))
@@ -274,6 +276,7 @@ class _Commanded:
         return partial(self._command, name, function)
 
     def _command(self, name: str, function: Any, *args: Any, **more: Any) -> Any:
+        args, more = tuple(map(plain, args)), {key: plain(value) for key, value in more.items()}
         for value in (*args, *more.values()):
             if isinstance(value, float) and not math.isfinite(value):  # SUMO takes it and says nothing
                 shown = ", ".join(map(repr, (*args, *more.values())))

@@ -28,6 +28,7 @@ from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import VehicleType
 from sbt.sumo.copies import copied
+from sbt.sumo.formatting import format_number
 
 __all__ = ["ABSENT", "Loadable", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
 
@@ -98,7 +99,7 @@ class Setup:
         net = self.net if self.copies == 1 else _copies_file(self.net, self.copies)
         return [
             "--net-file", net, "--additional-files", _types_file(self.types),
-            "--step-length", repr(self.step_length), "--lanechange.duration", repr(self.lane_change_duration),
+            "--step-length", format_number(self.step_length), "--lanechange.duration", format_number(self.lane_change_duration),
             "--seed", str(seed), *_OPTIONS, *self.options,
         ]  # fmt: skip
 
@@ -113,7 +114,8 @@ def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
     """Write the vehicle types of the next load and return the file's name; SUMO reads it while it loads, never again."""
     lines = []
     for name, kind in types:
-        attributes = {**_DEFAULTS, "length": repr(kind.length), "width": repr(kind.width), **dict(kind.attributes)}
+        size = {"length": format_number(kind.length), "width": format_number(kind.width)}
+        attributes = {**_DEFAULTS, **size, **dict(kind.attributes)}
         lines.append(f"<vType id={quoteattr(name)} " + " ".join(f"{k}={quoteattr(v)}" for k, v in attributes.items()) + "/>")
     path = Path(_scratch().name) / "types.add.xml"
     path.write_text("<additional>\n" + "\n".join(lines) + "\n</additional>\n")

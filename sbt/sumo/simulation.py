@@ -19,6 +19,7 @@ from sbt.sumo.actors import Scene
 from sbt.sumo.batch import simulate_many
 from sbt.sumo.driving import Drive
 from sbt.sumo.ego import Ego
+from sbt.sumo.formatting import plain_values
 from sbt.sumo.models import SUBLANE
 from sbt.sumo.nets import net_file
 from sbt.sumo.placing import insert, type_name, verify
@@ -160,6 +161,7 @@ class SumoSimulation:
 
     def built(self, values: Mapping[str, float], seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
+        values = plain_values(values)
         return self.scene(values, self.ego.bound(values), stream(seed, "scene"))
 
     def setup(self, scene: Scene, copies: int = 1) -> Setup:

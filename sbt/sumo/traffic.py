@@ -14,6 +14,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.sumo.actors import Actor, VehicleType
 from sbt.sumo.ego import SUMO, Ego
+from sbt.sumo.formatting import format_number
 
 __all__ = ["DRIVER", "Column", "automated"]
 
@@ -31,9 +32,9 @@ def automated(ego: Ego, speed: float, limit: float) -> VehicleType:
     Its driver is perfect (`sigma` 0) unless the ego's settings say otherwise.
     """
     margin = 1.0 + 1e-9  # SUMO refuses a start above the desired speed, which it computes as factor times limit
-    attributes = dict(DRIVER) | {"sigma": "0", "speedFactor": repr(speed / limit * margin)}
+    attributes = dict(DRIVER) | {"sigma": "0", "speedFactor": format_number(speed / limit * margin)}
     if ego.kind != SUMO:
-        return VehicleType(attributes=(("speedFactor", repr(max(speed / limit, 1.0) * margin)),))
+        return VehicleType(attributes=(("speedFactor", format_number(max(speed / limit, 1.0) * margin)),))
     del attributes["carFollowModel"]
     return ego.vehicle_type(VehicleType(attributes=tuple(attributes.items())), speed * margin)
 
@@ -60,7 +61,7 @@ class Column:
 
     def driven(self, **attributes: float) -> Column:
         """Return the column with other vType attributes of its drivers, such as `tau`."""
-        changed = dict(self.type.attributes) | {name: repr(float(value)) for name, value in attributes.items()}
+        changed = dict(self.type.attributes) | {name: format_number(value) for name, value in attributes.items()}
         return replace(self, type=replace(self.type, attributes=tuple(changed.items())))
 
     def draw(
@@ -88,7 +89,7 @@ class Column:
         position = first - pace * mean * rng.random()
         while position > last:
             factor = 1.0 + self.spread * float(np.clip(rng.standard_normal(), -2.0, 2.0))
-            attributes = dict(self.type.attributes) | {"speedFactor": repr(speed * factor / self.limit)}
+            attributes = dict(self.type.attributes) | {"speedFactor": format_number(speed * factor / self.limit)}
             kind = VehicleType(self.type.length, self.type.width, tuple(attributes.items()))
             cars.append(Actor(f"{self.name}_{len(cars)}", self.route, self.lane, position, pace * factor, type=kind))
             position -= pace * (shortest + (mean - shortest) * rng.standard_exponential())
