@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib.util
 import sys
 import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -16,11 +18,40 @@ from typing import Any
 
 from sbt.errors import InputError, PluginError, did_you_mean
 
-__all__ = ["KINDS", "load", "names"]
+__all__ = ["KINDS", "OBJECT", "Scope", "load", "names"]
+
+OBJECT = "object:"
+"""Before the name of an object that was given in Python, where a name is asked for."""
 
 KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns", "sources")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Where the names of a configuration are looked up: its folder, and the objects that were given beside it.
+
+    Args:
+        folder: where a relative `file.py:NAME` is looked up.
+        objects: (kind, name) -> object, such as ("scenarios", "object:disc").
+    """
+
+    folder: Path = field(default_factory=Path.cwd)
+    objects: Mapping[tuple[str, str], Any] = field(default_factory=dict)
+
+    def load(self, kind: str, name: str) -> Any:
+        """Return the object with this name; as `load`, and the objects of the scope.
+
+        Raises:
+            PluginError: nothing has this name, or it was defined in Python and is not given here.
+        """
+        if not name.startswith(OBJECT):
+            return load(kind, name, self.folder)
+        if (kind, name) not in self.objects:
+            one, own = kind.removesuffix("s"), name.removeprefix(OBJECT)
+            raise PluginError(f"the {one} '{own}' was defined in Python and must be given again: {one}={own}")
+        return self.objects[kind, name]
 
 
 @cache

@@ -152,7 +152,7 @@ def _heat() -> Any:
 
 def _scatter(history: History, requirement: Requirement, x: Vector, y: Vector, ax: Axes, size: float | None = None) -> None:
     """Draw the runs by verdict, the rare kinds on top."""
-    critical, held = requirement.critical.contains(history.y(requirement.metric)), history.stage == VALIDATION
+    critical, held = requirement.critical_runs(history), history.stage == VALIDATION
     rim = 1.0 if size is not None else 1.0 + min(1e-4 * len(history), 1.0)  # hollow markers stand out among many filled ones
     size = float(np.clip(9000 / max(len(history), 1), 7, 30)) if size is None else size
     kinds: list[tuple[str, Mask, dict[str, Any]]] = [
