@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
-from sbt.acquisitions import boundary, expected_feasibility, straddle
+from sbt.acquisitions import is_greedy
 from sbt.campaigns.choices import Choice, from_roi, greedily, mixed
 from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
 from sbt.errors import InputError
@@ -19,14 +18,13 @@ __all__ = ["boundary_points", "recipe", "validation_of"]
 
 _VOLUMES = ("critical_fraction", "expected_misclassified", "ambiguous_volume")
 _INTERNAL = ("sides", "believed", "weights", *_VOLUMES)
-_GREEDY = {"u": boundary, "straddle": straddle, "expected_feasibility": expected_feasibility}
 
 
 def recipe(settings: Settings) -> Campaign:
     """Return the campaign: even first, then batches from the acquisition's region of interest.
 
-    The acquisition decides how: `mix` (exploration where critical runs are rare, representative of a_BI,
-    greedy, space filling), `u`, `straddle` and `expected_feasibility` greedily, any acquisition function
+    The acquisition decides how: without one `mix` (exploration where critical runs are rare, representative of a_BI,
+    greedy, space filling); one that is declared greedy (`u`, `straddle`, `expected_feasibility`) greedily; any other
     by rejection (`boundary`: the paper's).
 
     The conclusion holds shares of the input space as the metamodel sees them: `critical_fraction`, the
@@ -55,14 +53,14 @@ def recipe(settings: Settings) -> Campaign:
         conclusion["held_out_fraction"] = critical_share(held_out, settings.scenario)
         return conclusion, fit_of(belief)
 
-    return Campaign((BatchStage("boundary", *_choice(settings)),), conclude)
+    return Campaign((BatchStage("boundary", settings, _choice(settings)),), conclude)
 
 
-def _choice(settings: Settings) -> tuple[Settings, Choice]:
-    """Return the rule that chooses batches, and the settings with its criterion."""
-    if settings.method in _GREEDY:
-        return replace(settings, acquisition=_GREEDY[settings.method]), greedily
-    return settings, from_roi if settings.acquisition is not None else mixed
+def _choice(settings: Settings) -> Choice:
+    """Return the rule that chooses batches."""
+    if settings.acquisition is None:
+        return mixed
+    return greedily if is_greedy(settings.acquisition) else from_roi
 
 
 def boundary_points(settings: Settings, history: History, most: int = 500) -> Points:

@@ -38,7 +38,7 @@ class CampaignKind:
 CAMPAIGNS: Mapping[str, CampaignKind] = {
     "boundary": CampaignKind(
         "identify where critical meets uncritical", "mix", stop={"stable": None, "misclassified": None},
-        methods=("mix", "u", "straddle", "expected_feasibility"),
+        methods=("mix",),
         metamodel={"kind": "auto", "preset": "quick"},
     ),
     "falsification": CampaignKind(

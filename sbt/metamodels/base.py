@@ -7,13 +7,12 @@ scenario declares them, are further columns, scaled to about [0, 1]); y is the s
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -174,6 +173,4 @@ def standardise(y: Vector) -> tuple[Vector, float, float]:
 def _unknown(kind: str, what: str, name: str, valid: Iterable[str]) -> str:
     """Return the message about a name that is not among the valid ones."""
     names = sorted(valid)
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"{kind} takes a {what} of {', '.join(names) or '(none)'}, but got {name!r}{hint}"
+    return f"{kind} takes a {what} of {', '.join(names) or '(none)'}, but got {name!r}{did_you_mean(name, names)}"
