@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.acquisitions import boundary, even
+from sbt.acquisitions import boundary, even, log_scores
 from sbt.campaigns.exploration import EXPLORATION_SHARE, explore, should_explore
 from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.settings import Acquisition, Settings
@@ -20,7 +20,7 @@ from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.samplers.greedy import influence_on_mean, refine_diverse, select_diverse, select_representative
+from sbt.samplers.greedy import influence_on_mean, propose_greedily, select_diverse, select_representative
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.smc import smc
@@ -30,7 +30,6 @@ from sbt.seeds import stream
 __all__ = ["ChoiceRule", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 
 _MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to particles: about a second with a GP
-_CANDIDATES = 4096
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
@@ -144,7 +143,7 @@ def _score(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acqu
     def score(u: Points) -> Vector:
         if fitted is None or acquisition is even:
             return np.zeros(len(u))
-        return acquisition(fitted.predict(u), critical, space.log_density(space.from_unit(u)))
+        return log_scores(acquisition, fitted.predict(u), critical, space.log_density(space.from_unit(u)))
 
     return score
 
@@ -236,8 +235,9 @@ def _greedy(
         u = rows.points(0, len(rows))
         picks = select_diverse(u, score(u), there, n, scale)
         return scenario.pool.x[rows.rows[picks]], len(u)
-    u, value = refine_diverse(score, rng.random((_CANDIDATES, space.dimension)), scale, rng)
-    u = np.clip(space.to_unit(space.from_unit(u)), 0.0, 1.0)  # integers are what will be run
-    if admissible is not None:
-        value = np.where(admissible(u), value, -np.inf)
-    return space.from_unit(u[select_diverse(u, value, there, n, scale)]), len(u)
+
+    def snap(v: Points) -> Points:  # integers are what will be run
+        return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
+
+    u, looked = propose_greedily(score, there, n, scale, rng, snap=snap, admissible=admissible)
+    return space.from_unit(u), looked

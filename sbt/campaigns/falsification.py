@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from sbt.acquisitions import is_greedy, log_scores
 from sbt.campaigns.failures import CONFIRM, FailureSearch, FalsificationConclusion, confirmations, search_runs
 from sbt.campaigns.parts import held_out_runs, named_inputs
 from sbt.campaigns.records import SearchProposal
@@ -19,8 +20,9 @@ from sbt.loop.stages import Batch, Campaign, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.samplers import evolution, portfolio
 from sbt.samplers.criteria import CRITERIA, propose_by
+from sbt.samplers.greedy import influence_on_mean, propose_greedily
 from sbt.samplers.roi import rejection
-from sbt.samplers.search import Picks
+from sbt.samplers.search import Picks, fill
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
@@ -138,7 +140,7 @@ class SearchStage:
         return evolution.propose(u[int(np.argmin(begin))], generations, n, s.seed)
 
     def _scored(self, log: Log, n: int) -> Points:
-        """Return n points drawn in proportion to the exponential of an acquisition function."""
+        """Return n points by an acquisition function: drawn in proportion to exp(score), or greedily."""
         s = self.failure_search.settings
         if s.learner is None or s.acquisition is None:
             raise InputError("an acquisition function needs a metamodel, but got none")
@@ -148,12 +150,28 @@ class SearchStage:
         def scored(u: Points) -> Vector:
             if fitted is None:
                 return np.zeros(len(u))
-            return score(fitted.predict(u), s.scenario.requirement.critical, space.log_density(space.from_unit(u)))
+            log_density = space.log_density(space.from_unit(u))
+            return log_scores(score, fitted.predict(u), s.scenario.requirement.critical, log_density)
 
-        sobol = SobolSequence(space.dimension, s.seed + 1)  # not the one that fills space
         feasible = self.failure_search.search.feasible
+        if fitted is not None and is_greedy(score):
+            return self._greedily(scored, fitted, log, n)
+        sobol = SobolSequence(space.dimension, s.seed + 1)  # not the one that fills space
         start = 2**20 * log.iteration
         return rejection(scored, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=feasible).u
+
+    def _greedily(self, score: Callable[[Points], Vector], fitted: FittedMetamodel, log: Log, n: int) -> Points:
+        """Return the n points of the highest scores that are far from each other and from earlier runs."""
+        s, feasible = self.failure_search.settings, self.failure_search.search.feasible
+        space = s.scenario.space
+        rng, existing = stream(s.seed, "greedy", log.iteration), np.clip(space.to_unit(log.history.x), 0.0, 1.0)
+        scale = influence_on_mean(fitted.predict, space.dimension, rng)
+
+        def snap(v: Points) -> Points:  # integers are what will be run
+            return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
+
+        u, _ = propose_greedily(score, existing, n, scale, rng, snap=snap, admissible=feasible)
+        return np.concatenate([u, fill(feasible, n - len(u), space.dimension, rng)])
 
     def _snapped(self, parts: list[tuple[str, Points]], runs: History) -> list[PlannedRun]:
         """Return the runs of each part by its stage; where rows are recorded, the nearest one not taken yet."""

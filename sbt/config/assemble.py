@@ -13,13 +13,12 @@ from typing import Any, TypeVar
 
 from sbt.acquisitions import Acquisition, even
 from sbt.config.load import Loaded
-from sbt.config.model import CAMPAIGNS, Choice
+from sbt.config.model import Choice
 from sbt.config.source import Key, Problems, must_be_one_of
 from sbt.config.space import configured_space
 from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.recalibrated import Recalibrated
-from sbt.plugins import load
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 
@@ -149,7 +148,7 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
     choice = loaded.config.metamodel
     if choice is None:
         return None
-    kind = problems.attempt(("metamodel", "kind"), lambda: load("metamodels", choice.kind, loaded.folder))
+    kind = problems.attempt(("metamodel", "kind"), lambda: loaded.scope.load("metamodels", choice.kind))
     if kind is None:
         return None
     if not isinstance(kind, type) or not callable(getattr(kind, "fit", None)):
@@ -168,9 +167,9 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
 
 def _acquisition(loaded: Loaded, problems: Problems) -> Acquisition | None:
     kind = loaded.config.acquisition.kind
-    if kind in CAMPAIGNS[loaded.config.campaign].methods:
+    if kind in loaded.kind.methods:
         return None
-    found = problems.attempt(("acquisition", "kind"), lambda: load("acquisitions", kind, loaded.folder))
+    found = problems.attempt(("acquisition", "kind"), lambda: loaded.scope.load("acquisitions", kind))
     if found is not None and not callable(found):
         problems.add(("acquisition", "kind"), f"an acquisition must be a function, but '{kind}' is not")
     return even if found is None else found  # `even` only stands in until the problems are raised

@@ -42,7 +42,7 @@ def from_json(kind: type[T], data: Any) -> T:
         StoreError: the data are those of something else.
     """
     try:
-        found: T = _adapter(kind).validate_python(data)
+        found: T = _adapter(kind).validate_python(data)  # type: ignore[arg-type]
     except ValueError as error:
         first = str(error).splitlines()[1:3]
         raise StoreError(f"a record of the log must be a {kind.__name__}, but is not: {' '.join(first)}") from error
