@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -11,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
     from sbt.config.load import Loaded
+    from sbt.loop.stages import Shard
     from sbt.store.database import Store
 
 __all__ = ["export", "merge", "report", "run", "status"]
@@ -54,32 +56,29 @@ def run(
         overrides.append(f"store={json.dumps(str(store))}")
     if workers is not None:
         overrides.append(f"executor.workers={workers}")
-    try:
-        with clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
-            from sbt.config.load import load
+    with resumable() as work, clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
+        from sbt.config.load import load
 
-            loaded = load(config, overrides)
-            from sbt.workflows.running import run_campaign  # after the configuration, which is wrong more often
+        loaded = load(config, overrides)
+        from sbt.workflows.running import run_campaign  # after the configuration, which is wrong more often
 
-            if shard is None:
-                result = run_campaign(loaded, progress=show)
-            else:
-                result = _run_shard(loaded, shard, show, own_folder=store is None)
-    except KeyboardInterrupt:
-        raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+        part: dict[str, Any] = {}
+        if shard is not None:
+            loaded, part["shard"] = _sharded(loaded, shard, own_folder=store is None)
+        work.folder = Path(loaded.config.store)
+        result = run_campaign(loaded, progress=show, **part)
     _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
 
 
-def _run_shard(loaded: Loaded, text: str, show: ProgressDisplay, *, own_folder: bool) -> dict[str, Any]:
-    """Run one shard, in a folder inside the campaign's where the user names none."""
+def _sharded(loaded: Loaded, text: str, *, own_folder: bool) -> tuple[Loaded, Shard]:
+    """Return one shard, with a folder inside the campaign's where the user names none."""
     from sbt.loop.stages import Shard
-    from sbt.workflows.running import run_campaign
 
     shard = Shard.parse(text)
     if own_folder:
         folder = Path(loaded.config.store) / f"shard-{shard.number}-of-{shard.of}"
         loaded = replace(loaded, config=loaded.config.model_copy(update={"store": str(folder)}))
-    return run_campaign(loaded, progress=show, shard=shard)
+    return loaded, shard
 
 
 def merge(
@@ -165,7 +164,7 @@ def status(
     """Say how far a campaign is, also while it runs."""
     found = _status(folder)
     try:
-        while watch and found["conclusion"] is None:
+        while watch and found["conclusion"] is None and not getattr(sys.stdout, "gone", False):
             if not as_json:
                 print("\n".join(_status_lines(found)), flush=True)
             time.sleep(2.0)
