@@ -16,6 +16,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
+from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
 
 __all__ = ["KINDS", "OBJECT", "Scope", "load", "names"]
@@ -93,8 +94,10 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
         return entries[name].load()
     except InputError:
         raise
-    except Exception as error:
-        raise PluginError(f"{kind[:-1]} '{name}' cannot be imported: {type(error).__name__}: {error}") from error
+    except BaseException as error:  # SystemExit too: it would end the program without a word
+        if interruption.is_interruption(error):
+            raise
+        raise PluginError(f"{kind[:-1]} '{name}' cannot be imported: {_what(error)}") from error
 
 
 @cache
@@ -108,11 +111,17 @@ def _module(path: str) -> Any:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except BaseException as error:  # SystemExit too: it would end the program without a word
         del sys.modules[name]
-        line = _line_of(error, path)
-        raise PluginError(f"plug-in file {path}{line} raised on import: {type(error).__name__}: {error}") from error
+        if interruption.is_interruption(error):
+            raise
+        raise PluginError(f"plug-in file {path}{_line_of(error, path)} raised on import: {_what(error)}") from error
     return module
+
+
+def _what(error: BaseException) -> str:
+    """Return type and message of an error."""
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _line_of(error: BaseException, path: str) -> str:

@@ -22,7 +22,7 @@ PACKAGE = ROOT / "sbt"
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 FLOORS = (
-    ("sbt", "errors", "files", "seeds", "plugins"),
+    ("sbt", "errors", "files", "seeds", "plugins", "interruption", "processes"),
     ("problem",),
     ("metrics",),
     ("sumo", "metamodels", "testbeds"),
@@ -38,7 +38,7 @@ FLOORS = (
     ("__main__",),
 )
 """Rooms from the ground up; those on one floor do not know each other unless stated in NEIGHBOURS."""
-NEIGHBOURS = {"samplers": {"acquisitions"}, "plugins": {"errors"}}
+NEIGHBOURS = {"samplers": {"acquisitions"}, "plugins": {"errors", "interruption"}}
 LATE = {
     "metrics": {"sumo"},  # reading recorded FCD needs the networks' geometry
 }

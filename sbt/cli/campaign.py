@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,18 +53,16 @@ def run(
         overrides.append(f"store={json.dumps(str(store))}")
     if workers is not None:
         overrides.append(f"executor.workers={workers}")
-    try:
-        with clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
-            from sbt.loop.stages import Shard
-            from sbt.workflows.running import run_study
-            from sbt.workflows.study import Study
+    with resumable() as work, clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
+        from sbt.loop.stages import Shard
+        from sbt.workflows.running import run_study
+        from sbt.workflows.study import Study
 
-            study, part = Study.from_file(config, overrides), None if shard is None else Shard.parse(shard)
-            if part is not None and store is None:
-                study = study.with_store(Path(study.config.store) / f"shard-{part.number}-of-{part.of}")
-            result = run_study(study, progress=show, shard=part).to_dict()
-    except KeyboardInterrupt:
-        raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+        study, part = Study.from_file(config, overrides), None if shard is None else Shard.parse(shard)
+        if part is not None and store is None:
+            study = study.with_store(Path(study.config.store) / f"shard-{part.number}-of-{part.of}")
+        work.folder = Path(study.config.store)
+        result = run_study(study, progress=show, shard=part).to_dict()
     _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
 
 
@@ -150,7 +149,7 @@ def status(
     """Say how far a campaign is, also while it runs."""
     found = _status(folder)
     try:
-        while watch and found["conclusion"] is None:
+        while watch and found["conclusion"] is None and not getattr(sys.stdout, "gone", False):
             if not as_json:
                 print("\n".join(_status_lines(found)), flush=True)
             time.sleep(2.0)

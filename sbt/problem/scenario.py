@@ -44,7 +44,7 @@ class Batched(Protocol):
 
     def simulate_many(
         self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = ...
-    ) -> list[Trace | Exception]:
+    ) -> list[Trace | BaseException]:
         """Return the trace, or the error, of each of these values and seeds: the same as one by one.
 
         `at_work` is told, again and again, which of them are being run.

@@ -11,10 +11,10 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from sbt import interruption
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
@@ -32,6 +32,7 @@ _LOOK = 64
 """The wall clock is looked at, and life is shown, once in so many steps."""
 
 AtWork = Callable[[Sequence[int]], None]
+_Found = dict[int, Trace | BaseException]
 
 
 class _Simulation(Protocol):
@@ -65,24 +66,29 @@ class _Slot:
 
 def simulate_many(
     simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], at_work: AtWork
-) -> list[Trace | Exception]:
+) -> list[Trace | BaseException]:
     """Run concrete scenarios, in copies of the network where allowed; see `SumoSimulation.simulate_many`."""
-    found: dict[int, Trace | Exception] = {}
+    found: _Found = {}
     if simulation.batched and len(work) > 1:
-        with suppress(Exception):  # whose it is and what it says, the runs that are missing show alone
+        try:
             _together(simulation, work, found, at_work)
+        except BaseException as error:  # whose it is and what it says, the runs that are missing show alone
+            if interruption.is_interruption(error):
+                raise
     for index, (values, seed) in enumerate(work):
         if index not in found:
             at_work((index,))
             try:
                 found[index] = simulation(values, seed)
-            except Exception as error:  # a user's scenario may raise anything
+            except BaseException as error:  # a user's scenario may raise anything
+                if interruption.is_interruption(error):
+                    raise
                 found[index] = error
     return [found[index] for index in range(len(work))]
 
 
 def _together(
-    simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], found: dict[int, Trace | Exception], at_work: AtWork
+    simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], found: _Found, at_work: AtWork
 ) -> None:
     """Fill `found` with the traces of the runs that can share a simulation."""
     scenes: dict[int, Scene] = {}
@@ -96,7 +102,7 @@ def _together(
 
 
 def _roll(
-    sumo: Any, simulation: _Simulation, waiting: dict[int, Scene], found: dict[int, Trace | Exception], at_work: AtWork
+    sumo: Any, simulation: _Simulation, waiting: dict[int, Scene], found: _Found, at_work: AtWork
 ) -> None:
     """Keep every copy busy until no run is left."""
     step, colliding = direct(sumo, "simulation", "step"), direct(sumo, "simulation", "getCollidingVehiclesNumber")

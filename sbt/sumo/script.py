@@ -26,9 +26,11 @@ from typing import Any
 
 import numpy as np
 
+from sbt import interruption
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
+from sbt.processes import scratch
 from sbt.seeds import stream
 from sbt.sumo.asked import Asked, asked_of, number_or_none
 from sbt.sumo.ego import Ego
@@ -47,7 +49,7 @@ Opened = Callable[[Launch], AbstractContextManager[Any]]
 @cache
 def _scratch() -> tempfile.TemporaryDirectory[str]:
     """Return the folder of this process for filled copies; it goes away with it."""
-    return tempfile.TemporaryDirectory(prefix="sbt-own-")
+    return scratch("own")
 
 
 def just_step(sumo: Any, values: Mapping[str, float], rng: np.random.Generator) -> None:
@@ -230,11 +232,12 @@ class Handed:
             self._own.loop(self, dict(self._values), stream(self._seed, "loop"))
         except Over as over:
             return over.ended
-        except Exception as error:
+        except BaseException as error:  # SystemExit too
             self.line = _line_of(error, self._own.loop)
-            if isinstance(error, RunError) or "TraCI" in type(error).__name__:
+            if isinstance(error, RunError) or "TraCI" in type(error).__name__ or interruption.is_interruption(error):
                 raise
-            raise RunError(Status.FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}") from error
+            message = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+            raise RunError(Status.FAILED, message) from error
         if self._watch is not None and self._watch.over:  # the loop held it with a bare `except`
             return self._watch.over
         if self._module is not None:
@@ -242,7 +245,7 @@ class Handed:
         return "loop"
 
 
-def _line_of(error: Exception, loop: Loop) -> str:
+def _line_of(error: BaseException, loop: Loop) -> str:
     """Return the last line of the user's own file that an error came through, as ` (file:line)`."""
     file = getattr(getattr(loop, "__code__", None), "co_filename", "")
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]

@@ -26,6 +26,7 @@ from xml.sax.saxutils import quoteattr
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
+from sbt.processes import scratch
 from sbt.sumo.actors import VehicleType
 from sbt.sumo.copies import copied
 from sbt.sumo.formatting import format_number
@@ -107,7 +108,7 @@ class Setup:
 @cache
 def _scratch() -> tempfile.TemporaryDirectory[str]:
     """Return a folder of this process that goes away with it."""
-    return tempfile.TemporaryDirectory(prefix="sbt-")
+    return scratch("sumo")
 
 
 def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
