@@ -33,7 +33,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 
 SCENARIO = LogicalScenario(
-    "empty", ParameterSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))), Requirement("y", CriticalInterval(high=0.5)),
+    "empty", ParameterSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))), Requirement("y", high=0.5),
     evaluate=lambda values, seed: {"y": values["a"]}, metric_names=("y",),
 )
 """

@@ -12,7 +12,7 @@ import numpy as np
 
 from sbt.acquisitions import boundary
 from sbt.metamodels.automatic import Auto
-from sbt.metamodels.base import about, build, log_ambiguity_bound
+from sbt.metamodels.base import build, log_ambiguity_bound, with_target
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.roi import RoiDraw, rejection
@@ -50,7 +50,7 @@ def _line(kind: str, d: int, n: int, samples: int, seed: int) -> None:
     rng = stream(seed, "screening", d, n)
     critical = CriticalInterval(high=float(np.quantile(_metric(rng.random((200_000, d)), rng), CRITICAL)))
     u = SobolSequence(d, seed).points(0, n)
-    predict = about(KINDS[kind], critical).fit(u, _metric(u, rng), stream(seed, "fit", n))
+    predict = with_target(KINDS[kind], critical).fit(u, _metric(u, rng), stream(seed, "fit", n))
 
     def score(points: np.ndarray) -> np.ndarray:
         return boundary(predict(points), critical, np.zeros(len(points)))

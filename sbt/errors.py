@@ -6,7 +6,10 @@ folder of a campaign; `RunError` ends one run and becomes a row of the store, ne
 
 from __future__ import annotations
 
-__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError"]
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "did_you_mean"]
 
 
 class SbtError(Exception):
@@ -36,3 +39,16 @@ class RunError(SbtError):
     def __reduce__(self) -> tuple[type[RunError], tuple[str, str]]:
         """Pickle by status and reason (`Exception` would call `__init__` with the reason alone)."""
         return type(self), (self.status, self.reason)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the hint at the end of a message about an unknown name: the closest known one, in any case.
+
+    >>> did_you_mean("Budgte", ["batch", "budget"])
+    " (did you mean 'budget'?)"
+    >>> did_you_mean("xyz", ["batch", "budget"])
+    ''
+    """
+    by_lower = {each.lower(): each for each in known}
+    close = get_close_matches(name.lower(), by_lower, 1)
+    return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""

@@ -6,7 +6,6 @@ user's own file, and only because the user names it.
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 import sys
 import threading
@@ -15,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from sbt.errors import InputError, PluginError
+from sbt.errors import InputError, PluginError, did_you_mean
 
 __all__ = ["KINDS", "load", "names"]
 
@@ -57,10 +56,8 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
         return load("sources", source)(rest, folder or Path.cwd())
     entries = _entries(kind)
     if name not in entries:
-        near = difflib.get_close_matches(name, entries, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
         known = ", ".join(sorted(entries)) or "nothing is installed"
-        raise PluginError(f"{kind} must be one of {known}, or file.py:NAME, but got '{name}'{hint}")
+        raise PluginError(f"{kind} must be one of {known}, or file.py:NAME, but got '{name}'{did_you_mean(name, entries)}")
     try:
         return entries[name].load()
     except InputError:

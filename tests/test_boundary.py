@@ -14,19 +14,19 @@ from typer.testing import CliRunner
 
 from sbt import testbeds
 from sbt.acquisitions import expected_feasibility, straddle
-from sbt.campaigns.hunt import HUNTED, in_vain, is_on
+from sbt.campaigns.exploration import EXPLORED, fruitless_runs, should_explore
 from sbt.campaigns.settings import Settings
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.loop.learner import Belief, Learner
+from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.stages import Log
 from sbt.metamodels.automatic import Auto
-from sbt.metamodels.base import functions, simplest
+from sbt.metamodels.base import sample_paths, simplest
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.recalibrated import Recalibrated
 from sbt.problem.requirement import CriticalInterval
-from sbt.samplers.greedy import diverse, influence, refined, representative
+from sbt.samplers.greedy import influence_on_mean, refine_diverse, select_diverse, select_representative
 from sbt.samplers.smc import smc
 from sbt.samplers.surface import crossings
 from sbt.seeds import stream
@@ -73,7 +73,7 @@ def test_influence_is_the_root_of_the_total_effect():
     def predict(u: np.ndarray) -> Prediction:
         return Prediction.gaussian(4 * u[:, 0] + 2 * u[:, 1], np.ones(len(u)))
 
-    found = influence(predict, 3, stream(0, "influence"))
+    found = influence_on_mean(predict, 3, stream(0, "influence"))
     np.testing.assert_allclose(found[:2], [1.0, 0.5], rtol=0.25)
     assert found[2] == 0.05
 
@@ -83,14 +83,14 @@ def test_greedy_picks_are_good_and_apart():
     u = rng.random((2000, 2))
     log_score = -50 * np.abs(u[:, 0] - 0.5)
     there = np.array([[0.5, 0.5]])
-    picks = diverse(u, log_score, there, 12, np.ones(2))
+    picks = select_diverse(u, log_score, there, 12, np.ones(2))
     assert len(set(picks.tolist())) == 12
     assert (np.abs(u[picks, 0] - 0.5) < 0.06).all()
     chosen = np.vstack([there, u[picks]])
     gaps = np.linalg.norm(chosen[:, None] - chosen[None], axis=2)[np.triu_indices(13, 1)]
     assert gaps.min() > 0.04
-    assert len(diverse(u, np.full(2000, -np.inf), there, 3, np.ones(2))) == 0
-    assert len(diverse(there, np.zeros(1), there, 3, np.ones(2))) == 0  # nobody's duplicate
+    assert len(select_diverse(u, np.full(2000, -np.inf), there, 3, np.ones(2))) == 0
+    assert len(select_diverse(there, np.zeros(1), there, 3, np.ones(2))) == 0  # nobody's duplicate
 
 
 def test_refinement_finds_a_small_region():
@@ -98,7 +98,7 @@ def test_refinement_finds_a_small_region():
         return -np.linalg.norm(u - 0.123, axis=1)
 
     start = stream(3, "start").random((500, 4))
-    u, value = refined(score, start, np.ones(4), stream(3, "refine"))
+    u, value = refine_diverse(score, start, np.ones(4), stream(3, "refine"))
     np.testing.assert_array_equal(value, score(u))
     assert value.max() > 0.4 * score(start).max()
 
@@ -132,7 +132,7 @@ class Asking:
 
     told: list[CriticalInterval] = field(default_factory=list)
 
-    def about(self, critical: CriticalInterval) -> Asking:
+    def with_target(self, critical: CriticalInterval) -> Asking:
         self.told.append(critical)
         return self
 
@@ -175,15 +175,15 @@ def test_a_bound_spares_scores_and_changes_no_particle():
 def test_what_auto_alone_believes_draws_functions_as_the_process_does():
     u = stream(0, "rows").random((60, 2))
     y = np.sin(5 * u[:, 0]) + u[:, 1]
-    mixed = Auto(ensemble_rows=10**6).about(CriticalInterval(high=0.0)).fit(u, y, stream(0, "fit"))
-    assert mixed.choice.weights["gp"] == 1.0
+    mixed = Auto(ensemble_rows=10**6).with_target(CriticalInterval(high=0.0)).fit(u, y, stream(0, "fit"))
+    assert mixed.comparison.weights["gp"] == 1.0
     line = np.column_stack([np.linspace(0, 1, 200), np.full(200, 0.5)])
-    drawn, own = (functions(p, line, 50, stream(1, "draws")) for p in (mixed, mixed.predictors[0]))
+    drawn, own = (sample_paths(p, line, 50, stream(1, "draws")) for p in (mixed, mixed.predictors[0]))
     np.testing.assert_array_equal(drawn.shape, (50, 200))
     np.testing.assert_allclose(np.abs(np.diff(drawn)).max(), np.abs(np.diff(own)).max(), rtol=0.3)
     blind = Auto(ensemble_rows=10**6).fit(u, np.round(y), stream(0, "fit"))
-    assert 0 < blind.choice.weights["et"] < 1
-    assert functions(blind, line, 50, stream(1, "draws")).shape == (50, 200)
+    assert 0 < blind.comparison.weights["et"] < 1
+    assert sample_paths(blind, line, 50, stream(1, "draws")).shape == (50, 200)
     assert simplest(Auto()) == GaussianProcess(nu=2.5, input_noise=False)
 
 
@@ -225,21 +225,21 @@ def test_representative_picks_leave_little_doubt_far_from_a_run():
         runs = np.concatenate([there, u[list(picks)]]) * scale
         return float(weight @ cdist(u * scale, runs, "sqeuclidean").min(axis=1))
 
-    picks = tuple(representative(u, weight, there, 6, scale).tolist())
+    picks = tuple(select_representative(u, weight, there, 6, scale).tolist())
     assert len(set(picks)) == 6
     best = min(left((k,)) for k in range(300))
     assert left(picks[:1]) == pytest.approx(best)
     random = [left(tuple(rng.choice(300, 6, replace=False))) for _ in range(200)]
     assert left(picks) < min(random)
-    assert len(representative(there, np.ones(10), there, 3, scale)) == 0  # nobody's duplicate
-    assert len(representative(u, np.where(u[:, 0] < 0.5, 1.0, 0.0), u[u[:, 0] < 0.5], 3, scale)) == 0  # no doubt is left
+    assert len(select_representative(there, np.ones(10), there, 3, scale)) == 0  # nobody's duplicate
+    assert len(select_representative(u, np.where(u[:, 0] < 0.5, 1.0, 0.0), u[u[:, 0] < 0.5], 3, scale)) == 0  # no doubt is left
 
 
 def hunting_log(batches: list[tuple[int, list[tuple[float, float]]]]) -> Log:
-    """Return a log of batches (runs that hunted, x and y of each run); critical is y <= 0, one input."""
+    """Return a log of batches (runs that explored, x and y of each run); critical is y <= 0, one input."""
     rows, hows = [], []
-    for k, (hunted, runs) in enumerate(batches):
-        hows.append({"iteration": k, HUNTED: hunted})
+    for k, (explored, runs) in enumerate(batches):
+        hows.append({"iteration": k, EXPLORED: explored})
         for x, y in runs:
             rows.append(Record(len(rows), "boundary", k, {"x": x}, 0, "ok", {"y": y}, "", None, 0.0, "", ""))
     return Log(History(("x",), tuple(rows)), tuple(hows), ())
@@ -255,20 +255,20 @@ NEVER, HIT = [(0.2, 1.0), (0.4, 1.0), (0.6, 1.0)], [(0.1, -1.0), (0.2, 1.0), (0.
 
 
 def test_a_hunt_ends_when_it_was_in_vain_for_a_fifth_of_the_budget():
-    rare, common = (Belief(lambda u: Prediction.gaussian(u, u), {"critical_fraction": p}, 9, 0.0) for p in (1e-3, 0.1))
+    rare, common = (FittedMetamodel(lambda u: Prediction.gaussian(u, u), {"critical_fraction": p}, 9, 0.0) for p in (1e-3, 0.1))
     nothing = hunting_log([(0, NEVER)] + [(2, NEVER)] * 9)
-    assert in_vain(hunter(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
-    assert is_on(hunter(40), rare, nothing)
-    assert not is_on(hunter(40), common, nothing)
+    assert fruitless_runs(hunter(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
+    assert should_explore(hunter(40), rare, nothing)
+    assert not should_explore(hunter(40), common, nothing)
     before = [(0, NEVER), (2, HIT)]
-    spent = [in_vain(hunter(40), hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
+    spent = [fruitless_runs(hunter(40), hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
     assert spent == [0, 2, 4, 6, 8, 10]
-    on = [is_on(hunter(40), rare, hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
+    on = [should_explore(hunter(40), rare, hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
     assert on == [True] * 4 + [False] * 2
     same = hunting_log([*before, (2, NEVER), (2, [(0.15, -1.0), (0.3, 1.0)])])
     another = hunting_log([*before, (2, NEVER), (2, [(0.3, 1.0), (0.9, -1.0)])])
     by_doubt = hunting_log([*before, (2, NEVER), (1, [(0.3, 1.0), (0.9, -1.0)])])
-    assert [in_vain(hunter(40), log) for log in (same, another, by_doubt)] == [4, 0, 3]
+    assert [fruitless_runs(hunter(40), log) for log in (same, another, by_doubt)] == [4, 0, 3]
 
 
 SMALL = """
@@ -289,9 +289,9 @@ def test_small_regions_are_hunted_until_all_are_known(tmp_path: Path):
         hows, history = store.iterations(), store.history()
     hits = history.x[history.y("y") <= 0.0]
     assert len(np.unique(hits[:, 0] > 0.5)) == 2  # both regions
-    hunted = np.array([how.get(HUNTED, 0) for how in hows])
-    assert hunted[1] > 0
-    assert hunted[-1] == 0
+    explored = np.array([how.get(EXPLORED, 0) for how in hows])
+    assert explored[1] > 0
+    assert explored[-1] == 0
 
 
 def test_stops_where_little_is_expected_on_the_wrong_side(tmp_path: Path):

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sbt.campaigns.counting import counted_batches
-from sbt.campaigns.gate import Limits, decided
+from sbt.campaigns.gate import Limits, gate_verdict
 from sbt.cli import app
 from sbt.config.load import ConfigError, load, parse
 from sbt.errors import InputError
@@ -177,9 +177,9 @@ def test_an_earlier_campaign_teaches_and_is_not_counted(campaign: Run, configure
 
 def test_the_gate_decides_by_one_sided_limits():
     limits = Limits(lambda c: 0.01 * (1 - c), lambda c: 0.01 * (1 + c))
-    assert decided(limits, probability=0.02, confidence=0.95)["verdict"] == "pass"
-    assert decided(limits, probability=0.0001, confidence=0.95)["verdict"] == "fail"
-    assert decided(limits, probability=0.01, confidence=0.95)["verdict"] == "undecided"
+    assert gate_verdict(limits, probability=0.02, confidence=0.95)["verdict"] == "pass"
+    assert gate_verdict(limits, probability=0.0001, confidence=0.95)["verdict"] == "fail"
+    assert gate_verdict(limits, probability=0.01, confidence=0.95)["verdict"] == "undecided"
 
 
 @pytest.mark.parametrize(("probability", "code", "verdict"), [(0.9, 0, "pass"), (0.05, 3, "fail"), (0.28, 3, "undecided")])

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from scipy.stats import binomtest
 
-from sbt.estimators.importance import BLIND, SHARES, chosen, planned
-from sbt.estimators.intervals import Counted, binomial_upper, combined, few_hits_bound
-from sbt.estimators.mixture import Mixture, Normals, fitted, log_normal, particles, wide_scales
-from sbt.estimators.monte_carlo import Share
-from sbt.estimators.subset import Repeat, spread_of
+from sbt.estimators.binomial import interval, lower, upper
+from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch
+from sbt.estimators.intervals import CountedBatch, combine_estimates, few_hits_bound
+from sbt.estimators.mixture import Mixture, Normals, fit_mixture, log_normal, particles, wide_scales
+from sbt.estimators.monte_carlo import Proportion
+from sbt.estimators.subset import SubsetRun, combine_repeats
 from sbt.seeds import stream
 
 WIDE = wide_scales(np.zeros(2))
@@ -39,12 +41,12 @@ def replicate(belief, rng, *, form=None, n=20, shares=SHARES):
     z, stratum = H.sample(300, rng)
     log_h = H.log_density(z)
     log_pi, log_not = belief(z)
-    plan = planned(log_pi, log_not, log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum, shares)
+    plan = plan_batch(log_pi, log_not, log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum, shares)
     if form == "meta":
-        plan = replace(plan, form="meta", prior=0.0, believed=np.zeros(len(z)))
-    draws = chosen(plan, n, log_pi, rng)
+        plan = replace(plan, form="meta", prior=0.0, control_variate=np.zeros(len(z)))
+    draws = draw_systematic(plan, n, log_pi, rng)
     critical = (z[draws.rows, 0] > 2.0).astype(float)
-    return Counted(plan.prior, plan.anticipated, plan.pool_variance, draws.coefficient, draws.believed, critical)
+    return CountedBatch(plan.prior, plan.anticipated, plan.pool_variance, draws.coefficient, draws.control_variate, critical)
 
 
 @pytest.mark.parametrize("form", [None, "meta"])
@@ -73,10 +75,10 @@ def test_every_pool_point_is_expected_as_often_as_its_probability_says():
     rng = stream(4, "systematic")
     z, stratum = Mixture(WIDE).sample(60, rng)
     log_h = Mixture(WIDE).log_density(z)
-    plan = planned(*wrong(z), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
+    plan = plan_batch(*wrong(z), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
     counts = np.zeros(60)
     for _ in range(4000):
-        counts += np.bincount(chosen(plan, 10, z[:, 0], rng).rows, minlength=60)
+        counts += np.bincount(draw_systematic(plan, 10, z[:, 0], rng).rows, minlength=60)
     expected = 4000 * 10 * plan.probability
     assert np.all(np.abs(counts - expected) < 5 * np.sqrt(expected) + 5)
 
@@ -84,11 +86,11 @@ def test_every_pool_point_is_expected_as_often_as_its_probability_says():
 def test_the_mixture_has_the_density_it_claims():
     rng = stream(5, "mixture")
     cloud = rng.standard_normal((400, 2)) * np.array([0.3, 1.0]) + np.array([3.0, -1.0])
-    h = fitted((cloud, cloud - np.array([6.0, 0.0])), WIDE, rng)
+    h = fit_mixture((cloud, cloud - np.array([6.0, 0.0])), WIDE, rng)
     z, _ = h.sample(40_000, rng)
     ratio = np.exp(log_normal(z) - h.log_density(z))
     assert ratio.mean() == pytest.approx(1.0, abs=4 * ratio.std() / 200)
-    far = log_normal(z - [3.0, -1.0], np.array([0.3, 1.0]))  # a density that h was fitted to
+    far = log_normal(z - [3.0, -1.0], np.array([0.3, 1.0]))  # a density that h was fit_mixture to
     ratio = np.exp(far - h.log_density(z))
     assert ratio.mean() == pytest.approx(1.0, abs=4 * ratio.std() / 200)
 
@@ -104,63 +106,88 @@ def test_particles_follow_their_target():
 
 def batch(values, anticipated=0.0):
     critical = np.asarray(values, dtype=float)
-    return Counted(0.0, anticipated, 0.0, np.ones(len(critical)), np.zeros(len(critical)), critical)
+    return CountedBatch(0.0, anticipated, 0.0, np.ones(len(critical)), np.zeros(len(critical)), critical)
 
 
 def test_weights_of_batches_look_at_no_result():
     """Inverse variance would give nearly all weight to the calm batch."""
     calm, wild = batch([0.1] * 10), batch([0.0] * 9 + [5.0])
     c = np.array([1.0, math.sqrt(2.0)]) / (1.0 + math.sqrt(2.0))
-    assert combined([calm, wild]).value == pytest.approx(c @ [0.1, 0.5])
-    assert combined([wild, calm]).value == pytest.approx(c @ [0.5, 0.1])
+    assert combine_estimates([calm, wild]).value == pytest.approx(c @ [0.1, 0.5])
+    assert combine_estimates([wild, calm]).value == pytest.approx(c @ [0.5, 0.1])
 
 
 def test_the_interval_believes_the_larger_variance():
     alike = [batch([0.5] * 4 + [0.5]) for _ in range(5)]
-    assert combined(alike).std_error == pytest.approx(0.0, abs=1e-12)
-    assert combined([batch([0.5] * 5, anticipated=1.0) for _ in range(5)]).std_error > 0.1  # anticipated
+    assert combine_estimates(alike).std_error == pytest.approx(0.0, abs=1e-12)
+    assert combine_estimates([batch([0.5] * 5, anticipated=1.0) for _ in range(5)]).std_error > 0.1  # anticipated
     apart = [batch([v] * 5) for v in (0.1, 0.9, 0.2, 0.8)]
-    assert combined(apart).std_error > 0.1  # between the batches
-    c = combined(apart)
+    assert combine_estimates(apart).std_error > 0.1  # between the batches
+    c = combine_estimates(apart)
     assert c.limit(0.975, side=-1) < c.limit(0.9, side=-1) < c.value < c.limit(0.9, side=1) < c.limit(0.975, side=1)
 
 
 @pytest.mark.parametrize("hits", [0, 1, 7])
 def test_few_hits_bound_is_the_binomial_one_where_all_draws_are_nominal(hits):
-    assert few_hits_bound(hits, np.ones(50), 0.95) == pytest.approx(binomial_upper(hits, 50, 0.95), rel=1e-6)
-    assert few_hits_bound(hits, np.full(50, 0.5), 0.95) > binomial_upper(hits, 50, 0.95)
+    assert few_hits_bound(hits, np.ones(50), 0.95) == pytest.approx(upper(hits, 50, 0.95), rel=1e-6)
+    assert few_hits_bound(hits, np.full(50, 0.5), 0.95) > upper(hits, 50, 0.95)
     assert few_hits_bound(0, np.full(300, 0.05), 0.95) == pytest.approx(3.0 / 15.0, rel=0.02)  # 3 / n_p
     assert few_hits_bound(hits, np.empty(0), 0.95) == 1.0
 
 
+@pytest.mark.parametrize("n", [1, 20, 3000])
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+def test_exact_binomial_limits_against_scipy(n, confidence):
+    hits = np.unique([0, 1, n // 3, n - 1, n])
+    limits = [interval(hits, n, confidence), (lower(hits, n, confidence), upper(hits, n, confidence))]
+    for side, (low, high) in zip(("two-sided", "one-sided"), limits, strict=True):
+        for k, hit in enumerate(hits):
+            # at most p, at least p: SciPy solves the tails of the binomial distribution themselves
+            least, most = (binomtest(int(hit), n, alternative=a) for a in ("greater", "less"))
+            if side == "two-sided":
+                least = most = binomtest(int(hit), n)
+            truth = least.proportion_ci(confidence, method="exact").low, most.proportion_ci(confidence, method="exact").high
+            assert (low[k], high[k]) == pytest.approx(truth, rel=1e-9, abs=1e-12)
+
+
+def test_exact_binomial_limits_without_runs_or_hits_and_in_any_shape():
+    assert [float(end) for end in interval(0, 0)] == [0.0, 1.0]
+    assert (float(lower(0, 0, 0.9)), float(upper(0, 0, 0.9))) == (0.0, 1.0)
+    assert float(upper(0, 100, 0.95)) == pytest.approx(1 - 0.05 ** (1 / 100), rel=1e-12)
+    low, high = interval([[0, 3], [7, 20]], [20, 20])
+    assert low.shape == high.shape == (2, 2)
+    for (i, j), hit in np.ndenumerate([[0, 3], [7, 20]]):
+        assert (low[i, j], high[i, j]) == tuple(map(float, interval(hit, 20)))
+
+
 def test_crude_monte_carlo_covers():
     rng, p = stream(6, "crude"), 0.03
-    shares = [Share(100, int(rng.binomial(100, p))) for _ in range(2000)]
+    shares = [Proportion(100, int(rng.binomial(100, p))) for _ in range(2000)]
     assert np.mean([s.lower(0.975) <= p <= s.upper(0.975) for s in shares]) >= 0.95
-    assert Share(100, 2, failed=5).upper(0.9) == Share(100, 7).upper(0.9)
-    assert Share(100, 2, failed=5).lower(0.9) == Share(100, 2).lower(0.9)
+    assert Proportion(100, 2, failed=5).upper(0.9) == Proportion(100, 7).upper(0.9)
+    assert Proportion(100, 2, failed=5).lower(0.9) == Proportion(100, 2).lower(0.9)
 
 
 def test_subset_simulation_meets_a_plane_in_many_dimensions():
     truth = float(ndtr(-3.0))
     found = []
     for k in range(10):
-        repeat, rng = Repeat(300, 30), stream(7, "subset", k)
+        repeat, rng = SubsetRun(300, 30), stream(7, "subset", k)
         while not repeat.finished:
-            z = repeat.asked(rng)
-            repeat = repeat.told(z, 3.0 - z.sum(axis=1) / math.sqrt(30))
+            z = repeat.ask(rng)
+            repeat = repeat.tell(z, 3.0 - z.sum(axis=1) / math.sqrt(30))
         found.append(repeat.share)
-    spread = spread_of(found)
+    spread = combine_repeats(found)
     assert abs(spread.value - truth) < 3 * spread.std_error < 1.5 * truth
 
 
 def test_subset_simulation_ends_on_a_plateau_and_without_a_run():
     for margin in (np.ones(100), np.full(100, np.nan)):
-        repeat = Repeat(100, 3)
+        repeat = SubsetRun(100, 3)
         for _ in range(300):
             if repeat.finished:
                 break
-            z = repeat.asked(stream(8, "plateau"))
-            repeat = repeat.told(z, margin[: len(z)])
+            z = repeat.ask(stream(8, "plateau"))
+            repeat = repeat.tell(z, margin[: len(z)])
         assert repeat.finished
         assert repeat.share == 0.0

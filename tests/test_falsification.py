@@ -22,7 +22,7 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers import portfolio
 from sbt.samplers.criteria import log_expected_improvement
-from sbt.samplers.search import DEFLATION, Search, believe, deflated
+from sbt.samplers.search import DEFLATION, Search, deflated, fit_warped
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION
@@ -62,7 +62,7 @@ def coin(values, seed):
 
 def own(name, evaluate):
     space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
-    return LogicalScenario(name, space, Requirement("y", CriticalInterval(high=0.0)), evaluate=evaluate, metric_names=("y",))
+    return LogicalScenario(name, space, Requirement("y", high=0.0), evaluate=evaluate, metric_names=("y",))
 
 
 TWO = analytic(two_holes, inputs=BOX, critical=LOW, name="two holes")
@@ -87,7 +87,7 @@ def beside(values, seed):
 
 
 SIDES = LogicalScenario(
-    "sides", TWO.space, Requirement("speed", CriticalInterval(high=2.0)), simulate=beside,
+    "sides", TWO.space, Requirement("speed", high=2.0), simulate=beside,
     metrics=(Metric("speed", lambda trace: float(trace.speed[0, 0])),),
 )
 COIN = own("coin", coin)
@@ -96,7 +96,7 @@ Run = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture
-def hunted(tmp_path: Path) -> Run:
+def falsified(tmp_path: Path) -> Run:
     (tmp_path / "cases.py").write_text(CASES)
 
     def run(scenario: str, store: str = "s", **keys: Any) -> dict[str, Any]:
@@ -115,8 +115,8 @@ def rows(result: dict[str, Any]) -> list[Any]:
         return [(r.index, r.stage, r.iteration, dict(r.inputs), r.seed, dict(r.metrics)) for r in store.history().records]
 
 
-def test_both_holes_are_found_confirmed_and_told_apart(hunted: Run):
-    result = hunted("TWO", budget=80)
+def test_both_holes_are_found_confirmed_and_told_apart(falsified: Run):
+    result = falsified("TWO", budget=80)
     found = result["conclusion"]
     assert len(found["failure_modes"]) == 2
     assert found["critical_runs"] == sum(mode["size"] for mode in found["failure_modes"])
@@ -140,8 +140,8 @@ def test_both_holes_are_found_confirmed_and_told_apart(hunted: Run):
     assert found["statement"].startswith(f"{found['critical_runs']} of 80 runs of the search were critical, in 2 failure modes.")
 
 
-def test_what_differs_in_the_traces_is_not_one_mode(hunted: Run):
-    result = hunted("SIDES", budget=30, stop={"failures": None})
+def test_what_differs_in_the_traces_is_not_one_mode(falsified: Run):
+    result = falsified("SIDES", budget=30, stop={"failures": None})
     kept, modes = rows(result), result["conclusion"]["failure_modes"]
     assert {mode["conflict"] for mode in modes} == {"ahead of ego, same direction", "left of ego, same direction"}
     assert sum(mode["size"] for mode in modes) == 30  # everything is critical, and joined by the metamodel
@@ -150,16 +150,16 @@ def test_what_differs_in_the_traces_is_not_one_mode(hunted: Run):
         assert {kept[run][3]["b"] < 0.5 for run in mode["runs"]} == {mode["conflict"].startswith("ahead")}
 
 
-def test_a_failure_of_one_seed_is_told_from_one_of_the_scenario(hunted: Run):
-    mode = hunted("COIN", budget=40)["conclusion"]["failure_modes"]
+def test_a_failure_of_one_seed_is_told_from_one_of_the_scenario(falsified: Run):
+    mode = falsified("COIN", budget=40)["conclusion"]["failure_modes"]
     assert any(m["confirmed"] < 1.0 for m in mode)
 
 
 @pytest.mark.parametrize(
     ("stop", "reason"), [({"failures": 1}, "failures"), ({"failures": 3}, "failures"), ({"modes": 2}, "modes"), ({}, "budget")]
 )
-def test_it_stops_where_it_was_told_to(hunted: Run, stop: dict[str, int], reason: str):
-    result = hunted("TWO", budget=80, stop=stop)
+def test_it_stops_where_it_was_told_to(falsified: Run, stop: dict[str, int], reason: str):
+    result = falsified("TWO", budget=80, stop=stop)
     found = result["conclusion"]
     assert result["stopped"] == reason
     assert found["critical_runs"] >= stop.get("failures", 1)
@@ -171,9 +171,9 @@ def test_it_stops_where_it_was_told_to(hunted: Run, stop: dict[str, int], reason
         assert sum(row[5]["y"] <= 0 for row in kept if row[2] < last) < stop["failures"]  # not a batch too late
 
 
-def test_where_nothing_is_found_only_the_space_filling_runs_bound(hunted: Run):
+def test_where_nothing_is_found_only_the_space_filling_runs_bound(falsified: Run):
     for name in ("NOTHING", "BEYOND", "FLAT"):
-        result = hunted(name, name)
+        result = falsified(name, name)
         found = result["conclusion"]
         assert (found["first_critical_run"], found["critical_runs"], found["failure_modes"]) == (None, 0, [])
         stages = Counter(row[1] for row in rows(result))
@@ -184,21 +184,21 @@ def test_where_nothing_is_found_only_the_space_filling_runs_bound(hunted: Run):
         assert "No critical run in 50" in found["statement"]
         assert "14 space-filling" in found["statement"]
     assert found["closest"]["margin"] == 3.0
-    sobol = hunted("NOTHING", "sobol", validation={"share": 0})
+    sobol = falsified("NOTHING", "sobol", validation={"share": 0})
     assert Counter(row[1] for row in rows(sobol)) == {"initial": 10, "search": 36, "even": 4}
     assert sobol["conclusion"]["bound"]["random_runs"] == 0
 
 
-def test_everything_critical_is_one_mode_and_the_search_spreads(hunted: Run):
-    result = hunted("EVERYTHING")
+def test_everything_critical_is_one_mode_and_the_search_spreads(falsified: Run):
+    result = falsified("EVERYTHING")
     found = result["conclusion"]
     assert (found["first_critical_run"], found["critical_runs"], len(found["failure_modes"])) == (1, 50, 1)
     assert found["failure_modes"][0]["nearest_safe"] is None
     assert "Every run that gave a metric was critical (50)" in found["statement"]
 
 
-def test_failed_runs_are_said_and_widen_the_bound(hunted: Run):
-    result = hunted("HALF")
+def test_failed_runs_are_said_and_widen_the_bound(falsified: Run):
+    result = falsified("HALF")
     found = result["conclusion"]
     assert result["failed"] > 0
     assert found["first_critical_run"] is None
@@ -209,53 +209,53 @@ def test_failed_runs_are_said_and_widen_the_bound(hunted: Run):
     assert sum(row[3]["a"] >= 0.5 for row in guided) > 0
 
 
-def test_plateaus_and_idle_inputs(hunted: Run):
-    assert hunted("PLATEAU", budget=150, stop={"failures": 1})["conclusion"]["first_critical_run"] is not None
-    idle = hunted("IDLE", "idle", budget=60)["conclusion"]
+def test_plateaus_and_idle_inputs(falsified: Run):
+    assert falsified("PLATEAU", budget=150, stop={"failures": 1})["conclusion"]["first_critical_run"] is not None
+    idle = falsified("IDLE", "idle", budget=60)["conclusion"]
     assert 1 <= len(idle["failure_modes"]) <= 3  # one slab; idle inputs do not split it into many
     assert idle["first_critical_run"] <= 40
 
 
-def test_recorded_rows_are_chosen_once_each_and_never_repeated(hunted: Run):
-    result = hunted("RECORDED", budget=200, batch=30)
+def test_recorded_rows_are_chosen_once_each_and_never_repeated(falsified: Run):
+    result = falsified("RECORDED", budget=200, batch=30)
     assert result["stopped"] == "no rows left"
     points = [tuple(row[3].values()) for row in rows(result)]
     assert (len(points), len(set(points))) == (81, 81)
     assert [m["confirmed"] for m in result["conclusion"]["failure_modes"]] == [None, None]
 
 
-def test_constraints_hold_for_every_run(hunted: Run):
-    result = hunted("TWO", budget=50, constraints=["a + b < 1.2"])
+def test_constraints_hold_for_every_run(falsified: Run):
+    result = falsified("TWO", budget=50, constraints=["a + b < 1.2"])
     assert all(row[3]["a"] + row[3]["b"] < 1.2 for row in rows(result))
     assert len(result["conclusion"]["failure_modes"]) == 1
 
 
-def test_a_budget_below_the_first_design_is_a_design_alone(hunted: Run):
-    result = hunted("TWO", budget=4, initial=4)
+def test_a_budget_below_the_first_design_is_a_design_alone(falsified: Run):
+    result = falsified("TWO", budget=4, initial=4)
     assert (result["stopped"], [row[1] for row in rows(result)][:4]) == ("budget", ["initial"] * 4)
     if result["conclusion"]["first_critical_run"] is None:
         assert result["conclusion"]["bound"]["space_filling_runs"] == 4
-    one = hunted("NOTHING", "one", budget=1, initial=1)
+    one = falsified("NOTHING", "one", budget=1, initial=1)
     assert one["conclusion"]["bound"]["box_fraction"] == pytest.approx(0.95)
-    hit = hunted("EVERYTHING", "hit", budget=1, initial=1)
+    hit = falsified("EVERYTHING", "hit", budget=1, initial=1)
     assert len(hit["conclusion"]["failure_modes"]) == 1
 
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "portfolio"] + ["even", "boundary"])
-def test_every_method_finds_a_hole(hunted: Run, method: str):
+def test_every_method_finds_a_hole(falsified: Run, method: str):
     if method == "cma_es" and importlib.util.find_spec("cma") is None:
         with pytest.raises(Exception, match=r"needs the library cma, .* pip install 'sumo-sbt\[compare\]'"):
-            hunted("TWO", acquisition={"kind": method})
+            falsified("TWO", acquisition={"kind": method})
         return
-    result = hunted("TWO", budget=50, acquisition={"kind": method}, stop={"failures": 1})
+    result = falsified("TWO", budget=50, acquisition={"kind": method}, stop={"failures": 1})
     assert result["conclusion"]["critical_runs"] > 0
     if method in ("thompson", "cma_es"):
-        assert rows(result) == rows(hunted("TWO", "again", budget=50, acquisition={"kind": method}, stop={"failures": 1}))
+        assert rows(result) == rows(falsified("TWO", "again", budget=50, acquisition={"kind": method}, stop={"failures": 1}))
 
 
-def test_two_workers_and_a_broken_off_campaign_give_the_same_rows(hunted: Run, monkeypatch: pytest.MonkeyPatch):
-    whole = hunted("TWO", "whole", budget=40)
-    local = hunted("TWO", "local", budget=40, executor={"kind": "local", "workers": 2})
+def test_two_workers_and_a_broken_off_campaign_give_the_same_rows(falsified: Run, monkeypatch: pytest.MonkeyPatch):
+    whole = falsified("TWO", "whole", budget=40)
+    local = falsified("TWO", "local", budget=40, executor={"kind": "local", "workers": 2})
     assert rows(local) == rows(whole)
     append, done = Store.append, 0
 
@@ -269,15 +269,15 @@ def test_two_workers_and_a_broken_off_campaign_give_the_same_rows(hunted: Run, m
     monkeypatch.setattr(Store, "append", dies)
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
-            hunted("TWO", "broken", budget=40)
-    assert rows(hunted("TWO", "broken", budget=40)) == rows(whole)
+            falsified("TWO", "broken", budget=40)
+    assert rows(falsified("TWO", "broken", budget=40)) == rows(whole)
 
 
-def test_a_larger_budget_goes_on(hunted: Run):
-    small = rows(hunted("TWO", "grown", budget=40))
-    grown = hunted("TWO", "grown", budget=60)
+def test_a_larger_budget_goes_on(falsified: Run):
+    small = rows(falsified("TWO", "grown", budget=40))
+    grown = falsified("TWO", "grown", budget=60)
     assert rows(grown)[: len(small)] == small
-    at_once = [row[3] for row in rows(hunted("TWO", "at once", budget=60)) if row[1] != CONFIRM]
+    at_once = [row[3] for row in rows(falsified("TWO", "at once", budget=60)) if row[1] != CONFIRM]
     assert [row[3] for row in rows(grown) if row[1] != CONFIRM] == at_once
 
 
@@ -337,7 +337,7 @@ def test_the_warp_keeps_what_is_critical_and_the_order(critical: CriticalInterva
 def test_log_expected_improvement_is_the_expectation_and_finite_far_away():
     search = Search(CriticalInterval(high=-2.4), GaussianProcess(nu=2.5, input_noise=False))
     u, y = hartmann(2, 30)
-    belief = believe(search, u, y, stream(1, "fit"))
+    belief = fit_warped(search, u, y, stream(1, "fit"))
     at = stream(3, "at").random((20, 6))
     best = float(belief.critical.margin(belief.warp.values(y)).min())
     told = log_expected_improvement(belief, at, best)
@@ -352,7 +352,7 @@ def test_draws_of_a_process_are_its_belief():
     u, y = hartmann(2, 30)
     process = GaussianProcess(nu=2.5, input_noise=False).fit(u, y, stream(1, "fit"))
     at = stream(3, "at").random((5, 6))
-    drawn, p = process.draws(at, 40_000, stream(1, "draws")), process(at)
+    drawn, p = process.sample_paths(at, 40_000, stream(1, "draws")), process(at)
     np.testing.assert_allclose(drawn.mean(axis=0), p.mu, atol=0.02)
     np.testing.assert_allclose(drawn.std(axis=0), p.epistemic, rtol=0.05, atol=0.005)
 

@@ -268,9 +268,9 @@ def test_settings_are_checked_by_name():
     assert build(GaussianProcess, "paper").nu == 0.5
     assert build(GaussianProcess, "paper", {"nu": 2.5}).nu == 2.5
     assert build(ExtraTrees) == ExtraTrees()
-    with pytest.raises(InputError, match=r"preset of paper, but got 'papper'; did you mean 'paper'\?"):
+    with pytest.raises(InputError, match=r"preset of paper, but got 'papper' \(did you mean 'paper'\?\)"):
         build(ExtraTrees, "papper")
-    with pytest.raises(InputError, match=r"fit_rows.*got 'fitrows'; did you mean 'fit_rows'\?"):
+    with pytest.raises(InputError, match=r"fit_rows.*got 'fitrows' \(did you mean 'fit_rows'\?\)"):
         build(GaussianProcess, settings={"fitrows": 100})
     with pytest.raises(InputError, match="does not take"):
         build(ExtraTrees, settings={"trees": "many"})

@@ -17,7 +17,7 @@ from pretended_cuda import pretended_cuda
 
 from sbt.errors import InputError
 from sbt.metamodels.automatic import Auto
-from sbt.metamodels.base import about, build
+from sbt.metamodels.base import build, with_target
 from sbt.metamodels.bayesian_network import BayesianNetwork, _mask
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.deep_gp import DeepGaussianProcess
@@ -156,7 +156,7 @@ def test_everything_moves_to_the_device(name, monkeypatch):
         np.testing.assert_allclose(belief.mean, here(asked).mean, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(belief.std, here(asked).std, rtol=1e-6)
         if name.startswith("gp"):
-            draws = [p.draws(asked, 3, np.random.default_rng(1)) for p in (here, there)]
+            draws = [p.sample_paths(asked, 3, np.random.default_rng(1)) for p in (here, there)]
             np.testing.assert_allclose(*draws, rtol=1e-6, atol=1e-6)
             bounds = [p.probability_bounds(asked, critical) for p in (here, there)]
             np.testing.assert_allclose(*bounds, rtol=1e-6, atol=1e-9)
@@ -348,7 +348,7 @@ def test_weights_are_those_of_largest_likelihood():
 def test_auto_says_what_it_chose_and_why():
     u, y = rows(120)
     predictor = Auto(ensemble_rows=10**6).fit(u, y, np.random.default_rng(0))
-    choice = predictor.choice
+    choice = predictor.comparison
     assert set(choice.weights) == {"gp", "et"}
     assert set(choice.scores) == {"gp", "et", "mixture"}
     assert sum(choice.weights.values()) == pytest.approx(1.0)
@@ -356,7 +356,7 @@ def test_auto_says_what_it_chose_and_why():
     assert choice.scores["mixture"] > choice.scores["et"]
     assert "gp" in choice.reason
     assert "ensemble takes part from" in choice.reason
-    few = Auto().fit(u[:6], y[:6], np.random.default_rng(0)).choice
+    few = Auto().fit(u[:6], y[:6], np.random.default_rng(0)).comparison
     assert few.scores == {}
     assert "too few" in few.reason
 
@@ -365,12 +365,12 @@ def test_auto_that_knows_the_critical_interval_looks_at_its_edge():
     u, critical = np.random.default_rng(1).random((120, 2)), CriticalInterval(high=0.0)
     y = np.where(u[:, 1] < 0.5, 8.0 * (u[:, 0] - 0.3) + np.sin(6.0 * u[:, 1]), 10.0)  # in half of the space no conflict
     settings = Auto(ensemble_rows=10**6)
-    blind, aimed = (m.fit(u, y, np.random.default_rng(0)).choice for m in (settings, about(settings, critical)))
+    blind, targeted = (m.fit(u, y, np.random.default_rng(0)).comparison for m in (settings, with_target(settings, critical)))
     assert blind.weights["et"] > 0.7  # it knows the plateau best, to the last digit
-    assert aimed.weights["gp"] > 0.5
-    assert "ranges cut at" in aimed.reason
-    assert about(GaussianProcess(), critical) == GaussianProcess()
-    assert about(Recalibrated(settings), critical) == Recalibrated(about(settings, critical))
+    assert targeted.weights["gp"] > 0.5
+    assert "ranges cut at" in targeted.reason
+    assert with_target(GaussianProcess(), critical) == GaussianProcess()
+    assert with_target(Recalibrated(settings), critical) == Recalibrated(with_target(settings, critical))
 
 
 @pytest.mark.parametrize("critical", [CriticalInterval(high=0.0), CriticalInterval(low=1.0), CriticalInterval(-0.5, 0.5)])
@@ -388,7 +388,7 @@ def test_the_ranges_of_a_score_cover_all_values_and_m_c_is_closed(critical):
 
 def test_auto_leaves_the_gp_out_of_many_rows():
     u, y = rows(60)
-    choice = Auto(gp_rows=50, ensemble_rows=10**6).fit(u, y, np.random.default_rng(0)).choice
+    choice = Auto(gp_rows=50, ensemble_rows=10**6).fit(u, y, np.random.default_rng(0)).comparison
     assert choice.weights == {"et": 1.0}
     assert "gp takes part up to 50" in choice.reason
 
@@ -396,8 +396,8 @@ def test_auto_leaves_the_gp_out_of_many_rows():
 def test_auto_compares_on_some_rows_and_learns_from_all():
     u, y = rows(200)
     found = Auto(compare_rows=40, ensemble_rows=10**6).fit(u, y, np.random.default_rng(0))
-    assert "of 40 rows" in found.choice.reason
-    gp = next(p for p, name in zip(found.predictors, found.choice.weights, strict=False) if name == "gp")
+    assert "of 40 rows" in found.comparison.reason
+    gp = next(p for p, name in zip(found.predictors, found.comparison.weights, strict=False) if name == "gp")
     assert len(gp.u) == 200
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from sbt.errors import InputError
 from sbt.metamodels import persistence
-from sbt.metamodels.automatic import Auto, Choice, MixturePredictor
+from sbt.metamodels.automatic import Auto, MixturePredictor, ModelComparison
 from sbt.metamodels.bayesian_network import BayesianNetwork
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.deep_gp import DeepGaussianProcess
@@ -83,12 +83,12 @@ def test_loaded_predictors_predict_the_same_bits(name, tmp_path):
 
 def test_auto_with_its_ensemble_keeps_its_choice(tmp_path):
     rng = np.random.default_rng(0)
-    choice = Choice({"et": 0.25, "ensemble": 0.75}, {"et": -1.0, "ensemble": -0.5, "mixture": -0.4}, "because")
-    parts = tuple(KINDS[name].fit(U, Y, rng) for name in choice.weights)
-    predictor = MixturePredictor(parts, np.array([0.25, 0.75]), choice)
+    comparison = ModelComparison({"et": 0.25, "ensemble": 0.75}, {"et": -1.0, "ensemble": -0.5, "mixture": -0.4}, "because")
+    parts = tuple(KINDS[name].fit(U, Y, rng) for name in comparison.weights)
+    predictor = MixturePredictor(parts, np.array([0.25, 0.75]), comparison)
     save(predictor, tmp_path / "auto")
     loaded = load(tmp_path / "auto")
-    assert loaded.choice == choice
+    assert loaded.comparison == comparison
     np.testing.assert_array_equal(loaded(U).mean, predictor(U).mean)
 
 

@@ -173,7 +173,7 @@ from sbt.metrics.longitudinal import collision
 
 SCENARIO = LogicalScenario(
     "awkward", ParameterSpace((Parameter("kind", 0.0, 9.0), Parameter("v", 1.0, 90.0))),
-    Requirement("collision", CriticalInterval(low=1.0)), tests.AWKWARD, (collision(),),
+    Requirement("collision", low=1.0), tests.AWKWARD, (collision(),),
 )
 """
 

@@ -18,7 +18,7 @@ from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
 from sbt.problem.outcome import Job, Outcome, Status
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -80,7 +80,7 @@ def car(name: str = "ego", position: float = 100.0, speed: float = 20.0, lane: i
 
 
 def outcome(simulation: SumoSimulation, **inputs: float) -> Outcome:
-    requirement = Requirement("collision", CriticalInterval(low=1.0))
+    requirement = Requirement("collision", low=1.0)
     metrics = tuple(m for m in CUT_IN.metrics if m.name == "collision")
     scenario = LogicalScenario("test", ParameterSpace(CUT_IN.space.parameters), requirement, simulation, metrics)
     return run_job(scenario, Job(0, inputs, 1))

@@ -20,7 +20,7 @@ from sbt.metrics.stl import stl
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
 from sbt.problem.outcome import Job, Status
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -117,7 +117,7 @@ def test_absent_is_nan_in_every_state_and_the_ego_never_is():
     found = []
     for trace in traces:
         scenario = LogicalScenario(
-            "t", ParameterSpace((Parameter("a", 0, 1),)), Requirement("collision", CriticalInterval(low=1.0)),
+            "t", ParameterSpace((Parameter("a", 0, 1),)), Requirement("collision", low=1.0),
             lambda values, seed, trace=trace: trace, (in_traffic(collision(), "v"),),
         )  # fmt: skip
         found.append(run_job(scenario, Job(0, {"a": 0.5}, 1)).status)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +19,8 @@ from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
 from sbt.errors import SbtError
 from sbt.execution.protocol import SerialExecutor
-from sbt.loop.learner import Belief, Learner
+from sbt.files import write_atomically
+from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.stages import Batch, Campaign, Fit, Log, Progress, run_stages
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Outcome, Status
@@ -61,7 +63,7 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
     if parts.metamodel is None or parts.acquisition is None:
         raise ValueError(f"a cell needs a metamodel and an acquisition, but {cell.name} has none")
     rows = None if scenario.pool is not None else reference_rows(cell.reference, scenario, n)
-    learner = _ReferenceLearner(scenario, parts.metamodel, config.seed, aimed=cell.acquisition != "even", rows=rows)
+    learner = _ReferenceLearner(scenario, parts.metamodel, config.seed, target_aware=cell.acquisition != "even", rows=rows)
     acquisition = parts.acquisition if cell.acquisition != "even" else None
     stage = _BenchmarkStage(scenario, learner, acquisition, config.seed, cell.iterations, cell.batch, cell.max_candidates)
 
@@ -98,7 +100,7 @@ class _ReferenceLearner(Learner):
         """Return x (n, d) and y (n,) that score."""
         return super().unseen(history) if self.rows is None else self.rows
 
-    def fit(self, history: History) -> Belief | None:
+    def fit(self, history: History) -> FittedMetamodel | None:
         """Return the belief, the seconds of fit and of scoring among its scores."""
         start = time.perf_counter()
         belief = super().fit(history)
@@ -145,7 +147,7 @@ class _BenchmarkStage:
         }  # fmt: skip
         return Batch(runs, how, None if belief is None else Fit(belief.scores, belief.seconds))
 
-    def _draw(self, belief: Belief | None, log: Log) -> tuple[RoiDraw, Points]:
+    def _draw(self, belief: FittedMetamodel | None, log: Log) -> tuple[RoiDraw, Points]:
         """Return the draw and its points in the inputs' units, exactly as recorded where they are."""
         space, critical = self.scenario.space, self.scenario.requirement.critical
         acquisition = self.acquisition
@@ -213,7 +215,7 @@ def _known_runs(cell: Cell) -> dict[tuple[int, tuple[float, ...]], Outcome]:
     return known
 
 
-def _keep_predictions(folder: Path, learner: _ReferenceLearner, belief: Belief, history: History) -> None:
+def _keep_predictions(folder: Path, learner: _ReferenceLearner, belief: FittedMetamodel, history: History) -> None:
     """Write what the last metamodel believes about the reference runs, for the figures."""
     x, y = learner.unseen(history)
     u, critical = learner.scenario.space.to_unit(x), learner.scenario.requirement.critical
@@ -223,9 +225,7 @@ def _keep_predictions(folder: Path, learner: _ReferenceLearner, belief: Belief, 
         log_p, log_not = part.log_probability(critical)
         columns.append(np.stack([part.mu, part.sigma, np.exp(log_p), log_p - log_not]))
     mu, sigma, p, odds = np.concatenate(columns, axis=1)
-    temporary = folder / ("part." + PREDICTIONS)
     ends = [critical.low, critical.high]
-    np.savez_compressed(
-        temporary, y=y, mu=mu, sigma=sigma, p=p, odds=odds, critical=critical.contains(y), requirement=ends
-    )
-    temporary.replace(folder / PREDICTIONS)
+    content = io.BytesIO()
+    np.savez_compressed(content, y=y, mu=mu, sigma=sigma, p=p, odds=odds, critical=critical.contains(y), requirement=ends)
+    write_atomically(folder / PREDICTIONS, content.getvalue())

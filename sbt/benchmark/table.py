@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sbt.config.benchmark import Cell
+from sbt.files import write_atomically
 from sbt.store.database import Store
 
 __all__ = ["COLUMNS", "read_table", "rows_of", "write_table"]
@@ -46,15 +47,19 @@ def rows_of(cell: Cell) -> Iterator[dict[str, Any]]:
 
 def write_table(path: Path, cells: Iterable[Cell]) -> int:
     """Write the table of all cells as CSV, as a whole or not at all, and return the number of its rows."""
-    part, count = path.with_suffix(".part"), 0
-    with part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for cell in cells:
-            for row in rows_of(cell):
-                writer.writerow(row)
-                count += 1
-    part.replace(path)
+    count = 0
+
+    def write(part: Path) -> None:
+        nonlocal count
+        with part.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            for cell in cells:
+                for row in rows_of(cell):
+                    writer.writerow(row)
+                    count += 1
+
+    write_atomically(path, write)
     return count
 
 

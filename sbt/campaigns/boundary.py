@@ -25,7 +25,7 @@ _GREEDY = {"u": boundary, "straddle": straddle, "expected_feasibility": expected
 def recipe(settings: Settings) -> Campaign:
     """Return the campaign: even first, then batches from the acquisition's region of interest.
 
-    The acquisition decides how: `mix` (a hunt where critical runs are rare, representative of a_BI,
+    The acquisition decides how: `mix` (exploration where critical runs are rare, representative of a_BI,
     greedy, space filling), `u`, `straddle` and `expected_feasibility` greedily, any acquisition function
     by rejection (`boundary`: the paper's).
 

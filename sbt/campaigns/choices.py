@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from sbt.acquisitions import boundary, even
-from sbt.campaigns.hunt import HUNTED, SHARE, hunt, is_on
+from sbt.campaigns.exploration import EXPLORATION_SHARE, EXPLORED, explore, should_explore
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
-from sbt.loop.learner import Belief
+from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.samplers.greedy import diverse, influence, refined, representative
+from sbt.samplers.greedy import influence_on_mean, refine_diverse, select_diverse, select_representative
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.smc import smc
@@ -33,7 +33,7 @@ _POSITION = "next_position"
 _FEW = 2**14  # candidates that the mix looks at by rejection before it turns to particles
 _CANDIDATES = 4096
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
-_TYPICAL = 0.8  # share of what neither hunts nor fills the space; the rest is chosen greedily
+_TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
 
 
@@ -45,17 +45,17 @@ class Chosen:
     how: Mapping[str, Any]
 
 
-Choice = Callable[[Settings, Belief | None, Log, int], Chosen]
+Choice = Callable[[Settings, FittedMetamodel | None, Log, int], Chosen]
 
 
-def evenly(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
+def evenly(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return the next n points of the Sobol sequence, or of a table's random order."""
     del belief
     draw, x = _draw(settings, None, even, log, n)
     return Chosen(x, _how(draw))
 
 
-def from_roi(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
+def from_roi(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return n points with a density proportional to the acquisition, by rejection from the Sobol sequence.
 
     Where that takes more than half a million candidates the points are particles of a sequential Monte
@@ -69,7 +69,7 @@ def from_roi(settings: Settings, belief: Belief | None, log: Log, n: int) -> Cho
     return Chosen(x, _how(draw))
 
 
-def greedily(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
+def greedily(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return the n candidates of the highest acquisition that are far from each other and from earlier runs."""
     if belief is None:
         return evenly(settings, belief, log, n)
@@ -83,17 +83,17 @@ def greedily(settings: Settings, belief: Belief | None, log: Log, n: int) -> Cho
     return Chosen(np.concatenate([x, rest]), how)
 
 
-def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen:
-    """Return a batch of parts: a hunt where critical runs are rare, representative, greedy and space-filling runs.
+def mixed(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
+    """Return a batch of parts: exploration where critical runs are rare, representative, greedy and space-filling runs.
 
     Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
     least doubt far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
     nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
-    less than 1 % of the space is believed critical, half of the batch hunts first (see `hunt`).
+    less than 1 % of the space is believed critical, half of the batch explores first (see `explore`).
     """
     if belief is None:
         return evenly(settings, belief, log, n)
-    looking = hunt(settings, log, _rounded(SHARE * n, log) if is_on(settings, belief, log) else 0)
+    looking = explore(settings, log, _rounded(EXPLORATION_SHARE * n, log) if should_explore(settings, belief, log) else 0)
     filling = min(_rounded(max(_FILLING - settings.share, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, belief, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
@@ -106,23 +106,23 @@ def mixed(settings: Settings, belief: Belief | None, log: Log, n: int) -> Chosen
         so_far = np.concatenate([so_far, more])
     how = {
         "method": "mix", "random": second.method, "candidates": second.candidates + looked,
-        "acceptance": second.acceptance, _POSITION: last.next_position, HUNTED: len(looking), "filling": len(fill),
+        "acceptance": second.acceptance, _POSITION: last.next_position, EXPLORED: len(looking), "filling": len(fill),
         "representative": len(typical), "greedy": len(greedy),
     }  # fmt: skip
     return Chosen(so_far, how)
 
 
 def _typical(
-    settings: Settings, belief: Belief, log: Log, n: int, taken: Points, start: int
+    settings: Settings, belief: FittedMetamodel, log: Log, n: int, taken: Points, start: int
 ) -> tuple[RoiDraw, Points]:
     """Return a draw from a_BI, and the n of its points that represent it best beside the runs there are."""
     space = settings.scenario.space
     drawn = max(n, min(_DRAWN + 2 * n, _MOST_DRAWN)) if n else 0
     draw, x = _draw(settings, belief, boundary, log, drawn, taken=taken, start=start, most=_FEW)
     u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.history.x, taken])))
-    scale = influence(belief.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
+    scale = influence_on_mean(belief.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
     weight = np.exp(_score(settings, belief, boundary)(u))  # a_BI once more: sharper than it was drawn
-    return draw, x[representative(u, weight, there, n, scale)]
+    return draw, x[select_representative(u, weight, there, n, scale)]
 
 
 def _rounded(wanted: float, log: Log) -> int:
@@ -141,7 +141,7 @@ def _position(log: Log) -> int:
     return int(log.iterations[-1][_POSITION]) if log.iterations else 0
 
 
-def _score(settings: Settings, belief: Belief | None, acquisition: Acquisition) -> Callable[[Points], Vector]:
+def _score(settings: Settings, belief: FittedMetamodel | None, acquisition: Acquisition) -> Callable[[Points], Vector]:
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
 
     def score(u: Points) -> Vector:
@@ -158,7 +158,7 @@ def _admissible(settings: Settings) -> Callable[[Points], Mask] | None:
 
 
 def _draw(
-    settings: Settings, belief: Belief | None, acquisition: Acquisition, log: Log, n: int, *,
+    settings: Settings, belief: FittedMetamodel | None, acquisition: Acquisition, log: Log, n: int, *,
     taken: Points | None = None, start: int | None = None, most: int = 2**19,
 ) -> tuple[RoiDraw, Points]:  # fmt: skip
     """Return n points drawn by an acquisition, and their values exactly as recorded where they are.
@@ -226,21 +226,21 @@ def _rows(settings: Settings, log: Log, taken: Points | None) -> PoolSequence:
 
 
 def _greedy(
-    settings: Settings, belief: Belief, acquisition: Acquisition, log: Log, n: int, taken: Points
+    settings: Settings, belief: FittedMetamodel, acquisition: Acquisition, log: Log, n: int, taken: Points
 ) -> tuple[Points, int]:
     """Return up to n points in the inputs' units, and the number of candidates looked at."""
     scenario, space = settings.scenario, settings.scenario.space
     rng = stream(settings.seed, "greedy", log.iteration)
     score, admissible = _score(settings, belief, acquisition), _admissible(settings)
-    scale = influence(belief.predict, space.dimension, rng)
+    scale = influence_on_mean(belief.predict, space.dimension, rng)
     there = np.clip(space.to_unit(np.concatenate([log.history.x, taken])), 0.0, 1.0)
     if scenario.pool is not None:
         rows = _rows(settings, log, taken)
         u = rows.points(0, len(rows))
-        picks = diverse(u, score(u), there, n, scale)
+        picks = select_diverse(u, score(u), there, n, scale)
         return scenario.pool.x[rows.rows[picks]], len(u)
-    u, value = refined(score, rng.random((_CANDIDATES, space.dimension)), scale, rng)
+    u, value = refine_diverse(score, rng.random((_CANDIDATES, space.dimension)), scale, rng)
     u = np.clip(space.to_unit(space.from_unit(u)), 0.0, 1.0)  # integers are what will be run
     if admissible is not None:
         value = np.where(admissible(u), value, -np.inf)
-    return space.from_unit(u[diverse(u, value, there, n, scale)]), len(u)
+    return space.from_unit(u[select_diverse(u, value, there, n, scale)]), len(u)

@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
-from sbt.estimators.intervals import Counted
+from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Vector
 
@@ -19,7 +19,7 @@ DRAWN = "estimation"
 _DENIED = 0.01
 
 
-def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = False) -> list[Counted]:
+def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = False) -> list[CountedBatch]:
     """Return the batches that count, with their outcomes; failed runs count as stated.
 
     Raises:
@@ -37,7 +37,7 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
             continue  # a batch counts only when it is complete
         if any(log.history.records[k].log_q is None for k in rows):
             raise InputError("an estimate needs runs with a known proposal density, but a counted run has none")
-        found.append(Counted(
+        found.append(CountedBatch(
             how["prior"], how["anticipated"], how["pool_variance"], np.array(how["coefficient"]), np.array(how["believed"]),
             critical[rows].astype(np.float64),
         ))  # fmt: skip

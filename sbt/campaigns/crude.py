@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.campaigns.parts import Settings
-from sbt.estimators.monte_carlo import Share
-from sbt.estimators.subset import Repeat
+from sbt.estimators.monte_carlo import Proportion
+from sbt.estimators.subset import SubsetRun
 from sbt.loop.stages import Batch, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.space import ParameterSpace
@@ -72,7 +72,7 @@ class SubsetStage:
         runs: list[PlannedRun] = []
         for k, repeat in enumerate(repeats_of(log, s)):
             if not repeat.finished:
-                z = repeat.asked(stream(s.seed, "subset", k, log.iteration))
+                z = repeat.ask(stream(s.seed, "subset", k, log.iteration))
                 stage = "subset level 0" if repeat.levels == 0 else "subset"
                 x = space.from_normal(z)
                 log_q = space.log_density(x) if repeat.levels == 0 and not space.constraints else None
@@ -80,21 +80,21 @@ class SubsetStage:
         return Batch(tuple(runs), {"method": "subset", "phase": "subset"})
 
 
-def repeats_of(log: Log, settings: Settings) -> list[Repeat]:
+def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:
     """Return where the repeats stand, replayed from the log: their draws belong to the seed, the metrics are there."""
     requirement, space = settings.scenario.requirement, settings.scenario.space
     level = max(settings.budget // (4 * _REPEATS) // 10, 2) * 10
     if settings.budget < _REPEATS * level:
         level = max(settings.budget // _REPEATS, 1)
-    repeats = [Repeat(level, space.dimension) for _ in range(_REPEATS)]
+    repeats = [SubsetRun(level, space.dimension) for _ in range(_REPEATS)]
     margin = requirement.critical.margin(log.history.y(requirement.metric))
     for how in log.iterations:
         rows, start = np.flatnonzero(log.history.iteration == how["iteration"]), 0
         for k, repeat in enumerate(repeats):
             if not repeat.finished:
-                z = repeat.asked(stream(settings.seed, "subset", k, how["iteration"]))
+                z = repeat.ask(stream(settings.seed, "subset", k, how["iteration"]))
                 told = _outcomes(margin[rows[start : start + len(z)]], z, space)
-                repeats[k], start = repeat.told(z, told), start + len(z)
+                repeats[k], start = repeat.tell(z, told), start + len(z)
     return repeats
 
 
@@ -102,7 +102,7 @@ def _outcomes(margin: Vector, z: Points, space: ParameterSpace) -> Vector:
     return np.where(space.feasible(space.from_normal(z)), margin, np.inf) if space.constraints else margin
 
 
-def _width(repeat: Repeat) -> int:
+def _width(repeat: SubsetRun) -> int:
     return repeat.n if repeat.levels == 0 else len(repeat.front)
 
 
@@ -114,9 +114,9 @@ def _runs(space: ParameterSpace, x: Points, stage: str, log_q: Vector | None) ->
     )
 
 
-def law_share(log: Log, settings: Settings, stage: str = _LAW) -> Share:
+def law_share(log: Log, settings: Settings, stage: str = _LAW) -> Proportion:
     """Return the hits among the runs of a stage that were drawn from the law."""
     requirement = settings.scenario.requirement
     runs = log.history.where(log.history.stage == stage)
     hits = int(requirement.critical.contains(runs.y(requirement.metric)).sum())
-    return Share(len(runs), hits, int((~runs.ok).sum()))
+    return Proportion(len(runs), hits, int((~runs.ok).sum()))

@@ -7,12 +7,12 @@ from typing import Any
 
 from sbt.campaigns.counting import Seen, counted_batches, drawn_shares
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, law_share, repeats_of
-from sbt.campaigns.gate import Limits, decided
+from sbt.campaigns.gate import Limits, gate_verdict
 from sbt.campaigns.parts import Settings
 from sbt.campaigns.sequential import FEWEST_BATCHES, SequentialStage
 from sbt.errors import InputError
-from sbt.estimators.intervals import FEWEST_HITS, Counted, combined, few_hits_bound
-from sbt.estimators.subset import spread_of
+from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates, few_hits_bound
+from sbt.estimators.subset import combine_repeats
 from sbt.loop.stages import Campaign, Fit, Log, Stage
 
 __all__ = ["recipe"]
@@ -57,7 +57,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Any) -> Campaign:
                 f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
             ))  # fmt: skip
         if settings.gate is not None:
-            found["gate"] = decided(limits, **settings.gate)
+            found["gate"] = gate_verdict(limits, **settings.gate)
         return found, None
 
     return Campaign((stage,), conclude)
@@ -79,7 +79,7 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
     safe, critical = counted_batches(log, settings), counted_batches(log, settings, failed_critical=True)
     if not safe:
         return _uncounted(log, settings)
-    low, high, seen = combined(safe), combined(critical), Seen.of(log, settings)
+    low, high, seen = combine_estimates(safe), combine_estimates(critical), Seen.of(log, settings)
     hits, misses = _hits(safe), sum(len(b.critical) for b in critical) - _hits(critical)
     counted = drawn_shares(log)
     undetected = few_hits_bound(seen.surprises, counted, _CONFIDENCE)
@@ -116,12 +116,12 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
     ), limits  # fmt: skip
 
 
-def _convergence(log: Log, safe: list[Counted], critical: list[Counted]) -> list[dict[str, float]]:
+def _convergence(log: Log, safe: list[CountedBatch], critical: list[CountedBatch]) -> list[dict[str, float]]:
     """Return estimate and interval after each counted batch but the first, whose spread is not known."""
     counted = [how["iteration"] for how in log.iterations if how.get("phase") == "count"]
     tail, steps = 0.5 * (1.0 + _CONFIDENCE), []
     for k in range(2, len(safe) + 1):
-        low, high = combined(safe[:k]), combined(critical[:k])
+        low, high = combine_estimates(safe[:k]), combine_estimates(critical[:k])
         runs = int((log.history.iteration <= counted[k - 1]).sum())
         steps.append({
             "runs": runs, "probability": _clipped(low.value), "low": low.limit(tail, side=-1), "high": high.limit(tail, side=1)
@@ -173,7 +173,7 @@ def _from_repeats(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
         )
         rest = {"exact_bound": limits.upper(_CONFIDENCE)} if hits == 0 else {}
         return _conclusion(None, limits, hits=hits, undetected_mass_bound=undetected, warnings=[told], **rest), limits
-    found = spread_of([r.share for r in repeats])
+    found = combine_repeats([r.share for r in repeats])
     if found.value == 0.0:
         limits = Limits(lambda _: 0.0, first.upper)
         told = _NOTHING + "; subset simulation came to a level from which no run got lower"
@@ -194,5 +194,5 @@ def _clipped(value: float) -> float:
     return min(max(value, 0.0), 1.0)
 
 
-def _hits(batches: list[Counted]) -> int:
+def _hits(batches: list[CountedBatch]) -> int:
     return int(sum(b.critical.sum() for b in batches))

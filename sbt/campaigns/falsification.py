@@ -12,14 +12,15 @@ from scipy.spatial.distance import cdist
 
 from sbt.campaigns.boundary import validation_of
 from sbt.campaigns.modes import Mode, described, modes_of
-from sbt.campaigns.parts import Settings, clopper_pearson, fit_of, held_out_runs, named_inputs
+from sbt.campaigns.parts import Settings, fit_of, held_out_runs, named_inputs
 from sbt.errors import InputError
+from sbt.estimators.binomial import upper
 from sbt.loop.stages import Batch, Campaign, Fit, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.samplers import evolution, portfolio
 from sbt.samplers.criteria import CRITERIA, propose_by
 from sbt.samplers.roi import rejection
-from sbt.samplers.search import Picks, Search, believe
+from sbt.samplers.search import Picks, Search, fit_warped
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
@@ -55,20 +56,20 @@ def recipe(settings: Settings) -> Campaign:
         raise InputError("campaign falsification needs a metamodel, but got none")
     if settings.method == "cma_es":
         evolution.require()
-    hunt = Hunt(settings)
+    failures = FailureSearch(settings)
 
     def conclude(log: Log) -> tuple[dict[str, Any], Fit | None]:
         belief = settings.learner.fit(log.history) if settings.learner is not None else None
-        conclusion = hunt.conclusion(log.history)
+        conclusion = failures.conclusion(log.history)
         conclusion["validation"] = None if belief is None else validation_of(belief.scores)
         return conclusion, fit_of(belief)
 
-    return Campaign((SearchStage(hunt), ConfirmStage(hunt)), conclude)
+    return Campaign((SearchStage(failures), ConfirmStage(failures)), conclude)
 
 
 @dataclass(frozen=True)
-class Hunt:
-    """A falsification as functions of its runs; both stages and the conclusion ask it.
+class FailureSearch:
+    """A search for failures as functions of its runs, shared by both stages and the conclusion.
 
     Args:
         settings: of the campaign.
@@ -112,12 +113,12 @@ class Hunt:
             only = int(ok[0])
             return [Mode((only,), only, only, None)]
         u, y = scenario.space.to_unit(history.x[ok]), history.y(scenario.requirement.metric)[ok]
-        belief = believe(self.search, u, y, stream(self.settings.seed, "modes", len(history)))
+        belief = fit_warped(self.search, u, y, stream(self.settings.seed, "modes", len(history)))
         return modes_of(belief, history, scenario)
 
     def conclusion(self, history: History) -> dict[str, Any]:
         """Return what was found; see `recipe`."""
-        searched, metric = sought(history), self.settings.scenario.requirement.metric
+        searched, metric = search_runs(history), self.settings.scenario.requirement.metric
         margin = self.margin(searched)
         hits = np.flatnonzero(margin <= 0)
         found = []
@@ -132,7 +133,7 @@ class Hunt:
         }  # fmt: skip
 
 
-def sought(history: History) -> History:
+def search_runs(history: History) -> History:
     """Return the runs of the search, without the confirmations."""
     return history.where(history.stage != CONFIRM)
 
@@ -146,17 +147,17 @@ def confirmations(history: History, inputs: Any) -> History:
 class SearchStage:
     """Batches towards the next distinct failure; the first one is evenly distributed."""
 
-    hunt: Hunt
+    failure_search: FailureSearch
     name: str = _SEARCH
 
     def stop(self, log: Log) -> str | None:
         """Return `failures` or `modes` once so many are found, `budget` once it is used up."""
-        s, runs = self.hunt.settings, sought(log.history)
-        critical = int((self.hunt.margin(runs) <= 0).sum())
+        s, runs = self.failure_search.settings, search_runs(log.history)
+        critical = int((self.failure_search.margin(runs) <= 0).sum())
         failures, modes = s.stop.get("failures"), s.stop.get("modes")
         if failures is not None and critical >= failures:
             return "failures"
-        if modes is not None and critical >= modes and len(self.hunt.modes(runs)) >= modes:
+        if modes is not None and critical >= modes and len(self.failure_search.modes(runs)) >= modes:
             return "modes"
         if log.iterations and len(runs) - s.reference >= s.budget:
             return "budget"
@@ -166,7 +167,7 @@ class SearchStage:
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch, the run of largest P(critical) first."""
-        s, first, runs = self.hunt.settings, not log.iterations, sought(log.history)
+        s, first, runs = self.failure_search.settings, not log.iterations, search_runs(log.history)
         spent, number = len(runs) - (0 if first else s.reference), self._number(log)
         size = min(s.initial if first else s.batch, s.budget - spent)
         start = int(log.iterations[-1][_POSITION]) if log.iterations else 0
@@ -188,17 +189,16 @@ class SearchStage:
 
     def _even(self, n: int, start: int) -> tuple[Points, int]:
         """Return the next n points of the campaign's Sobol sequence, and the position after them."""
-        s = self.hunt.settings
+        s = self.failure_search.settings
         space = s.scenario.space
         sobol = SobolSequence(space.dimension, s.seed)
-        draw = rejection(
-            lambda u: np.zeros(len(u)), sobol, n, start=start, seed=s.seed, label="even", accept_filter=self.hunt.search.feasible
-        )
+        feasible = self.failure_search.search.feasible
+        draw = rejection(lambda u: np.zeros(len(u)), sobol, n, start=start, seed=s.seed, label="even", accept_filter=feasible)
         return draw.u, draw.next_position
 
     def _guided(self, log: Log, runs: History, n: int) -> tuple[Points, dict[str, Any]]:
         """Return n points by the configured method, and what the log keeps of how."""
-        s, search = self.hunt.settings, self.hunt.search
+        s, search = self.failure_search.settings, self.failure_search.search
         space, requirement = s.scenario.space, s.scenario.requirement
         u, y = np.clip(space.to_unit(runs.x), 0.0, 1.0), runs.y(requirement.metric)
         rng = stream(s.seed, "search", self._number(log))
@@ -215,7 +215,7 @@ class SearchStage:
 
     def _evolved(self, runs: History, u: Points, n: int) -> Picks:
         """Return the next generation of CMA-ES, which starts at the best run of the even start."""
-        s, margin = self.hunt.settings, self.hunt.margin(runs)
+        s, margin = self.failure_search.settings, self.failure_search.margin(runs)
         begin = np.where(np.isfinite(margin) & (runs.iteration == 0), margin, np.inf)
         generations = [
             margin[(runs.iteration == k) & (runs.stage == _SEARCH)] for k in np.unique(runs.iteration[runs.stage == _SEARCH])
@@ -224,7 +224,7 @@ class SearchStage:
 
     def _scored(self, log: Log, n: int) -> Points:
         """Return n points drawn in proportion to the exponential of an acquisition function."""
-        s = self.hunt.settings
+        s = self.failure_search.settings
         if s.learner is None or s.acquisition is None:
             raise InputError("an acquisition function needs a metamodel, but got none")
         space, score = s.scenario.space, s.acquisition
@@ -236,13 +236,13 @@ class SearchStage:
             return score(belief.predict(u), s.scenario.requirement.critical, space.log_density(space.from_unit(u)))
 
         sobol = SobolSequence(space.dimension, s.seed + 1)  # not the one that fills space
-        feasible = self.hunt.search.feasible
+        feasible = self.failure_search.search.feasible
         start = 2**20 * log.iteration
         return rejection(scored, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=feasible).u
 
     def _snapped(self, parts: list[tuple[str, Points]], runs: History) -> list[PlannedRun]:
         """Return the runs of each part by its stage; where rows are recorded, the nearest one not taken yet."""
-        scenario = self.hunt.settings.scenario
+        scenario = self.failure_search.settings.scenario
         rows = [(stage, point) for stage, points in parts for point in points]
         if scenario.pool is None:
             return [PlannedRun(stage, named_inputs(scenario, scenario.space.from_unit(u[None])[0])) for stage, u in rows]
@@ -260,21 +260,21 @@ class SearchStage:
 class ConfirmStage:
     """Repeats each mode's representative with fresh seeds: is the failure one of the scenario, or of a seed?"""
 
-    hunt: Hunt
+    failure_search: FailureSearch
     name: str = CONFIRM
 
     def _missing(self, log: Log) -> list[PlannedRun]:
-        if self.hunt.settings.scenario.pool is not None:
+        if self.failure_search.settings.scenario.pool is not None:
             return []  # a recorded row cannot be repeated
-        runs, planned = sought(log.history), []
-        for mode in self.hunt.modes(runs)[:_MOST_CONFIRMED]:
+        runs, planned = search_runs(log.history), []
+        for mode in self.failure_search.modes(runs)[:_MOST_CONFIRMED]:
             inputs = runs.records[mode.representative].inputs
             planned += [PlannedRun(CONFIRM, inputs)] * (_REPEATS - len(confirmations(log.history, inputs)))
         return planned
 
     def stop(self, log: Log) -> str | None:
         """Return why the search was over, once the ten deepest modes are repeated."""
-        return None if self._missing(log) else SearchStage(self.hunt).stop(log)
+        return None if self._missing(log) else SearchStage(self.failure_search).stop(log)
 
     def propose(self, log: Log) -> Batch:
         """Return three runs a mode, beside the budget."""
@@ -295,11 +295,11 @@ def _bound(runs: History) -> dict[str, Any]:
     filling = runs.where(np.isin(runs.stage, _FILLING))
     n, failed = len(filling), int((~filling.ok).sum())
     drawn = int((filling.stage == VALIDATION).sum())
-    high = 1.0 - 0.05 ** (1.0 / n) if n else 1.0
+    high, with_failed = (float(upper(k, n, 0.95)) for k in (0, failed))
     return {
         "box_fraction": high, "confidence": 0.95, "space_filling_runs": n, "random_runs": drawn,
-        "box_fraction_random_runs": 1.0 - 0.05 ** (1.0 / drawn) if drawn else None, "failed_runs": failed,
-        "box_fraction_failed_as_critical": high if failed == 0 else clopper_pearson(failed, n, 0.9)[1],
+        "box_fraction_random_runs": float(upper(0, drawn, 0.95)) if drawn else None, "failed_runs": failed,
+        "box_fraction_failed_as_critical": with_failed,
     }  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Limits", "decided"]
+__all__ = ["Limits", "gate_verdict"]
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Limits:
     upper: Callable[[float], float]
 
 
-def decided(limits: Limits, *, probability: float, confidence: float) -> dict[str, Any]:
+def gate_verdict(limits: Limits, *, probability: float, confidence: float) -> dict[str, Any]:
     """Return the verdict: `pass`, `fail` or `undecided`, with the limits it rests on and a sentence.
 
     `pass`: the one-sided upper limit (failed runs as critical) is at most the threshold. `fail`: the one-sided

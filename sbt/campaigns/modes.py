@@ -13,7 +13,7 @@ from sbt.metrics.encounter import NAME as CONFLICT_TYPE
 from sbt.metrics.encounter import conflict_type_in_words
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
-from sbt.samplers.search import Belief
+from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
 
 __all__ = ["Mode", "connected", "described", "modes_of"]
@@ -43,7 +43,7 @@ class Mode:
     safe: int | None
 
 
-def connected(belief: Belief, u: Points, kind: Vector) -> NDArray[np.int64]:
+def connected(belief: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
 
     Args:
@@ -74,7 +74,7 @@ def connected(belief: Belief, u: Points, kind: Vector) -> NDArray[np.int64]:
     return group
 
 
-def modes_of(belief: Belief, history: History, scenario: LogicalScenario) -> list[Mode]:
+def modes_of(belief: WarpedModel, history: History, scenario: LogicalScenario) -> list[Mode]:
     """Return the failure modes, the one with the deepest run first.
 
     Args:

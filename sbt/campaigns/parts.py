@@ -9,11 +9,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.special import betaincinv
 
 from sbt.campaigns.choices import Choice, evenly
 from sbt.campaigns.settings import Settings
-from sbt.loop.learner import Belief, changed_share
+from sbt.estimators.binomial import interval
+from sbt.loop.learner import FittedMetamodel, changed_share
 from sbt.loop.stages import Batch, Fit, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
@@ -23,7 +23,7 @@ from sbt.store.database import PlannedRun
 from sbt.store.history import VALIDATION, History
 
 __all__ = [
-    "BatchStage", "Settings", "clopper_pearson", "critical_share", "fit_of", "held_out_runs", "named_inputs",
+    "BatchStage", "Settings", "critical_share", "fit_of", "held_out_runs", "named_inputs",
 ]  # fmt: skip
 
 
@@ -65,7 +65,7 @@ class BatchStage:
         if target is None or fit["expected_misclassified"] > target or not fit.get("n"):
             return False
         wrong = round(fit["error_rate"] * fit["n"])
-        return clopper_pearson(wrong, fit["n"])[0] <= target
+        return bool(interval(wrong, fit["n"])[0] <= target)
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
@@ -114,23 +114,9 @@ def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
     return {name: float(value) for name, value in zip(scenario.space.names, row, strict=True)}
 
 
-def fit_of(belief: Belief | None) -> Fit | None:
+def fit_of(belief: FittedMetamodel | None) -> Fit | None:
     """Return what the store keeps of a belief."""
     return None if belief is None else Fit({**belief.scores, "learned": belief.runs}, belief.seconds)
-
-
-def clopper_pearson(hits: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the exact binomial interval of a share.
-
-    Source:
-        Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
-    """
-    if n == 0:
-        return 0.0, 1.0
-    tail = (1 - confidence) / 2
-    low = 0.0 if hits == 0 else float(betaincinv(hits, n - hits + 1, tail))
-    high = 1.0 if hits == n else float(betaincinv(hits + 1, n - hits, 1 - tail))
-    return low, high
 
 
 def critical_share(history: History, scenario: LogicalScenario) -> dict[str, Any]:
@@ -142,6 +128,5 @@ def critical_share(history: History, scenario: LogicalScenario) -> dict[str, Any
     y = history.y(scenario.requirement.metric)
     hits, n, failed = int(scenario.requirement.critical.contains(y).sum()), len(history), int((~history.ok).sum())
     ok = n - failed
-    low, _ = clopper_pearson(hits, n)
-    _, high = clopper_pearson(hits + failed, n)
+    low, high = float(interval(hits, n)[0]), float(interval(hits + failed, n)[1])
     return {"critical_fraction": hits / ok if ok else None, "low": low, "high": high, "confidence": 0.95, "counted": n}

@@ -1,6 +1,6 @@
-"""The sequential estimator as a stage: hunt, learn, then count, every batch a function of the log.
+"""The sequential estimator as a stage: search, learn, then count, every batch a function of the log.
 
-A batch of the estimation has draws from a fresh pool, with known density, and hunting picks without
+A batch of the estimation has draws from a fresh pool, with known density, and search picks without
 one. Up to a stopping time the draws only teach; from then on they count, with weights fixed in advance.
 """
 
@@ -19,10 +19,10 @@ from threadpoolctl import threadpool_limits
 from sbt.campaigns.counting import DRAWN, counted_batches
 from sbt.campaigns.parts import Settings
 from sbt.errors import InputError
-from sbt.estimators.importance import BLIND, SHARES, Plan, chosen, planned
-from sbt.estimators.intervals import combined
-from sbt.estimators.mixture import Mixture, fitted, log_normal, particles, wide_scales
-from sbt.estimators.surrogate import Coordinates, LogProbability, learned
+from sbt.estimators.importance import BLIND, SHARES, Plan, draw_systematic, plan_batch
+from sbt.estimators.intervals import combine_estimates
+from sbt.estimators.mixture import Mixture, fit_mixture, log_normal, particles, wide_scales
+from sbt.estimators.surrogate import Coordinates, LogProbability, fit_log_probability
 from sbt.loop.stages import Batch, Log
 from sbt.metamodels.base import Metamodel
 from sbt.problem.arrays import Mask, Points, Vector
@@ -35,7 +35,7 @@ from sbt.store.history import History
 
 __all__ = ["FEWEST_BATCHES", "SequentialStage"]
 
-_HUNT, _LEARN = "hunt", "learn"
+_SEARCH_STAGE, _LEARN = "hunt", "learn"
 _POOL = 10_000
 _PARTICLES = 800
 _CANDIDATES = 6_000
@@ -46,7 +46,7 @@ _COMMON = 0.02
 _STALLED, _USABLE = 1.5, 0.5
 _LATEST = 0.6
 _FEWEST_LEARNED = 3
-_HUNTED_SHARE = (0.2, 0.1)
+_SEARCH_SHARE = (0.2, 0.1)
 _LOST, _MEMORY, _SURPRISE = 10.0, 4, 0.01
 FEWEST_BATCHES = 4
 """Batches that must count before a target is believed to be met."""
@@ -55,7 +55,7 @@ _TARGET = 0.02
 
 @dataclass(frozen=True)
 class SequentialStage:
-    """Hunts critical regions, learns them, then draws runs that count.
+    """Searches for critical regions, learns them, then draws runs that count.
 
     Source:
         the difference form, its defence, weights and interval: `sbt.estimators`.
@@ -80,7 +80,7 @@ class SequentialStage:
         target = s.stop.get("cov")
         counted = counted_batches(log, s)
         if target is not None and len(counted) >= FEWEST_BATCHES:
-            found = combined(counted)
+            found = combine_estimates(counted)
             hits = sum(float(b.critical.sum()) for b in counted)
             if hits >= 10 and found.value > 0 and found.std_error <= target * found.value:
                 return "cov"
@@ -98,10 +98,10 @@ class SequentialStage:
         size = min(s.batch, s.budget - len(log.history))
         known = _Known.of(log.history, self._coordinates, s)
         belief = known.learn(stream(s.seed, "fit", log.iteration))
-        modes = self._hunting(log, known, belief)
+        modes = self._modes_while_searching(log, known, belief)
         if modes is not None:
-            rows = self._hunt(known, log.iteration, size)
-            return Batch(self._runs(rows, _HUNT), {"method": "hunt", "phase": "hunt", "modes": modes})
+            rows = self._search_modes(known, log.iteration, size)
+            return Batch(self._runs(rows, _SEARCH_STAGE), {"method": "hunt", "phase": "hunt", "modes": modes})
         return self._drawn(log, known, belief, size)
 
     def _initial(self, n: int) -> Batch:
@@ -128,7 +128,7 @@ class SequentialStage:
             for row, density in zip(rows, densities, strict=True)
         )
 
-    def _hunting(self, log: Log, known: _Known, belief: LogProbability | None) -> int | None:
+    def _modes_while_searching(self, log: Log, known: _Known, belief: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
         It ends with 40 % of the budget, after two batches without a new mode, and where failures are common:
@@ -147,8 +147,8 @@ class SequentialStage:
         z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
         return belief is not None and float(np.exp(belief(z)[0]).mean()) > _COMMON
 
-    def _hunt(self, known: _Known, iteration: int, n: int) -> Points:
-        """Return n hunting picks (n, d): the falsification portfolio in the cube of the wide law, some spread evenly."""
+    def _search_modes(self, known: _Known, iteration: int, n: int) -> Points:
+        """Return n search picks (n, d): the falsification portfolio in the cube of the wide law, some spread evenly."""
         s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", iteration)
         even = round(_EVEN_SHARE * n)
         spread = rng.random((even, space.dimension))
@@ -166,7 +166,7 @@ class SequentialStage:
         return ndtri(np.clip(v, 1e-9, 1.0 - 1e-9)) * self._wide
 
     def _drawn(self, log: Log, known: _Known, belief: LogProbability | None, size: int) -> Batch:
-        """Return draws from a fresh pool, and hunting picks."""
+        """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         shares = BLIND if known.one_sided else SHARES
         pool = self._pooled(belief, known, shares, rng)
@@ -179,18 +179,18 @@ class SequentialStage:
             "earlier": earlier is not None,
         }  # fmt: skip
         counts = known.one_sided or self._counts(log, size)
-        hunted = min(round(_HUNTED_SHARE[counts] * size), size - 1)
-        n = size - hunted
-        picks = self._runs(self._hunt(known, log.iteration, hunted), _HUNT)
+        searched = min(round(_SEARCH_SHARE[counts] * size), size - 1)
+        n = size - searched
+        picks = self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)
         if not counts:
-            rows = chosen(plan, n, log_pi - log_not, rng).rows
+            rows = draw_systematic(plan, n, log_pi - log_not, rng).rows
             how = {"method": "doubt", "phase": "learn", **doubt}
             return Batch((*self._runs(z[rows], _LEARN, None), *picks), how)
-        draws = chosen(plan, n, log_pi - log_not, rng)
+        draws = draw_systematic(plan, n, log_pi - log_not, rng)
         log_q = s.scenario.space.log_density(x[draws.rows]) - np.log(draws.coefficient)
         how = {
             "method": plan.form, "phase": "count", "draws": n, **doubt, "pool_variance": plan.pool_variance,
-            "nominal": plan.nominal, "coefficient": draws.coefficient.tolist(), "believed": draws.believed.tolist(),
+            "nominal": plan.nominal, "coefficient": draws.coefficient.tolist(), "believed": draws.control_variate.tolist(),
             "pi": np.exp(log_pi[draws.rows]).tolist(),
         }  # fmt: skip
         return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), how)
@@ -207,7 +207,7 @@ class SequentialStage:
         log_wide = log_normal(z, self._wide) - mixture.log_density(z)
         unsure = np.full(len(z), np.log(0.5))
         log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
-        plan = planned(log_pi, log_not, log_w, log_wide, stratum, shares)
+        plan = plan_batch(log_pi, log_not, log_w, log_wide, stratum, shares)
         return _Pool(mixture, z, x, plan, log_pi, log_not)
 
     def _earlier(self, log: Log, known: _Known, doubt: float) -> LogProbability | None:
@@ -250,7 +250,7 @@ class SequentialStage:
             return log_normal(points) + 0.5 * (log_pi + log_not)
 
         clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, doubt))
-        return fitted(clouds, self._wide, rng)
+        return fit_mixture(clouds, self._wide, rng)
 
     def _counts(self, log: Log, size: int) -> bool:
         """Return whether this batch counts: from the stopping time on.
@@ -266,7 +266,7 @@ class SequentialStage:
             return True
         if len(drawn) < _FEWEST_LEARNED:
             return False
-        left = math.sqrt((1.0 - _HUNTED_SHARE[True]) * (s.budget - spent))
+        left = math.sqrt((1.0 - _SEARCH_SHARE[True]) * (s.budget - spent))
         doubts = [_relative(i["anticipated"], i["prior"]) / left for i in drawn[-3:]]
         if max(doubts) < _STALLED * min(doubts) and doubts[-1] < _USABLE:
             return True  # learning no longer pays
@@ -343,7 +343,7 @@ class _Known:
         if len(self.y) < 2:
             return None
         interval = self.settings.scenario.requirement.critical
-        return learned(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng)
+        return fit_log_probability(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng)
 
 
 def metamodel_of(settings: Settings) -> Metamodel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +13,7 @@ import typer
 
 from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
 from sbt.errors import InputError
+from sbt.files import write_atomically
 
 if TYPE_CHECKING:
     from sbt.config.load import Loaded
@@ -239,14 +240,14 @@ def export(
 
 def _as_csv(store: Store) -> Path:
     """Write one row a run."""
-    return _written(store.folder / "exports" / "runs.csv", lambda part: store.history().to_frame().to_csv(part, index=False))
+    frame = store.history().to_frame()
+    return write_atomically(store.folder / "exports" / "runs.csv", lambda part: frame.to_csv(part, index=False))
 
 
 def _as_parquet(store: Store) -> Path:
     """Write one row a run."""
-    return _written(
-        store.folder / "exports" / "runs.parquet", lambda part: store.history().to_frame().to_parquet(part, index=False)
-    )
+    frame = store.history().to_frame()
+    return write_atomically(store.folder / "exports" / "runs.parquet", lambda part: frame.to_parquet(part, index=False))
 
 
 def _as_boundary(store: Store) -> Path:
@@ -259,16 +260,7 @@ def _as_boundary(store: Store) -> Path:
     loaded = loaded_from(store)
     settings = settings_of(loaded, assembly_of(loaded))
     points = pd.DataFrame(boundary_points(settings, store.history()), columns=list(settings.scenario.space.names))
-    return _written(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
-
-
-def _written(path: Path, write: Callable[[Path], None]) -> Path:
-    """Write a file as a whole or not at all."""
-    path.parent.mkdir(exist_ok=True)
-    part = path.with_suffix(".part")
-    write(part)
-    part.replace(path)
-    return path
+    return write_atomically(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
 
 
 def _as_data_set(store: Store) -> Path:

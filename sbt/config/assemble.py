@@ -20,7 +20,7 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.recalibrated import Recalibrated
 from sbt.plugins import load
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 
 __all__ = ["Assembly", "acquisition_of", "assemble", "metamodel_of", "scenario_of", "spec_of"]
@@ -134,7 +134,7 @@ def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) 
     """Return the scenario's requirement with the configured metric and interval."""
     change, own = loaded.config.requirement, scenario.requirement
     if change.stl is not None:
-        return own if change.critical is None else Requirement(own.metric, CriticalInterval(*change.critical))
+        return own if change.critical is None else Requirement(own.metric, *change.critical)
     metric = own.metric if change.metric is None else change.metric
     if metric not in scenario.measured:
         problems.add(("requirement", "metric"), must_be_one_of("a metric", metric, scenario.measured))
@@ -142,7 +142,7 @@ def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) 
     if change.critical is None and metric != own.metric:
         problems.add(("requirement",), f"critical: [low, high] is required with the metric {metric}")
         return own
-    return Requirement(metric, own.critical if change.critical is None else CriticalInterval(*change.critical))
+    return Requirement(metric, *((own.low, own.high) if change.critical is None else change.critical))
 
 
 def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:

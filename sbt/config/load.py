@@ -15,7 +15,6 @@ import io
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
@@ -24,6 +23,7 @@ from pydantic import BaseModel, ValidationError
 
 from sbt.config.model import Configuration
 from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
+from sbt.errors import did_you_mean
 
 __all__ = [
     "ConfigError", "Loaded", "checked", "differences", "dump", "fingerprint", "load", "located", "parse", "read_text", "resolve",
@@ -234,8 +234,7 @@ def _problem(error: Any, model: type[BaseModel]) -> tuple[Key, str, bool]:
 
 def _unknown_key(path: Key, model: type[BaseModel]) -> str:
     known = _keys_at(path[:-1], model)
-    near = get_close_matches(str(path[-1]), known, 1)
-    return f"unknown key (did you mean '{near[0]}'?)" if near else f"unknown key; the keys here are {', '.join(known)}"
+    return "unknown key" + (did_you_mean(str(path[-1]), known) or f"; the keys here are {', '.join(known)}")
 
 
 def _keys_at(path: Key, model: type[BaseModel]) -> list[str]:

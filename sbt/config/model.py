@@ -6,10 +6,10 @@ name, low < high) are checked in `sbt.config.assemble`, everything else here.
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Callable
-from difflib import get_close_matches
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 from sbt.config.campaigns import CAMPAIGNS, CampaignKind
+from sbt.errors import did_you_mean
 from sbt.problem.expression import Expression
 from sbt.problem.requirement import CriticalInterval
 
@@ -46,9 +47,7 @@ def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
     def check(value: str) -> str:
         if value in choices:
             return value
-        near = get_close_matches(value, choices, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{hint}")
+        raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{did_you_mean(value, choices)}")
 
     return check
 
@@ -268,11 +267,18 @@ def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
     return AcquisitionChoice(kind=CAMPAIGNS[data["campaign"]].acquisition)
 
 
+def _shown(settings: Mapping[str, Any]) -> str:
+    """Return settings as they are written in YAML."""
+    return "{" + ", ".join(f"{key}: {json.dumps(value).strip(chr(34))}" for key, value in settings.items()) + "}"
+
+
 class Configuration(_Strict):
     """A campaign: what is asked, of which scenario, with how many runs."""
 
     campaign: CampaignName = Field(description="; ".join(f"{name}: {kind.description}" for name, kind in CAMPAIGNS.items()))
-    scenario: Name = Field(description="An installed scenario, or file.py:NAME (relative to the configuration file).")
+    scenario: Name = Field(
+        description="An installed scenario, or file.py:NAME or scenario.yaml (relative to the configuration file)."
+    )
     requirement: RequirementChange = Field(
         default=RequirementChange(), description="What is critical; default: the scenario's own."
     )
@@ -304,12 +310,13 @@ class Configuration(_Strict):
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
         default_factory=_metamodel,
-        description="What learns the safety metric; default: gp with nu 2.5 and one noise; coverage: none.",
+        description="What learns the safety metric; default: "
+        + "; ".join(f"{name}: {_shown(kind.metamodel) if kind.adaptive else 'none'}" for name, kind in CAMPAIGNS.items()),
     )
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,
-        description="How runs are chosen; default: mix for boundary, portfolio for falsification, "
-        "difference for estimation, even for coverage.",
+        description="How runs are chosen; default: "
+        + "; ".join(f"{name}: {kind.acquisition}" for name, kind in CAMPAIGNS.items()),
     )
     stop: StopRules = Field(
         default_factory=StopRules, validate_default=True, description="When to stop before the budget is used up."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -14,10 +13,10 @@ from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, law_of
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
@@ -84,7 +83,7 @@ class _Builder:
         problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
         return LogicalScenario(
-            name, space or ParameterSpace(()), requirement or Requirement("", CriticalInterval(high=0.0)), simulation, metrics,
+            name, space or ParameterSpace(()), requirement or Requirement("", high=0.0), simulation, metrics,
             model.description, roles=Roles(model.ego.id, None),
         )  # fmt: skip
 
@@ -138,11 +137,9 @@ class _Builder:
     def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> EgoVehicle | None:
         if files is not None and self._model.simulate is None and files.vehicle(entry.id) is None:
             names = files.names()
-            near = get_close_matches(entry.id, names, 1)
-            hint = f" (did you mean '{near[0]}'?)" if near else ""
             known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
             rule = f"the ego must be a vehicle, trip or flow of the files ({known})"
-            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{hint}")
+            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{did_you_mean(entry.id, names)}")
         kind = entry.kind
         if kind is None:
             if entry.settings:
@@ -173,13 +170,13 @@ class _Builder:
         wanted, problems = self._model.requirement, self._problems
         names = [m.name for m in metrics]
         if wanted.stl is not None:
-            return Requirement("stl", CriticalInterval(*(wanted.critical or (-math.inf, 0.0))))
+            return Requirement("stl", *(wanted.critical or (-math.inf, 0.0)))
         if wanted.metric is None or wanted.critical is None:
             problems.add(("requirement",), "a requirement must have a metric and critical: [low, high]")
             return None
         if wanted.metric not in names and len(names) == len(self._model.metrics):
             problems.add(("requirement", "metric"), must_be_one_of("a metric", wanted.metric, names))
-        return Requirement(wanted.metric, CriticalInterval(*wanted.critical))
+        return Requirement(wanted.metric, *wanted.critical)
 
     def _check_inputs(self, files: SumoFiles) -> None:
         """Compare placeholders and inputs."""

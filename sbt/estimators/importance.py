@@ -19,7 +19,7 @@ import numpy as np
 
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["SHARES", "Draws", "Plan", "chosen", "planned"]
+__all__ = ["SHARES", "Draws", "Plan", "draw_systematic", "plan_batch"]
 
 SHARES = (0.78, 0.05, 0.05, 0.12)
 """Of the draws: in proportion to doubt, to the nominal law, to the pool, to the wide law."""
@@ -34,7 +34,7 @@ class Plan:
     Attributes:
         form: "difference" or "meta" (Meta-IS).
         probability: (N,) r, the probability of each pool point, sum 1.
-        believed: (N,) pi as the correction uses it: 0 for Meta-IS.
+        control_variate: (N,) pi as the correction uses it: 0 for Meta-IS.
         weight: (N,) w / N.
         prior: the first sum: what the metamodel thinks; 0 for Meta-IS.
         anticipated: variance of one draw if the metamodel is right.
@@ -44,7 +44,7 @@ class Plan:
 
     form: str
     probability: Vector
-    believed: Vector
+    control_variate: Vector
     weight: Vector
     prior: float
     anticipated: float
@@ -58,10 +58,10 @@ class Draws:
 
     rows: Vector
     coefficient: Vector
-    believed: Vector
+    control_variate: Vector
 
 
-def planned(
+def plan_batch(
     log_pi: Vector, log_not: Vector, log_w: Vector, log_wide: Vector, stratum: Vector, shares: tuple[float, ...] = SHARES
 ) -> Plan:
     """Return the plan of smaller anticipated variance, the difference form or Meta-IS.
@@ -117,7 +117,7 @@ def _stratified_variance(values: Vector, stratum: Vector) -> float:
     return total / n**2
 
 
-def chosen(plan: Plan, n: int, order: Points, rng: np.random.Generator) -> Draws:
+def draw_systematic(plan: Plan, n: int, order: Points, rng: np.random.Generator) -> Draws:
     """Return n draws, systematic with probabilities r along an order of the pool.
 
     Every pool point is expected n r times, exactly; neighbours in the order are not drawn together more
@@ -133,4 +133,4 @@ def chosen(plan: Plan, n: int, order: Points, rng: np.random.Generator) -> Draws
     edges = np.cumsum(plan.probability[rows])
     at = (np.arange(n) + rng.random()) / n * edges[-1]
     drawn = rows[np.minimum(np.searchsorted(edges, at, side="right"), len(rows) - 1)]
-    return Draws(drawn, plan.weight[drawn] / plan.probability[drawn], plan.believed[drawn])
+    return Draws(drawn, plan.weight[drawn] / plan.probability[drawn], plan.control_variate[drawn])

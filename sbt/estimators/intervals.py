@@ -11,19 +11,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaincinv, stdtrit
+from scipy.special import stdtrit
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Vector
 
-__all__ = ["Combined", "Counted", "binomial_upper", "combined", "few_hits_bound", "undetected_mass"]
+__all__ = ["CombinedEstimate", "CountedBatch", "combine_estimates", "few_hits_bound", "undetected_mass"]
 
 FEWEST_HITS = 10
 """Critical runs below which there is a one-sided bound instead of an interval."""
 
 
 @dataclass(frozen=True, eq=False)
-class Counted:
+class CountedBatch:
     """A batch that counts, with its outcomes.
 
     Args:
@@ -31,7 +31,7 @@ class Counted:
         anticipated: variance of one draw if the metamodel is right.
         pool_variance: of the batch through its pool.
         coefficient: (n,) w / (N r) of the draws.
-        believed: (n,) pi of the draws, as the correction subtracts it.
+        control_variate: (n,) pi of the draws, as the correction subtracts it.
         critical: (n,) 1 where the run was critical, else 0.
     """
 
@@ -39,24 +39,24 @@ class Counted:
     anticipated: float
     pool_variance: float
     coefficient: Vector
-    believed: Vector
+    control_variate: Vector
     critical: Vector
 
     @property
     def value(self) -> float:
         """Estimate of this batch alone; may be negative."""
-        return self.prior + float((self.coefficient * (self.critical - self.believed)).mean())
+        return self.prior + float((self.coefficient * (self.critical - self.control_variate)).mean())
 
     @property
     def variance(self) -> float:
         """The larger of realised and anticipated variance, plus the pool's."""
-        n, terms = len(self.critical), self.coefficient * (self.critical - self.believed)
+        n, terms = len(self.critical), self.coefficient * (self.critical - self.control_variate)
         realised = float(terms.var(ddof=1)) / n if n > 1 else math.inf
         return max(realised, self.anticipated / n) + self.pool_variance
 
 
 @dataclass(frozen=True)
-class Combined:
+class CombinedEstimate:
     """An estimate from all counted batches.
 
     Attributes:
@@ -79,7 +79,7 @@ class Combined:
         return min(max(self.value + side * reach, 0.0), 1.0)
 
 
-def combined(batches: Sequence[Counted]) -> Combined:
+def combine_estimates(batches: Sequence[CountedBatch]) -> CombinedEstimate:
     """Return the estimate with weights sqrt(t) n_t, t = 1 for the first batch that counts.
 
     Source:
@@ -99,19 +99,10 @@ def combined(batches: Sequence[Counted]) -> Combined:
     between = float((c**2) @ (values - value) ** 2) / (1.0 - share) if len(batches) > 1 else 0.0
     weights = np.concatenate([ct / len(b.critical) * b.coefficient for ct, b in zip(c, batches, strict=True)])
     total = float(weights.sum())
-    return Combined(
+    return CombinedEstimate(
         value, math.sqrt(max(own, between)), max(1.0 / share - 1.0, 1.0),
         total**2 / float((weights**2).sum()) if total > 0 else 0.0, float(weights.max()) / total if total > 0 else 1.0,
     )  # fmt: skip
-
-
-def binomial_upper(hits: int, n: int, confidence: float) -> float:
-    """Return the exact one-sided upper limit of a share after `hits` of n.
-
-    Source:
-        Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
-    """
-    return 1.0 if hits >= n else float(betaincinv(hits + 1, n - hits, confidence))
 
 
 def few_hits_bound(hits: int, nominal: Vector, confidence: float) -> float:

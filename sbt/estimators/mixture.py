@@ -16,7 +16,7 @@ from scipy.special import gammainccinv, logsumexp
 
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["Mixture", "Normals", "fitted", "log_normal", "particles", "wide_scales"]
+__all__ = ["Mixture", "Normals", "fit_mixture", "log_normal", "particles", "wide_scales"]
 
 LogTarget = Callable[[Points], Vector]
 _TAIL = 1e-4
@@ -161,7 +161,7 @@ def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: 
     return z
 
 
-def fitted(clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generator, inflate: float = 1.25) -> Mixture:
+def fit_mixture(clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generator, inflate: float = 1.25) -> Mixture:
     """Return the mixture whose normals are fitted to each cloud of particles, equal shares, by EM and BIC.
 
     Args:

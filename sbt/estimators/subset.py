@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["LEVEL_SHARE", "Repeat", "Spread", "spread_of"]
+__all__ = ["LEVEL_SHARE", "RepeatedEstimate", "SubsetRun", "combine_repeats"]
 
 LEVEL_SHARE = 0.1
 """Share of a level's points that seeds the next one."""
@@ -27,8 +27,8 @@ _AIM = 0.44
 
 
 @dataclass(frozen=True, eq=False)
-class Repeat:
-    """One subset simulation, at whatever point: a value; `asked` and `told` take it one step further.
+class SubsetRun:
+    """One subset simulation, at whatever point: a value; `ask` and `tell` take it one step further.
 
     Args:
         n: points a level; a multiple of 10.
@@ -55,14 +55,14 @@ class Repeat:
     levels: int = 0
     finished: bool = False
 
-    def asked(self, rng: np.random.Generator) -> Points:
+    def ask(self, rng: np.random.Generator) -> Points:
         """Return the points to run next: all of the first level, then one step of every chain."""
         if self.levels == 0:
             return rng.standard_normal((self.n, self.dimension))
         keep = math.sqrt(1.0 - self.spread**2)
         return keep * self.front + self.spread * rng.standard_normal(self.front.shape)
 
-    def told(self, z: Points, margin: Vector) -> Repeat:
+    def tell(self, z: Points, margin: Vector) -> SubsetRun:
         """Return the repeat after the runs it asked for; NaN margins (failed runs) are never accepted."""
         if self.levels == 0:
             return replace(self, z=z, margin=np.where(np.isnan(margin), np.inf, margin))._next()
@@ -76,7 +76,7 @@ class Repeat:
         )  # fmt: skip
         return grown._next() if len(grown.z) >= self.n else grown
 
-    def _next(self) -> Repeat:
+    def _next(self) -> SubsetRun:
         """Return the repeat at the start of the next level, or finished."""
         hits = int((self.margin <= 0).sum())
         seeds = max(round(LEVEL_SHARE * self.n), 1)
@@ -94,7 +94,7 @@ class Repeat:
 
 
 @dataclass(frozen=True)
-class Spread:
+class RepeatedEstimate:
     """Mean of independent repeats with the t interval of their spread."""
 
     value: float
@@ -107,7 +107,7 @@ class Spread:
         return min(max(self.value + side * reach, 0.0), 1.0)
 
 
-def spread_of(values: Sequence[float]) -> Spread:
+def combine_repeats(values: Sequence[float]) -> RepeatedEstimate:
     """Return the mean of at least two independent estimates with its standard error."""
     v = np.asarray(values, dtype=np.float64)
-    return Spread(float(v.mean()), float(v.std(ddof=1)) / math.sqrt(len(v)), len(v))
+    return RepeatedEstimate(float(v.mean()), float(v.std(ddof=1)) / math.sqrt(len(v)), len(v))

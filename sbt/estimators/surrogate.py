@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.metamodels.base import Metamodel, about
+from sbt.metamodels.base import Metamodel, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["Coordinates", "LogProbability", "learned"]
+__all__ = ["Coordinates", "LogProbability", "fit_log_probability"]
 
 LogProbability = Callable[[Points], tuple[Vector, Vector]]
 """(n, d) normal scores to (n,) log P(critical) and (n,) log P(uncritical)."""
@@ -55,13 +55,13 @@ class Coordinates:
         return np.column_stack([own, self.space.metamodel_inputs(u)[:, self.space.dimension :]])
 
 
-def learned(
+def fit_log_probability(
     metamodel: Metamodel, coordinates: Coordinates, critical: CriticalInterval, z: Points, y: Vector, rng: np.random.Generator
 ) -> LogProbability:
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,)."""
     u, warp = coordinates(z), Warp.about(y, critical, quantile=0.5)
     t, inside = warp.values(y), warp.interval(critical)
-    plain = about(metamodel, inside).fit(u, t, rng)
+    plain = with_target(metamodel, inside).fit(u, t, rng)
     trend = _trend(u, t)
     if trend is None:
         return lambda points: plain(coordinates(points)).log_probability(inside)

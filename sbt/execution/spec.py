@@ -15,7 +15,7 @@ from typing import Any
 from sbt.errors import InputError, PluginError
 from sbt.metrics.encounter import conflict_type
 from sbt.plugins import load
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 
 __all__ = ["ScenarioSpec"]
@@ -79,7 +79,7 @@ def _requiring(scenario: LogicalScenario, formula: str) -> LogicalScenario:
         raise InputError(f"a formula needs the trace of a run, but scenario {scenario.name} gives its metrics directly")
     roles = scenario.roles
     metric = stl(formula, "stl", roles.ego, roles.other, roles.margin)
-    return replace(_measuring(scenario, metric), requirement=Requirement(metric.name, CriticalInterval(high=0.0)))
+    return replace(_measuring(scenario, metric), requirement=Requirement(metric.name, high=0.0))
 
 
 def _measuring(scenario: LogicalScenario, metric: Metric) -> LogicalScenario:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sbt.errors import SbtError
 from sbt.execution.worker import place_of
-from sbt.metamodels.base import Metamodel, Predictor, Screened, about, log_ambiguity_bound
+from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.arrays import Mask, Points, Vector
@@ -22,14 +22,14 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.history import History
 
-__all__ = ["Belief", "Learner", "changed_share", "chunked"]
+__all__ = ["FittedMetamodel", "Learner", "changed_share", "chunked"]
 
 _PROBE = 4096
 _CHUNK = 4096
 
 
 @dataclass(frozen=True)
-class Belief:
+class FittedMetamodel:
     """A fitted metamodel and how good it is.
 
     Attributes:
@@ -59,17 +59,17 @@ class Learner:
         scenario: with the campaign's space and requirement.
         metamodel: its settings.
         seed: of the campaign.
-        aimed: the critical edge is what is looked for, and the metamodel is told where it is; otherwise all of y counts.
+        target_aware: the critical edge is what is looked for, and the metamodel is told where it is; otherwise all of y counts.
         last: the last belief by what it was made from: a campaign's conclusion and its report ask for the same.
     """
 
     scenario: LogicalScenario
     metamodel: Metamodel
     seed: int
-    aimed: bool = True
-    last: dict[bytes, Belief] = field(default_factory=dict, repr=False, compare=False)
+    target_aware: bool = True
+    last: dict[bytes, FittedMetamodel] = field(default_factory=dict, repr=False, compare=False)
 
-    def fit(self, history: History) -> Belief | None:
+    def fit(self, history: History) -> FittedMetamodel | None:
         """Return the belief after these runs; None with fewer than two to learn from."""
         if len(history.training) < 2:
             return None
@@ -80,7 +80,7 @@ class Learner:
             self.last[key] = self._fit(history)
         return self.last[key]
 
-    def _fit(self, history: History) -> Belief:
+    def _fit(self, history: History) -> FittedMetamodel:
         training, start = history.training, time.perf_counter()
         space, predictor = self.scenario.space, self.train(training)
         seconds = time.perf_counter() - start
@@ -97,16 +97,16 @@ class Learner:
             def bound(points: Points) -> Vector:
                 return log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
 
-        chosen = getattr(getattr(predictor, "predictor", predictor), "choice", None)  # also of a recalibrated one
+        chosen = getattr(getattr(predictor, "predictor", predictor), "comparison", None)  # also of a recalibrated one
         told = {} if chosen is None else {"believed": chosen.reason, "weights": dict(chosen.weights)}
-        return Belief(predict, self._scores(predict, history) | told, len(training), seconds, bound)
+        return FittedMetamodel(predict, self._scores(predict, history) | told, len(training), seconds, bound)
 
     def train(self, training: History) -> Predictor:
         """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""
         space, requirement = self.scenario.space, self.scenario.requirement
         y = training.y(requirement.metric)
         u = space.metamodel_inputs(space.to_unit(training.x))
-        metamodel = about(self.metamodel, requirement.critical) if self.aimed else self.metamodel
+        metamodel = with_target(self.metamodel, requirement.critical) if self.target_aware else self.metamodel
         with self._named(len(training)):
             return metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, functions
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, sample_paths
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -22,7 +22,7 @@ from sbt.metamodels.torch_tools import check_device
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Auto", "Choice", "MixturePredictor"]
+__all__ = ["Auto", "MixturePredictor", "ModelComparison"]
 
 _FEWEST = 10  # rows from which on a score on held-out rows says something
 _LEAST = 0.02  # weight below which a model is left out
@@ -37,7 +37,7 @@ class Auto:
     fitted to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
     every batch, takes about a quarter of the time: a smaller ensemble, two folds of at most 400 rows, and none below 300.
 
-    A campaign that looks for the critical edge tells where it is (`about`). Then what counts is not the density of y
+    A campaign that looks for the critical edge tells where it is (`with_target`). Then what counts is not the density of y
     but the probability of the range that it fell into (see `Bins`), and the first model, `gp` with nu 2.5 and one noise, is
     believed alone unless the mixture is better by three standard errors: rows crowd at the edge, where a mixture that
     hedges looks better than it is over the space.
@@ -93,30 +93,31 @@ class Auto:
         """What is believed about the critical edge where there is no time to compare."""
         return GaussianProcess(nu=2.5, input_noise=False, device=self.device)
 
-    def about(self, critical: CriticalInterval) -> _About:
+    def with_target(self, critical: CriticalInterval) -> _TargetedAuto:
         """Return the same settings for runs whose critical interval is known."""
-        return _About(self, critical)
+        return _TargetedAuto(self, critical)
 
     def _fit(self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None) -> MixturePredictor:
         u, y = check_rows(u, y)
-        n, bins, aimed = len(y), None if critical is None else Bins.about(y, critical), critical is not None
-        models, compared = self._models(n, n, aimed=aimed), min(n, self.compare_rows)
+        n, bins, target_aware = len(y), None if critical is None else Bins.about(y, critical), critical is not None
+        models, compared = self._models(n, n, target_aware=target_aware), min(n, self.compare_rows)
         if n < _FEWEST:
             weights, scores = np.full(len(models), 1.0 / len(models)), None
         else:
             rows = rng.permutation(n)[:compared] if compared < n else slice(None)
-            scores = held_out(self._models(n, compared, aimed=aimed).values(), u[rows], y[rows], self.folds, rng, bins)
+            rivals = self._models(n, compared, target_aware=target_aware).values()
+            scores = held_out(rivals, u[rows], y[rows], self.folds, rng, bins)
             weights = stacked(scores, self.prior)
-        choice = _explain(list(models), weights, scores, compared, self, bins)
-        kept = {name: model for name, model in models.items() if choice.weights[name] > 0.0}
+        comparison = _explain(list(models), weights, scores, compared, self, bins)
+        kept = {name: model for name, model in models.items() if comparison.weights[name] > 0.0}
         predictors = tuple(model.fit(u, y, rng) for model in kept.values())
-        return MixturePredictor(predictors, np.array([choice.weights[name] for name in kept]), choice)
+        return MixturePredictor(predictors, np.array([comparison.weights[name] for name in kept]), comparison)
 
-    def _models(self, n: int, learned: int, *, aimed: bool) -> dict[str, Metamodel]:
+    def _models(self, n: int, learned: int, *, target_aware: bool) -> dict[str, Metamodel]:
         """Return the models that take part with n rows, to be fitted to `learned` of them."""
         models: dict[str, Metamodel] = {}
         if n <= self.gp_rows:
-            models["gp"] = self.simplest if aimed else GaussianProcess(device=self.device)
+            models["gp"] = self.simplest if target_aware else GaussianProcess(device=self.device)
         models["et"] = ExtraTrees()
         if n >= self.ensemble_rows:
             models["ensemble"] = _paced(learned, Ensemble(members=self.members, device=self.device), self.pace)
@@ -124,15 +125,15 @@ class Auto:
 
 
 @dataclass(frozen=True)
-class _About:
+class _TargetedAuto:
     """`Auto` that knows what is critical."""
 
     settings: Auto
     critical: CriticalInterval
 
-    def about(self, critical: CriticalInterval) -> _About:
+    def with_target(self, critical: CriticalInterval) -> _TargetedAuto:
         """Return the same settings for another interval."""
-        return _About(self.settings, critical)
+        return _TargetedAuto(self.settings, critical)
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
         """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
@@ -150,7 +151,7 @@ def _paced(n: int, full: Ensemble, pace: float) -> Ensemble:
 
 
 @dataclass(frozen=True)
-class Choice:
+class ModelComparison:
     """What was chosen and why.
 
     Attributes:
@@ -172,12 +173,12 @@ class MixturePredictor:
     Args:
         predictors: of each model with a weight > 0.
         weight: of each, > 0, sum 1.
-        choice: what was chosen and why.
+        comparison: what was chosen and why.
     """
 
     predictors: tuple[Predictor, ...]
     weight: Vector
-    choice: Choice
+    comparison: ModelComparison
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) lower and (n,) upper bounds of P(y in M_c): quick where the predictors have quick ones."""
@@ -191,17 +192,19 @@ class MixturePredictor:
             low, high = low + weight * ends[0], high + weight * ends[1]
         return low, np.minimum(high, 1.0)
 
-    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+    def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of y as a function at u (m, d), each from one of the predictors."""
         counts = rng.multinomial(n, self.weight)
-        return np.concatenate([functions(p, u, k, rng) for p, k in zip(self.predictors, counts.tolist(), strict=True)])
+        return np.concatenate([sample_paths(p, u, k, rng) for p, k in zip(self.predictors, counts.tolist(), strict=True)])
 
     def __call__(self, u: Points) -> Prediction:
         """Return the belief at u (n, d)."""
         return Prediction.mixture_of([predict(u) for predict in self.predictors], self.weight)
 
 
-def _explain(names: list[str], weights: Vector, held: Points | None, n: int, settings: Auto, bins: Bins | None) -> Choice:
+def _explain(
+    names: list[str], weights: Vector, held: Points | None, n: int, settings: Auto, bins: Bins | None
+) -> ModelComparison:
     """Return the choice, models with little weight left out."""
     kept = np.where(weights >= _LEAST, weights, 0.0)
     kept /= kept.sum()
@@ -211,7 +214,7 @@ def _explain(names: list[str], weights: Vector, held: Points | None, n: int, set
     mixed = ", ".join(f"{100 * w:.0f} % {name}" for name, w in shares.items() if w > 0.0)
     if held is None:
         reason = f"{mixed}: {n} rows are too few to compare models (from {_FEWEST} on)"
-        return Choice(shares, {}, reason)
+        return ModelComparison(shares, {}, reason)
     scores = {name: float(row.mean()) for name, row in zip(names, held, strict=True)}
     scores["mixture"] = float(mixture_score(held, kept).mean())
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
@@ -223,4 +226,4 @@ def _explain(names: list[str], weights: Vector, held: Points | None, n: int, set
         reason += f"; the ensemble takes part from {settings.ensemble_rows} rows on"
     if "gp" not in names:
         reason += f"; the gp takes part up to {settings.gp_rows} rows"
-    return Choice(shares, scores, reason)
+    return ModelComparison(shares, scores, reason)

@@ -7,20 +7,19 @@ scenario declares them, are further columns, scaled to about [0, 1]); y is the s
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Aimed", "Metamodel", "Predictor", "Screened", "about", "build", "check_rows", "functions", "log_ambiguity_bound",
-    "simplest", "split_validation", "standardise",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "log_ambiguity_bound", "sample_paths", "simplest",
+    "split_validation", "standardise", "with_target",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -42,13 +41,13 @@ def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterv
     return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), 1e-304))
 
 
-def functions(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
+def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
     """Return (n, m) draws of y as a function, at u (m, d).
 
-    A predictor with `draws` (a process) draws functions; of a mixture one component stands for a function; a single
+    A predictor with `sample_paths` (a process) draws functions; of a mixture one component stands for a function; a single
     Gaussian a point is drawn point by point.
     """
-    joint: Any = getattr(predictor, "draws", None)
+    joint: Any = getattr(predictor, "sample_paths", None)
     if joint is not None:
         return joint(u, n, rng)
     p = predictor(u)
@@ -76,17 +75,17 @@ class Metamodel(Protocol):
 
 
 @runtime_checkable
-class Aimed(Protocol):
+class TargetAware(Protocol):
     """Settings of a metamodel that learns otherwise where it knows what is critical."""
 
-    def about(self, critical: CriticalInterval) -> Metamodel:
+    def with_target(self, critical: CriticalInterval) -> Metamodel:
         """Return the same settings, told M_c in the unit of the y that it will learn (warped, where y is)."""
         ...
 
 
-def about(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
+def with_target(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
     """Return the metamodel told of M_c where it wants to know, else itself."""
-    return metamodel.about(critical) if isinstance(metamodel, Aimed) else metamodel
+    return metamodel.with_target(critical) if isinstance(metamodel, TargetAware) else metamodel
 
 
 def simplest(metamodel: Metamodel) -> Metamodel:
@@ -174,6 +173,4 @@ def standardise(y: Vector) -> tuple[Vector, float, float]:
 def _unknown(kind: str, what: str, name: str, valid: Iterable[str]) -> str:
     """Return the message about a name that is not among the valid ones."""
     names = sorted(valid)
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"{kind} takes a {what} of {', '.join(names) or '(none)'}, but got {name!r}{hint}"
+    return f"{kind} takes a {what} of {', '.join(names) or '(none)'}, but got {name!r}{did_you_mean(name, names)}"

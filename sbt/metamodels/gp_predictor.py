@@ -140,7 +140,7 @@ class GaussianProcessPredictor:
         across = np.column_stack([-2.0 * a, (a**2).sum(axis=1) + self._cancelled, np.ones(len(a))]).T
         return np.ascontiguousarray(across), self.hyper.outputscale * self.alpha
 
-    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+    def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m.
 
         Source:

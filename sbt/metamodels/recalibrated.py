@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, about, check_rows, split_validation
+from sbt.metamodels.base import Metamodel, Predictor, check_rows, split_validation, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -38,9 +38,9 @@ class Recalibrated:
 
     metamodel: Metamodel
 
-    def about(self, critical: CriticalInterval) -> Recalibrated:
+    def with_target(self, critical: CriticalInterval) -> Recalibrated:
         """Return the same, the metamodel told of M_c."""
-        return replace(self, metamodel=about(self.metamodel, critical))
+        return replace(self, metamodel=with_target(self.metamodel, critical))
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> RecalibratedPredictor:
         """Return the predictor learned from u (n, d) and y (n,); see `Metamodel.fit`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.stats import qmc
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Mask, Points, Vector, as_points
 from sbt.problem.parameter import Parameter
 
@@ -198,8 +197,7 @@ class ParameterSpace:
         """
         for name in given:
             if name not in self.names:
-                near = difflib.get_close_matches(name, self.names, 1)
-                hint = f" (did you mean '{near[0]}'?)" if near else ""
+                hint = did_you_mean(name, self.names)
                 raise InputError(f"an input must be one of {', '.join(self.names)}, but got '{name}'{hint}")
         full = {p.name: float(given.get(p.name, p.centre)) for p in self.parameters}
         for p in self.parameters:

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import betaincinv
 
+from sbt.estimators.binomial import interval
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.requirement import Requirement
 from sbt.report.axes import reach, shade
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PANELS",
-    "binomial_interval",
     "plot_metric_histogram",
     "plot_precision_recall",
     "plot_progress",
@@ -45,19 +44,6 @@ PANELS: Mapping[str, tuple[tuple[str, str], ...]] = {
 """The panels of `plot_validation`: label of the ordinate, and (key of a fit, name of the curve) pairs."""
 _CURVE = 400
 """A curve over the runs is drawn at no more places than this."""
-
-
-def binomial_interval(hits: Vector, n: Vector, confidence: float = 0.95) -> tuple[Vector, Vector]:
-    """Return (m,) lower and (m,) upper ends of the Clopper-Pearson interval of hits/n, n >= 1.
-
-    >>> low, high = binomial_interval(np.array([0.0]), np.array([100.0]))
-    >>> low.tolist(), high.round(4).tolist()
-    ([0.0], [0.0362])
-    """
-    hits, n, tail = np.asarray(hits, float), np.asarray(n, float), (1 - confidence) / 2
-    low = np.where(hits > 0, betaincinv(np.maximum(hits, 0.5), n - hits + 1, tail), 0.0)
-    high = np.where(hits < n, betaincinv(hits + 1, np.maximum(n - hits, 0.5), 1 - tail), 1.0)
-    return low, high
 
 
 def plot_validation(fits: Sequence[Mapping[str, Any]], panel: str, ax: Axes, *, unit: str = "") -> Axes:
@@ -123,7 +109,7 @@ def plot_reliability(p: Vector, critical: Mask, ax: Axes, *, bins: int = 10) -> 
     mean, frequency, count = (np.asarray(column, dtype=np.float64) for column in reliability(p, critical, bins))
     some = count > 0
     mean, frequency, count = mean[some], frequency[some], count[some]
-    low, high = binomial_interval(np.round(frequency * count), count)
+    low, high = interval(np.round(frequency * count), count)
     ax.plot([0, 1], [0, 1], color="#777777", linestyle="--", linewidth=1.0)
     bars = np.stack([np.maximum(frequency - low, 0.0), np.maximum(high - frequency, 0.0)])
     ax.errorbar(mean, frequency, yerr=bars, fmt="o-", color=MODEL, markersize=5, linewidth=1.2, elinewidth=1.0, capsize=2.5)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
-import tempfile
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from sbt.files import write_atomically
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
 from sbt.report.modes import mode_table
-from sbt.report.projection import Predict, influence, influence_from_runs
+from sbt.report.projection import Predict, influence_from_runs, influence_on_probability
 from sbt.report.tables import critical_table, failed_table, input_table, iteration_table
 from sbt.report.words import NOTHING, SCORES, Findings, conclusion_sentences, number, requirement_words, warnings_for
 from sbt.store.database import Store
@@ -38,12 +37,12 @@ def write_report(store: Store, scenario: LogicalScenario, predict: Predict | Non
     """
     target = Path(folder) if folder is not None else store.folder
     found, fits = Findings.of(store, scenario), store.fits()
-    weights = None if predict is None else influence(predict, scenario.requirement.critical, scenario.space.dimension)
+    critical, d = scenario.requirement.critical, scenario.space.dimension
+    weights = None if predict is None else influence_on_probability(predict, critical, d)
     order = weights if weights is not None and weights.any() else influence_from_runs(found.history, scenario.requirement)
     drawings = draw(found, scenario.space, fits, predict, order)
-    (target / "figures").mkdir(parents=True, exist_ok=True)
     for drawing in drawings:
-        _replace(target / "figures" / f"{drawing.name}.svg", drawing.svg)
+        write_atomically(target / "figures" / f"{drawing.name}.svg", drawing.svg)
     reference = str(found.configuration.get("scenario", scenario.name))
     page = _render({
         "title": _title(scenario),
@@ -62,8 +61,7 @@ def write_report(store: Store, scenario: LogicalScenario, predict: Predict | Non
         "commands": _commands(found, store),
         "configuration": _configuration(found),
     })  # fmt: skip
-    _replace(target / REPORT, page)
-    return target / REPORT
+    return write_atomically(target / REPORT, page)
 
 
 def _render(values: Mapping[str, Any]) -> str:
@@ -144,16 +142,3 @@ def _commands(found: Findings, store: Store) -> dict[str, str]:
 def _configuration(found: Findings) -> str:
     """Return the configuration as the user would write it, or all that the store keeps of it."""
     return str(found.configuration.get("yaml") or json.dumps(found.configuration, indent=2, ensure_ascii=False))
-
-
-def _replace(path: Path, text: str) -> None:
-    """Write a file whole or not at all: a reader may have it open."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

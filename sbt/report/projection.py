@@ -22,8 +22,8 @@ from sbt.store.history import History
 __all__ = [
     "Plane",
     "Predict",
-    "influence",
     "influence_from_runs",
+    "influence_on_probability",
     "log_probability",
     "most_telling_pairs",
     "probability",
@@ -68,7 +68,7 @@ def probability(predict: Predict, critical: CriticalInterval, u: Points) -> Vect
     return np.exp(log_probability(predict, critical, u)[0])
 
 
-def influence(predict: Predict, critical: CriticalInterval, dimension: int, points: int = 512) -> Vector:
+def influence_on_probability(predict: Predict, critical: CriticalInterval, dimension: int, points: int = 512) -> Vector:
     """Return (d,) the total influence of each input on P(critical), relative to the largest.
 
     Total Sobol indices by Jansen's formula over the ranges (uniform): the mean squared change of

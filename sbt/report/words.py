@@ -8,12 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from sbt.estimators.binomial import interval, upper
 from sbt.problem.distribution import Distribution
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
-from sbt.report.curves import binomial_interval
 from sbt.store.database import Store
 from sbt.store.history import PLANNED, VALIDATION, History
 
@@ -252,8 +250,8 @@ def _held_out_fraction(found: Findings) -> dict[str, Any]:
     if ok == 0:
         return {}
     hits = int((found.held_out & found.critical).sum())
-    low, high = binomial_interval(np.array([hits, hits + n - ok]), np.array([n, n]))
-    return {"critical_fraction": hits / ok, "low": float(low[0]), "high": float(high[1]), "counted": n}
+    low, high = float(interval(hits, n)[0]), float(interval(hits + n - ok, n)[1])
+    return {"critical_fraction": hits / ok, "low": low, "high": high, "counted": n}
 
 
 def warnings_for(found: Findings) -> list[str]:
@@ -289,9 +287,8 @@ def _about_runs(found: Findings) -> list[str]:
     said += _about_far_side(found)
     if history.ok.any() and not found.critical.any():
         n = int(found.held_out.sum())
-        bound = (
-            f" From the {n:,} random held-out runs alone, up to {share(1 - 0.05 ** (1 / n))} may be critical (95 %)." if n else ""
-        )
+        most = share(float(upper(0, n, 0.95)))
+        bound = f" From the {n:,} random held-out runs alone, up to {most} may be critical (95 %)." if n else ""
         said.append(f"No critical run was found. That is no proof that there is none.{bound}")
     if len({record.versions for record in history.records}) > 1:
         said.append("Runs were made with different versions of the software; see the header.")

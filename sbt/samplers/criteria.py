@@ -8,13 +8,13 @@ import numpy as np
 from scipy.special import erfcx, log_ndtr
 
 from sbt.problem.arrays import Points, Vector
-from sbt.samplers.search import Belief, Picks, Search, believe, fill, known, refined, repelled
+from sbt.samplers.search import Picks, Search, WarpedModel, fill, fit_warped, known, refine_best, repelled
 
 __all__ = [
     "CRITERIA", "Criterion", "log_expected_improvement", "lower_confidence_bound", "probability_of_violation", "propose_by",
 ]  # fmt: skip
 
-Criterion = Callable[[Belief, Points, float], Vector]
+Criterion = Callable[[WarpedModel, Points, float], Vector]
 """(belief, points (n, d), margin of the best run in warped units) -> (n,) scores, larger is better."""
 
 _KAPPA = 2.0  # standard deviations below the mean
@@ -23,7 +23,7 @@ _DRAWN = 600  # candidates at which functions are drawn
 _SQRT_HALF_PI, _LOG_SQRT_2PI = np.sqrt(0.5 * np.pi), 0.5 * np.log(2.0 * np.pi)
 
 
-def probability_of_violation(belief: Belief, u: Points, best: float) -> Vector:
+def probability_of_violation(belief: WarpedModel, u: Points, best: float) -> Vector:
     """Return (n,) log P(critical).
 
     Source:
@@ -33,7 +33,7 @@ def probability_of_violation(belief: Belief, u: Points, best: float) -> Vector:
     return belief.log_probability(u)
 
 
-def lower_confidence_bound(belief: Belief, u: Points, best: float) -> Vector:
+def lower_confidence_bound(belief: WarpedModel, u: Points, best: float) -> Vector:
     """Return (n,) minus the margin two standard deviations towards the critical interval.
 
     Source:
@@ -44,7 +44,7 @@ def lower_confidence_bound(belief: Belief, u: Points, best: float) -> Vector:
     return _KAPPA * p.sigma - belief.critical.margin(p.mu)
 
 
-def log_expected_improvement(belief: Belief, u: Points, best: float) -> Vector:
+def log_expected_improvement(belief: WarpedModel, u: Points, best: float) -> Vector:
     """Return (n,) log E[max(best - margin, 0)], the margin measured from the end on which the mean lies.
 
     Source:
@@ -90,12 +90,12 @@ def propose_by(
     seen, d = known(search, u, y, batch, rng), u.shape[1]
     if len(seen.u) < 2:
         return Picks(fill(seen.admissible, n, d, rng), (name,) * n)
-    belief = believe(search, seen.u, seen.y, rng)
+    belief = fit_warped(search, seen.u, seen.y, rng)
     margin = belief.critical.margin(belief.warp.values(seen.y))
     start = seen.u[np.argsort(margin, kind="stable")[:30]]
     best = float(margin.min())
     score = probability_of_violation if criterion is None else criterion
-    candidates, values = refined(lambda v: score(belief, v, best), start, seen.admissible, rng)
+    candidates, values = refine_best(lambda v: score(belief, v, best), start, seen.admissible, rng)
     if criterion is None:
         return Picks(_thompson(belief, candidates[np.argsort(-values, kind="stable")[:_DRAWN]], n, rng), (name,) * n)
     values = values + repelled(candidates, u, 0.2 * _CLEAR * np.sqrt(d))
@@ -106,9 +106,9 @@ def propose_by(
     return Picks(picks, (name,) * n)
 
 
-def _thompson(belief: Belief, candidates: Points, n: int, rng: np.random.Generator) -> Points:
+def _thompson(belief: WarpedModel, candidates: Points, n: int, rng: np.random.Generator) -> Points:
     """Return n points, each the best of a function drawn over the candidates; no point twice."""
-    drawn = belief.critical.margin(belief.draws(candidates, n, rng))
+    drawn = belief.critical.margin(belief.sample_paths(candidates, n, rng))
     chosen = np.empty((n, candidates.shape[1]))
     for k in range(n):
         at = int(np.argmin(drawn[k]))

@@ -1,8 +1,8 @@
 """Greedy batches: the best candidates that are also far from every run there is, and the most representative.
 
 Distances are measured in the inputs' influence on the metamodel's mean: an input without influence
-separates nothing. `diverse` multiplies the score of a candidate by its squared distance to the nearest
-run, which favours corners; `representative` sums this product over all points that a run would serve.
+separates nothing. `select_diverse` multiplies the score of a candidate by its squared distance to the nearest
+run, which favours corners; `select_representative` sums this product over all points that a run would serve.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from scipy.spatial.distance import cdist
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["diverse", "influence", "refined", "representative"]
+__all__ = ["influence_on_mean", "refine_diverse", "select_diverse", "select_representative"]
 
 _KEEP, _CHILDREN, _ROUNDS = 60, 16, 3
 _PROBES = 128
 _LEAST = 0.05  # of the largest influence: an input the metamodel calls irrelevant may not be
 
 
-def influence(predict: Callable[[Points], Prediction], dimension: int, rng: np.random.Generator) -> Vector:
+def influence_on_mean(predict: Callable[[Points], Prediction], dimension: int, rng: np.random.Generator) -> Vector:
     """Return (d,) how much each input moves the mean, the largest 1 and none below 0.05.
 
     The root mean squared change of mu when one input is drawn anew, the others kept: the square root of
@@ -42,7 +42,7 @@ def influence(predict: Callable[[Points], Prediction], dimension: int, rng: np.r
     return np.maximum(effect / largest, _LEAST) if largest > 0 else np.ones(dimension)
 
 
-def refined(
+def refine_diverse(
     score: Callable[[Points], Vector], u: Points, scale: Vector, rng: np.random.Generator
 ) -> tuple[Points, Vector]:
     """Return candidates (m, d) and their log scores (m,): the given ones and ever closer ones around good ones.
@@ -58,7 +58,7 @@ def refined(
     found, value = u, score(u)
     width = 0.1 / scale
     for _ in range(_ROUNDS):
-        best = found[diverse(found, value, np.empty((0, u.shape[1])), _KEEP, scale)]
+        best = found[select_diverse(found, value, np.empty((0, u.shape[1])), _KEEP, scale)]
         step = width * rng.standard_normal((len(best) * _CHILDREN, u.shape[1]))
         near = np.clip(np.repeat(best, _CHILDREN, axis=0) + step, 1e-9, 1 - 1e-9)
         found, value = np.concatenate([found, near]), np.concatenate([value, score(near)])
@@ -66,7 +66,7 @@ def refined(
     return found, value
 
 
-def diverse(u: Points, log_score: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
+def select_diverse(u: Points, log_score: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
     """Return the indices (<= n) of candidates chosen one by one by log score plus log squared distance.
 
     Args:
@@ -97,7 +97,7 @@ def diverse(u: Points, log_score: Vector, there: Points, n: int, scale: Vector) 
     return np.array(chosen, dtype=np.int64)
 
 
-def representative(u: Points, weight: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
+def select_representative(u: Points, weight: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
     """Return the indices (<= n) of points chosen one by one so that little weight stays far from a run.
 
     Each choice reduces the weighted sum of squared distances to the nearest run the most: the greedy

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.samplers.search import Belief, Picks, Search, believe, fill, known, refined, repelled
+from sbt.samplers.search import Picks, Search, WarpedModel, fill, fit_warped, known, refine_best, repelled
 
 __all__ = ["Region", "propose", "regions"]
 
@@ -52,7 +52,7 @@ def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generat
     seen, d = known(search, u, y, batch, rng), u.shape[1]
     if len(seen.u) < 2:
         return Picks(fill(seen.admissible, n, d, rng), ("global",) * n)
-    belief = believe(search, seen.u, seen.y, rng)
+    belief = fit_warped(search, seen.u, seen.y, rng)
     fresh = ~seen.flank
     found = regions(seen.u[fresh], search.critical.margin(seen.y[fresh]), seen.batch[fresh])
     niches = _hopeful(belief, found, seen.admissible, rng)
@@ -129,7 +129,7 @@ def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
 
 
 def _hopeful(
-    belief: Belief, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator
+    belief: WarpedModel, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator
 ) -> list[tuple[Region, Points]]:
     """Return the regions in which a critical run may be, each with its candidates."""
     kept = []
@@ -144,14 +144,14 @@ def _hopeful(
     return kept
 
 
-def _thompson(belief: Belief, niches: list[tuple[Region, Points]], n: int, d: int, rng: np.random.Generator) -> Points:
+def _thompson(belief: WarpedModel, niches: list[tuple[Region, Points]], n: int, d: int, rng: np.random.Generator) -> Points:
     """Return n points, each the best of a function drawn over the candidates of a region; none without regions.
 
     Every second one is from the region whose draw is best, the others from each region in turn.
     """
     if not niches:
         return np.empty((0, d))
-    drawn = [belief.critical.margin(belief.draws(points, n, rng)) for _, points in niches]
+    drawn = [belief.critical.margin(belief.sample_paths(points, n, rng)) for _, points in niches]
     picks = np.empty((n, d))
     for k in range(n):
         which = (k // 2) % len(niches) if k % 2 else int(np.argmin([values[k].min() for values in drawn]))
@@ -162,7 +162,7 @@ def _thompson(belief: Belief, niches: list[tuple[Region, Points]], n: int, d: in
 
 
 def _globally(
-    belief: Belief, picks: Points, n: int, u: Points, niches: list[tuple[Region, Points]],
+    belief: WarpedModel, picks: Points, n: int, u: Points, niches: list[tuple[Region, Points]],
     admissible: Callable[[Points], Mask], rng: np.random.Generator,
 ) -> Points:  # fmt: skip
     """Return the picks and further ones, n in all: the largest P(critical), every second time inflated.
@@ -171,7 +171,7 @@ def _globally(
     """
     d = u.shape[1]
     start = np.vstack([np.empty((0, d)), *(points for _, points in niches)])
-    candidates, wide = refined(lambda v: belief.log_probability(v, _INFLATION), start, admissible, rng)
+    candidates, wide = refine_best(lambda v: belief.log_probability(v, _INFLATION), start, admissible, rng)
     scores = [np.maximum(values, np.log(_HOPELESS)) for values in (belief.log_probability(candidates), wide)]
     away = repelled(candidates, u, 0.2 * _CLEAR * np.sqrt(d))
     for point in picks:

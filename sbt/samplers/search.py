@@ -15,14 +15,15 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.metamodels.base import Metamodel, Predictor, about, functions
+from sbt.metamodels.base import Metamodel, Predictor, sample_paths, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "DEFLATION", "Belief", "Free", "Known", "Picks", "Search", "believe", "deflated", "fill", "known", "refined", "repelled",
+    "DEFLATION", "Free", "Known", "Picks", "Search", "WarpedModel", "deflated", "fill", "fit_warped", "known", "refine_best",
+    "repelled",
 ]  # fmt: skip
 
 DEFLATION = 0.22
@@ -65,7 +66,7 @@ class Picks:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class WarpedModel:
     """A metamodel of the warped metric."""
 
     predictor: Predictor
@@ -87,17 +88,17 @@ class Belief:
         """Return (n,) P(critical) at u."""
         return np.exp(self.log_probability(u))
 
-    def draws(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+    def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of the warped metric as a function, at u (m, d)."""
-        return functions(self.predictor, self.columns(u), n, rng)
+        return sample_paths(self.predictor, self.columns(u), n, rng)
 
 
-def believe(search: Search, u: Points, y: Vector, rng: np.random.Generator) -> Belief:
+def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator) -> WarpedModel:
     """Return the belief learned from u (n, d) and finite y (n,), n >= 2."""
     warp = Warp.about(y, search.critical)
     critical = warp.interval(search.critical)
-    predictor = about(search.metamodel, critical).fit(search.columns(u), warp.values(y), rng)
-    return Belief(predictor, search.columns, warp, critical)
+    predictor = with_target(search.metamodel, critical).fit(search.columns(u), warp.values(y), rng)
+    return WarpedModel(predictor, search.columns, warp, critical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +191,7 @@ def fill(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Ge
     return np.vstack([kept, rng.random((missing, d))]) if missing > 0 else kept[:n]
 
 
-def refined(
+def refine_best(
     score: Callable[[Points], Vector], start: Points, admissible: Callable[[Points], Mask], rng: np.random.Generator
 ) -> tuple[Points, Vector]:
     """Return (m, d) candidates and (m,) scores: uniform ones, those of `start` (k, d), and steps from the best of them."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State, VehicleType
@@ -99,5 +99,5 @@ SCENARIO = LogicalScenario(
     ),
     simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",)),
     metrics=(nearest_ttc(), nearest_distance(), struck(), struck_speed()),
-    requirement=Requirement("ttc_path_min", CriticalInterval(high=0.5)),
+    requirement=Requirement("ttc_path_min", high=0.5),
 )

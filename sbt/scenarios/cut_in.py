@@ -13,7 +13,7 @@ import numpy as np
 
 from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, EndCondition, Scene, State, VehicleType
@@ -92,6 +92,6 @@ SCENARIO = LogicalScenario(
         thw_min(margin=MARGIN),
         drac_max(margin=MARGIN),
     ),
-    requirement=Requirement("ttc_min", CriticalInterval(-5.0, 0.5)),
+    requirement=Requirement("ttc_min", -5.0, 0.5),
     roles=Roles(margin=MARGIN),
 )

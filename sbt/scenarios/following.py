@@ -14,7 +14,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, EndCondition, Scene, State, VehicleType
@@ -97,5 +97,5 @@ SCENARIO = LogicalScenario(
         isolations=("fresh", "reuse", "replicas"),
     ),
     metrics=(ttc_min(), d_min(), collision(), impact_speed(), thw_min(), drac_max()),
-    requirement=Requirement("ttc_min", CriticalInterval(high=0.1)),
+    requirement=Requirement("ttc_min", high=0.1),
 )

@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
@@ -83,5 +83,5 @@ SCENARIO = LogicalScenario(
         lane_change_duration=LANE_CHANGE,
     ),
     metrics=(nearest_ttc(), time_left(horizon=HORIZON), nearest_distance(), struck(), struck_speed(), others_braking()),
-    requirement=Requirement("ttc_path_min", CriticalInterval(high=2.0)),
+    requirement=Requirement("ttc_path_min", high=2.0),
 )

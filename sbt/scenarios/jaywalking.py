@@ -16,7 +16,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.cache import per_trace
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -219,5 +219,5 @@ SCENARIO = LogicalScenario(
     ),
     metrics=(MIN_DIST, COLLISION, IMPACT_SPEED),
     roles=Roles(other="child"),
-    requirement=Requirement("min_dist", CriticalInterval(high=-1e-6)),
+    requirement=Requirement("min_dist", high=-1e-6),
 )

@@ -16,7 +16,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.lateral import Curve, lateral_metrics
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -162,5 +162,5 @@ SCENARIO = LogicalScenario(
         net="winding", scene=scene, duration=DURATION, step_length=0.05, ego=Ego("lane_keeping"),
     ),
     metrics=(*lateral_metrics(ROAD), LANE_LOST),
-    requirement=Requirement("pos_lat_abs_err_max", CriticalInterval(low=3.0)),
+    requirement=Requirement("pos_lat_abs_err_max", low=3.0),
 )  # fmt: skip

@@ -16,7 +16,7 @@ from sbt.errors import InputError
 from sbt.metrics.cache import per_trace
 from sbt.metrics.geometry import contact_index, rectangle_distance, swept_contact
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import ActorTrace, Trace
@@ -161,5 +161,5 @@ SCENARIO = LogicalScenario(
     ),
     metrics=(CRITERION, D_MIN, COLLISION, V_EGO, V_CO),
     roles=Roles(other="co_1"),
-    requirement=Requirement("criterion", CriticalInterval(high=-10.0)),
+    requirement=Requirement("criterion", high=-10.0),
 )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
@@ -88,5 +88,5 @@ SCENARIO = LogicalScenario(
         struck_speed(),
         others_braking(),
     ),
-    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
+    requirement=Requirement("pet_ego_first", high=1.5),
 )

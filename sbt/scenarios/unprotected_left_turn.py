@@ -12,7 +12,7 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, EndCondition, Scene, State
@@ -78,5 +78,5 @@ SCENARIO = LogicalScenario(
     ),
     simulate=SumoSimulation(net="left_turn", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
     metrics=(time_left(horizon=HORIZON), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
-    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
+    requirement=Requirement("pet_ego_first", high=1.5),
 )

@@ -6,14 +6,13 @@ are told by. Source: SUMO's documentation, "Definition of Vehicles, Vehicle Type
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.sumo.formatting import format_number
 
 __all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "known_attributes", "unit_of", "vtype_attributes"]
@@ -98,7 +97,7 @@ def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
     known = known_attributes(model, lane_change)
     for name, value in given.items():
         if name not in known:
-            hint = _hint(name, known)
+            hint = did_you_mean(name, known)
             owners = [m for m, own in {**CAR_FOLLOWING, **LANE_CHANGE}.items() if name in own]
             of = f"; it belongs to {', '.join(owners)}" if owners else hint
             rule = f"ego settings of kind sumo must be vType attributes of {model} or {lane_change}"
@@ -112,14 +111,8 @@ def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
 
 def _of(key: str, table: Mapping[str, Mapping[str, str]], name: str) -> Mapping[str, str]:
     if name not in table:
-        raise InputError(f"ego.{key} must be one of SUMO's {', '.join(table)}, but got '{name}'{_hint(name, table)}")
+        raise InputError(f"ego.{key} must be one of SUMO's {', '.join(table)}, but got '{name}'{did_you_mean(name, table)}")
     return table[name]
-
-
-def _hint(name: str, known: Iterable[str]) -> str:
-    lower = {k.lower(): k for k in known}
-    near = difflib.get_close_matches(name.lower(), lower, 1)
-    return f" (did you mean '{lower[near[0]]}'?)" if near else ""
 
 
 def _finite(value: Any) -> bool:

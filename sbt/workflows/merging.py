@@ -6,7 +6,6 @@ shards: rows, batches, fits and the conclusion come about as they would have wit
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from sbt import plugins
 from sbt.errors import InputError
+from sbt.files import move_atomically
 from sbt.loop.stages import Campaign, Shard, run_stages
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.store.database import DATABASE, Store
@@ -83,17 +83,10 @@ def merge(folders: Sequence[Path], into: Path, *, report: bool = True) -> dict[s
     with tempfile.TemporaryDirectory(prefix=".merge-", dir=into) as folder:
         result = _run(loaded, parts, Path(folder))
         for name in (RESOLVED, DATABASE):  # the database last: with it the folder becomes a store
-            _move(Path(folder) / name, into / name)
+            move_atomically(Path(folder) / name, into / name)
     if report:
         rebuild_report(into)
     return result
-
-
-def _move(path: Path, target: Path) -> None:
-    """Move a file, as a whole and not before it is on the disk."""
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
-    path.replace(target)
 
 
 def _part(folder: Path) -> _Part:

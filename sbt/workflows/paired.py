@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import betaincinv
 
 from sbt.config.load import load
 from sbt.errors import InputError
-from sbt.estimators.monte_carlo import Share
+from sbt.estimators.binomial import interval
+from sbt.estimators.monte_carlo import Proportion
 from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask
 from sbt.store.database import Store
@@ -58,21 +58,12 @@ class Pairs:
         Exact binomial limits of the shares of new and of fixed failures, each with half of the error
         (Bonferroni); a failed run counts as whatever is worse for the end in question.
         """
-        n, tail = len(self.before), (1.0 - confidence) / 4.0
         perhaps_new = (self.after | self.failed_after) & (~self.before | self.failed_before)
         perhaps_fixed = (self.before | self.failed_before) & (~self.after | self.failed_after)
-        return (
-            _low(int(self.new.sum()), n, tail) - _high(int(perhaps_fixed.sum()), n, tail),
-            _high(int(perhaps_new.sum()), n, tail) - _low(int(self.fixed.sum()), n, tail),
-        )
-
-
-def _low(hits: int, n: int, tail: float) -> float:
-    return float(betaincinv(hits, n - hits + 1, tail)) if hits else 0.0
-
-
-def _high(hits: int, n: int, tail: float) -> float:
-    return float(betaincinv(hits + 1, n - hits, 1.0 - tail)) if hits < n else 1.0
+        n, each = len(self.before), 0.5 * (1.0 + confidence)
+        new, fixed = interval([self.new.sum(), self.fixed.sum()], n, each)[0]
+        most_new, most_fixed = interval([perhaps_new.sum(), perhaps_fixed.sum()], n, each)[1]
+        return float(new - most_fixed), float(most_new - fixed)
 
 
 def compare_egos(
@@ -126,7 +117,7 @@ def _result(first: History, second: History, requirement: Any) -> dict[str, Any]
     critical = [requirement.critical.contains(h.y(requirement.metric)) for h in (first, second)]
     pairs = Pairs(critical[0], critical[1], ~first.ok, ~second.ok)
     low, high = pairs.difference()
-    shares = [Share(len(h), int(c.sum()), int((~h.ok).sum())) for h, c in zip((first, second), critical, strict=True)]
+    shares = [Proportion(len(h), int(c.sum()), int((~h.ok).sum())) for h, c in zip((first, second), critical, strict=True)]
     tail = 0.5 * (1.0 + _CONFIDENCE)
     return {
         "pairs": len(first), "confidence": _CONFIDENCE,

@@ -11,14 +11,13 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.persistence import load, read_info, save
@@ -159,7 +158,8 @@ def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, .
         raise InputError(f"{path}:1: a column must stand once, but '{doubled}' stands {short.count(doubled)} times")
     missing = [name for name in space.names if name not in short]
     if missing:
-        raise InputError(f"{path}:1: every input must be a column, but missing: {', '.join(_hinted(m, head) for m in missing)}")
+        named = ", ".join(name + did_you_mean(name, head) for name in missing)
+        raise InputError(f"{path}:1: every input must be a column, but missing: {named}")
     where = [short.index(name) for name in space.names]
     rows = [
         [_value(path, number, line, column, p) for column, p in zip(where, space.parameters, strict=True)]
@@ -167,11 +167,6 @@ def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, .
     ]  # fmt: skip
     others = tuple(name for k, name in enumerate(head) if k not in where)
     return np.array(rows, dtype=np.float64).reshape(len(rows), space.dimension), others
-
-
-def _hinted(name: str, head: list[str]) -> str:
-    near = get_close_matches(name, head, 1)
-    return f"{name} (did you mean '{near[0]}'?)" if near else name
 
 
 def _value(path: Path, number: int, line: list[str], column: int, parameter: Parameter) -> float:

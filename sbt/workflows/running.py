@@ -15,6 +15,7 @@ from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job, versions
+from sbt.files import write_atomically
 from sbt.loop.learner import Learner
 from sbt.loop.stages import Campaign, Progress, Shard, check_shard, run_shard, run_stages
 from sbt.problem.outcome import Job, Outcome, Status
@@ -101,7 +102,7 @@ def keep_configuration(store: Store, config: Configuration, kept: Mapping[str, A
     from sbt.config.load import dump
 
     store.update_configuration(kept)
-    _write_text(store.folder / RESOLVED, dump(config))
+    write_atomically(store.folder / RESOLVED, dump(config))
 
 
 def assembly_of(loaded: Loaded) -> Assembly:
@@ -276,10 +277,3 @@ def result_of(
         "ok": ok, "failed": len(history) - ok, "critical": int(critical.sum()), "iterations": len(store.iterations()),
         "stopped": stopped, "seconds": {k: round(v, 4) for k, v in seconds.items()}, "conclusion": dict(conclusion),
     }  # fmt: skip
-
-
-def _write_text(path: Path, text: str) -> None:
-    """Write a file as a whole or not at all."""
-    part = path.with_suffix(".part")
-    part.write_text(text)
-    part.replace(path)

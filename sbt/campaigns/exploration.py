@@ -1,7 +1,7 @@
-"""The hunt of a boundary campaign: regions of critical runs that are easily missed, because they are small.
+"""Exploration in a boundary campaign: the search for regions of critical runs that are easily missed, because they are small.
 
-A metamodel that knows one small region doubts its border and nothing else. A part of each batch searches
-elsewhere, as a falsification does, until the searches have been in vain for long enough.
+A metamodel that knows one small region is uncertain at its border only. A part of each batch searches
+elsewhere, as a falsification does, until enough exploratory runs have found no new region.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from sbt.campaigns.settings import Settings
-from sbt.loop.learner import Belief
+from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.metamodels.base import simplest
 from sbt.problem.arrays import Points
@@ -19,31 +19,30 @@ from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION
 
-__all__ = ["HUNTED", "SHARE", "hunt", "in_vain", "is_on"]
+__all__ = ["EXPLORATION_SHARE", "EXPLORED", "explore", "fruitless_runs", "should_explore"]
 
-HUNTED = "hunted"
-"""How many runs of an iteration hunted, in its record; they are the first ones of the batch."""
-SHARE = 0.5
-"""Of a batch, while the hunt is on."""
+EXPLORED = "hunted"
+"""Key of the iteration record: how many runs of the batch explored; they are its first ones."""
+EXPLORATION_SHARE = 0.5
+"""Share of a batch that explores."""
 _RARE = 0.01  # critical share of the space below which a region is easily missed
-_PATIENCE = 0.2  # of the budget: hunted runs in vain that end the hunt
+_PATIENCE = 0.2  # of the budget: exploratory runs without a new region that end the exploration
 
 
-def is_on(settings: Settings, belief: Belief, log: Log) -> bool:
-    """Return whether to hunt: critical runs seem rare, and the hunts were not in vain for too long.
+def should_explore(settings: Settings, belief: FittedMetamodel, log: Log) -> bool:
+    """Return whether the next batch explores: critical runs seem rare, and the exploration still finds new regions.
 
-    Rare: less than 1 % of the space is believed critical. Too long: as many runs as 20 % of the budget.
-    Never among the rows of a recorded table.
+    Rare: the mean P(critical) is below 1 %. Exploration ends when runs worth 20 % of the budget have found no new
+    region. Recorded tables are never explored.
     """
     rare = belief.scores["critical_fraction"] < _RARE and settings.scenario.pool is None
-    return rare and in_vain(settings, log) < _PATIENCE * settings.budget
+    return rare and fruitless_runs(settings, log) < _PATIENCE * settings.budget
 
 
-def in_vain(settings: Settings, log: Log) -> int:
-    """Return how many runs have hunted since a hunt last met a critical run apart from all before.
+def fruitless_runs(settings: Settings, log: Log) -> int:
+    """Return the number of exploratory runs since one last met a critical run apart from all earlier ones.
 
-    Apart: by more than the half side of a deflated box, 0.22 in the unit cube. Counted from the first
-    critical run on: as long as there is none, no hunt was in vain.
+    Apart: by more than the half side of a deflated box, 0.22 in the unit cube. Zero as long as there is no critical run.
     """
     scenario, history = settings.scenario, log.history
     hit = scenario.requirement.critical.contains(history.y(scenario.requirement.metric))
@@ -54,14 +53,14 @@ def in_vain(settings: Settings, log: Log) -> int:
         before = u[hit & (iteration < k)]
         if len(before) == 0:
             continue
-        first = np.flatnonzero(iteration == k)[: how.get(HUNTED, 0)]
+        first = np.flatnonzero(iteration == k)[: how.get(EXPLORED, 0)]
         met = first[hit[first]]
         new = len(met) > 0 and bool((cdist(u[met], before, "chebyshev").min(axis=1) > DEFLATION).any())
         spent = 0 if new else spent + len(first)
     return spent
 
 
-def hunt(settings: Settings, log: Log, n: int) -> Points:
+def explore(settings: Settings, log: Log, n: int) -> Points:
     """Return n points (n, d) in the inputs' units that search for a region apart from those that are known.
 
     Raises:
@@ -69,7 +68,7 @@ def hunt(settings: Settings, log: Log, n: int) -> Points:
     """
     scenario, space = settings.scenario, settings.scenario.space
     if settings.learner is None:
-        raise ValueError("a hunt needs a metamodel")
+        raise ValueError("exploration needs a metamodel")
     if n == 0:
         return np.empty((0, space.dimension))
     seen = log.history.where(log.history.stage != VALIDATION)
