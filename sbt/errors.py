@@ -6,10 +6,11 @@ folder of a campaign; `RunError` ends one run and becomes a row of the store, ne
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "did_you_mean"]
+__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "did_you_mean", "place_of"]
 
 
 class SbtError(Exception):
@@ -52,3 +53,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     by_lower = {each.lower(): each for each in known}
     close = get_close_matches(name.lower(), by_lower, 1)
     return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""
+
+
+def place_of(error: BaseException) -> str:
+    """Return file:line where the error was raised."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "no place"

@@ -152,10 +152,10 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
     kind = problems.attempt(("metamodel", "kind"), lambda: load("metamodels", choice.kind, loaded.folder))
     if kind is None:
         return None
-    if not isinstance(kind, type) or not callable(getattr(kind, "fit", None)):
+    if not callable(getattr(kind, "fit", None)):
         problems.add(
             ("metamodel", "kind"),
-            f"a metamodel must be a class with fit(u, y, rng), but '{choice.kind}' is not",
+            f"a metamodel must be a class (or an object) with fit(u, y, rng), but '{choice.kind}' is not",
         )
         return None
     settings = choice.settings

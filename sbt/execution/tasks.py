@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from typing import TypeVar
 
+from sbt.errors import place_of
 from sbt.execution.local import _THREADS, _end_with
-from sbt.execution.worker import place_of
 
 __all__ = ["each"]
 

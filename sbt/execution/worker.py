@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 import time
-import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
 
 import numpy as np
 
-from sbt.errors import InputError, RunError
+from sbt.errors import InputError, RunError, place_of
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["place_of", "run_job", "run_jobs", "versions"]
+__all__ = ["run_job", "run_jobs", "versions"]
 
 
 def run_job(scenario: LogicalScenario, job: Job) -> Outcome:
@@ -91,12 +90,6 @@ def _check_trace(trace: Trace) -> None:
         wrong = ~np.isfinite(values) & trace.present
         if wrong.any() or not trace.present[:, 0].all():
             raise RunError(Status.FAILED, f"every state must be finite, but trace.{name} is not")
-
-
-def place_of(error: BaseException) -> str:
-    """Return file:line where the error was raised."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "no place"
 
 
 def versions() -> str:
