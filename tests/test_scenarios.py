@@ -19,10 +19,10 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.scenarios import jaywalking, lane_keeping
 from sbt.sumo.actors import Action, Actor, Obstacle, State
-from sbt.sumo.drivers import ArcExit, SpeedProfile, Stand
+from sbt.sumo.drivers import ArcExit, SpeedProfile, Stationary
 from sbt.sumo.dynamics import Gust, JerkLimitedStop, SingleTrack
 from sbt.sumo.lane_keeping import MarkingSensor
-from sbt.sumo.sight import Boxes, outline
+from sbt.sumo.occlusion import Occluders, outline
 
 NAMES = ("following", "jaywalking", "lane_keeping", "parking")
 BUILT_IN = names("scenarios")
@@ -293,10 +293,10 @@ def test_boxes_hide_what_shapely_says() -> None:
         corners = [Obstacle("o", b[:3], *b[3:]).corners for b in boxes]
         union = shapely.union_all([shapely.Polygon(c) for c in corners])
         expected = [shapely.LineString([eye, p]).intersection(union).length > 0 for p in points]
-        assert Boxes(boxes).hides(eye, points).tolist() == expected
+        assert Occluders(boxes).occlude(eye, points).tolist() == expected
         lengths = [sum(shapely.LineString([eye, p]).intersection(shapely.Polygon(c)).length for c in corners) for p in points]
-        assert np.abs(Boxes(boxes).depth(eye, points) - lengths).max() < 1e-9
-    assert Boxes([]).depth(eye, points).tolist() == [0.0] * 40
+        assert np.abs(Occluders(boxes).blocked_length(eye, points) - lengths).max() < 1e-9
+    assert Occluders([]).blocked_length(eye, points).tolist() == [0.0] * 40
 
 
 def test_outline_lies_on_the_sides() -> None:
@@ -382,12 +382,12 @@ def test_actors_by_pose_need_a_controller() -> None:
     with pytest.raises(InputError, match="needs a controller"):
         Actor("a", ("road",), 0, 0.0, 0.0, None, pose=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="must have a pose"):
-        Actor("a", ("road",), 0, 0.0, 0.0, Stand(), person=True)
+        Actor("a", ("road",), 0, 0.0, 0.0, Stationary(), person=True)
 
 
 @pytest.mark.sumo
 def test_an_actor_by_pose_must_go_on_by_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = load("scenarios", "parking")
-    monkeypatch.setattr("sbt.sumo.drivers.Stand.act", lambda self, t, own, others: Action(speed=0.0))
+    monkeypatch.setattr("sbt.sumo.drivers.Stationary.act", lambda self, t, own, others: Action(speed=0.0))
     with pytest.raises(RunError, match="moves by pose"):
         scenario.run(centre(scenario), 0)

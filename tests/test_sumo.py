@@ -28,7 +28,7 @@ from sbt.sumo.actors import KEEP, Action, Actor, Obstacle, Scene, State, Vehicle
 from sbt.sumo.ego import Ego
 from sbt.sumo.sensors import Track
 from sbt.sumo.session import libsumo
-from sbt.sumo.simulation import DEADLINE_STEPS, SumoSimulation
+from sbt.sumo.simulation import CLOCK_STEPS, SumoSimulation
 
 pytestmark = pytest.mark.sumo
 
@@ -267,7 +267,7 @@ def test_a_slow_run_is_a_timeout():
         time.sleep(0.001)
         return Action(speed=1.0)
 
-    slow = driving(car(act=act, speed=0.0), duration=0.05 * (DEADLINE_STEPS + 50))
+    slow = driving(car(act=act, speed=0.0), duration=0.05 * (CLOCK_STEPS + 50))
     assert outcome(slow.limited(30.0)).status == Status.OK
     found = outcome(slow.limited(0.1))
     assert found.status == Status.TIMEOUT

@@ -73,8 +73,8 @@ def _show(
     """Show a run, or write it out, in the ways that are asked for."""
     from sbt.report.film import write_film
     from sbt.report.outside import write_csv, write_folder
+    from sbt.sumo.gui import gui_program, run_in_gui
     from sbt.sumo.nets import lanes, net_file
-    from sbt.sumo.window import gui_program, watch
 
     net = getattr(scenario.simulate, "net", None)
     if trace is not None:
@@ -87,6 +87,6 @@ def _show(
         title = f"{scenario.name}, run {record.index}: {metric.name} = {record.metrics[metric.name]:.3g} {metric.unit}"
         write_film(gif, states, metric, need, lanes=() if net is None else lanes(net), title=title)
     if gui:
-        watched = watch(scenario.simulate, record.inputs, record.seed, gui_program())
-        if not watched.identical(states):
+        shown = run_in_gui(scenario.simulate, record.inputs, record.seed, gui_program())
+        if not shown.identical(states):
             print("what sumo-gui showed differs from the run in the last digits", file=sys.stderr)

@@ -20,10 +20,10 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
+from sbt.sumo.ego_vehicle import EgoVehicle
 from sbt.sumo.files import SumoFiles, options_of_config
-from sbt.sumo.own_ego import OwnEgo
-from sbt.sumo.script import Loop, OwnSimulation, just_step
-from sbt.sumo.watch import Watching
+from sbt.sumo.recorder import RecordingSettings
+from sbt.sumo.user_simulation import Loop, UserSimulation, step_until_over
 
 __all__ = ["from_file", "is_scenario"]
 
@@ -76,8 +76,8 @@ class _Builder:
         problems.check()
         named = tuple(dict.fromkeys((*model.others.named, *(n for m in model.metrics for n in actors_of(m)))))
         named = tuple(n for n in named if n != model.ego.id)
-        simulation = problems.attempt(("step_length",), lambda: OwnSimulation(
-            Watching(ego or OwnEgo(model.ego.id), model.duration, model.others.within, named, model.wait),
+        simulation = problems.attempt(("step_length",), lambda: UserSimulation(
+            RecordingSettings(ego or EgoVehicle(model.ego.id), model.duration, model.others.within, named, model.wait),
             files, loop, self._folder, model.step_length,
         ))  # fmt: skip
         problems.check()
@@ -127,14 +127,14 @@ class _Builder:
     def _loop(self) -> Loop:
         name = self._model.simulate
         if name is None:
-            return just_step
+            return step_until_over
         found = self._problems.attempt(("simulate",), lambda: load("scenarios", name, self._folder))
         if found is not None and not callable(found):
             self._problems.add(("simulate",), f"a loop must be a function simulate(sumo, values, rng), but '{name}' is not")
-        loop: Loop = found if found is not None else just_step
+        loop: Loop = found if found is not None else step_until_over
         return loop
 
-    def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> OwnEgo | None:
+    def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> EgoVehicle | None:
         if files is not None and self._model.simulate is None and files.vehicle(entry.id) is None:
             names = files.names()
             known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
@@ -144,11 +144,11 @@ class _Builder:
         if kind is None:
             if entry.settings:
                 self._problems.add(("ego",), f"settings need a kind (a controller, or sumo), but got {', '.join(entry.settings)}")
-            return OwnEgo(entry.id, None, entry.set_speed, entry.lights, entry.may_leave)
+            return EgoVehicle(entry.id, None, entry.set_speed, entry.lights, entry.may_leave)
         if ".py:" in kind:
             kind = str(self._folder / Path(kind).expanduser())
         driver = self._problems.attempt(("ego",), lambda: Ego.of(kind, **entry.settings))
-        return OwnEgo(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave)
+        return EgoVehicle(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave)
 
     def _metrics(self) -> tuple[Metric, ...]:
         made: dict[str, Metric] = {}
@@ -182,7 +182,7 @@ class _Builder:
         """Compare placeholders and inputs."""
         known, used = list(self._model.inputs), set()
         try:
-            holes = list(files.holes())
+            holes = list(files.placeholders())
         except InputError as error:
             self._problems.add(("sumo",), str(error))
             return

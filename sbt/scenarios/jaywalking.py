@@ -20,7 +20,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
-from sbt.sumo.actors import Actor, Obstacle, Scene, State, Until, VehicleType
+from sbt.sumo.actors import Actor, EndCondition, Obstacle, Scene, State, VehicleType
 from sbt.sumo.drivers import Walk
 from sbt.sumo.dynamics import Gust
 from sbt.sumo.ego import Ego
@@ -111,13 +111,13 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
             Actor("ego", ("road",), 1, START, speed, driver, CAR),
             Actor("child", ("road",), 0, x, values["v_ped"], child, CHILD, start, person=True),
         ),
-        until_over(),
+        end_condition(),
         (machine,),
         {"friction": lambda: grip},
     )
 
 
-def until_over() -> Until:
+def end_condition() -> EndCondition:
     """Return the rule that ends the run: ego touches the child, has passed it, or it has crossed."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:

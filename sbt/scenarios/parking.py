@@ -20,8 +20,8 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import ActorTrace, Trace
-from sbt.sumo.actors import Actor, Pose, Scene, State, Until, VehicleType
-from sbt.sumo.drivers import ArcExit, Stand
+from sbt.sumo.actors import Actor, EndCondition, Pose, Scene, State, VehicleType
+from sbt.sumo.drivers import ArcExit, Stationary
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
 
@@ -63,14 +63,14 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
         (
             Actor("ego", ("aisle",), 0, 10.0, speed, driver, CAR, (values["x_ego"], values["y_ego"], WEST)),
             Actor("co_1", ("aisle",), 0, 30.0, 0.0, leaving, CAR, start),
-            Actor("co_2", ("aisle",), 0, 50.0, 0.0, Stand(), CAR, bay(2, values)),
-            Actor("co_3", ("aisle",), 0, 70.0, 0.0, Stand(), CAR, bay(3, values)),
+            Actor("co_2", ("aisle",), 0, 50.0, 0.0, Stationary(), CAR, bay(2, values)),
+            Actor("co_3", ("aisle",), 0, 70.0, 0.0, Stationary(), CAR, bay(3, values)),
         ),
-        until_over(leaving.end),
+        end_condition(leaving.end),
     )
 
 
-def until_over(end: float) -> Until:
+def end_condition(end: float) -> EndCondition:
     """Return the rule that ends the run: ego has passed co 1, or both stand."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:

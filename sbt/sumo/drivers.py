@@ -12,7 +12,7 @@ from sbt.sumo.actors import KEEP, Action, Pose, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, Gust
 from sbt.sumo.sensors import PERIOD, RangeSensor, Target
 
-__all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stand", "Walk"]
+__all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stationary", "Walk"]
 
 _as_action = partial(tuple.__new__, Action)
 """An `Action` of its four parts, without the default values that take most of the time to make one."""
@@ -203,7 +203,7 @@ class Walk:
         )
 
 
-class Stand:
+class Stationary:
     """Stands where it is."""
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:

@@ -15,7 +15,7 @@ from sbt.problem.parameter import Parameter
 from sbt.seeds import stream
 from sbt.sumo.actors import Controller, VehicleType
 from sbt.sumo.formatting import format_number, plain
-from sbt.sumo.models import checked, unit_of
+from sbt.sumo.models import unit_of, vtype_attributes
 
 __all__ = ["SUMO", "Ego"]
 
@@ -49,7 +49,7 @@ class Ego:
         ego = cls(kind, tuple((name, _setting(name, value)) for name, value in sorted(settings.items())))
         trial = ego.bound({p.name: p.centre for p in ego.inputs})
         if kind == SUMO:
-            checked(dict(trial.settings))
+            vtype_attributes(dict(trial.settings))
         elif not callable(getattr(trial.driver(stream(0, "ego"), 1.0), "act", None)):
             raise InputError(f"ego.kind must name a controller with act(t, own, others), but '{kind}' has none")
         return ego
@@ -99,7 +99,7 @@ class Ego:
         """Return the SUMO type of the ego: `base`, with SUMO's models where they drive."""
         if self.kind != SUMO:
             return base
-        given = checked(dict(self.settings))
+        given = vtype_attributes(dict(self.settings))
         length, width = float(given.pop("length", base.length)), float(given.pop("width", base.width))
         attributes = {"maxSpeed": format_number(set_speed), **_DEFAULTS, **dict(base.attributes), **given}
         return replace(base, length=length, width=width, attributes=tuple(sorted(attributes.items())))

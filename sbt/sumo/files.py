@@ -16,7 +16,7 @@ from pathlib import Path
 
 from sbt.errors import InputError
 from sbt.sumo.formatting import format_number
-from sbt.sumo.template import Hole, Template, Vehicle, fill, holes, template
+from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template
 
 __all__ = ["OWN", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
 
@@ -100,12 +100,12 @@ class SumoFiles:
         _check_net(template(self.net))
         return found
 
-    def holes(self) -> Iterator[Hole]:
+    def placeholders(self) -> Iterator[Placeholder]:
         """Yield every placeholder, in the files and in the options."""
         for one in self.templates:
-            yield from (p.hole for p in one.parts if p.hole is not None)
+            yield from (p.placeholder for p in one.parts if p.placeholder is not None)
         for name, value in self.options.items():
-            yield from holes(value, f"{self.places.get(name, '')}: {name}")
+            yield from placeholders(value, f"{self.places.get(name, '')}: {name}")
 
     def vehicle(self, name: str) -> tuple[Vehicle, Template] | None:
         """Return a vehicle, or the flow that makes it, and its file; None where there is none."""

@@ -15,7 +15,7 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean
 from sbt.sumo.formatting import format_number
 
-__all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "attributes_of", "checked", "unit_of"]
+__all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "known_attributes", "unit_of", "vtype_attributes"]
 
 SUBLANE = "SL2015"
 """The lane-change model that needs SUMO's option --lateral-resolution; without it, it never changes lanes."""
@@ -65,7 +65,7 @@ LANE_CHANGE: Mapping[str, Mapping[str, str]] = {
 """Lane-change model to its attributes and their units. SL2015 needs SUMO's option --lateral-resolution."""
 
 
-def attributes_of(model: str, lane_change: str) -> dict[str, str]:
+def known_attributes(model: str, lane_change: str) -> dict[str, str]:
     """Return the attributes that a vehicle of these two models takes, with their units.
 
     Raises:
@@ -80,7 +80,7 @@ def unit_of(name: str) -> str:
     return next((table[name] for table in tables if name in table), "")
 
 
-def checked(settings: Mapping[str, Any]) -> dict[str, str]:
+def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the vType attributes that settings of an ego of kind `sumo` mean, after a check of names and numbers.
 
     `model` and `lane_change` choose the models (SUMO's `carFollowModel` and `laneChangeModel`; Krauss and LC2013).
@@ -88,13 +88,13 @@ def checked(settings: Mapping[str, Any]) -> dict[str, str]:
     Raises:
         InputError: an unknown model, an attribute that these models do not have, or one that is no finite number.
 
-    >>> checked({"model": "IDM", "tau": 1.2})
+    >>> vtype_attributes({"model": "IDM", "tau": 1.2})
     {'carFollowModel': 'IDM', 'laneChangeModel': 'LC2013', 'tau': '1.2'}
     """
     aliases = {"carFollowModel": "model", "laneChangeModel": "lane_change"}
     given = {aliases.get(name, name): value for name, value in settings.items()}
     model, lane_change = str(given.pop("model", "Krauss")), str(given.pop("lane_change", "LC2013"))
-    known = attributes_of(model, lane_change)
+    known = known_attributes(model, lane_change)
     for name, value in given.items():
         if name not in known:
             hint = did_you_mean(name, known)

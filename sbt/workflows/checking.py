@@ -206,7 +206,7 @@ def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: 
 
 def _warned(spec: ScenarioSpec) -> list[Finding]:
     """Return what the simulator warned of in the last run, where the scenario passes it on (a user's own SUMO files)."""
-    said = getattr(spec.resolve().simulate, "said", None)
+    said = getattr(spec.resolve().simulate, "warnings", None)
     lines = () if said is None else said()
     more = f" (and {len(lines) - _WARNINGS} more)" if len(lines) > _WARNINGS else ""
     told = "; ".join(line.removeprefix("Warning: ") for line in lines[:_WARNINGS]) + more
