@@ -26,6 +26,8 @@ from sbt.problem.scenario import LogicalScenario
 __all__ = ["carry", "delivered"]
 
 _LOCK = threading.Lock()
+_ORIGINALS: dict[bytes, LogicalScenario] = {}
+"""In the process that carried them: runs there use the scenario itself, not a copy."""
 _DEPTH = 12
 """So deep it is searched for what cannot travel."""
 _FIND = """
@@ -60,6 +62,7 @@ def carry(scenario: LogicalScenario) -> bytes:
                 f"a scenario must be made of plain data and code to reach its workers, but {where} of scenario {scenario.name} "
                 f"cannot: {reason}; make it inside the function that uses it"
             ) from None
+    _ORIGINALS[data] = scenario
     return data
 
 
@@ -70,6 +73,8 @@ def delivered(data: bytes, name: str) -> LogicalScenario:
     Raises:
         InputError: the process lacks a package that the scenario uses, or the bytes are those of something else.
     """
+    if data in _ORIGINALS:
+        return _ORIGINALS[data]
     try:
         found = _cloudpickle().loads(data)
     except BaseException as error:

@@ -7,9 +7,9 @@ name elsewhere, as it was defined in a script or a notebook, is carried as bytes
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 
 __all__ = ["ScenarioSpec"]
+
+Attempt = Callable[[tuple[str | int, ...], Callable[[], LogicalScenario]], LogicalScenario | None]
 
 
 @dataclass(frozen=True)
@@ -59,28 +61,66 @@ class ScenarioSpec:
             InputError: the scenario does not offer one of the choices, or was carried and cannot be loaded here.
         """
         ego = None if self.ego is None else json.dumps(dict(self.ego), sort_keys=True)
-        folder = str(Path(self.folder).resolve())
-        choices = (ego, self.isolation, self.step_length, self.formula, self.conflict_type, self.metrics)
-        return _resolve(self.name, folder, self.carried, *choices)
+        plain = replace(self, ego=None, folder=str(Path(self.folder).resolve()))
+        return _resolved(plain, ego)
+
+    def resolve_at(self, attempt: Attempt) -> LogicalScenario | None:
+        """Return the scenario, one choice after the other.
+
+        Args:
+            attempt: (key of the configuration, what makes the scenario with this choice) -> the scenario, or None where the
+                choice is impossible; the other choices are then tried without it.
+
+        Returns:
+            The scenario with every choice that is possible; None where there is none at all.
+        """
+        scenario = attempt(("scenario",), partial(_loaded, self.name, Path(self.folder), self.carried))
+        if scenario is None:
+            return None
+        for key, change in self._choices():
+            scenario = attempt(key, partial(change, scenario)) or scenario
+        return scenario
+
+    def _choices(self) -> Iterator[tuple[tuple[str | int, ...], Callable[[LogicalScenario], LogicalScenario]]]:
+        """Yield each choice by its key in the configuration, as a change of the scenario."""
+        for k, name in enumerate(self.metrics):
+            yield ("metrics", k), partial(_with_metric, name, Path(self.folder))
+        if self.formula is not None:
+            yield ("requirement", "stl"), partial(_requiring, formula=self.formula)
+        if self.conflict_type:
+            yield ("campaign",), _with_conflict_type
+        if self.ego is not None:
+            yield ("ego",), partial(LogicalScenario.configured, ego=self.ego)
+        if self.step_length is not None:
+            yield ("simulation", "step_length"), partial(LogicalScenario.configured, step_length=self.step_length)
+        yield ("executor", "isolation"), partial(LogicalScenario.configured, isolation=self.isolation)  # may depend on the ego
 
 
-@cache
-def _resolve(
-    name: str, folder: str, carried: bytes, ego: str | None, isolation: str, step_length: float | None, formula: str | None,
-    conflict: bool, metrics: tuple[str, ...],
-) -> LogicalScenario:  # fmt: skip
-    scenario = delivered(carried, name) if carried else load("scenarios", name, Path(folder))
+def _loaded(name: str, folder: Path, carried: bytes) -> LogicalScenario:
+    """Return the scenario itself, without any choice."""
+    scenario = delivered(carried, name) if carried else load("scenarios", name, folder)
     if not isinstance(scenario, LogicalScenario):
         hint = "; a TraCI loop goes into a scenario.yaml: simulate: file.py:NAME" if callable(scenario) else ""
         raise PluginError(f"a scenario must be a LogicalScenario, but '{name}' is a {type(scenario).__name__}{hint}")
-    for metric in metrics:
-        scenario = _measuring(scenario, _metric(metric, Path(folder), scenario))
-    if formula is not None:
-        scenario = _requiring(scenario, formula)
-    if conflict and scenario.simulate is not None:
-        scenario = _measuring(scenario, conflict_type(scenario.roles.ego))
-    chosen = scenario.configured(None if ego is None else json.loads(ego), None, step_length)
-    return chosen.configured(isolation=isolation)  # afterwards: what is allowed may depend on the ego
+    return scenario
+
+
+@cache
+def _resolved(spec: ScenarioSpec, ego: str | None) -> LogicalScenario:
+    found = replace(spec, ego=None if ego is None else json.loads(ego)).resolve_at(lambda _, make: make())
+    if found is None:
+        raise PluginError(f"scenario {spec.name} cannot be loaded")
+    return found
+
+
+def _with_metric(name: str, folder: Path, scenario: LogicalScenario) -> LogicalScenario:
+    """Return the scenario with a metric of this name."""
+    return _measuring(scenario, _metric(name, folder, scenario))
+
+
+def _with_conflict_type(scenario: LogicalScenario) -> LogicalScenario:
+    """Return the scenario with the type of conflict as a metric, where runs have a trace."""
+    return scenario if scenario.simulate is None else _measuring(scenario, conflict_type(scenario.roles.ego))
 
 
 def _metric(name: str, folder: Path, scenario: LogicalScenario) -> Metric:
