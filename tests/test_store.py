@@ -218,10 +218,17 @@ def test_damage_is_told_and_never_read_as_a_result(tmp_path: Path, written: byte
         read_everything(tmp_path)
 
 
-@pytest.mark.parametrize("content", [b"", b"SQLite format 3\x00" + b"\x00" * 50, b"not a database at all" * 400])
-def test_a_file_that_is_no_store_is_told(tmp_path: Path, content: bytes):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "there is none in"),
+        (b"SQLite format 3\x00" + b"\x00" * 50, "is not a database"),
+        (b"not a database at all" * 400, "is not a database"),
+    ],
+)
+def test_a_file_that_is_no_store_is_told(tmp_path: Path, content: bytes, message: str):
     (tmp_path / DATABASE).write_bytes(content)
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match=message):
         Store.read(tmp_path)
 
 
