@@ -111,7 +111,7 @@ def awkward(values, seed):
     if kind == 3:
         raise KeyError("no such thing")  # marked
     if kind == 4:
-        return {"y": float("nan")}
+        return {"y": float("nan"), "noise": 0.0}
     if kind == 5:
         time.sleep(0.1)
     return disc(values, seed)

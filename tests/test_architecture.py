@@ -199,7 +199,8 @@ def test_nothing_heavy_is_loaded_early():
     assert loaded_by("import sbt") & set(HEAVY) == set()
     assert loaded_by("import sbt.cli") & set(HEAVY) == set()
     later = {"torch", "gpytorch", "libsumo", "pandas", "sklearn", "matplotlib"}
-    assert loaded_by("import sbt.workflows.running, sbt.config.assemble, sbt.store.database, sbt.execution.local") & later == set()
+    loop = "sbt.workflows.running, sbt.config.assemble, sbt.store.database, sbt.execution.local"
+    assert loaded_by(f"import {loop}") & later == set()
     method = "sbt.acquisitions, sbt.samplers.roi, sbt.testing, sbt.metamodels.base, sbt.metamodels.scores"
     assert loaded_by(f"import {method}") & later == set()
 
