@@ -39,10 +39,11 @@ def describe_scenario(scenario: LogicalScenario) -> dict[str, Any]:
 
 
 def _parameter(p: Parameter) -> dict[str, Any]:
-    law = p.distribution
+    found = p.distribution
+    distribution = None if found is None else {"kind": found.kind, "parameters": [list(pair) for pair in found.parameters]}
     return {
         "name": p.name, "low": _ended(p.low), "high": _ended(p.high), "unit": p.unit, "kind": p.kind, "description": p.description,
-        "distribution": None if law is None else {"kind": law.kind, "parameters": [list(pair) for pair in law.parameters]},
+        "distribution": distribution,
     }  # fmt: skip
 
 

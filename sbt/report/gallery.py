@@ -92,7 +92,7 @@ def _runs_over_one(found: Findings, space: ParameterSpace, predict: Predict | No
     caption = f"The safety metric of every run; shaded where critical. {_MARKERS} Failed runs lie on the floor."
     if predict is not None:
         u = np.linspace(0.0, 1.0, 401)[:, None]
-        figures.plot_belief(space.from_unit(u)[:, 0], predict(u), ax)
+        figures.plot_prediction(space.from_unit(u)[:, 0], predict(u), ax)
         caption += " Line and band: the metamodel's mean and its 5 % to 95 % quantiles."
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return Drawing("runs", "Runs in input space", caption, to_svg(figure, "runs"))

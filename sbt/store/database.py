@@ -245,7 +245,7 @@ class Store:
         for k, (index, run) in enumerate(zip(places, runs, strict=True)):
             inputs = _dump([run.inputs[name] for name in names])
             chosen, seed = run.seed is not None, seeds[k] if run.seed is None else run.seed
-            log_q = None if run.log_q is None else float(run.log_q)
+            log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
             row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, run.warm_up, log_q)
             rows.append((*row, _checksum(*row), PLANNED))
         text = _dump(proposal if isinstance(proposal, dict) else to_json(proposal))
