@@ -206,10 +206,10 @@ def configured(analytic: Path) -> Callable[..., Path]:
 def campaign(configured: Callable[..., Path]) -> Callable[..., dict[str, Any]]:
     """Run a campaign of an analytic scenario in this process; no report unless it is asked for."""
     from sbt.config.load import load
-    from sbt.workflows.running import run_campaign
+    from studies import run_loaded
 
     def run(name: str = "c", scenario: str = "SCENARIO", *, report: bool = False, **keys: Any) -> dict[str, Any]:
-        return run_campaign(load(configured(name, scenario, **keys)), report=report)
+        return run_loaded(load(configured(name, scenario, **keys)), report=report)
 
     return run
 

@@ -21,7 +21,7 @@ from sbt.plugins import load
 from sbt.problem.requirement import CriticalInterval
 from sbt.store.database import Store
 from sbt.testing import ContractError, check_acquisition, check_metamodel
-from sbt.workflows.running import run_campaign
+from studies import run_loaded
 
 PLUGINS = '''
 import numpy as np
@@ -117,7 +117,7 @@ def run(folder: Path) -> Run:
         settings = {"campaign": "boundary", "scenario": "own.py:PLANE", "budget": 60, "initial": 20, "batch": 20, "seed": 1,
                     "executor": {"kind": "serial"}, "store": str(folder / store), **keys}  # fmt: skip
         text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in settings.items())
-        result = run_campaign(parse(text, folder=folder), report=False)
+        result = run_loaded(parse(text, folder=folder), report=False)
         with Store.read(folder / store) as written:
             return result, written.history().x
 
