@@ -18,7 +18,6 @@ import numpy as np
 
 import sbt
 from sbt import testbeds
-from sbt.loop.learner import chunked
 from sbt.metamodels.scores import scores
 from sbt.seeds import stream
 
@@ -49,9 +48,9 @@ def boundary(size: int, seed: int) -> dict:
             campaign="boundary", scenario=f"testbed:{BOUNDARY}", seed=seed, budget=100, initial=20, batch=size, metamodel="gp",
             executor="serial", store=f"{folder}/store", report=False,
         )  # fmt: skip
-        space, history = result.scenario.space, result.history
+        space, learner, runs = result.scenario.space, result.study.learner, result.history.finished
     u = stream(99, "reference").random((20_000, space.dimension))
-    prediction = chunked(result.study.learner.train(history.finished), space.metamodel_inputs(u))
+    prediction = learner.on_inputs(learner.train(runs), len(runs))(u)
     y = testbeds.values(BOUNDARY, space.from_unit(u))
     return {"value": scores(prediction, y, result.scenario.requirement.critical)["f1"], "hours": hours(result)}
 

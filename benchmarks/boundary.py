@@ -22,7 +22,6 @@ from scipy.spatial import cKDTree
 import sbt
 from sbt.execution.local import LocalExecutor
 from sbt.execution.spec import ScenarioSpec
-from sbt.loop.learner import chunked
 from sbt.metamodels.scores import scores
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job
@@ -78,8 +77,8 @@ def main() -> None:
                 learner, scenario, history = result.study.learner, result.scenario, result.history
                 reference = reference or reference_set(args, scenario)
             for n in range(args.batch, args.budget + 1, args.batch):
-                predictor = learner.train(history.where(np.arange(len(history)) < n).finished)
-                prediction = chunked(predictor, scenario.space.metamodel_inputs(scenario.space.to_unit(reference[0])))
+                runs = history.where(np.arange(len(history)) < n).finished
+                prediction = learner.on_inputs(learner.train(runs), len(runs))(scenario.space.to_unit(reference[0]))
                 found = scores(prediction, reference[1], scenario.requirement.critical)
                 for metric in METRICS:
                     rows.setdefault((n, campaign), {}).setdefault(metric, []).append(found[metric])

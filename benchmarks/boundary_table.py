@@ -34,7 +34,6 @@ import sbt
 from sbt import testbeds
 from sbt.execution.local import LocalExecutor
 from sbt.execution.spec import ScenarioSpec
-from sbt.loop.learner import chunked
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Job
 from sbt.problem.scenario import LogicalScenario
@@ -145,11 +144,11 @@ def cell(problem: str, method: str, metamodel: str, seed: int, folder: Path, n: 
         start = time.process_time()
         result = run(problem, method, seed, place, metamodel)
         seconds = time.process_time() - start
-        predictor = result.study.learner.train(result.history.finished)
-        scenario = result.scenario
+        scenario, learner, runs = result.scenario, result.study.learner, result.history.finished
+        predict = learner.on_inputs(learner.train(runs), len(runs))
     space, interval = scenario.space, scenario.requirement.critical
     x, critical, weight = test_points(problem, scenario, folder, n) if apart is None else apart
-    p = chunked(predictor, space.metamodel_inputs(space.to_unit(x))).probability(interval)
+    p = predict(space.to_unit(x)).probability(interval)
     return {**weighted_scores(p, critical, weight), "cpu_s": seconds}
 
 

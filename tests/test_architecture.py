@@ -45,7 +45,8 @@ LATE = {
 """Imports inside functions that may look up: only when they are needed."""
 BELONGS = {
     "libsumo": {"sumo"}, "traci": {"sumo"}, "torch": {"metamodels"}, "gpytorch": {"metamodels"}, "sklearn": {"metamodels"},
-    "joblib": {"execution"}, "distributed": {"execution"}, "sqlite3": {"store", "cli"}, "typer": {"cli"}, "pydantic": {"config", "store"},  # of files, and of records read back
+    "joblib": {"execution"}, "distributed": {"execution"}, "sqlite3": {"store", "cli"}, "typer": {"cli"},
+    "pydantic": {"config", "store"},  # reads configurations, and records of the log
 }  # fmt: skip
 HEAVY = ("torch", "gpytorch", "libsumo", "pandas", "scipy", "sklearn", "matplotlib", "pydantic", "joblib", "numpy")
 
@@ -85,7 +86,8 @@ def imports(path: Path) -> Iterator[tuple[str, int, str]]:
             for alias in node.names:
                 named = ROOT / Path(*base.split("."), alias.name)
                 submodule = named.with_suffix(".py").is_file() or (named / "__init__.py").is_file()
-                yield (f"{base}.{alias.name}" if submodule and base.startswith("sbt") else base, node.lineno, kind.get(node, "now"))
+                target = f"{base}.{alias.name}" if submodule and base.startswith("sbt") else base
+                yield (target, node.lineno, kind.get(node, "now"))
 
 
 def test_imports_go_down():
@@ -109,7 +111,7 @@ def test_the_root_is_small():
 
 
 def test_rooms_know_few_rooms():
-    """A room is a folder, a loose module at the root, or benchmarks/; an edge is a room that any of its files imports, now or late."""
+    """Rooms: folders, loose modules at the root, benchmarks/. An edge: a room that one of its files imports, now or late."""
     files = [*zip(FILES, map(room, MODULES), strict=True), *((path, "benchmarks") for path in (ROOT / "benchmarks").glob("*.py"))]
     edges = {
         (here, room(target)) for path, here in files for target, _, when in imports(path)
