@@ -82,6 +82,20 @@ class Study:
         """Return the study with another store."""
         return replace(self, loaded=replace(self.loaded, config=self.config.model_copy(update={"store": str(folder)})))
 
+    def sharded(self, text: str, *, apart: bool) -> tuple[Study, Shard]:
+        """Return the study of one share of the runs, and which it is.
+
+        Args:
+            text: I/N, as on the command line.
+            apart: in a store of its own, in the folder of the study's.
+
+        Raises:
+            InputError: the text is no share.
+        """
+        shard = Shard.parse(text)
+        folder = Path(self.config.store) / f"shard-{shard.number}-of-{shard.of}"
+        return self.with_store(folder) if apart else self, shard
+
     @property
     def config(self) -> Configuration:
         """The checked configuration."""
