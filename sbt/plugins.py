@@ -24,7 +24,7 @@ __all__ = ["KINDS", "OBJECT", "Scope", "load", "names"]
 OBJECT = "object:"
 """Before the name of an object that was given in Python, where a name is asked for."""
 
-KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns", "sources")
+KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
 

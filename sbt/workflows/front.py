@@ -237,6 +237,7 @@ class Run:
         seed: of the run.
         outcome: status, metrics, or the reason why there are none.
         states: the trace; None where the scenario has none or the run failed.
+        name: of the scenario, as it was asked for.
     """
 
     scenario: LogicalScenario
@@ -244,6 +245,11 @@ class Run:
     seed: int
     outcome: Outcome
     states: Trace | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        """Take the scenario's own name where it was given as an object."""
+        object.__setattr__(self, "name", self.name or self.scenario.name)
 
     @property
     def status(self) -> Status:
@@ -288,7 +294,7 @@ class Run:
     def to_dict(self) -> dict[str, Any]:
         """Return what `simulate --json` prints."""
         return {
-            "scenario": self.scenario.name, "seed": self.seed, "inputs": dict(self.inputs), "status": str(self.status),
+            "scenario": self.name, "seed": self.seed, "inputs": dict(self.inputs), "status": str(self.status),
             "metrics": dict(self.metrics), "critical": self.critical, "reason": self.reason, "seconds": self.outcome.seconds,
         }  # fmt: skip
 
@@ -296,7 +302,7 @@ class Run:
         """Return status, metrics and verdict."""
         metrics = ", ".join(f"{name} {value:g}" for name, value in self.metrics.items())
         verdict = {True: "critical", False: "not critical", None: self.reason}[self.critical]
-        return f"<Run of {self.scenario.name}, seed {self.seed}: {self.status}, {metrics or 'no metrics'}; {verdict}>"
+        return f"<Run of {self.name}, seed {self.seed}: {self.status}, {metrics or 'no metrics'}; {verdict}>"
 
 
 def simulate_scenario(
@@ -333,7 +339,7 @@ def simulate_scenario(
         found = replace(found, metrics=(*found.metrics, *own))
     values = found.space.values({name: _number(name, value) for name, value in (inputs or {}).items()})
     outcome, states = run_traced(found, Job(0, values, seed))
-    return Run(found, values, seed, outcome, states)
+    return Run(found, values, seed, outcome, states, "" if isinstance(scenario, LogicalScenario) else str(scenario))
 
 
 def _number(name: str, value: Any) -> float:
@@ -362,6 +368,10 @@ class Checked:
         """Whether every rule holds."""
         return all(finding.ok for finding in self.findings)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `check --json` prints, but the target."""
+        return {"ok": self.ok, "findings": [vars(finding) for finding in self.findings]}
+
     def __repr__(self) -> str:
         """Return a line a rule."""
         return "\n".join(f"{'ok  ' if f.ok else 'FAIL'}  {f.rule}: {f.detail}" for f in self.findings)
@@ -384,7 +394,6 @@ def check_target(target: LogicalScenario | str | Path, *, seed: int = 0, isolati
     return Checked(check_scenario(_spec(target, isolation), seed))
 
 
-_KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 _WRITTEN = {"table": "table:FOLDER", "testbed": "testbed:NAME", "yaml": "FOLDER/scenario.yaml"}
 """How the sources of this package are asked for a scenario; others as PREFIX:REST."""
 
@@ -398,8 +407,8 @@ def installed(kind: str = "scenarios") -> dict[str, str]:
     Raises:
         InputError: there is no such kind.
     """
-    if kind not in _KINDS:
-        raise InputError(f"KIND must be one of {', '.join(_KINDS)}, but got '{kind}'{did_you_mean(kind, _KINDS)}")
+    if kind not in plugins.KINDS:
+        raise InputError(f"KIND must be one of {', '.join(plugins.KINDS)}, but got '{kind}'{did_you_mean(kind, plugins.KINDS)}")
     if kind == "sources":
         from sbt import testbeds
 
