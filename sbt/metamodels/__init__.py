@@ -12,3 +12,8 @@ def __getattr__(name: str) -> Any:
     if name.startswith("_") or name not in plugins.names("metamodels"):
         raise AttributeError(f"module 'sbt.metamodels' has no attribute '{name}'; installed: {', '.join(plugins.names('metamodels'))}")
     return plugins.load("metamodels", name)
+
+
+def __dir__() -> list[str]:
+    """Return the names of those that are installed."""
+    return plugins.names("metamodels")

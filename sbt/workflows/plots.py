@@ -164,7 +164,7 @@ class Plots:
         log_p, log_not = log_probability(self._fitted.predict, need.critical, space.to_unit(held.x))
         return log_p, log_not, need.critical_runs(held)
 
-    def _need(self, there: bool, what: str) -> None:  # noqa: FBT001
+    def _need(self, there: bool, what: str) -> None:
         if not there:
             raise InputError(f"this figure needs {what}, but {self.result.store} has none")
 
