@@ -41,12 +41,7 @@ __all__ = [
     "ContractError", "check_acquisition", "check_campaign", "check_metamodel", "check_metric", "check_sampler", "check_scenario",
 ]  # fmt: skip
 
-_INTERVALS = (
-    CriticalInterval(high=0.0),
-    CriticalInterval(low=1.0),
-    CriticalInterval(-0.5, 0.5),
-    CriticalInterval(high=-1e6),
-)
+_INTERVALS = (CriticalInterval(high=0.0), CriticalInterval(low=1.0), CriticalInterval(-0.5, 0.5), CriticalInterval(high=-1e6))
 _SINGLE = 1e-5  # relative: networks predict in single precision (eps 1.2e-7), and another shape adds in another order
 
 
@@ -204,7 +199,7 @@ def check_campaign(kind: CampaignKind | Callable[[Settings], Campaign], *, seed:
             _require(said == found, "the same runs must give the same conclusion", f"{said} after {found} ({case})")
             half = len(rows) // 2
             stopped, part = Path(folder) / "stopped", f"{case}, stopped after {half} runs"
-            with suppress(_Stopped):
+            with suppress(_StoppedError):
                 _ran(kind, share, seed, stopped, part, stop_after=half)
             resumed, same = _ran(kind, share, seed, stopped, part)
             _require(same == rows, "a campaign that was stopped must go on to the same runs: a stage may look at the log alone",
@@ -218,7 +213,7 @@ _BUDGET = 36
 _ENDLESS = 10  # times the budget: confirmations come beside it
 
 
-class _Stopped(Exception):
+class _StoppedError(Exception):
     """The campaign was stopped on purpose."""
 
 
@@ -235,17 +230,21 @@ def _ran(
         return {"y": float(np.hypot(values["a"] - 0.6, values["b"] - 0.5)) - 0.3}
 
     def listen(progress: Progress) -> None:
-        _require(progress.done <= _ENDLESS * _BUDGET, f"a campaign must end near its budget of {_BUDGET}", f"{progress.done} runs")
+        rule = f"a campaign must end near its budget of {_BUDGET}"
+        _require(progress.done <= _ENDLESS * _BUDGET, rule, f"{progress.done} runs")
         if stop_after is not None and progress.done >= stop_after:
-            raise _Stopped
+            raise _StoppedError
 
-    scenario = LogicalScenario("disc", [Parameter("a", 0, 1), Parameter("b", 0, 1)], Requirement("y", high=0.0), evaluate=evaluate)
-    sizes: dict[str, Any] = {"budget": _BUDGET, "initial": 12, "batch": 12, "seed": seed, "store": store}
+    inputs = [Parameter("a", 0, 1), Parameter("b", 0, 1)]
+    scenario = LogicalScenario("disc", inputs, Requirement("y", high=0.0), evaluate=evaluate)
+    settings: dict[str, Any] = {"budget": _BUDGET, "initial": 12, "batch": 12, "seed": seed, "store": store}
+    if CampaignKind.of(kind, "check_campaign").adaptive:
+        settings["metamodel"] = "et"
     try:
         found = run_campaign(
-            campaign=kind, scenario=scenario, executor="serial", metamodel="et", report=False, progress=listen, **sizes
+            campaign=kind, scenario=scenario, executor="serial", report=False, progress=listen, **settings
         )
-    except (_Stopped, ContractError):
+    except (_StoppedError, ContractError):
         raise
     except Exception as error:
         raise ContractError(f"a campaign must run to its end, but raised {described(error)} ({case})") from error

@@ -140,7 +140,7 @@ def _listed(proposal: Mapping[str, Any]) -> str:
 
 
 def simulate_command(scenario: str, record: Record) -> str:
-    """Return the command that runs a concrete scenario again, its inputs to the last digit; in Python where it was defined there."""
+    """Return the command that runs a concrete scenario again, to the last digit; in Python where it was defined there."""
     if scenario.startswith(OBJECT):
         return f"sbt.simulate({scenario.removeprefix(OBJECT)}, {dict(record.inputs)!r}, seed={record.seed})"
     inputs = (f"{name}={value!r}" for name, value in record.inputs.items())

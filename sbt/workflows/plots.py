@@ -39,7 +39,8 @@ class Plots:
 
         Args:
             ax: where; None: a new figure.
-            x, y: names of the inputs; None: the most influential ones.
+            x: name of the input along the axis; None: the most influential one.
+            y: likewise, upwards.
         """
         from sbt.report import figures
 
@@ -53,7 +54,8 @@ class Plots:
 
         Args:
             ax: where; None: a new figure.
-            x, y: names of the inputs; None: the most influential ones.
+            x: name of the input along the axis; None: the most influential one.
+            y: likewise, upwards.
         """
         from sbt.report import figures
         from sbt.report.projection import probability_plane

@@ -195,10 +195,12 @@ class Result(Generic[C]):
         config, ok = self.study.config, int(self.history.ok.sum())
         critical = int(self.scenario.requirement.critical_runs(self.history).sum())
         facts = {
-            "campaign": config.campaign.removeprefix(OBJECT), "scenario": config.scenario.removeprefix(OBJECT), "runs": f"{len(self.history):,}",
-            "critical": f"{critical:,}", "failed": f"{len(self.history) - ok:,}", "store": str(self.store),
+            "campaign": config.campaign.removeprefix(OBJECT), "scenario": config.scenario.removeprefix(OBJECT),
+            "runs": f"{len(self.history):,}", "critical": f"{critical:,}", "failed": f"{len(self.history) - ok:,}",
+            "store": str(self.store),
         }  # fmt: skip
-        rows = "".join(f"<tr><th style='text-align:left'>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())
+        pairs = ((html.escape(name), html.escape(value)) for name, value in facts.items())
+        rows = "".join(f"<tr><th style='text-align:left'>{name}</th><td>{value}</td></tr>" for name, value in pairs)
         said = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in self.sentences())
         return f"<div>{said}<table>{rows}</table></div>"
 
