@@ -47,12 +47,12 @@ class Scope:
         Raises:
             PluginError: nothing has this name, or it was defined in Python and is not given here.
         """
-        if not name.startswith(OBJECT):
-            return load(kind, name, self.folder)
-        if (kind, name) not in self.objects:
+        if (kind, name) in self.objects:
+            return self.objects[kind, name]
+        if name.startswith(OBJECT):
             one, own = kind.removesuffix("s"), name.removeprefix(OBJECT)
             raise PluginError(f"the {one} '{own}' was defined in Python and must be given again: {one}={own}")
-        return self.objects[kind, name]
+        return load(kind, name, self.folder)
 
 
 @cache

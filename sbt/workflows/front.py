@@ -20,7 +20,7 @@ from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_traced
 from sbt.plugins import OBJECT, Scope
-from sbt.problem.description import scenario_differences
+from sbt.problem.description import describe_scenario, scenario_differences
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario, Metric, metric_from
 from sbt.problem.trace import Trace
@@ -109,12 +109,15 @@ def open_result(
     """
     folder = Path(store)
     given = {"scenario": scenario, "metamodel": metamodel, "acquisition": acquisition, "campaign": campaign}
+    for name, value in given.items():
+        if isinstance(value, str | Path):
+            raise InputError(f"{name} must be the object that the store was made with, but got '{value}'; what has a name is found")
     _, objects = as_data({key: value for key, value in given.items() if value is not None} | {"metrics": metrics})
     with Store.read(folder) as opened:
         study = Study.from_store(opened, objects=objects)
         _check_objects(study, objects, folder)
         if scenario is not None and not study.config.metrics:
-            changed = scenario_differences(study.kept["described"], Study(study.loaded).snapshot()["described"])
+            changed = scenario_differences(study.kept["described"], describe_scenario(study.runnable))
             if changed:
                 raise InputError(f"scenario {scenario.name} must be the one that {folder} was made with, but {changed}")
     return Result(folder, objects)

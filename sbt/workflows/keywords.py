@@ -56,7 +56,7 @@ def as_data(keys: Mapping[str, Any]) -> tuple[dict[str, Any], dict[tuple[str, st
 
     def named(kind: str, thing: Any) -> str:
         """Return the name that stands for an object in the configuration."""
-        name = OBJECT + str(getattr(thing, "name", None) or getattr(thing, "__name__", None) or type(thing).__name__)
+        name = OBJECT + str(getattr(thing, "name", "") or getattr(thing, "__name__", None) or type(thing).__name__)
         objects[kind, name] = thing
         return name
 

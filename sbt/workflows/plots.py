@@ -140,7 +140,7 @@ class Plots:
         from sbt.report.projection import influence_from_runs, influence_on_probability
 
         r = self.result
-        if r.fitted is not None:
+        if r.study.learns and r.fitted is not None:
             weights = influence_on_probability(r.fitted.predict, r.scenario.requirement.critical, r.scenario.space.dimension)
             if weights.any():
                 return weights
@@ -151,7 +151,7 @@ class Plots:
         """The metamodel."""
         fitted = self.result.fitted
         if fitted is None:
-            self._need(self.result.study.learner is not None, "metamodel (run with metamodel=...)")
+            self._need(self.result.study.learner is not None, "a metamodel (run with metamodel=...)")
             raise InputError(f"this figure needs two runs to learn from, but {self.result.store} has fewer")
         return fitted
 
