@@ -111,7 +111,7 @@ def open_result(
     given = {"scenario": scenario, "metamodel": metamodel, "acquisition": acquisition, "campaign": campaign}
     for name, value in given.items():
         if isinstance(value, str | Path):
-            raise InputError(f"{name} must be the object that the store was made with, but got '{value}'; what has a name is found")
+            raise InputError(f"{name} must be the object that the store was made with, but got '{value}'")
     _, objects = as_data({key: value for key, value in given.items() if value is not None} | {"metrics": metrics})
     with Store.read(folder) as opened:
         study = Study.from_store(opened, objects=objects)
