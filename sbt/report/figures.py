@@ -24,7 +24,7 @@ from sbt.store.history import VALIDATION, History
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_prediction", "plot_metric", "plot_probability", "plot_runs"]
+__all__ = ["plot_metric", "plot_prediction", "plot_probability", "plot_runs"]
 
 _RASTER = 1500
 """More markers than this become an image inside the SVG, which keeps the file small."""
