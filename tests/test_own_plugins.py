@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 from typer.testing import CliRunner
 
 from sbt.acquisitions import boundary, greedy, is_greedy, log_scores
@@ -147,7 +148,7 @@ class Missing:
 
 class Refuses:
     def __init__(self, degree=1):
-        assert degree < 5, "too wiggly"  # noqa: PT018
+        assert degree < 5, "too wiggly"
 
     def fit(self, u, y, rng):
         return None
@@ -230,22 +231,19 @@ def test_scores_above_zero_are_drawn_from(run, campaign, kind):
 @pytest.mark.parametrize("campaign", ["boundary", "falsification"])
 @pytest.mark.parametrize("kind", ["straddle", "expected_feasibility", "u", "own.py:farthest", "own.py:WIDE"])
 def test_greedy_acquisitions_are_chosen_greedily(run, campaign, kind):
-    """Of the same budget: the highest scores, none of them near another."""
-    keys = {"campaign": campaign, "metamodel": {"kind": "own.py:Nearest"}, "validation": {"share": 0}, "stop": None}
-    keys = {k: v for k, v in keys.items() if v is not None}
+    """No point twice; where the score is the distance to the runs, points lie farther apart than even ones."""
+    keys = {"campaign": campaign, "metamodel": {"kind": "own.py:Nearest"}, "validation": {"share": 0}}
     _, x = run(acquisition={"kind": kind}, **keys)
-    u = x[:60] / 0.5
-    gaps = np.linalg.norm(u[:, None] - u[None], axis=2)[np.triu_indices(len(u), 1)]
-    if kind in ("own.py:farthest", "own.py:WIDE"):
-        _, random = run("random", acquisition={"kind": "even"}, **keys)
-        far = np.linalg.norm((random[:60] / 0.5)[:, None] - (random[:60] / 0.5)[None], axis=2)[np.triu_indices(60, 1)]
-        assert gaps.min() > far.min()
-    assert len(np.unique(u, axis=0)) == 60
+    assert len(np.unique(x[:60], axis=0)) == 60
+    if kind.startswith("own.py"):
+        _, even = run("even", acquisition={"kind": "even"}, **keys)
+        assert pdist(x[:60]).min() > pdist(even[:60]).min()
 
 
 def test_an_error_of_an_acquisition_names_it_and_the_line(run, folder):
     line = next(i for i, text in enumerate(PLUGINS.splitlines(), 1) if "# marked" in text)
-    with pytest.raises(InputError, match=rf"acquisition broken must score \d+ points, but raised AttributeError: .*own.py:{line}\)"):
+    message = rf"acquisition broken must score \d+ points, but raised AttributeError: .*own.py:{line}\)"
+    with pytest.raises(InputError, match=message):
         run(acquisition={"kind": "own.py:broken"})
 
 

@@ -1,1 +1,1 @@
-"""What is believed: metamodels and their predictions; the only place with torch and scikit-learn."""
+"""Metamodels and their predictions; the only place with torch and scikit-learn."""
