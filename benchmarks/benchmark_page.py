@@ -65,7 +65,7 @@ none of them learned from. Written by `benchmarks/benchmark_page.py` from the re
 Iterations x runs: {entries}. Cells done: {_seeds(results)}. What is reduced against the paper
 stands at the top of the configuration; {_few(loaded)}
 
-```
+```bash
 sumo-sbt benchmark configs/{config.name}          # resumes where it was stopped; --workers 2
 sumo-sbt benchmark configs/{config.name} --reference-only
 python benchmarks/benchmark_page.py configs/{config.name}

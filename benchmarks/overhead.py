@@ -23,7 +23,7 @@ from scipy.stats import qmc
 from sbt.config.load import parse
 from sbt.plugins import load
 from sbt.sumo import simulation
-from sbt.sumo.driving import Drive
+from sbt.sumo.sumo_run import SumoRun
 from sbt.workflows.running import run_campaign
 
 EMPTY = """
@@ -33,7 +33,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 
 SCENARIO = LogicalScenario(
-    "empty", ParameterSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))), Requirement("y", CriticalInterval(high=0.5)),
+    "empty", ParameterSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))), Requirement("y", high=0.5),
     evaluate=lambda values, seed: {"y": values["a"]}, metric_names=("y",),
 )
 """
@@ -46,7 +46,7 @@ def worker(runs: int) -> list[float]:
     values = [dict(zip(scenario.space.names, map(float, row), strict=True)) for row in x]
     inside, found = [0.0], []
 
-    class TimedDrive(Drive):
+    class TimedRun(SumoRun):
         """Knows how long the loop over the steps took: from its making to its trace."""
 
         def __init__(self, *args):
@@ -57,7 +57,7 @@ def worker(runs: int) -> list[float]:
             inside[0] += time.perf_counter() - self.begun
             return super().trace()
 
-    with patch.object(simulation, "Drive", TimedDrive):
+    with patch.object(simulation, "SumoRun", TimedRun):
         scenario.run(values[0], 0)
         for _ in range(5):
             inside[0] = 0.0

@@ -82,7 +82,7 @@ def traci_load(scenario: LogicalScenario, values: list[dict[str, float]], progra
     fresh = scenario.configured(isolation="fresh")
 
     def run() -> None:
-        with sumo_session.session().through(client):  # the subprocess stays, `traci.load` goes on with it
+        with sumo_session.session().using(client):  # the subprocess stays, `traci.load` goes on with it
             for k, v in enumerate(values):
                 fresh.run(v, k)
 

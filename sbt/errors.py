@@ -6,11 +6,10 @@ folder of a campaign; `RunError` ends one run and becomes a row of the store, ne
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "did_you_mean", "place_of"]
+__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "described", "did_you_mean", "place_of"]
 
 
 class SbtError(Exception):
@@ -55,7 +54,20 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""
 
 
+def described(error: BaseException) -> str:
+    """Return type, message and place of an error, on one line where its message has one."""
+    try:
+        message = str(error)
+    except BaseException:  # an exception of a user's own
+        message = "(its message cannot be read)"
+    return f"{type(error).__name__}{': ' if message else ''}{message} ({place_of(error)})"
+
+
 def place_of(error: BaseException) -> str:
     """Return file:line where the error was raised."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "no place"
+    frame = error.__traceback__
+    if frame is None:
+        return "no place"
+    while frame.tb_next is not None:
+        frame = frame.tb_next
+    return f"{frame.tb_frame.f_code.co_filename}:{frame.tb_lineno}"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
-from collections.abc import Callable
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,46 @@ from hypothesis import settings
 
 settings.register_profile("fixed", derandomize=True, deadline=None)  # the same examples every time
 settings.load_profile("fixed")
+
+NO_SUMO = Path(__file__).resolve().parent / "no_sumo"
+"""A folder with a libsumo that cannot be imported."""
+NO_SUMO_LOG = "SBT_NO_SUMO_LOG"
+"""Environment variable: the file to which that libsumo adds a byte whenever somebody tries."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--no-sumo", action="store_true", help="only tests that do not run SUMO; libsumo cannot be imported")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Hide libsumo from this process and from every process that a test starts."""
+    if config.getoption("--no-sumo"):
+        sys.path.insert(0, str(NO_SUMO))
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(NO_SUMO), os.environ.get("PYTHONPATH")]))
+        handle, os.environ[NO_SUMO_LOG] = tempfile.mkstemp(prefix="no_sumo_")
+        os.close(handle)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if config.getoption("--no-sumo"):
+        Path(os.environ.pop(NO_SUMO_LOG)).unlink()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--no-sumo"):
+        of_sumo = [item for item in items if item.get_closest_marker("sumo")]
+        config.hook.pytest_deselected(items=of_sumo)
+        items[:] = [item for item in items if item not in of_sumo]
+
+
+@pytest.fixture(autouse=True)
+def _without_sumo() -> Iterator[None]:
+    """Fail a test that wanted SUMO under `--no-sumo`, also where it took the failed runs for granted."""
+    log = Path(os.environ.get(NO_SUMO_LOG, os.devnull))
+    before = log.stat().st_size
+    yield
+    if log.stat().st_size > before:
+        pytest.fail("this test runs SUMO and must be marked with @pytest.mark.sumo")
 
 ANALYTIC = '''
 """A disc of radius 0.3 in the unit square (pi 0.09 of it is critical), a line, and things that go wrong."""
@@ -75,7 +118,7 @@ def awkward(values, seed):
 
 
 def scenario(evaluate, space=SQUARE):
-    requirement = Requirement("y", CriticalInterval(high=0.0))
+    requirement = Requirement("y", high=0.0)
     return LogicalScenario(evaluate.__name__, space, requirement, evaluate=evaluate, metric_names=("y", "noise"))
 
 

@@ -22,7 +22,7 @@ PACKAGE = ROOT / "sbt"
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 FLOORS = (
-    ("sbt", "errors", "seeds", "plugins"),
+    ("sbt", "errors", "files", "seeds", "plugins", "interruption", "processes"),
     ("problem",),
     ("metrics",),
     ("sumo", "metamodels", "testbeds"),
@@ -38,7 +38,7 @@ FLOORS = (
     ("__main__",),
 )
 """Rooms from the ground up; those on one floor do not know each other unless stated in NEIGHBOURS."""
-NEIGHBOURS = {"samplers": {"acquisitions"}, "plugins": {"errors"}}
+NEIGHBOURS = {"samplers": {"acquisitions"}, "plugins": {"errors", "interruption"}}
 LATE = {
     "metrics": {"sumo"},  # reading recorded FCD needs the networks' geometry
 }
@@ -152,6 +152,29 @@ def test_public_names_exist_and_are_described(module):
     assert [name for name in offered if not hasattr(loaded, name)] == []
     for name in set(offered) & set(own):
         assert (getattr(loaded, name).__doc__ or "").strip(), f"{module}.{name} must be described"
+
+
+def exists(dotted: str) -> bool:
+    """Return whether `sbt.module.name` or `Class.name` of this package is there."""
+    names = dotted.split(".")
+    if names[0] == "sbt":
+        module = max((m for m in MODULES if dotted == m or dotted.startswith(m + ".")), key=len)
+        owners, rest = [importlib.import_module(module)], dotted.removeprefix(module).split(".")[1:]
+    else:
+        loaded = [importlib.import_module(m) for m in MODULES if m != "sbt.__main__"]
+        owners, rest = [vars(m)[names[0]] for m in loaded if names[0] in vars(m)], names[1:]
+    return not owners or not rest or any(hasattr(o, rest[0]) or rest[0] in getattr(o, "__annotations__", {}) for o in owners)
+
+
+def test_what_docstrings_name_exists():
+    """`sbt.module.name` and `Class.name` in backticks."""
+    gone = []
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named = re.findall(r"`((?:sbt|[A-Z]\w*[a-z]\w*)(?:\.\w+)+)(?:\(\))?`", node.value)
+                gone += [f"{path.relative_to(ROOT)}:{node.lineno}: {name}" for name in named if not exists(name)]
+    assert gone == []
 
 
 def test_randomness_begins_in_seeds_only():

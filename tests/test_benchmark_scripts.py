@@ -22,8 +22,10 @@ SMALLEST = {
     "warm_start.py": "{folder}/store --seeds 2 --batch 10 --batches 2",
     "boundary_table.py": "--problems testbed:borehole_1e-3:box --methods even --seeds 1 --reference 500 --store {folder}/table",
     "estimation.py": "--problems gayton_hat@200 --seeds 1 --table {folder}/table.jsonl",
+    "faults.py": "--kills 2",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
+SUMO = {"boundary.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py", "throughput.py"}
 LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
 
 
@@ -32,7 +34,7 @@ def test_every_script_is_known():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", SMALLEST)
+@pytest.mark.parametrize("script", [pytest.param(s, marks=[pytest.mark.sumo] if s in SUMO else []) for s in SMALLEST])
 def test_it_runs(script, tmp_path, campaign):
     if script == "warm_start.py":
         campaign(campaign="coverage", budget=100, store=str(tmp_path / "store"))

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sbt.campaigns.parts import clopper_pearson
 from sbt.cli import app
 from sbt.errors import InputError, SbtError
+from sbt.estimators.binomial import interval
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import run_seed, stream
 from sbt.store.database import Store
@@ -142,8 +142,8 @@ def test_coverage_is_the_sobol_sequence_alone(campaign: Run):
     np.testing.assert_array_equal(found.x, SobolSequence(2, 3).points(0, 50))
     share = float((found.y("y") <= 0).mean())
     assert result["conclusion"] == {
-        "critical_fraction": share, "low": clopper_pearson(round(50 * share), 50)[0],
-        "high": clopper_pearson(round(50 * share), 50)[1], "confidence": 0.95, "counted": 50,
+        "critical_fraction": share, "low": float(interval(round(50 * share), 50)[0]),
+        "high": float(interval(round(50 * share), 50)[1]), "confidence": 0.95, "counted": 50,
     }  # fmt: skip
     assert result["conclusion"]["low"] < 0.09 * math.pi < result["conclusion"]["high"]
 
@@ -286,14 +286,6 @@ def test_progress_counts_what_was_run(configured: Callable[..., Path]):
     resumed: list[Any] = []
     run_campaign(load(configured("c", "SOME_FAIL", budget=60)), progress=resumed.append, report=False)
     assert resumed[0].done == 40
-
-
-def test_exact_binomial_intervals():
-    assert clopper_pearson(0, 0) == (0.0, 1.0)
-    low, high = clopper_pearson(0, 100)
-    assert (low, high) == (0.0, pytest.approx(1 - 0.025 ** (1 / 100)))
-    assert clopper_pearson(100, 100) == (pytest.approx(1 - high), 1.0)
-    np.testing.assert_allclose(clopper_pearson(10, 50), (0.1003, 0.3372), atol=1e-4)  # Clopper and Pearson's own method in R
 
 
 def test_an_interruption_can_be_resumed(configured: Callable[..., Path], rows: Rows, campaign: Run):

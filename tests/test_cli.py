@@ -61,7 +61,7 @@ def elsewhere(values, seed):
 
 def scenario(evaluate):
     space = ParameterSpace((Parameter("speed", 0.0, 10.0, "m/s"), Parameter("gap", 1.0, 5.0, "m")))
-    requirement = Requirement("margin", CriticalInterval(high=0.0))
+    requirement = Requirement("margin", high=0.0)
     return LogicalScenario("plane", space, requirement, evaluate=evaluate, metric_names=("margin",))
 
 
@@ -329,6 +329,7 @@ def test_schema_is_json():
     assert json.loads(call("schema").stdout)["properties"]["scenario"]["type"] == "string"
 
 
+@pytest.mark.sumo
 def test_doctor_finds_this_environment_sound(folder: Path):
     done = process("doctor", "--json", "--store", str(folder / "not" / "yet"))
     found = json.loads(done.stdout)
@@ -338,6 +339,7 @@ def test_doctor_finds_this_environment_sound(folder: Path):
     assert list(folder.glob(".sbt-doctor*")) == []
 
 
+@pytest.mark.sumo
 def test_doctor_warns_of_a_strange_sumo_home(folder: Path):
     done = process("doctor", SUMO_HOME=str(folder / "old"))
     assert re.search(r"warning +SUMO_HOME +'.*old' is no folder; unset SUMO_HOME", done.stdout)

@@ -26,7 +26,7 @@ from sbt.problem.requirement import CriticalInterval, Requirement
 SCENARIO = LogicalScenario(
     name="plane",
     space=ParameterSpace((Parameter("speed", 0.0, 10.0, "m/s"), Parameter("gap", 1.0, 5.0, "m"), Parameter("n", 0, 4, kind="integer"))),
-    requirement=Requirement("margin", CriticalInterval(high=0.0)),
+    requirement=Requirement("margin", high=0.0),
     evaluate=lambda values, seed: {"margin": values["gap"] - values["speed"] / 2, "other": 1.0},
     metric_names=("margin", "other"),
 )
@@ -265,6 +265,17 @@ def test_schema_describes_every_key():
     assert found["$defs"]["ExecutorChoice"]["properties"]["kind"]["enum"] == list(EXECUTORS)
     models = [found, *(d for d in found["$defs"].values() if "properties" in d)]
     assert all("description" in key for model in models for key in model["properties"].values())
+
+
+@pytest.mark.parametrize("campaign", CAMPAIGNS)
+@pytest.mark.parametrize("key", ["metamodel", "acquisition"])
+def test_schema_says_the_defaults_of_each_campaign(campaign: str, key: str):
+    default = parse(f"campaign: {campaign}\nscenario: cut_in\n").config.model_dump(exclude_none=True).get(key)
+    described = schema()["properties"][key]["description"]
+    written = f"{campaign}: none" if default is None else f"{campaign}: {default['kind']}"
+    if key == "metamodel" and default is not None:
+        written = f"{campaign}: {{" + ", ".join(f"{k}: {json.dumps(v)}" for k, v in default.items()).replace('"', "") + "}"
+    assert written in described
 
 
 def test_a_full_configuration_is_assembled(folder: Path):

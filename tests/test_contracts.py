@@ -49,12 +49,12 @@ def test_metrics(name):
     check_metric(metric, traces())
 
 
-@pytest.mark.sumo
 def _scenarios() -> list[object]:
     slow = {"lane_keeping"}  # 49 runs of a long drive, six times
     return [pytest.param(name, marks=pytest.mark.slow if name in slow else ()) for name in plugins.names("scenarios")]
 
 
+@pytest.mark.sumo
 @pytest.mark.parametrize("name", _scenarios())
 def test_scenarios(name):
     start = time.process_time()

@@ -37,7 +37,7 @@ def deadly(values, seed):
 
 
 SPACE = ParameterSpace((Parameter("a", 0.0, 1.0),))
-SCENARIO = LogicalScenario("deadly", SPACE, Requirement("y", CriticalInterval(high=0.0)), evaluate=deadly, metric_names=("y",))
+SCENARIO = LogicalScenario("deadly", SPACE, Requirement("y", high=0.0), evaluate=deadly, metric_names=("y",))
 '''
 
 

@@ -6,12 +6,14 @@ import doctest
 import importlib
 import json
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+from doc_blocks import PAGES, ROOT, Block, blocks_of, commands_of, inline_commands
 from typer.testing import CliRunner
 
 from sbt.cli import app
@@ -19,9 +21,6 @@ from sbt.config.assemble import assemble
 from sbt.config.benchmark import load_benchmark
 from sbt.config.load import load, parse
 
-ROOT = Path(__file__).resolve().parent.parent
-README = (ROOT / "README.md").read_text()
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 BENCHMARKS = sorted((ROOT / "configs").glob("benchmark_*.yaml"))
 CONFIGS = sorted(set((ROOT / "configs").glob("*.yaml")) - set(BENCHMARKS))
 EXAMPLES = sorted(
@@ -36,10 +35,6 @@ def small(config: Path) -> list[str]:
     reference = min(20, load(config).config.validation.reference)
     settings = {**SMALL, "validation.reference": reference, "executor.kind": "serial"}
     return [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
-
-
-def blocks(text: str, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def test_there_are_configurations_and_examples():
@@ -74,52 +69,122 @@ def test_examples_in_docstrings(module: str):
     assert (failed, tried > 0) == (0, True)
 
 
-def commands() -> list[list[str]]:
-    """The lines of the README's bash blocks, continued lines joined."""
-    lines = "\n".join(blocks(README, "bash")).replace("\\\n", " ").splitlines()
-    return [words for line in lines if (words := shlex.split(line, comments=True))]
-
-
 @pytest.mark.sumo
 def test_commands_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """One after the other in an empty folder, campaigns made small."""
     monkeypatch.chdir(tmp_path)
-    if not commands():
-        pytest.skip("the README has no commands yet")
     for folder in ("configs", "docs", "examples"):
         if (ROOT / folder).is_dir():
             (tmp_path / folder).symlink_to(ROOT / folder)
-    for program, *args in commands():
-        name = program.rpartition("/")[2]
-        if name == "test" or name in ("git", "cd", "pip", "source", "python3", "uv"):
+    for (program, *args), _ in (command for block in blocks_of(ROOT / "README.md", "bash") for command in commands_of(block)):
+        if program == "scripts/test":
             continue
-        if name == "run":
+        if program == "scripts/run":
             args = ["run", *(args or ["configs/cut_in_boundary.yaml"])]
         else:
-            assert name == "sumo-sbt", f"the README says '{program}', which this test does not know"
+            assert program == "sumo-sbt", f"the README says '{program}', which this test does not know"
         if args[0] == "run":
             args = [*args, *small(tmp_path / args[1]), "--set", "metamodel.kind=et"]
         done = CliRunner().invoke(app, args)
         assert done.exit_code == 0, f"{args}: {done.output}"
 
 
-def test_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    if not blocks(README, "python"):
-        pytest.skip("the README has no Python")
+LANGUAGES = {"bash", "console", "python", "text", "xml", "yaml"}
+RUN = {
+    "README.md": {"bash", "yaml"}, "docs/benchmark.md": {"bash"}, "docs/boundary.md": {"console"},
+    "docs/clusters.md": {"bash", "yaml"}, "docs/configuration.md": {"yaml"}, "docs/estimation.md": {"yaml"},
+    "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
+    "docs/scenarios.md": {"python"}, "docs/testbeds.md": {"console", "python", "yaml"},
+    "docs/tutorials/actors.md": {"bash", "python", "yaml"}, "docs/tutorials/own_files.md": {"bash", "xml", "yaml"},
+    "docs/tutorials/traci_loop.md": {"bash", "python", "xml", "yaml"},
+}  # fmt: skip
+"""What each page must show; all of it is run or checked, by this file or (a block that names a file) by test_tutorials.py."""
+BLOCKS = [block for page in PAGES for block in blocks_of(page)]
+
+
+def of(*languages: str) -> list[Any]:
+    """Return the blocks in these languages that no tutorial writes to a file; those that run SUMO are marked."""
+    return [
+        pytest.param(block, id=str(block), marks=[pytest.mark.sumo] if "sbt.sumo" in block.text else [])
+        for block in BLOCKS if block.language in languages and not block.name
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("page", RUN)
+def test_a_page_has_the_blocks_that_it_shall_have(page: str):
+    assert {block.language for block in BLOCKS if block.page == page} >= RUN[page]
+
+
+def test_every_block_says_its_language_and_few_are_not_run():
+    assert [str(block) for block in BLOCKS if block.language not in LANGUAGES] == []
+    assert [str(block) for block in BLOCKS if block.page not in RUN] == []
+    assert {(block.page, block.not_run) for block in BLOCKS if block.not_run} == {
+        ("docs/clusters.md", "a job script needs SLURM")
+    }
+    assert sum(bool(block.not_run) for block in BLOCKS) <= 2
+
+
+@pytest.mark.parametrize("block", of("python"))
+def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    for code in blocks(README, "python"):
-        exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
+    exec(compile(block.text, str(block), "exec"), {"__name__": "documentation"})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
-def test_configurations_in_the_documentation_load(page: Path):
-    found = [text for text in blocks(page.read_text(), "yaml") if re.search(r"^campaign:", text, re.MULTILINE)]
-    if not found:
-        pytest.skip("no configuration on this page")
-    for text in found:
-        loaded = parse(text, name=page.name, folder=ROOT)
+@pytest.mark.parametrize("block", of("yaml"))
+def test_yaml_fits_the_schema(block: Block):
+    """A whole configuration, or lines that are each a change of one."""
+    whole = re.search(r"^campaign:", block.text, re.MULTILINE)
+    texts = [block.text] if whole else [f"campaign: boundary\nscenario: cut_in\n{line}" for line in block.text.splitlines()]
+    for text in texts:
+        loaded = parse(text, name=str(block), folder=ROOT)
         if ".py:" not in loaded.config.scenario:
             assemble(loaded)
+
+
+def parsed(words: list[str]) -> None:
+    """Let the command line parse a command without running it; raises where it would end with code 2."""
+    group: Any = typer.main.get_command(app)
+    for command in group.commands.values():
+        command.callback = None
+    group.main(words[1:], prog_name="sumo-sbt", standalone_mode=False)
+
+
+@pytest.mark.parametrize("block", of("bash", "console"))
+def test_commands_fit_the_command_line(block: Block):
+    for words, _ in commands_of(block):
+        while "=" in words[0] and not block.not_run:  # variables of the environment before a command
+            words = words[1:]
+        if "sumo-sbt" in words:
+            parsed(words[words.index("sumo-sbt") :])
+        elif words[0] == "python":
+            script = ROOT / words[1]
+            assert script.is_file()
+            assert [word for word in words if word.startswith("--") and word not in script.read_text()] == []
+        else:
+            assert block.not_run or words[0] in ("sumo", "scripts/run", "scripts/test"), f"this test does not know '{words[0]}'"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if inline_commands(p)], ids=lambda path: path.stem)
+def test_commands_in_the_prose_fit_the_command_line(page: Path):
+    for words in inline_commands(page):
+        plain = [{"N": "1"}.get(word, word) for word in (word.strip("[]") for word in words)]
+        parsed(plain if len(plain) > 2 else [*plain, "--help"])  # two words: a verb that is only named
+
+
+CHEAP = ("list", "schema", "simulate", "check")
+
+
+@pytest.mark.parametrize("block", of("console"))
+def test_cheap_commands_print_what_the_page_shows(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    for (_, verb, *args), output in commands_of(block):
+        if verb in CHEAP and ("testbed:" in args[0] or verb in ("list", "schema")):
+            done = CliRunner().invoke(app, [verb, *args])
+            assert done.exit_code == 0, done.output
+            if output:
+                assert done.stdout == output
+        else:
+            assert output == "", f"{block}: nobody checks the output of '{verb}'"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)

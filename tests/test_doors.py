@@ -99,6 +99,16 @@ def test_placeholders_become_numbers_and_the_start_is_the_one_asked_for(study):
     assert "${" in (path.parent / CARS).read_text(), "the user's files stay as they are"
 
 
+def test_numpy_scalars_are_numbers_in_files_and_loops(study):
+    loop = "import numpy as np\ndef simulate(sumo, values, rng):\n    assert {type(v) for v in values.values()} == {float}\n"
+    loop += "    while True:\n        sumo.simulation.step()\n        sumo.vehicle.setSpeed('lead', np.float32(3.5))\n"
+    path = study({YAML: [("sumo: my.sumocfg", "sumo: my.sumocfg\nsimulate: mine.py:simulate")], "mine.py": [("", loop)]})
+    scenario, trace = simulated(path, gap=60.0, v_lead=12.0)
+    assert trace.actor("lead").speed[-1] == 3.5
+    for number in (np.float64, np.float32, np.int64):
+        assert trace.identical(scenario.simulate({"gap": number(60), "v_lead": number(12)}, np.int64(0)))
+
+
 def test_what_is_recorded_follows_the_motion(study):
     _, trace = simulated(study(), gap=60.0, v_lead=10.0)
     for name in trace.actors:
@@ -185,7 +195,7 @@ class Mad:
     ("changes", "status", "said"),
     [
         ({CARS: [(EGO, EGO.replace(' insertionChecks="none"', ""))], YAML: [("max: 80", "max: 40")]}, "invalid",
-         r"cars.rou.xml:7:5: you asked for 'ego' at t = 0 s, [\d.]+ m behind 'lead'; SUMO inserted it at t = [\d.]+ s, [\d.]+ m behind 'lead': "
+         r"cars.rou.xml:7:5: 'ego' must depart at t = 0 s, [\d.]+ m behind 'lead', but SUMO inserted it at t = [\d.]+ s, [\d.]+ m behind 'lead': "
          r'set insertionChecks="none" on the vehicle'),
         ({CARS: [('id="ego" type="car" route="ahead" depart="0"', 'id="ego" type="car" route="ahead" depart="100"')],
           YAML: [("duration: 10", "duration: 10\nwait: 5")]}, "invalid", "the ego 'ego' must depart within 5 s"),
@@ -308,7 +318,7 @@ def test_a_loop_runs_the_same_under_sumo_itself(study):
 
     path = study(page="traci_loop")
     scenario, trace = simulated(path, seed=5, time_gap=0.6, braking=6.0)
-    other = scenario.simulate.shown({"time_gap": 0.6, "braking": 6.0}, 5, traci, (program,))
+    other = scenario.simulate.run_with_traci({"time_gap": 0.6, "braking": 6.0}, 5, traci, (program,))
     assert trace.ended == other.ended
     assert trace.identical(other)
 
@@ -320,7 +330,7 @@ def test_a_loop_runs_the_same_under_sumo_itself(study):
         ([("        sumo.simulationStep()\n", "        sumo.simulationStep()\n        1 / 0\n")], "failed", r"ZeroDivisionError: .* \(.*loop.py:15\)"),
         ([('sumo.start(["sumo", "-n", "road.net.xml"', 'sumo.start(["sumo", "-n", "rode.net.xml"')], "failed", "net-file must name a file that exists"),
         ([(', "--insertion-checks", "none"', ""), ("values[\"time_gap\"] * 25.0", "1.0")], "invalid",
-         r"you asked for 'ego' at t = 0 s, 1 m behind 'lead'; (SUMO inserted it at t = .* option insertion-checks: none \(.*loop.py:14\))|SUMO holds it back since its departure, asked for 1 m behind 'lead'"),
+         r"'ego' must depart at t = 0 s, 1 m behind 'lead', but (SUMO inserted it at t = .* option insertion-checks: none \(.*loop.py:14\))|SUMO holds it back since its departure, requested 1 m behind 'lead'"),
         ([("while sumo.simulation.getMinExpectedNumber() > 0:", "for _ in range(0):")], "invalid", "must depart, but had not when the loop ended"),
         ([("    sumo.start([", "    return\n    sumo.start([")], "failed", r"a loop must call sumo.start"),
         ([("rng.lognormal(-0.3, 0.3)", "0.1"), ("max(speed - deceleration * sumo.simulation.getDeltaT(), 0.0)", "float('nan')")], "failed",

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from scipy.stats import binomtest
 
+from sbt.estimators.binomial import interval, lower, upper
 from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch
-from sbt.estimators.intervals import CountedBatch, binomial_upper, combine_estimates, few_hits_bound
+from sbt.estimators.intervals import CountedBatch, combine_estimates, few_hits_bound
 from sbt.estimators.mixture import Mixture, Normals, fit_mixture, log_normal, particles, wide_scales
 from sbt.estimators.monte_carlo import Proportion
 from sbt.estimators.subset import SubsetRun, combine_repeats
@@ -127,10 +129,35 @@ def test_the_interval_believes_the_larger_variance():
 
 @pytest.mark.parametrize("hits", [0, 1, 7])
 def test_few_hits_bound_is_the_binomial_one_where_all_draws_are_nominal(hits):
-    assert few_hits_bound(hits, np.ones(50), 0.95) == pytest.approx(binomial_upper(hits, 50, 0.95), rel=1e-6)
-    assert few_hits_bound(hits, np.full(50, 0.5), 0.95) > binomial_upper(hits, 50, 0.95)
+    assert few_hits_bound(hits, np.ones(50), 0.95) == pytest.approx(upper(hits, 50, 0.95), rel=1e-6)
+    assert few_hits_bound(hits, np.full(50, 0.5), 0.95) > upper(hits, 50, 0.95)
     assert few_hits_bound(0, np.full(300, 0.05), 0.95) == pytest.approx(3.0 / 15.0, rel=0.02)  # 3 / n_p
     assert few_hits_bound(hits, np.empty(0), 0.95) == 1.0
+
+
+@pytest.mark.parametrize("n", [1, 20, 3000])
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+def test_exact_binomial_limits_against_scipy(n, confidence):
+    hits = np.unique([0, 1, n // 3, n - 1, n])
+    limits = [interval(hits, n, confidence), (lower(hits, n, confidence), upper(hits, n, confidence))]
+    for side, (low, high) in zip(("two-sided", "one-sided"), limits, strict=True):
+        for k, hit in enumerate(hits):
+            # at most p, at least p: SciPy solves the tails of the binomial distribution themselves
+            least, most = (binomtest(int(hit), n, alternative=a) for a in ("greater", "less"))
+            if side == "two-sided":
+                least = most = binomtest(int(hit), n)
+            truth = least.proportion_ci(confidence, method="exact").low, most.proportion_ci(confidence, method="exact").high
+            assert (low[k], high[k]) == pytest.approx(truth, rel=1e-9, abs=1e-12)
+
+
+def test_exact_binomial_limits_without_runs_or_hits_and_in_any_shape():
+    assert [float(end) for end in interval(0, 0)] == [0.0, 1.0]
+    assert (float(lower(0, 0, 0.9)), float(upper(0, 0, 0.9))) == (0.0, 1.0)
+    assert float(upper(0, 100, 0.95)) == pytest.approx(1 - 0.05 ** (1 / 100), rel=1e-12)
+    low, high = interval([[0, 3], [7, 20]], [20, 20])
+    assert low.shape == high.shape == (2, 2)
+    for (i, j), hit in np.ndenumerate([[0, 3], [7, 20]]):
+        assert (low[i, j], high[i, j]) == tuple(map(float, interval(hit, 20)))
 
 
 def test_crude_monte_carlo_covers():

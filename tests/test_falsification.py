@@ -62,7 +62,7 @@ def coin(values, seed):
 
 def own(name, evaluate):
     space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
-    return LogicalScenario(name, space, Requirement("y", CriticalInterval(high=0.0)), evaluate=evaluate, metric_names=("y",))
+    return LogicalScenario(name, space, Requirement("y", high=0.0), evaluate=evaluate, metric_names=("y",))
 
 
 TWO = analytic(two_holes, inputs=BOX, critical=LOW, name="two holes")
@@ -87,7 +87,7 @@ def beside(values, seed):
 
 
 SIDES = LogicalScenario(
-    "sides", TWO.space, Requirement("speed", CriticalInterval(high=2.0)), simulate=beside,
+    "sides", TWO.space, Requirement("speed", high=2.0), simulate=beside,
     metrics=(Metric("speed", lambda trace: float(trace.speed[0, 0])),),
 )
 COIN = own("coin", coin)

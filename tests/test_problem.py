@@ -276,9 +276,9 @@ WRONG = {
     "interval": (lambda: CriticalInterval(1.0, 0.0), r"low <= high, but got \[1.0, 0.0\]"),
     "interval nan": (lambda: CriticalInterval(math.nan, 0.0), "low <= high"),
     "everything": (lambda: CriticalInterval(), "at least one finite end"),
-    "no way to run": (lambda: LogicalScenario("s", SQUARE, Requirement("y", CriticalInterval(0, 1))), "simulate or evaluate"),
+    "no way to run": (lambda: LogicalScenario("s", SQUARE, Requirement("y", 0, 1)), "simulate or evaluate"),
     "metric": (
-        lambda: LogicalScenario("s", SQUARE, Requirement("z", CriticalInterval(0, 1)), evaluate=dict, metric_names=("y",)),
+        lambda: LogicalScenario("s", SQUARE, Requirement("z", 0, 1), evaluate=dict, metric_names=("y",)),
         "one of y, but got 'z'",
     ),
     "seed": (lambda: stream(-1), "a seed must be an integer >= 0, but got -1"),
@@ -379,7 +379,7 @@ def test_metrics_of_a_run_are_finite_or_the_run_failed():
         with pytest.raises(RunError, match="metric m must be finite") as caught:
             Metric("m", lambda trace, v=value: v)(trace)
         assert caught.value.status == Status.FAILED
-    made = LogicalScenario("s", SQUARE, Requirement("y", CriticalInterval(0, 1)), evaluate=lambda v, s: {"y": math.nan},
+    made = LogicalScenario("s", SQUARE, Requirement("y", 0, 1), evaluate=lambda v, s: {"y": math.nan},
                            metric_names=("y",))  # fmt: skip
     with pytest.raises(RunError, match="metric y must be finite"):
         made.run({}, 0)

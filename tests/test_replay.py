@@ -19,7 +19,7 @@ from sbt.plugins import load, names
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.report.film import metric_so_far
-from sbt.sumo import window
+from sbt.sumo import gui
 from sbt.sumo.nets import lanes
 from sbt.sumo.session import libsumo, session
 from sbt.workflows.running import replay, run_campaign
@@ -131,13 +131,13 @@ def test_a_replay_that_cannot_be_shown_says_so(stored: dict[str, Run], tmp_path:
     monkeypatch.setattr(shutil, "which", lambda *_: None)
     monkeypatch.setattr("importlib.util.find_spec", lambda *_: None)
     with pytest.raises(InputError, match="needs sumo-gui on the path, but it is not there"):
-        window.gui_program()
+        gui.gui_program()
     monkeypatch.setattr(shutil, "which", lambda *_: "/bin/sumo-gui")
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(InputError, match="needs a display, but neither DISPLAY"):
-        window.gui_program()
+        gui.gui_program()
     text = f"campaign: coverage\nscenario: testbed:four_branch_7\nbudget: 4\nexecutor: {{kind: serial}}\nstore: {tmp_path}/s\n"
     run_campaign(parse(text), report=False)
     done = CliRunner().invoke(app, ["replay", str(tmp_path / "s"), "1", "--gif", str(tmp_path / "x.gif")])
@@ -152,7 +152,7 @@ def test_another_sumo_program_shows_the_same_run(name: str, stored: dict[str, Ru
     record = replay(folder, 1)[0]
     program = shutil.which("sumo")
     assert program is not None
-    assert window.watch(scenario.simulate, record.inputs, record.seed, program).identical(trace)
+    assert gui.run_in_gui(scenario.simulate, record.inputs, record.seed, program).identical(trace)
     assert scenario.simulate(record.inputs, record.seed).identical(trace)  # and libsumo goes on as before
 
 

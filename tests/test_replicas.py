@@ -25,11 +25,11 @@ from sbt.problem.trace import Trace
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import run_seed, stream
 from sbt.sumo.actors import Action, Actor, Scene, State, VehicleType
-from sbt.sumo.copies import copied
 from sbt.sumo.ego import Ego
 from sbt.sumo.nets import net_file
+from sbt.sumo.replicas import replicated_net
 from sbt.sumo.session import libsumo, session
-from sbt.sumo.simulation import DEADLINE_STEPS, SumoSimulation
+from sbt.sumo.simulation import CLOCK_STEPS, SumoSimulation
 
 pytestmark = pytest.mark.sumo
 
@@ -156,7 +156,7 @@ def test_a_run_that_cannot_share_costs_no_other_and_says_what_it_says_alone(kind
 
 
 def test_a_run_that_is_too_slow_is_a_timeout_and_its_company_is_not(alone: list[int]):
-    long = replace(AWKWARD, duration=0.05 * (DEADLINE_STEPS + 50), step_length=0.05)
+    long = replace(AWKWARD, duration=0.05 * (CLOCK_STEPS + 50), step_length=0.05)
     found = long.limited(0.2).simulate_many(awkward([0, 3, 0, 0]))
     assert [isinstance(t, Trace) for t in found] == [True, False, True, True]
     assert isinstance(found[1], RunError)
@@ -173,7 +173,7 @@ from sbt.metrics.longitudinal import collision
 
 SCENARIO = LogicalScenario(
     "awkward", ParameterSpace((Parameter("kind", 0.0, 9.0), Parameter("v", 1.0, 90.0))),
-    Requirement("collision", CriticalInterval(low=1.0)), tests.AWKWARD, (collision(),),
+    Requirement("collision", low=1.0), tests.AWKWARD, (collision(),),
 )
 """
 
@@ -210,7 +210,7 @@ def test_rows_do_not_depend_on_the_isolation():
 
 
 def test_copies_share_no_id_and_lie_on_each_other(tmp_path: Path):
-    (tmp_path / "copies.net.xml").write_text(copied(net_file("street"), 3))
+    (tmp_path / "copies.net.xml").write_text(replicated_net(net_file("street"), 3))
     simulation = replace(AWKWARD, net=str(tmp_path / "copies.net.xml"))
     with session().run(simulation.setup(Scene(())), 0, "fresh"):
         lanes = libsumo().lane.getIDList()
@@ -223,4 +223,4 @@ def test_a_network_with_a_state_of_its_own_is_not_copied(tmp_path: Path):
     net = net_file("straight").read_text().replace("</net>", '<tlLogic id="a" type="static" programID="0" offset="0"/></net>')
     (tmp_path / "lights.net.xml").write_text(net)
     with pytest.raises(InputError, match=r"needs a network of edges and junctions alone, but lights.net.xml has <tlLogic>"):
-        copied(tmp_path / "lights.net.xml", 2)
+        replicated_net(tmp_path / "lights.net.xml", 2)

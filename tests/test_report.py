@@ -51,7 +51,7 @@ def scenario_of(d, description="Wedge.\nAn analytic stand-in.", **changes):
     first = (Parameter("d_t", 0.2, 4.0, "s", description="time gap"), Parameter("d_v", -10.0, 30.0, "m/s", law))
     rest = tuple(Parameter(f"x{k}", 0, 5, "", kind="integer") for k in range(2, d))
     return LogicalScenario(
-        "wedge", ParameterSpace((first + rest)[:d]), Requirement("ttc_min", CRITICAL), description=description,
+        "wedge", ParameterSpace((first + rest)[:d]), Requirement("ttc_min", CRITICAL.low, CRITICAL.high), description=description,
         evaluate=lambda values, seed: {}, metric_names=("ttc_min", "speed"), **changes,
     )  # fmt: skip
 
@@ -173,7 +173,7 @@ def test_hostile_text_stays_text(tmp_path):
     evil = "<script>alert(1)</script>\n</style><img src=http://x.invalid/a onerror=alert(2)> ${x} {{ 7*7 }}"
     space = ParameterSpace((Parameter("a", 0, 1, "$<b>&\\frac"), Parameter("b", 0, 1, "--><script>", description=evil)))
     scenario = LogicalScenario(
-        "evil", space, Requirement("m", CRITICAL), description=evil, evaluate=lambda v, s: {}, metric_names=("m",)
+        "evil", space, Requirement("m", CRITICAL.low, CRITICAL.high), description=evil, evaluate=lambda v, s: {},
     )
     configuration = {"names": ["a", "b"], "scenario": "my; rm -rf <x>.yaml", "campaign": evil}
     with Store.open(tmp_path, configuration) as store:
@@ -262,7 +262,7 @@ def test_says_what_limits_the_conclusion(tmp_path):
 def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
     scenario = scenario_of(2)
     with fill(tmp_path, scenario) as store:
-        narrow = dataclasses.replace(scenario, requirement=Requirement("ttc_min", CriticalInterval(0.0, 0.5)))
+        narrow = dataclasses.replace(scenario, requirement=Requirement("ttc_min", 0.0, 0.5))
         n = int((store.history().y("ttc_min") < 0).sum())
         assert f"{n} runs have ttc_min below 0, beyond" in " ".join(warnings_for(Findings.of(store, narrow)))
         assert "beyond" not in " ".join(warnings_for(Findings.of(store, scenario)))
@@ -301,9 +301,9 @@ def test_ego_of_the_campaign_is_not_forgotten(tmp_path):
 
 
 def test_requirement_in_words():
-    assert requirement_words(Requirement("ttc_min", CRITICAL), "s") == "ttc_min in [-5, 0.5] s"
-    assert requirement_words(Requirement("m", CriticalInterval(high=0.0)), "") == "m ≤ 0"
-    assert requirement_words(Requirement("m", CriticalInterval(low=2.0)), "m") == "m ≥ 2 m"
+    assert requirement_words(Requirement("ttc_min", CRITICAL.low, CRITICAL.high), "s") == "ttc_min in [-5, 0.5] s"
+    assert requirement_words(Requirement("m", high=0.0), "") == "m ≤ 0"
+    assert requirement_words(Requirement("m", low=2.0), "m") == "m ≥ 2 m"
 
 
 def test_influence_finds_what_matters(tmp_path):
@@ -356,15 +356,6 @@ def test_star_and_base_rate():
     star = next(line for line in ax.lines if line.get_marker() == "*")
     assert star.get_ydata()[0] == pytest.approx(2 / 3)
     assert any("base rate 0.5" in text.get_text() for text in ax.get_legend().get_texts())
-
-
-def test_binomial_interval_against_scipy():
-    from scipy.stats import binomtest
-
-    low, high = curves.binomial_interval(np.array([0, 3, 20]), np.array([20, 20, 20]))
-    for k, hits in enumerate((0, 3, 20)):
-        truth = binomtest(hits, 20).proportion_ci(0.95, method="exact")
-        assert (low[k], high[k]) == pytest.approx((truth.low, truth.high), abs=1e-9)
 
 
 def test_svgs_of_a_page_share_no_id():

@@ -13,17 +13,19 @@ import pytest
 
 from sbt.errors import InputError, RunError
 from sbt.metrics.lateral import Curve
-from sbt.plugins import load
+from sbt.plugins import load, names
+from sbt.problem.parameter import Parameter
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.scenarios import jaywalking, lane_keeping
 from sbt.sumo.actors import Action, Actor, Obstacle, State
-from sbt.sumo.drivers import ArcExit, SpeedProfile, Stand
+from sbt.sumo.drivers import ArcExit, SpeedProfile, Stationary
 from sbt.sumo.dynamics import Gust, JerkLimitedStop, SingleTrack
 from sbt.sumo.lane_keeping import MarkingSensor
-from sbt.sumo.sight import Boxes, outline
+from sbt.sumo.occlusion import Occluders, outline
 
 NAMES = ("following", "jaywalking", "lane_keeping", "parking")
+BUILT_IN = names("scenarios")
 NETS = Path(__file__).resolve().parent.parent / "sumo_nets"
 DIMENSIONS = {"following": 13, "jaywalking": 7, "lane_keeping": 15, "parking": 20}
 CRITICAL = {
@@ -92,6 +94,28 @@ def test_same_seed_same_bits_fresh_and_reused(name: str) -> None:
         assert first[k].identical(fresh.simulate(values, k))
     other = reused.simulate(jobs[0][1], 99)
     assert name == "parking" or not first[0].identical(other), "sensors are noisy: another seed, another run"
+
+
+def whole(parameter: Parameter) -> np.integer | np.bool_ | np.float32:
+    """A whole number in the range of a parameter, as NumPy has it: a boolean where 1 is one of them, a float where none is."""
+    if parameter.low <= 1 <= parameter.high:
+        return np.bool_(True)
+    inside = math.ceil(parameter.low)
+    return np.int64(inside) if inside <= parameter.high else np.float32(parameter.centre)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_numpy_scalars_and_plain_numbers_give_the_identical_trace(name: str) -> None:
+    scenario = load("scenarios", name)
+    [point] = sobol(scenario, 1)
+    for typed in (
+        {name: np.float64(value) for name, value in point.items()},
+        {name: np.float32(value) for name, value in point.items()},
+        {p.name: whole(p) for p in scenario.space.parameters},
+    ):
+        plain = {name: float(value) for name, value in typed.items()}
+        assert scenario.simulate(typed, np.int64(5)).identical(scenario.simulate(plain, 5))
 
 
 @pytest.mark.sumo
@@ -269,10 +293,10 @@ def test_boxes_hide_what_shapely_says() -> None:
         corners = [Obstacle("o", b[:3], *b[3:]).corners for b in boxes]
         union = shapely.union_all([shapely.Polygon(c) for c in corners])
         expected = [shapely.LineString([eye, p]).intersection(union).length > 0 for p in points]
-        assert Boxes(boxes).hides(eye, points).tolist() == expected
+        assert Occluders(boxes).occlude(eye, points).tolist() == expected
         lengths = [sum(shapely.LineString([eye, p]).intersection(shapely.Polygon(c)).length for c in corners) for p in points]
-        assert np.abs(Boxes(boxes).depth(eye, points) - lengths).max() < 1e-9
-    assert Boxes([]).depth(eye, points).tolist() == [0.0] * 40
+        assert np.abs(Occluders(boxes).blocked_length(eye, points) - lengths).max() < 1e-9
+    assert Occluders([]).blocked_length(eye, points).tolist() == [0.0] * 40
 
 
 def test_outline_lies_on_the_sides() -> None:
@@ -358,12 +382,12 @@ def test_actors_by_pose_need_a_controller() -> None:
     with pytest.raises(InputError, match="needs a controller"):
         Actor("a", ("road",), 0, 0.0, 0.0, None, pose=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="must have a pose"):
-        Actor("a", ("road",), 0, 0.0, 0.0, Stand(), person=True)
+        Actor("a", ("road",), 0, 0.0, 0.0, Stationary(), person=True)
 
 
 @pytest.mark.sumo
 def test_an_actor_by_pose_must_go_on_by_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = load("scenarios", "parking")
-    monkeypatch.setattr("sbt.sumo.drivers.Stand.act", lambda self, t, own, others: Action(speed=0.0))
+    monkeypatch.setattr("sbt.sumo.drivers.Stationary.act", lambda self, t, own, others: Action(speed=0.0))
     with pytest.raises(RunError, match="moves by pose"):
         scenario.run(centre(scenario), 0)

@@ -161,14 +161,14 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 import sbt.workflows.merging
-left, move = int(sys.argv[1]), sbt.workflows.merging._move
+left, move = int(sys.argv[1]), sbt.workflows.merging.move_atomically
 def moved(*paths):
     global left
     if left == 0:
         os.kill(os.getpid(), signal.SIGKILL)
     left -= 1
     move(*paths)
-sbt.workflows.merging._move = moved
+sbt.workflows.merging.move_atomically = moved
 sbt.workflows.merging.merge([Path(p) for p in sys.argv[3:]], Path(sys.argv[2]))
 """
 

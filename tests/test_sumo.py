@@ -18,17 +18,17 @@ from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
 from sbt.problem.outcome import Job, Outcome, Status
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import run_seed, stream
-from sbt.sumo.actors import KEEP, Action, Actor, Scene, State, VehicleType
+from sbt.sumo.actors import KEEP, Action, Actor, Obstacle, Scene, State, VehicleType
 from sbt.sumo.ego import Ego
 from sbt.sumo.sensors import Track
 from sbt.sumo.session import libsumo
-from sbt.sumo.simulation import DEADLINE_STEPS, SumoSimulation
+from sbt.sumo.simulation import CLOCK_STEPS, SumoSimulation
 
 pytestmark = pytest.mark.sumo
 
@@ -80,7 +80,7 @@ def car(name: str = "ego", position: float = 100.0, speed: float = 20.0, lane: i
 
 
 def outcome(simulation: SumoSimulation, **inputs: float) -> Outcome:
-    requirement = Requirement("collision", CriticalInterval(low=1.0))
+    requirement = Requirement("collision", low=1.0)
     metrics = tuple(m for m in CUT_IN.metrics if m.name == "collision")
     scenario = LogicalScenario("test", ParameterSpace(CUT_IN.space.parameters), requirement, simulation, metrics)
     return run_job(scenario, Job(0, inputs, 1))
@@ -127,6 +127,33 @@ def test_positions_are_centres_and_start_as_asked():
 def test_a_controller_that_changes_nothing_keeps_its_speed():
     trace = driving(car(act=KEEP), car("co", 180.0, 10.0, 2, act=Action(lane=0)))({}, 0)
     np.testing.assert_array_equal(trace.speed, np.tile([20.0, 10.0], (21, 1)))
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64])
+def test_numpy_scalars_from_a_scene_or_a_controller_are_numbers(kind: Any):
+    """Everything a user's code hands to SUMO, once as plain numbers and once as NumPy's."""
+
+    def run(number: Callable[[float], Any], integer: Callable[[int], Any]) -> Trace:
+        box, pose = VehicleType(number(5), number(2)), (number(150), number(-5), number(0))
+        posed = Constant(Action(speed=number(3), pose=pose))
+        wall = Obstacle("wall", (number(300), number(-20), number(1)), number(4), number(2))
+        actors = (
+            Actor("ego", ("road",), integer(1), number(100), number(20), Constant(Action(number(-2), number(10))), box),
+            Actor("co", ("road",), integer(0), number(180), number(12), Constant(Action(lane=integer(1))), box),
+            Actor("posed", ("road",), integer(2), number(10), number(0), posed, box, pose),
+        )
+        settings = {"duration": number(1), "step_length": number(1) / 4, "lane_change_duration": number(1)}
+        return SumoSimulation("straight", lambda values, ego, rng: Scene(actors, obstacles=(wall,)), **settings)({}, 1)
+
+    assert run(kind, np.int64).identical(run(float, int))
+
+
+def test_numpy_scalars_are_settings_of_an_ego():
+    plain = Ego.of("sumo", tau=float(np.float32(1.2)), accel={"min": 1.0, "max": 3.0})
+    assert Ego.of("sumo", tau=np.float32(1.2), accel={"min": np.float64(1.0), "max": np.int64(3)}) == plain
+    assert Ego.of("acc_aeb", reaction_time=np.float32(0.5)) == Ego.of("acc_aeb", reaction_time=0.5)
+    with pytest.raises(InputError, match="finite number"):
+        Ego.of("sumo", tau=np.bool_(True))
 
 
 def test_acceleration_is_integrated_by_the_trapezoidal_rule():
@@ -240,7 +267,7 @@ def test_a_slow_run_is_a_timeout():
         time.sleep(0.001)
         return Action(speed=1.0)
 
-    slow = driving(car(act=act, speed=0.0), duration=0.05 * (DEADLINE_STEPS + 50))
+    slow = driving(car(act=act, speed=0.0), duration=0.05 * (CLOCK_STEPS + 50))
     assert outcome(slow.limited(30.0)).status == Status.OK
     found = outcome(slow.limited(0.1))
     assert found.status == Status.TIMEOUT

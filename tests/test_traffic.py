@@ -22,10 +22,11 @@ from sbt.plugins import load
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.samplers.sobol import SobolSequence
-from sbt.sumo import session as sessions
+from sbt.seeds import stream
 from sbt.sumo.ego import Ego
-from sbt.sumo.models import CAR_FOLLOWING, checked
-from sbt.sumo.traffic import SHORTEST, Column, automated
+from sbt.sumo.models import CAR_FOLLOWING, vtype_attributes
+from sbt.sumo.session import scratch_folder
+from sbt.sumo.traffic import MIN_HEADWAY, TrafficStream, ego_type
 from sbt.workflows.checking import check_scenario
 
 NETS = Path(__file__).resolve().parent.parent / "sumo_nets"
@@ -200,7 +201,7 @@ def test_types_of_many_runs_leave_one_file() -> None:
     scenario = load("scenarios", "unprotected_left_turn")
     for seed in range(3):
         scenario.simulate(centre(scenario), seed)
-    assert [p.name for p in Path(sessions._scratch().name).glob("types*")] == ["types.add.xml"]
+    assert [p.name for p in scratch_folder().glob("types*")] == ["types.add.xml"]
 
 
 @pytest.mark.parametrize(
@@ -214,7 +215,7 @@ def test_types_of_many_runs_leave_one_file() -> None:
         (lambda: Ego.of("sumo", tau={"low": 1.0}), "a value or a range such as {min: 0.5, max: 2.0}, but got"),
         (lambda: Ego.of("sumo", tau={"min": 2.0, "max": 1.0}), "ego_tau"),
         (lambda: load("scenarios", "highway_merge").configured(ego={"kind": "sumo", "lane_change": "SL2015"}), "lateral-resol"),
-        (lambda: Column("a", ("r",), 0, 10.0).draw(np.random.Generator(np.random.PCG64(1)), 9000.0, 10.0, 90.0, 0.0), "carries"),
+        (lambda: TrafficStream("a", ("r",), 0, 10.0).draw(stream(1), 9000.0, 10.0, 90.0, 0.0), "carries"),
     ],
 )  # fmt: skip
 def test_wrong_settings_are_told_with_rule_and_value(build: Callable[[], Any], message: str) -> None:
@@ -223,18 +224,18 @@ def test_wrong_settings_are_told_with_rule_and_value(build: Callable[[], Any], m
 
 
 def test_the_type_of_an_automated_ego_is_the_models() -> None:
-    kind = automated(Ego.of("sumo", model="IDM", tau=1.4, length=4.2), 10.0, 20.0)
+    kind = ego_type(Ego.of("sumo", model="IDM", tau=1.4, length=4.2), 10.0, 20.0)
     attributes = dict(kind.attributes)
     assert (kind.length, attributes["carFollowModel"], attributes["tau"], attributes["sigma"]) == (4.2, "IDM", "1.4", "0")
     assert float(attributes["speedFactor"]) == pytest.approx(0.5)
-    assert checked({}) == {"carFollowModel": "Krauss", "laneChangeModel": "LC2013"}
+    assert vtype_attributes({}) == {"carFollowModel": "Krauss", "laneChangeModel": "LC2013"}
 
 
 def test_a_column_has_its_flow_and_its_shortest_headway() -> None:
-    column, speed, flow = Column("co", ("r",), 0, 20.0, spread=0.1).driven(tau=0.7), 15.0, 900.0
+    column, speed, flow = TrafficStream("co", ("r",), 0, 20.0, spread=0.1).driven(tau=0.7), 15.0, 900.0
     cars = [column.draw(np.random.Generator(np.random.PCG64(k)), flow, speed, 900.0, 0.0) for k in range(200)]
     gaps = np.concatenate([-np.diff([c.position for c in row]) for row in cars])
-    assert gaps.min() >= SHORTEST * speed + 5.0 - 1e-9
+    assert gaps.min() >= MIN_HEADWAY * speed + 5.0 - 1e-9
     expected = 900.0 / (speed * 3600.0 / flow)
     assert np.mean([len(row) for row in cars]) == pytest.approx(expected, rel=0.03)
     factors = np.array([float(dict(c.type.attributes)["speedFactor"]) for row in cars for c in row])

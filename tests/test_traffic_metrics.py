@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+import weakref
 
 import numpy as np
 import pytest
 
 from sbt.errors import InputError, RunError
 from sbt.execution.worker import run_job
+from sbt.metrics import longitudinal
 from sbt.metrics.comfort import deceleration_max
 from sbt.metrics.conflict import distance_min
 from sbt.metrics.longitudinal import FAR, HORIZON, collision, drac_max, ttc_min
 from sbt.metrics.others import in_traffic, stretches, worst_signal
 from sbt.metrics.stl import stl
+from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
 from sbt.problem.outcome import Job, Status
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -46,6 +50,22 @@ def test_the_worst_of_all_others_counts_in_either_direction():
         single = [in_traffic(metric, "v", name)(one) for name, one in alone.items()]
         assert in_traffic(metric, "v")(trace) == worst(single)
         assert in_traffic(metric, "v", "fast")(trace) == single[1]
+
+
+def test_the_contact_of_a_pair_is_looked_for_once_per_trace_and_forgotten_with_it(monkeypatch: pytest.MonkeyPatch):
+    asked: list[None] = []
+    real = longitudinal.contact_index
+    monkeypatch.setattr(longitudinal, "contact_index", lambda a, b: (asked.append(None), real(a, b))[1])
+    trace = traffic(**{f"car_{k}": (30.0 * k, 0.0, 10.0, ALL) for k in range(1, 20)})
+    metrics = (nearest_distance("v"), struck("v"), struck_speed("v"), nearest_ttc("v"))
+    first = [metric(trace) for metric in metrics]
+    assert len(asked) == 19
+    assert [metric(dataclasses.replace(trace)) for metric in metrics] == first
+    assert len(asked) == 5 * 19, "another trace is another trace, equal or not"
+    kept = weakref.ref(trace)
+    del trace
+    gc.collect()
+    assert kept() is None
 
 
 def test_who_comes_and_goes_is_measured_while_there():
@@ -97,7 +117,7 @@ def test_absent_is_nan_in_every_state_and_the_ego_never_is():
     found = []
     for trace in traces:
         scenario = LogicalScenario(
-            "t", ParameterSpace((Parameter("a", 0, 1),)), Requirement("collision", CriticalInterval(low=1.0)),
+            "t", ParameterSpace((Parameter("a", 0, 1),)), Requirement("collision", low=1.0),
             lambda values, seed, trace=trace: trace, (in_traffic(collision(), "v"),),
         )  # fmt: skip
         found.append(run_job(scenario, Job(0, {"a": 0.5}, 1)).status)

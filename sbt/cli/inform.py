@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import inspect
 import json
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from sbt.cli.console import Exit, clean_stdout, print_json
-from sbt.errors import InputError, PluginError
+from sbt.errors import InputError, PluginError, did_you_mean
 
 __all__ = ["doctor", "list_", "schema"]
 
@@ -27,9 +26,7 @@ def list_(
 ) -> None:
     """List what is installed, with a line on each."""
     if kind is not None and kind not in _KINDS:
-        near = get_close_matches(kind, _KINDS, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise InputError(f"KIND must be one of {', '.join(_KINDS)}, but got '{kind}'{hint}")
+        raise InputError(f"KIND must be one of {', '.join(_KINDS)}, but got '{kind}'{did_you_mean(kind, _KINDS)}")
     with clean_stdout():
         found = {each: _entries(each) for each in ([kind] if kind is not None else _KINDS)}
     if as_json:
@@ -46,9 +43,9 @@ def _entries(kind: str) -> list[dict[str, str]]:
     from sbt.plugins import load, names
 
     if kind == "campaigns":
-        from sbt.config.model import CAMPAIGNS
+        from sbt.config.kinds import kinds
 
-        return [{"name": name, "summary": campaign.description} for name, campaign in CAMPAIGNS.items()]
+        return [{"name": name, "summary": kind.description} for name, kind in kinds().items()]
     if kind == "sources":
         return _sources()
     entries = []

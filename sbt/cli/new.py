@@ -77,7 +77,7 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> list[P
     Raises:
         InputError: the configuration cannot be read, has no such vehicle, or there is a scenario already.
     """
-    from sbt.sumo.asked import number_or_none
+    from sbt.sumo.departures import number_or_none
     from sbt.sumo.files import SumoFiles, options_of_config
 
     if (folder / "scenario.yaml").exists():
@@ -90,7 +90,7 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> list[P
     if found is None:
         raise InputError(f"--ego must be a vehicle of the files ({', '.join(names[:8]) or 'none'}), but got '{ego}'")
     folder.mkdir(parents=True, exist_ok=True)
-    inputs = {name: "{min: 0.0, max: 1.0}    # your range" for hole in files.holes() for name in hole.formula.names()}
+    inputs = {name: "{min: 0.0, max: 1.0}    # your range" for hole in files.placeholders() for name in hole.formula.names()}
     written, routes = [], ""
     if not inputs:
         inputs = {"speed_factor": "{min: 0.8, max: 1.2}    # of the ego: its speed by the allowed one"}

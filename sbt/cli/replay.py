@@ -34,14 +34,15 @@ def replay(
 ) -> None:
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
-        from sbt.workflows.running import replay as execute
+        from sbt.workflows.running import replay_run
 
-        record, outcome, states, scenario = execute(folder, run)
+        again = replay_run(folder, run)
+        record, outcome, states = again.record, again.outcome, again.trace
         if gui or gif or export or trace:
             if states is None:
                 raise InputError(f"only a run with a trace can be shown or written out, but run {run} has none: {outcome.reason}")
-            _show(scenario, record, states, gui=gui, gif=gif, export=export, trace=trace)
-    same = str(outcome.status) == record.status and dict(outcome.metrics) == dict(record.metrics)
+            _show(again.scenario, record, states, gui=gui, gif=gif, export=export, trace=trace)
+    same = again.identical
     if as_json:
         print_json({
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),
@@ -72,8 +73,8 @@ def _show(
     """Show a run, or write it out, in the ways that are asked for."""
     from sbt.report.film import write_film
     from sbt.report.outside import write_csv, write_folder
+    from sbt.sumo.gui import gui_program, run_in_gui
     from sbt.sumo.nets import lanes, net_file
-    from sbt.sumo.window import gui_program, watch
 
     net = getattr(scenario.simulate, "net", None)
     if trace is not None:
@@ -86,6 +87,6 @@ def _show(
         title = f"{scenario.name}, run {record.index}: {metric.name} = {record.metrics[metric.name]:.3g} {metric.unit}"
         write_film(gif, states, metric, need, lanes=() if net is None else lanes(net), title=title)
     if gui:
-        watched = watch(scenario.simulate, record.inputs, record.seed, gui_program())
-        if not watched.identical(states):
+        shown = run_in_gui(scenario.simulate, record.inputs, record.seed, gui_program())
+        if not shown.identical(states):
             print("what sumo-gui showed differs from the run in the last digits", file=sys.stderr)

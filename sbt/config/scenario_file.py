@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -14,17 +13,17 @@ from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, law_of
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
+from sbt.sumo.ego_vehicle import EgoVehicle
 from sbt.sumo.files import SumoFiles, options_of_config
-from sbt.sumo.own_ego import OwnEgo
-from sbt.sumo.script import Loop, OwnSimulation, just_step
-from sbt.sumo.watch import Watching
+from sbt.sumo.recorder import RecordingSettings
+from sbt.sumo.user_simulation import Loop, UserSimulation, step_until_over
 
 __all__ = ["from_file", "is_scenario"]
 
@@ -77,14 +76,14 @@ class _Builder:
         problems.check()
         named = tuple(dict.fromkeys((*model.others.named, *(n for m in model.metrics for n in actors_of(m)))))
         named = tuple(n for n in named if n != model.ego.id)
-        simulation = problems.attempt(("step_length",), lambda: OwnSimulation(
-            Watching(ego or OwnEgo(model.ego.id), model.duration, model.others.within, named, model.wait),
+        simulation = problems.attempt(("step_length",), lambda: UserSimulation(
+            RecordingSettings(ego or EgoVehicle(model.ego.id), model.duration, model.others.within, named, model.wait),
             files, loop, self._folder, model.step_length,
         ))  # fmt: skip
         problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
         return LogicalScenario(
-            name, space or ParameterSpace(()), requirement or Requirement("", CriticalInterval(high=0.0)), simulation, metrics,
+            name, space or ParameterSpace(()), requirement or Requirement("", high=0.0), simulation, metrics,
             model.description, roles=Roles(model.ego.id, None),
         )  # fmt: skip
 
@@ -128,30 +127,28 @@ class _Builder:
     def _loop(self) -> Loop:
         name = self._model.simulate
         if name is None:
-            return just_step
+            return step_until_over
         found = self._problems.attempt(("simulate",), lambda: load("scenarios", name, self._folder))
         if found is not None and not callable(found):
             self._problems.add(("simulate",), f"a loop must be a function simulate(sumo, values, rng), but '{name}' is not")
-        loop: Loop = found if found is not None else just_step
+        loop: Loop = found if found is not None else step_until_over
         return loop
 
-    def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> OwnEgo | None:
+    def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> EgoVehicle | None:
         if files is not None and self._model.simulate is None and files.vehicle(entry.id) is None:
             names = files.names()
-            near = get_close_matches(entry.id, names, 1)
-            hint = f" (did you mean '{near[0]}'?)" if near else ""
             known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
             rule = f"the ego must be a vehicle, trip or flow of the files ({known})"
-            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{hint}")
+            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{did_you_mean(entry.id, names)}")
         kind = entry.kind
         if kind is None:
             if entry.settings:
                 self._problems.add(("ego",), f"settings need a kind (a controller, or sumo), but got {', '.join(entry.settings)}")
-            return OwnEgo(entry.id, None, entry.set_speed, entry.lights, entry.may_leave)
+            return EgoVehicle(entry.id, None, entry.set_speed, entry.lights, entry.may_leave)
         if ".py:" in kind:
             kind = str(self._folder / Path(kind).expanduser())
         driver = self._problems.attempt(("ego",), lambda: Ego.of(kind, **entry.settings))
-        return OwnEgo(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave)
+        return EgoVehicle(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave)
 
     def _metrics(self) -> tuple[Metric, ...]:
         made: dict[str, Metric] = {}
@@ -173,19 +170,19 @@ class _Builder:
         wanted, problems = self._model.requirement, self._problems
         names = [m.name for m in metrics]
         if wanted.stl is not None:
-            return Requirement("stl", CriticalInterval(*(wanted.critical or (-math.inf, 0.0))))
+            return Requirement("stl", *(wanted.critical or (-math.inf, 0.0)))
         if wanted.metric is None or wanted.critical is None:
             problems.add(("requirement",), "a requirement must have a metric and critical: [low, high]")
             return None
         if wanted.metric not in names and len(names) == len(self._model.metrics):
             problems.add(("requirement", "metric"), must_be_one_of("a metric", wanted.metric, names))
-        return Requirement(wanted.metric, CriticalInterval(*wanted.critical))
+        return Requirement(wanted.metric, *wanted.critical)
 
     def _check_inputs(self, files: SumoFiles) -> None:
         """Compare placeholders and inputs."""
         known, used = list(self._model.inputs), set()
         try:
-            holes = list(files.holes())
+            holes = list(files.placeholders())
         except InputError as error:
             self._problems.add(("sumo",), str(error))
             return

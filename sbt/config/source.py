@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 
 __all__ = [
     "ConfigError",
@@ -130,9 +129,7 @@ class Problems:
 
 def must_be_one_of(what: str, name: str, known: Sequence[str]) -> str:
     """Return the message about a name that is not among the known ones."""
-    near = get_close_matches(name, known, 1)
-    hint = f" (did you mean '{near[0]}'?)" if near else ""
-    return f"{what} must be one of {', '.join(known)}, but got '{name}'{hint}"
+    return f"{what} must be one of {', '.join(known)}, but got '{name}'{did_you_mean(name, known)}"
 
 
 def _path(key: str | Key) -> Key:

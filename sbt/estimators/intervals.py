@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaincinv, stdtrit
+from scipy.special import stdtrit
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Vector
 
-__all__ = ["CombinedEstimate", "CountedBatch", "binomial_upper", "combine_estimates", "few_hits_bound", "undetected_mass"]
+__all__ = ["CombinedEstimate", "CountedBatch", "combine_estimates", "few_hits_bound", "undetected_mass"]
 
 FEWEST_HITS = 10
 """Critical runs below which there is a one-sided bound instead of an interval: the variance of fewer says little."""
@@ -104,15 +104,6 @@ def combine_estimates(batches: Sequence[CountedBatch]) -> CombinedEstimate:
         value, math.sqrt(max(own, between)), max(1.0 / share - 1.0, 1.0),
         total**2 / float((weights**2).sum()) if total > 0 else 0.0, float(weights.max()) / total if total > 0 else 1.0,
     )  # fmt: skip
-
-
-def binomial_upper(hits: int, n: int, confidence: float) -> float:
-    """Return the exact one-sided upper limit of a share after `hits` of n.
-
-    Source:
-        Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
-    """
-    return 1.0 if hits >= n else float(betaincinv(hits + 1, n - hits, confidence))
 
 
 def few_hits_bound(hits: int, nominal: Vector, confidence: float) -> float:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scipy.special import betaincinv
-
-from sbt.estimators.intervals import binomial_upper
+from sbt.estimators.binomial import lower, upper
 
 __all__ = ["Proportion"]
 
@@ -37,12 +35,8 @@ class Proportion:
 
     def lower(self, confidence: float) -> float:
         """Return the exact one-sided lower limit, failed runs as safe."""
-        return float(betaincinv(self.hits, self.n - self.hits + 1, 1.0 - confidence)) if self.hits else 0.0
+        return float(lower(self.hits, self.n, confidence))
 
     def upper(self, confidence: float) -> float:
-        """Return the exact one-sided upper limit, failed runs as critical.
-
-        Source:
-            Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
-        """
-        return binomial_upper(self.hits + self.failed, self.n, confidence) if self.n else 1.0
+        """Return the exact one-sided upper limit, failed runs as critical."""
+        return float(upper(self.hits + self.failed, self.n, confidence))

@@ -44,7 +44,7 @@ class Coordinates:
     @property
     def bounded(self) -> Vector:
         """(d,) 1 where the input is uniform on its range, else 0."""
-        return np.array([float(p.law is None) for p in self.space.parameters])
+        return np.array([float(p.truncated is None) for p in self.space.parameters])
 
     def __call__(self, z: Points) -> Points:
         """Return (n, d + f) coordinates of normal scores z (n, d)."""

@@ -29,7 +29,7 @@ from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError, SbtError, did_you_mean, place_of
+from sbt.errors import InputError, SbtError, described, did_you_mean
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -197,8 +197,8 @@ def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
     except SbtError:
         raise
     except Exception as error:
-        name, raised = type(metamodel).__name__, f"{type(error).__name__}: {error} ({place_of(error)})"
-        raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {raised}") from error
+        name = type(metamodel).__name__
+        raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {described(error)}") from error
 
 
 def checked(prediction: Prediction, n: int) -> Prediction:

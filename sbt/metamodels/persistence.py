@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.errors import InputError
+from sbt.files import write_atomically
 from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
 from sbt.metamodels import deep_ensemble as ensemble
@@ -68,14 +69,14 @@ def save(predictor: Predictor, path: Path | str, info: Mapping[str, Any] | None 
         text = json.dumps(head, allow_nan=False, indent=1)
     except (TypeError, ValueError) as error:
         raise InputError(f"a saved model and its info must be JSON without NaN, but got: {error}") from error
-    part = target.with_name(target.name + ".part")
-    with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr(zipfile.ZipInfo(_HEAD), text)  # ZipInfo: no date, the same model gives the same file
         for i, array in enumerate(arrays):
             buffer = io.BytesIO()
             np.save(buffer, array, allow_pickle=False)
             file.writestr(zipfile.ZipInfo(f"{i}.npy"), buffer.getvalue(), zipfile.ZIP_DEFLATED, 1)
-    part.replace(target)
+    write_atomically(target, content.getvalue())
 
 
 def load(path: Path | str, device: str | None = None) -> Predictor:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
+from sbt.metrics.cache import per_trace
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
@@ -88,7 +88,7 @@ def _integral(values: Vector, step: float) -> Vector:
     return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]))]) * step
 
 
-@lru_cache(maxsize=8)
+@per_trace
 def _errors(trace: Trace, curve: Curve, ego: str) -> tuple[Vector, Vector]:
     """Return the (t,) distance to the left of the curve (m) and the heading relative to it (degrees)."""
     actor = trace.actor(ego)

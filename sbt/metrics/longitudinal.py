@@ -11,10 +11,10 @@ Driving: A Review and Suitability Analysis of the State of the Art, doi 10.1007/
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
+from sbt.metrics.cache import per_trace
 from sbt.metrics.geometry import contact_index
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.scenario import Metric
@@ -69,13 +69,13 @@ class Encounter:
         return np.where(np.arange(len(values)) >= self.contact, at_contact, values)
 
 
-@lru_cache(maxsize=8)
+@per_trace
 def first_contact(trace: Trace, ego: str, other: str) -> int | None:
     """Return the index of the first contact of two actors, None without one; kept for the last few traces."""
     return contact_index(trace.actor(ego), trace.actor(other))
 
 
-@lru_cache(maxsize=8)
+@per_trace
 def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Encounter:
     """Return how `ego` and `other` stand to each other; kept for the last few traces."""
     a, b = trace.actor(ego), trace.actor(other)

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metrics.longitudinal import FAR, HORIZON
+from sbt.metrics.cache import per_trace
+from sbt.metrics.longitudinal import D_MIN, FAR, HORIZON, TTC_MIN, d_min, ttc_min
 from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, signal
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
-__all__ = ["in_traffic", "stretches", "worst_signal"]
+__all__ = ["in_traffic", "stretches", "without_verdict", "worst_signal"]
 
 _WITHOUT = {
     "gap": FAR, "ttc": HORIZON, "thw": HORIZON, "mttc": HORIZON, "ttc2d": HORIZON, "distance": FAR,
@@ -29,7 +29,7 @@ _WITHOUT = {
 _HIGH = ("drac", "mdrac", "btn")
 
 
-@lru_cache(maxsize=512)
+@per_trace
 def stretches(trace: Trace, ego: str, other: str) -> tuple[tuple[slice, Trace], ...]:
     """Return the instants and the trace (actors `ego` and `co`) of every stretch in which both are there.
 
@@ -84,6 +84,13 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
         return worst(values, default=metric.without)
 
     return replace(metric, name=name or metric.name, function=function)
+
+
+def without_verdict(metric: Metric) -> Metric:
+    """Return an installed metric as one that does not judge overtaking, which is no verdict in traffic."""
+    if metric is TTC_MIN:
+        return ttc_min(passed=HORIZON)
+    return d_min(passed=FAR) if metric is D_MIN else metric
 
 
 def worst_signal(trace: Trace, name: str, ego: str, margin: float = 0.0) -> Vector:

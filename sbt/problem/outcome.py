@@ -45,3 +45,5 @@ class Outcome:
     """wall-clock time in the worker (s)"""
     collisions: str = ""
     """SUMO's own collision list, as a cross-check of the geometric verdict"""
+    unconfirmed: str = ""
+    """contacts that SUMO's own list does not confirm, and what differs"""

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Mask, Vector
 
-__all__ = ["CriticalInterval", "Requirement"]
+__all__ = ["CriticalInterval", "Measured", "Requirement"]
+
+
+class Measured(Protocol):
+    """Runs whose metrics are known by name, such as a history."""
+
+    def y(self, metric: str) -> Vector:
+        """Return (n,) values of a metric, NaN where a run has none."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -41,13 +52,50 @@ class CriticalInterval:
         return (np.asarray(y) >= self.low) & (np.asarray(y) <= self.high)
 
     def margin(self, y: Vector) -> Vector:
-        """Return (n,) the signed distance of y to M_c, <= 0 where critical, in the unit of y."""
+        """Return (n,) the signed distance of y to M_c, <= 0 where critical, in the unit of y; NaN stays NaN."""
         return np.maximum(self.low - np.asarray(y), np.asarray(y) - self.high)
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """The name of a safety metric and the values of it that violate the requirement."""
+    """The name of a safety metric and the closed interval of its values that violate the requirement.
+
+    Args:
+        metric: name of the safety metric.
+        low, high: ends of the critical interval, in the unit of the metric; one of them may be infinite.
+
+    Raises:
+        InputError: no critical interval.
+
+    >>> Requirement("ttc_min", high=1.0).is_critical({"ttc_min": 0.4})
+    True
+    """
 
     metric: str
-    critical: CriticalInterval
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+                raise InputError(f"a requirement's {name} must be a number, but got {value!r}")
+            object.__setattr__(self, name, float(value))
+        CriticalInterval(self.low, self.high)
+
+    @cached_property
+    def critical(self) -> CriticalInterval:
+        """The critical interval M_c."""
+        return CriticalInterval(self.low, self.high)
+
+    def critical_runs(self, runs: Measured) -> Mask:
+        """Return (n,) booleans: the run violates the requirement; False for a run without the metric."""
+        return self.critical.contains(runs.y(self.metric))
+
+    def margins(self, runs: Measured) -> Vector:
+        """Return (n,) signed distances to M_c, <= 0 where critical; NaN for a run without the metric."""
+        return self.critical.margin(runs.y(self.metric))
+
+    def is_critical(self, metrics: Mapping[str, float]) -> bool:
+        """Return whether the metrics of one run violate the requirement."""
+        return self.low <= metrics[self.metric] <= self.high

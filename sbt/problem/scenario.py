@@ -10,7 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError, RunError
+from sbt import plugins
+from sbt.errors import InputError, RunError, did_you_mean
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
@@ -18,7 +19,10 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
-__all__ = ["Batched", "Configurable", "LogicalScenario", "Metric", "Pool", "Roles", "Simulate"]
+__all__ = ["Batched", "Configurable", "Evaluate", "LogicalScenario", "Metric", "Pool", "Roles", "Simulate", "metric_from"]
+
+Evaluate = Callable[[Mapping[str, float], int], Mapping[str, float]]
+"""(values, seed) -> metrics by name."""
 
 
 class Simulate(Protocol):
@@ -40,7 +44,7 @@ class Batched(Protocol):
 
     def simulate_many(
         self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = ...
-    ) -> list[Trace | Exception]:
+    ) -> list[Trace | BaseException]:
         """Return the trace, or the error, of each of these values and seeds: the same as one by one.
 
         `at_work` is told, again and again, which of them are being run.
@@ -146,25 +150,32 @@ class Roles:
     margin: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class LogicalScenario:
     """A parametrized traffic situation and its requirement.
 
     Args:
         name: as written in configurations.
-        space: the inputs.
-        simulate: values and seed to a trace; None where `evaluate` is given.
-        metrics: computed from the trace; the requirement's is one of them.
+        inputs: the parameter space, or its parameters where they are independent and unconstrained.
         requirement: default requirement.
+        simulate: values and seed to a trace; None where `evaluate` is given.
+        metrics: with `simulate`, what is computed from the trace: metrics, names of installed ones, or functions of a
+            trace; with `evaluate`, the names of what it returns (default: the requirement's metric alone).
         description: for people; the first line is a title.
         evaluate: values and seed to metrics directly (analytic functions, recorded tables), instead
             of `simulate`: there is no trace to look at.
-        metric_names: the metrics that `evaluate` gives.
+        metric_names: the metrics that `evaluate` gives, as `metrics`.
         pool: recorded outcomes; campaigns then choose among these rows only.
         roles: of the actors, for formulas as requirements.
+        space: the parameter space, in place of `inputs`.
 
     Raises:
-        InputError: neither or both of simulate and evaluate, or a requirement on an absent metric.
+        InputError: neither or both of simulate and evaluate, no inputs, or a requirement on an absent metric.
+
+    >>> scenario = LogicalScenario("disc", [Parameter("a", -1, 1, "m")], Requirement("gap", high=0.0),
+    ...                            evaluate=lambda values, seed: {"gap": values["a"] ** 2 - 0.5})
+    >>> scenario.run({"a": 0.5}, seed=0)
+    {'gap': -0.25}
     """
 
     name: str
@@ -173,23 +184,55 @@ class LogicalScenario:
     simulate: Simulate | None = None
     metrics: tuple[Metric, ...] = ()
     description: str = ""
-    evaluate: Callable[[Mapping[str, float], int], Mapping[str, float]] | None = None
+    evaluate: Evaluate | None = None
     metric_names: tuple[str, ...] = ()
     pool: Pool | None = None
     roles: Roles = Roles()
 
-    def __post_init__(self) -> None:
-        if (self.simulate is None) == (self.evaluate is None):
-            raise InputError(f"scenario {self.name}: give either simulate or evaluate")
-        if self.requirement.metric not in self.measured:
-            raise InputError(
-                f"requirement.metric must be one of {', '.join(self.measured)}, but got '{self.requirement.metric}'"
-            )
+    def __init__(
+        self, name: str, inputs: ParameterSpace | Sequence[Parameter] | None = None, requirement: Requirement | None = None,
+        simulate: Simulate | None = None, metrics: Sequence[Metric | str | Callable[[Trace], float]] = (), description: str = "",
+        evaluate: Evaluate | None = None, metric_names: Sequence[str] = (), pool: Pool | None = None, roles: Roles = Roles(), *,
+        space: ParameterSpace | None = None,
+    ):  # fmt: skip
+        given = space if inputs is None else inputs
+        if (inputs is None) == (space is None) or given is None:
+            raise InputError(f"scenario {name}: give the inputs (or a space) once")
+        if requirement is None:
+            raise InputError(f"scenario {name}: a requirement is needed, such as Requirement('ttc_min', high=1.0)")
+        if (simulate is None) == (evaluate is None):
+            raise InputError(f"scenario {name}: give either simulate or evaluate")
+        if evaluate is not None:
+            measured = tuple(m for m in metrics if isinstance(m, str))
+            if len(measured) < len(metrics):
+                rule = "with evaluate, metrics are the names of what it returns"
+                raise InputError(f"scenario {name}: {rule}, but got {metrics[0]!r}")
+            metric_names, metrics = tuple(metric_names) or measured or (requirement.metric,), ()
+        values = {
+            "name": name, "space": given if isinstance(given, ParameterSpace) else ParameterSpace(tuple(given)),
+            "requirement": requirement, "simulate": simulate, "metrics": tuple(metric_from(m) for m in metrics),
+            "description": description, "evaluate": evaluate, "metric_names": tuple(metric_names), "pool": pool, "roles": roles,
+        }  # fmt: skip
+        for key, value in values.items():
+            object.__setattr__(self, key, value)
+        if requirement.metric not in self.measured:
+            known, hint = ", ".join(self.measured), did_you_mean(requirement.metric, self.measured)
+            raise InputError(f"requirement.metric must be one of {known}, but got '{requirement.metric}'{hint}")
 
     @property
     def measured(self) -> tuple[str, ...]:
         """Names of the metrics that every run gives."""
         return self.metric_names if self.evaluate is not None else tuple(m.name for m in self.metrics)
+
+    @property
+    def unit(self) -> str:
+        """Unit of the requirement's metric, "" where it is not known."""
+        return next((m.unit for m in self.metrics if m.name == self.requirement.metric), "")
+
+    @property
+    def direction(self) -> str:
+        """`low` where small values of the requirement's metric are critical, `high` where large ones are."""
+        return next((m.direction for m in self.metrics if m.name == self.requirement.metric), "low")
 
     @property
     def isolations(self) -> tuple[str, ...]:
@@ -240,12 +283,54 @@ class LogicalScenario:
         Raises:
             RunError: it gives none; the error says which `Status` the run has.
         """
+        values = {name: float(value) for name, value in values.items()}
         if self.simulate is not None:
             return self.measure(self.simulate(values, seed))
         if self.evaluate is None:
             raise InputError(f"scenario {self.name}: give either simulate or evaluate")
-        metrics = {name: float(value) for name, value in self.evaluate(values, seed).items()}
-        for name, value in metrics.items():
-            if not math.isfinite(value):
-                raise RunError(Status.FAILED, f"metric {name} must be finite, but got {value}")
-        return metrics
+        return _checked(self.evaluate(values, seed), self.metric_names)
+
+
+def metric_from(given: Metric | str | Callable[[Trace], float]) -> Metric:
+    """Return a metric: itself, the installed one of this name, or a function of a trace under its own name.
+
+    Raises:
+        InputError: it is none of these.
+    """
+    if isinstance(given, Metric):
+        return given
+    if isinstance(given, str):
+        found = plugins.load("metrics", given)
+        if isinstance(found, str):
+            raise InputError(f"a metric must be a Metric or a function of a trace, but '{given}' is text")
+        return metric_from(found)
+    if not callable(given):
+        raise InputError(f"a metric must be a Metric, the name of one, or a function of a trace, but got {given!r}")
+    lines = (getattr(given, "__doc__", None) or "").strip().splitlines()
+    return Metric(getattr(given, "__name__", type(given).__name__), given, description=lines[0] if lines else "")
+
+
+def _checked(returned: Any, names: tuple[str, ...]) -> dict[str, float]:
+    """Return the metrics of a run by name.
+
+    Raises:
+        RunError: what was returned is no mapping with exactly these names and finite numbers.
+    """
+    if not isinstance(returned, Mapping):
+        raise RunError(Status.FAILED, f"a run must return its metrics by name, but got {type(returned).__name__}")
+    if missing := [name for name in names if name not in returned]:
+        raise RunError(Status.FAILED, f"a run must return the metrics {', '.join(names)}, but {', '.join(missing)} missing")
+    if surplus := [str(name) for name in returned if name not in names]:
+        raise RunError(
+            Status.FAILED, f"a run must return the metrics {', '.join(names)}, but got {', '.join(surplus)} too: declare them"
+        )
+    metrics = {}
+    for name in names:
+        value = returned[name]
+        try:
+            metrics[name] = math.nan if isinstance(value, str | bytes) else float(value)
+        except (TypeError, ValueError):
+            metrics[name] = math.nan
+        if not math.isfinite(metrics[name]):
+            raise RunError(Status.FAILED, f"metric {name} must be finite, but got {value!r}")
+    return metrics

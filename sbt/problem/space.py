@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.stats import qmc
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Mask, Points, Vector, as_points
 from sbt.problem.parameter import Parameter
 
@@ -87,7 +86,7 @@ class ParameterSpace:
 
     @cached_property
     def feasible_mass(self) -> float:
-        """Probability of the constraints under the law, by 32,768 Sobol points (1 without constraints)."""
+        """Probability of the constraints under the distribution, by 32,768 Sobol points (1 without constraints)."""
         if not self.constraints:
             return 1.0
         u = qmc.Sobol(self.dimension, scramble=True, rng=0).random(_MASS_POINTS)
@@ -110,7 +109,7 @@ class ParameterSpace:
         return mask
 
     def from_unit(self, u: Points) -> Points:
-        """Map (n, d) unit-cube coordinates to physical values, along the ranges (not the law)."""
+        """Map (n, d) unit-cube coordinates to physical values, along the ranges (not the distribution)."""
         u = as_points(u, self.dimension)
         return np.column_stack([p.from_unit(u[:, k]) for k, p in enumerate(self.parameters)])
 
@@ -120,7 +119,7 @@ class ParameterSpace:
         return np.column_stack([p.to_unit(x[:, k]) for k, p in enumerate(self.parameters)])
 
     def from_normal(self, z: Points) -> Points:
-        """Map (n, d) independent standard-normal scores to physical values under the law."""
+        """Map (n, d) independent standard-normal scores to physical values under the distribution."""
         z = as_points(z, self.dimension)
         if self._factor is not None:
             z = z @ self._factor.T
@@ -156,7 +155,7 @@ class ParameterSpace:
         return log_p
 
     def sample(self, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, d) values drawn from the law, constraints included (by rejection)."""
+        """Return (n, d) values drawn from the distribution, constraints included (by rejection)."""
         kept: list[Points] = []
         missing = n
         while missing > 0:
@@ -198,8 +197,7 @@ class ParameterSpace:
         """
         for name in given:
             if name not in self.names:
-                near = difflib.get_close_matches(name, self.names, 1)
-                hint = f" (did you mean '{near[0]}'?)" if near else ""
+                hint = did_you_mean(name, self.names)
                 raise InputError(f"an input must be one of {', '.join(self.names)}, but got '{name}'{hint}")
         full = {p.name: float(given.get(p.name, p.centre)) for p in self.parameters}
         for p in self.parameters:

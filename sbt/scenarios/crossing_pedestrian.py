@@ -12,13 +12,13 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State, VehicleType
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
-from sbt.sumo.traffic import Column, automated
+from sbt.sumo.traffic import TrafficStream, ego_type
 
 __all__ = ["SCENARIO"]
 
@@ -35,7 +35,7 @@ OVER = ("14#0", "-14#0", "-15")
 PACE = 0.05
 """Standard deviation of the pedestrian's speed as a share of `v_ped`: nobody walks by the clock."""
 WALKER = VehicleType(0.5, 0.5, (("vClass", "pedestrian"), ("minGap", "0.25")))
-ONCOMING = Column("oncoming", BACK, 1, LIMIT, spread=0.05)
+ONCOMING = TrafficStream("oncoming", BACK, 1, LIMIT, spread=0.05)
 NEAREST = 60.0
 """Foremost start of an oncoming car, on the 95 m before the junction behind the crossing (m): none leaves the town in time."""
 PAVEMENTS = (("14#1", "13"), ("-14#0", "-15"))
@@ -59,10 +59,10 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     way = walk * (DISTANCE / speed + values["t_ped"])
     cars = ONCOMING.draw(rng, values["flow_co"], LIMIT, NEAREST, 0.0)
     actors = (
-        Actor("ego", STREET, 1, start, speed, driver, automated(ego, speed, LIMIT)),
+        Actor("ego", STREET, 1, start, speed, driver, ego_type(ego, speed, LIMIT)),
         Actor("ped", OVER, 0, BLOCK - way, pace, type=WALKER, person=True),
     )
-    return Scene((*actors, *cars, *walkers(rng)), until_over)
+    return Scene((*actors, *cars, *walkers(rng)), end_condition)
 
 
 def walkers(rng: np.random.Generator) -> tuple[Actor, ...]:
@@ -74,7 +74,7 @@ def walkers(rng: np.random.Generator) -> tuple[Actor, ...]:
     )  # fmt: skip
 
 
-def until_over(t: float, states: Mapping[str, State]) -> str | None:
+def end_condition(t: float, states: Mapping[str, State]) -> str | None:
     """End the run once ego has passed the crossing."""
     ego = states["ego"]
     ahead = (CROSSING[0] - ego.x) * ego.cos + (CROSSING[1] - ego.y) * ego.sin
@@ -99,5 +99,5 @@ SCENARIO = LogicalScenario(
     ),
     simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",)),
     metrics=(nearest_ttc(), nearest_distance(), struck(), struck_speed()),
-    requirement=Requirement("ttc_path_min", CriticalInterval(high=0.5)),
+    requirement=Requirement("ttc_path_min", high=0.5),
 )

@@ -13,10 +13,10 @@ import numpy as np
 
 from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
-from sbt.sumo.actors import Actor, Scene, State, Until, VehicleType
+from sbt.sumo.actors import Actor, EndCondition, Scene, State, VehicleType
 from sbt.sumo.drivers import LaneChange
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
@@ -45,11 +45,11 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
             Actor("ego", ("road",), 1, START, speed, ego.driver(rng, speed), ego.vehicle_type(CAR, speed)),
             Actor("co", ("road",), 0, START + gap + CAR.length, CO_SPEED, LaneChange(lane=1), CAR),
         ),
-        until_over(),
+        end_condition(),
     )
 
 
-def until_over() -> Until:
+def end_condition() -> EndCondition:
     """Return the rule that ends the run: ego has passed co, or can no longer come closer to it."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
@@ -92,6 +92,6 @@ SCENARIO = LogicalScenario(
         thw_min(margin=MARGIN),
         drac_max(margin=MARGIN),
     ),
-    requirement=Requirement("ttc_min", CriticalInterval(-5.0, 0.5)),
+    requirement=Requirement("ttc_min", -5.0, 0.5),
     roles=Roles(margin=MARGIN),
 )

@@ -12,10 +12,10 @@ import numpy as np
 
 from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
-from sbt.sumo.actors import Actor, Scene, State, Until, VehicleType
+from sbt.sumo.actors import Actor, EndCondition, Scene, State, VehicleType
 from sbt.sumo.drivers import Braking
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
@@ -38,11 +38,11 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
             Actor("ego", ("road",), 1, START, v_ego, ego.driver(rng, v_ego), ego.vehicle_type(CAR, v_ego)),
             Actor("co", ("road",), 1, START + gap + CAR.length, v_co, Braking(-values["a_co"], final), CAR),
         ),
-        until_over(final),
+        end_condition(final),
     )
 
 
-def until_over(final: float) -> Until:
+def end_condition(final: float) -> EndCondition:
     """Return the rule that ends the run: co has braked, and ego no longer closes in on it."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
@@ -78,5 +78,5 @@ SCENARIO = LogicalScenario(
         isolations=("fresh", "reuse", "replicas"),
     ),
     metrics=(ttc_min(), d_min(), collision(), impact_speed(), thw_min(), drac_max()),
-    requirement=Requirement("ttc_min", CriticalInterval(high=0.1)),
+    requirement=Requirement("ttc_min", high=0.1),
 )

@@ -14,10 +14,10 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
-from sbt.sumo.actors import Actor, Scene, State, Until, VehicleType
+from sbt.sumo.actors import Actor, EndCondition, Scene, State, VehicleType
 from sbt.sumo.drivers import SpeedProfile
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
@@ -50,11 +50,11 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
             Actor("ego", ("road",), 1, START, 0.0, driver, ego.vehicle_type(CAR, SET_SPEED)),
             Actor("co", ("road",), 1, front, 0.0, profile, CAR),
         ),
-        until_over(profile.end),
+        end_condition(profile.end),
     )
 
 
-def until_over(end: float) -> Until:
+def end_condition(end: float) -> EndCondition:
     """Return the rule that ends the run: co stands again, and ego stands behind it."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
@@ -97,5 +97,5 @@ SCENARIO = LogicalScenario(
         isolations=("fresh", "reuse", "replicas"),
     ),
     metrics=(ttc_min(), d_min(), collision(), impact_speed(), thw_min(), drac_max()),
-    requirement=Requirement("ttc_min", CriticalInterval(high=0.1)),
+    requirement=Requirement("ttc_min", high=0.1),
 )

@@ -8,13 +8,13 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
-from sbt.sumo.traffic import Column, automated
+from sbt.sumo.traffic import TrafficStream, ego_type
 
 __all__ = ["SCENARIO"]
 
@@ -37,7 +37,7 @@ HORIZON = 5.0
 DURATION = 30.0
 """Longest time that is looked at (s)."""
 EGO = Ego.of("sumo", tau={"min": 0.4, "max": 1.6}, lcAssertive={"min": 1.0, "max": 5.0}, accel={"min": 1.5, "max": 3.5})
-LANES = tuple(Column(name, ("main", "merge", "after"), lane, LIMIT) for lane, name in enumerate(("right", "left")))
+LANES = tuple(TrafficStream(name, ("main", "merge", "after"), lane, LIMIT) for lane, name in enumerate(("right", "left")))
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
@@ -48,12 +48,12 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
         lane.draw(rng, flow, values["v_co"] / 3.6 * factor, NEAREST, FARTHEST)
         for lane, factor in zip(LANES, (1.0, 1.1), strict=True)
     )
-    kind = automated(ego, DESIRED, LIMIT)
+    kind = ego_type(ego, DESIRED, LIMIT)
     car = Actor("ego", ("ramp", "merge", "after"), 0, RAMP - DISTANCE, speed, driver, kind, lane_changes=True)
-    return Scene((car, *right, *left), until_over)
+    return Scene((car, *right, *left), end_condition)
 
 
-def until_over(t: float, states: Mapping[str, State]) -> str | None:
+def end_condition(t: float, states: Mapping[str, State]) -> str | None:
     """End the run once ego is well past the acceleration lane."""
     return "merged" if states["ego"].x > MERGED else None
 
@@ -83,5 +83,5 @@ SCENARIO = LogicalScenario(
         lane_change_duration=LANE_CHANGE,
     ),
     metrics=(nearest_ttc(), time_left(horizon=HORIZON), nearest_distance(), struck(), struck_speed(), others_braking()),
-    requirement=Requirement("ttc_path_min", CriticalInterval(high=2.0)),
+    requirement=Requirement("ttc_path_min", high=2.0),
 )

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
 
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.metrics.cache import per_trace
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
-from sbt.sumo.actors import Actor, Obstacle, Scene, State, Until, VehicleType
+from sbt.sumo.actors import Actor, EndCondition, Obstacle, Scene, State, VehicleType
 from sbt.sumo.drivers import Walk
 from sbt.sumo.dynamics import Gust
 from sbt.sumo.ego import Ego
@@ -111,13 +111,13 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
             Actor("ego", ("road",), 1, START, speed, driver, CAR),
             Actor("child", ("road",), 0, x, values["v_ped"], child, CHILD, start, person=True),
         ),
-        until_over(),
+        end_condition(),
         (machine,),
         {"friction": lambda: grip},
     )
 
 
-def until_over() -> Until:
+def end_condition() -> EndCondition:
     """Return the rule that ends the run: ego touches the child, has passed it, or it has crossed."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
@@ -134,7 +134,7 @@ def until_over() -> Until:
     return over
 
 
-@lru_cache(maxsize=8)
+@per_trace
 def distances(trace: Trace) -> tuple[float, float | None]:
     """Return the smallest distance of ego's rectangle and the child's circle, and ego's speed at the contact.
 
@@ -219,5 +219,5 @@ SCENARIO = LogicalScenario(
     ),
     metrics=(MIN_DIST, COLLISION, IMPACT_SPEED),
     roles=Roles(other="child"),
-    requirement=Requirement("min_dist", CriticalInterval(high=-1e-6)),
+    requirement=Requirement("min_dist", high=-1e-6),
 )

@@ -16,11 +16,11 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.lateral import Curve, lateral_metrics
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
-from sbt.sumo.actors import Actor, Obstacle, Scene, State, Until, VehicleType
+from sbt.sumo.actors import Actor, EndCondition, Obstacle, Scene, State, VehicleType
 from sbt.sumo.ego import Ego
 from sbt.sumo.lane_keeping import LaneKeeping
 from sbt.sumo.simulation import SumoSimulation
@@ -100,10 +100,10 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     if isinstance(driver, LaneKeeping):
         sensor = driver.sensor
         signals = {"seen_left": lambda: sensor.seen[0], "seen_right": lambda: sensor.seen[1]}
-    return Scene((Actor("ego", ("road",), 0, BEFORE, speed, driver, CAR, pose),), until_over(), hidden_by, signals)
+    return Scene((Actor("ego", ("road",), 0, BEFORE, speed, driver, CAR, pose),), end_condition(), hidden_by, signals)
 
 
-def until_over() -> Until:
+def end_condition() -> EndCondition:
     """Return the rule that ends the run: ego has come to the end of the road, or lost it; looked at every 0.2 s."""
     due = 0.0
 
@@ -162,5 +162,5 @@ SCENARIO = LogicalScenario(
         net="winding", scene=scene, duration=DURATION, step_length=0.05, ego=Ego("lane_keeping"),
     ),
     metrics=(*lateral_metrics(ROAD), LANE_LOST),
-    requirement=Requirement("pos_lat_abs_err_max", CriticalInterval(low=3.0)),
+    requirement=Requirement("pos_lat_abs_err_max", low=3.0),
 )  # fmt: skip

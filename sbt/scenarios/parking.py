@@ -13,14 +13,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.metrics.cache import per_trace
 from sbt.metrics.geometry import contact_index, rectangle_distance, swept_contact
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import ActorTrace, Trace
-from sbt.sumo.actors import Actor, Pose, Scene, State, Until, VehicleType
-from sbt.sumo.drivers import ArcExit, Stand
+from sbt.sumo.actors import Actor, EndCondition, Pose, Scene, State, VehicleType
+from sbt.sumo.drivers import ArcExit, Stationary
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
 
@@ -62,14 +63,14 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
         (
             Actor("ego", ("aisle",), 0, 10.0, speed, driver, CAR, (values["x_ego"], values["y_ego"], WEST)),
             Actor("co_1", ("aisle",), 0, 30.0, 0.0, leaving, CAR, start),
-            Actor("co_2", ("aisle",), 0, 50.0, 0.0, Stand(), CAR, bay(2, values)),
-            Actor("co_3", ("aisle",), 0, 70.0, 0.0, Stand(), CAR, bay(3, values)),
+            Actor("co_2", ("aisle",), 0, 50.0, 0.0, Stationary(), CAR, bay(2, values)),
+            Actor("co_3", ("aisle",), 0, 70.0, 0.0, Stationary(), CAR, bay(3, values)),
         ),
-        until_over(leaving.end),
+        end_condition(leaving.end),
     )
 
 
-def until_over(end: float) -> Until:
+def end_condition(end: float) -> EndCondition:
     """Return the rule that ends the run: ego has passed co 1, or both stand."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
@@ -83,6 +84,7 @@ def until_over(end: float) -> Until:
     return over
 
 
+@per_trace
 def _impact(trace: Trace) -> tuple[float, float] | None:
     """Return the speeds of ego and co 1 when they touch (km/h), None without a collision."""
     ego, co = trace.actor("ego"), trace.actor("co_1")
@@ -159,5 +161,5 @@ SCENARIO = LogicalScenario(
     ),
     metrics=(CRITERION, D_MIN, COLLISION, V_EGO, V_CO),
     roles=Roles(other="co_1"),
-    requirement=Requirement("criterion", CriticalInterval(high=-10.0)),
+    requirement=Requirement("criterion", high=-10.0),
 )  # fmt: skip

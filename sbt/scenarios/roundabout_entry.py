@@ -12,13 +12,13 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
-from sbt.sumo.traffic import Column, automated
+from sbt.sumo.traffic import TrafficStream, ego_type
 
 __all__ = ["SCENARIO"]
 
@@ -40,7 +40,7 @@ DURATION = 27.0
 """Longest time that is looked at (s); the fastest car is still there then."""
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
 RING = ("ring_south_east", "ring_east_north", "out_north")
-PASSING = Column("co", ("in_west", "ring_west_south", *RING), 0, RING_LIMIT)
+PASSING = TrafficStream("co", ("in_west", "ring_west_south", *RING), 0, RING_LIMIT)
 LEAVING = ("in_west", "ring_west_south", "out_south")
 
 
@@ -53,11 +53,11 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     )
     leaves = rng.random(len(cars)) < values["p_leave"]
     cars = tuple(replace(car, route=LEAVING) if out else car for car, out in zip(cars, leaves, strict=True))
-    car = Actor("ego", ("in_south", *RING), 0, ARM - DISTANCE, speed, driver, automated(ego, LIMIT, LIMIT))
-    return Scene((car, *cars), until_over)
+    car = Actor("ego", ("in_south", *RING), 0, ARM - DISTANCE, speed, driver, ego_type(ego, LIMIT, LIMIT))
+    return Scene((car, *cars), end_condition)
 
 
-def until_over(t: float, states: Mapping[str, State]) -> str | None:
+def end_condition(t: float, states: Mapping[str, State]) -> str | None:
     """End the run once ego is on the northern arm: whom it bothered at its entry has come there."""
     return "passed" if states["ego"].y > CLEAR else None
 
@@ -88,5 +88,5 @@ SCENARIO = LogicalScenario(
         struck_speed(),
         others_braking(),
     ),
-    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
+    requirement=Requirement("pet_ego_first", high=1.5),
 )

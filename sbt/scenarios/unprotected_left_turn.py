@@ -12,13 +12,13 @@ import numpy as np
 
 from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
-from sbt.sumo.actors import Actor, Scene, State, Until
+from sbt.sumo.actors import Actor, EndCondition, Scene, State
 from sbt.sumo.ego import Ego
 from sbt.sumo.simulation import SumoSimulation
-from sbt.sumo.traffic import Column, automated
+from sbt.sumo.traffic import TrafficStream, ego_type
 
 __all__ = ["SCENARIO"]
 
@@ -37,7 +37,7 @@ HORIZON = 5.0
 DURATION = 38.0
 """Longest time that is looked at (s); the fastest oncoming car is still there then."""
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
-ONCOMING = Column("oncoming", ("in_east", "out_west"), 0, LIMIT)
+ONCOMING = TrafficStream("oncoming", ("in_east", "out_west"), 0, LIMIT)
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
@@ -45,11 +45,11 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     speed = values["v_ego"] / 3.6
     driver = ego.driver(rng, speed)
     cars = ONCOMING.draw(rng, values["flow_co"], values["v_co"] / 3.6, NEAREST, FARTHEST)
-    car = Actor("ego", ("in_west", "out_north"), 0, ARM - DISTANCE, speed, driver, automated(ego, speed, LIMIT))
-    return Scene((car, *cars), until_over())
+    car = Actor("ego", ("in_west", "out_north"), 0, ARM - DISTANCE, speed, driver, ego_type(ego, speed, LIMIT))
+    return Scene((car, *cars), end_condition())
 
 
-def until_over() -> Until:
+def end_condition() -> EndCondition:
     """Return the rule that ends the run: ego left the junction `HORIZON` ago."""
     left: list[float] = []
 
@@ -78,5 +78,5 @@ SCENARIO = LogicalScenario(
     ),
     simulate=SumoSimulation(net="left_turn", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
     metrics=(time_left(horizon=HORIZON), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
-    requirement=Requirement("pet_ego_first", CriticalInterval(high=1.5)),
+    requirement=Requirement("pet_ego_first", high=1.5),
 )

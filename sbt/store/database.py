@@ -13,52 +13,74 @@ import fcntl
 import json
 import sqlite3
 import time
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sbt.errors import StoreError
 from sbt.problem.outcome import Job, Outcome
-from sbt.store.history import PLANNED, History, Record
+from sbt.store.history import PLANNED, History, Rows
+from sbt.store.records import FitRecord, Iteration, from_json, to_json
 
 __all__ = ["DATABASE", "PlannedRun", "Store"]
 
 DATABASE = "campaign.sqlite"
-_VERSION = 1
+_VERSION = 2
 _TOGETHER = 0.1
 """Seconds within which runs wait for the disk once."""
 _SCHEMA = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum INTEGER NOT NULL);
 CREATE TABLE runs (
     idx INTEGER PRIMARY KEY, stage TEXT NOT NULL, iteration INTEGER NOT NULL, inputs TEXT NOT NULL,
-    seed INTEGER NOT NULL, log_q REAL, status TEXT NOT NULL, metrics TEXT NOT NULL DEFAULT '{}',
+    seed INTEGER NOT NULL, seed_chosen INTEGER NOT NULL, level INTEGER NOT NULL, warm_up INTEGER, log_q REAL,
+    plan_checksum INTEGER NOT NULL, status TEXT NOT NULL, metrics TEXT NOT NULL DEFAULT '{}',
     reason TEXT NOT NULL DEFAULT '', seconds REAL NOT NULL DEFAULT 0, collisions TEXT NOT NULL DEFAULT '',
-    versions TEXT NOT NULL DEFAULT '');
+    unconfirmed TEXT NOT NULL DEFAULT '', versions TEXT NOT NULL DEFAULT '', checksum INTEGER NOT NULL DEFAULT 0);
 CREATE INDEX unfinished ON runs (status) WHERE status = 'planned';
-CREATE TABLE iterations (iteration INTEGER PRIMARY KEY, stage TEXT NOT NULL, proposal TEXT NOT NULL);
-CREATE TABLE fits (runs INTEGER PRIMARY KEY, iteration INTEGER NOT NULL, scores TEXT NOT NULL);
+CREATE TABLE iterations (iteration INTEGER PRIMARY KEY, stage TEXT NOT NULL, proposal TEXT NOT NULL, checksum INTEGER NOT NULL);
+CREATE TABLE fits (runs INTEGER PRIMARY KEY, iteration INTEGER NOT NULL, scores TEXT NOT NULL, checksum INTEGER NOT NULL);
 """
+_PLAN = ("idx", "stage", "iteration", "inputs", "seed", "seed_chosen", "level", "warm_up", "log_q")
+_OUTCOME = ("status", "metrics", "reason", "seconds", "collisions", "unconfirmed", "versions")
+_FIELDS = ("stage", "iteration", "seed", "seed_chosen", "level", "warm_up", "log_q", "status", "reason", "seconds", "collisions",
+           "unconfirmed", "versions")  # fmt: skip
+"""Columns of a row that a history holds as they are."""
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run that a stage asks for, before it has an index."""
+    """A run that a stage asks for, before it has an index and a seed.
+
+    Args:
+        stage: what asks for it.
+        inputs: values by name, in their units.
+        log_q: log density that they were drawn with; None: they were chosen.
+        seed: where it was chosen for what it draws; None: it is drawn.
+        level: of fidelity, 0 the scenario's own.
+        warm_up: number of the warm-up to start from.
+    """
 
     stage: str
     inputs: Mapping[str, float]
     log_q: float | None = None
+    seed: int | None = None
+    level: int = 0
+    warm_up: int | None = None
 
 
 class Store:
     """A campaign's folder, open for reading or (by one process at a time) for writing.
 
-    Use `Store.create`, `Store.resume` and `Store.read`; each is a context manager.
+    Use `Store.open` and `Store.read`; both are context managers.
 
     Raises:
         StoreError: the folder cannot be read or written, holds no campaign, is being written by
-            another process, or was made by a newer version.
+            another process, was made by another version, or is damaged.
     """
 
     def __init__(self, folder: Path, connection: sqlite3.Connection, lock: Any = None):
@@ -67,14 +89,19 @@ class Store:
         self._lock = lock
         self._may_hurry, self._waits = False, True  # commits need not wait for the disk, and do
         self._waited = -_TOGETHER  # when a run last did, on the monotonic clock
+        self._rows: Rows | None = None  # finished rows before the first unfinished one: they never change
+        self._read_up_to = 0  # index of the first row that is not among them
+        self._iterations: list[Iteration] = []
+        self._fits: list[FitRecord] = []
 
     @classmethod
-    def open(cls, folder: Path, configuration: Mapping[str, Any], *, durable: bool = True) -> Store:
+    def open(cls, folder: Path, configuration: Mapping[str, Any] | None = None, *, durable: bool = True) -> Store:
         """Open for writing: a new store with this configuration, or the one that is there.
 
         Args:
             folder: made where there is none.
-            configuration: what must not change between a campaign and its resumption.
+            configuration: what must not change between a campaign and its resumption; None: a new store has no campaign
+                until `begin` is called.
             durable: commits reach the disk; False where the whole file can be written again.
         """
         folder = Path(folder)
@@ -89,14 +116,21 @@ class Store:
             mode = _set_journal(db, durable=durable)
             store = cls(folder, db, lock)
             store._may_hurry = durable and mode == "wal"
-            if db.execute("PRAGMA user_version").fetchone()[0] == 0:
-                with store._transaction():
-                    for statement in _SCHEMA.strip().split(";\n"):
-                        db.execute(statement)
-                    store._set_meta("configuration", dict(configuration))
-                    db.execute(f"PRAGMA user_version = {_VERSION}")
-            store._check_version()
+            if db.execute("PRAGMA user_version").fetchone()[0] != 0:
+                store._check_version()
+            elif configuration is not None:
+                store.begin(configuration)
             return store
+
+    def begin(self, configuration: Mapping[str, Any]) -> None:
+        """Make the tables of a new store, with the configuration of its campaign; a store that has them stays as it is."""
+        if self._db.execute("PRAGMA user_version").fetchone()[0] != 0:
+            return
+        with self._transaction():
+            for statement in _SCHEMA.strip().split(";\n"):
+                self._db.execute(statement)
+            self._set_meta("configuration", dict(configuration))
+            self._db.execute(f"PRAGMA user_version = {_VERSION}")
 
     @classmethod
     def read(cls, folder: Path) -> Store:
@@ -136,6 +170,11 @@ class Store:
         if version != _VERSION:
             raise StoreError(f"{self.folder}: this version reads stores of version {_VERSION}, but got version {version}")
 
+    def _checked(self, what: str, stored: int, *parts: Any) -> None:
+        """Refuse a row that is not what was written."""
+        if stored != _checksum(*parts):
+            raise StoreError(f"{self.folder}: {what} is damaged: its checksum is wrong")
+
     @contextmanager
     def _transaction(self, *, waits: bool = True) -> Iterator[None]:
         """Return a transaction that waits for the disk at its end, and there takes along those before that did not."""
@@ -153,15 +192,21 @@ class Store:
             self._db.execute("COMMIT")
 
     def _set_meta(self, key: str, value: Any) -> None:
-        self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, _dump(value)))
+        text = _dump(value)
+        self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (key, text, _checksum(key, text)))
 
     def _get_meta(self, key: str) -> Any:
-        row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
-        return None if row is None else json.loads(row[0])
+        if self._db.execute("PRAGMA user_version").fetchone()[0] == 0:
+            return None
+        row = self._db.execute("SELECT value, checksum FROM meta WHERE key = ?", (key,)).fetchone()
+        if row is None:
+            return None
+        self._checked(f"the {key}", row[1], key, row[0])
+        return json.loads(row[0])
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """What the campaign was started with."""
+        """What the campaign was started with; empty where none was begun."""
         return dict(self._get_meta("configuration") or {})
 
     def update_configuration(self, configuration: Mapping[str, Any]) -> None:
@@ -181,7 +226,7 @@ class Store:
             self._set_meta("conclusion", dict(conclusion))
 
     def plan(
-        self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: Mapping[str, Any],
+        self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: object,
         *, indices: Sequence[int] | None = None,
     ) -> None:  # fmt: skip
         """Write a batch before it runs, all of it or nothing.
@@ -191,37 +236,48 @@ class Store:
             stage: what asked for it.
             runs: the batch.
             seeds: one a run.
-            proposal: how the batch was chosen (JSON), such as the position in the Sobol sequence.
+            proposal: how the batch was chosen: a record (dataclass) or JSON data.
             indices: of the runs; None: they continue those of the store.
         """
-        start = self.planned
+        start, names = self.planned, self._names
         places = range(start, start + len(runs)) if indices is None else indices
-        rows = [
-            (index, run.stage, iteration, _dump(dict(run.inputs)), seeds[k], run.log_q, PLANNED)
-            for k, (index, run) in enumerate(zip(places, runs, strict=True))
-        ]
+        rows = []
+        for k, (index, run) in enumerate(zip(places, runs, strict=True)):
+            inputs = _dump([run.inputs[name] for name in names])
+            chosen, seed = run.seed is not None, seeds[k] if run.seed is None else run.seed
+            log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
+            row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, run.warm_up, log_q)
+            rows.append((*row, _checksum(*row), PLANNED))
+        text = _dump(proposal if isinstance(proposal, dict) else to_json(proposal))
         with self._transaction():
             self._db.executemany(
-                "INSERT INTO runs (idx, stage, iteration, inputs, seed, log_q, status) VALUES (?, ?, ?, ?, ?, ?, ?)", rows
+                f"INSERT INTO runs ({', '.join(_PLAN)}, plan_checksum, status) VALUES ({', '.join('?' * (len(_PLAN) + 2))})", rows
             )
-            self._db.execute("INSERT INTO iterations VALUES (?, ?, ?)", (iteration, stage, _dump(dict(proposal))))
+            checksum = _checksum(iteration, stage, text)
+            self._db.execute("INSERT INTO iterations VALUES (?, ?, ?, ?)", (iteration, stage, text, checksum))
 
     def append(self, outcome: Outcome, versions: str = "") -> None:
         """Write one run's outcome."""
         now = time.monotonic()
         waits = now - self._waited >= _TOGETHER
         self._waited = now if waits else self._waited
+        row = (
+            str(outcome.status), _dump(dict(outcome.metrics)), outcome.reason, float(outcome.seconds), outcome.collisions,
+            outcome.unconfirmed, versions,
+        )  # fmt: skip
         with self._transaction(waits=waits):
             self._db.execute(
-                "UPDATE runs SET status = ?, metrics = ?, reason = ?, seconds = ?, collisions = ?, versions = ? WHERE idx = ?",
-                (str(outcome.status), _dump(dict(outcome.metrics)), outcome.reason, outcome.seconds,
-                 outcome.collisions, versions, outcome.index),
-            )  # fmt: skip
+                f"UPDATE runs SET {', '.join(f'{name} = ?' for name in _OUTCOME)}, checksum = ? WHERE idx = ?",
+                (*row, _checksum(outcome.index, *row), outcome.index),
+            )
 
-    def add_fit(self, runs: int, iteration: int, scores: Mapping[str, Any]) -> None:
-        """Keep the scores of the metamodel that learned from the first `runs` rows."""
+    def add_fit(self, fit: FitRecord) -> None:
+        """Keep what is known of the metamodel that learned from the first `fit.runs` rows."""
+        text = _dump(to_json(fit))
         with self._transaction():
-            self._db.execute("INSERT OR REPLACE INTO fits VALUES (?, ?, ?)", (runs, iteration, _dump(dict(scores))))
+            row = (fit.runs, fit.iteration, text, _checksum(fit.runs, fit.iteration, text))
+            self._db.execute("INSERT OR REPLACE INTO fits VALUES (?, ?, ?, ?)", row)
+        self._fits = [known for known in self._fits if known.runs < fit.runs]
 
     @property
     def planned(self) -> int:
@@ -233,33 +289,74 @@ class Store:
         """Number of runs by status, `planned` for those without an outcome."""
         return dict(self._db.execute("SELECT status, COUNT(*) FROM runs GROUP BY status").fetchall())
 
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Names of the inputs, in the order of the columns of x."""
+        if self._rows is None:
+            self._rows = Rows(tuple(self.configuration["names"]))
+        return self._rows.names
+
     def unfinished(self) -> list[Job]:
         """Return the planned runs that have no outcome yet."""
-        rows = self._db.execute("SELECT idx, inputs, seed FROM runs WHERE status = ? ORDER BY idx", (PLANNED,))
-        return [Job(index, json.loads(inputs), seed) for index, inputs, seed in rows]
+        rows = self._db.execute(
+            f"SELECT {', '.join(_PLAN)}, plan_checksum FROM runs WHERE status = ? ORDER BY idx", (PLANNED,)
+        ).fetchall()
+        for row in rows:
+            self._checked(f"run {row[0]}", row[-1], *row[:-1])
+        names = self._names
+        return [Job(row[0], dict(zip(names, json.loads(row[3]), strict=True)), row[4]) for row in rows]
 
-    def iterations(self) -> list[dict[str, Any]]:
-        """Return how each batch was chosen: iteration, stage and the proposal's own keys."""
-        rows = self._db.execute("SELECT iteration, stage, proposal FROM iterations ORDER BY iteration")
-        return [{"iteration": i, "stage": stage, **json.loads(proposal)} for i, stage, proposal in rows]
+    def iterations(self) -> list[Iteration]:
+        """Return how each batch was chosen."""
+        last = self._iterations[-1].number if self._iterations else -1
+        rows = self._db.execute("SELECT * FROM iterations WHERE iteration > ? ORDER BY iteration", (last,))
+        for number, stage, text, checksum in rows:
+            self._checked(f"iteration {number}", checksum, number, stage, text)
+            self._iterations.append(Iteration(number, stage, json.loads(text)))
+        return list(self._iterations)
 
-    def fits(self) -> list[dict[str, Any]]:
-        """Return the metamodel's scores: runs, iteration and what was measured, in the order of the runs."""
-        rows = self._db.execute("SELECT runs, iteration, scores FROM fits ORDER BY runs")
-        return [{"runs": n, "iteration": i, **json.loads(scores)} for n, i, scores in rows]
+    def fits(self) -> list[FitRecord]:
+        """Return what is known of each fitted metamodel, in the order of the runs."""
+        last = self._fits[-1].runs if self._fits else -1
+        for runs, iteration, text, checksum in self._db.execute("SELECT * FROM fits WHERE runs > ? ORDER BY runs", (last,)):
+            self._checked(f"the fit after {runs} runs", checksum, runs, iteration, text)
+            self._fits.append(from_json(FitRecord, json.loads(text)))
+        return list(self._fits)
 
     def history(self) -> History:
-        """Return all finished runs as columns."""
+        """Return all finished runs as columns; what was read before is not decoded again."""
         with _reported(self.folder):
-            rows = self._db.execute(
-                "SELECT idx, stage, iteration, inputs, seed, status, metrics, reason, log_q, seconds, collisions, versions"
-                " FROM runs WHERE status != ? ORDER BY idx", (PLANNED,),
-            ).fetchall()  # fmt: skip
-        records = tuple(
-            Record(index, stage, iteration, json.loads(inputs), seed, status, json.loads(metrics), *rest)
-            for index, stage, iteration, inputs, seed, status, metrics, *rest in rows
-        )
-        return History(tuple(self.configuration["names"]), records)
+            names = self._names
+            done = self._rows if self._rows is not None else Rows(names)
+            pending = self._db.execute("SELECT MIN(idx) FROM runs WHERE status = ?", (PLANNED,)).fetchone()[0]
+            until = "" if pending is None else f" AND idx < {int(pending)}"
+            self._read_into(done, f"idx >= {self._read_up_to}{until}")
+            if done.count:
+                self._read_up_to = int(done.history().index[-1]) + 1
+            if pending is None:
+                return done.history()
+            some = Rows(names)  # rows behind one that is still being run may get neighbours later
+            self._read_into(some, f"idx > {int(pending)} AND status != '{PLANNED}'")
+            return done.history() if some.count == 0 else done.history().extended(some.history())
+
+    def _read_into(self, rows: Rows, condition: str) -> None:
+        """Append the rows that meet a condition, in the order of their index."""
+        query = f"SELECT {', '.join((*_PLAN, *_OUTCOME))}, plan_checksum, checksum FROM runs WHERE {condition} ORDER BY idx"
+        cursor = self._db.execute(query)
+        n = len(_PLAN)
+        while found := cursor.fetchmany(10_000):
+            for row in found:
+                self._checked(f"run {row[0]}", row[-2], *row[:n])
+                self._checked(f"the outcome of run {row[0]}", row[-1], row[0], *row[n:-2])
+            columns = dict(zip((*_PLAN, *_OUTCOME), zip(*found, strict=True), strict=False))
+            x = np.array(json.loads(f"[{','.join(columns['inputs'])}]"), dtype=np.float64).reshape(len(found), len(rows.names))
+            metrics = json.loads(f"[{','.join(columns['metrics'])}]")
+            rows.append(x, {"index": columns["idx"], **{name: columns[name] for name in _FIELDS}}, metrics)
+
+
+def _checksum(*parts: Any) -> int:
+    """Return the CRC-32 of the parts of a row."""
+    return zlib.crc32(repr(parts).encode("utf-8", "surrogatepass"))
 
 
 def _dump(value: Any) -> str:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Status
+from sbt.problem.requirement import Requirement
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["PLANNED", "VALIDATION", "History", "Record"]
+__all__ = ["PLANNED", "VALIDATION", "History", "Record", "Rows"]
 
 PLANNED = "planned"
 """Status of a run that was decided on and has no outcome yet."""
@@ -25,7 +27,26 @@ VALIDATION = "validation"
 
 @dataclass(frozen=True)
 class Record:
-    """One row of the store."""
+    """One row of the store.
+
+    Args:
+        index: of the run in the campaign, from 0.
+        stage: what asked for it.
+        iteration: number of its batch, from 0.
+        inputs: values by name, in their units.
+        seed: of the run.
+        status: a `Status`.
+        metrics: by name, empty unless the status is ok.
+        reason: why there are no metrics.
+        log_q: log density that the inputs were drawn with; None: they were chosen.
+        seconds: wall-clock time of the run.
+        collisions: SUMO's own collision list.
+        versions: of the software that ran it.
+        seed_chosen: the seed was chosen by what it draws, not drawn at random.
+        level: of fidelity, 0 the scenario's own.
+        warm_up: number of the warm-up that the run started from; None: it ran from the beginning.
+        unconfirmed: contacts that SUMO's own list does not confirm, and what differs.
+    """
 
     index: int
     stage: str
@@ -34,67 +55,199 @@ class Record:
     seed: int
     status: str
     metrics: Mapping[str, float]
-    reason: str
-    log_q: float | None
-    seconds: float
-    collisions: str
-    versions: str
+    reason: str = ""
+    log_q: float | None = None
+    seconds: float = 0.0
+    collisions: str = ""
+    versions: str = ""
+    seed_chosen: bool = False
+    level: int = 0
+    warm_up: int | None = None
+    unconfirmed: str = ""
 
 
-@dataclass(frozen=True)
+_NUMBERS: Mapping[str, tuple[Any, Callable[[Any], Any]]] = {
+    "index": (np.int64, int), "iteration": (np.int64, int), "seed": (np.int64, int), "level": (np.int64, int),
+    "log_q": (np.float64, lambda v: np.nan if v is None else v), "seconds": (np.float64, float),
+    "warm_up": (np.int64, lambda v: -1 if v is None else v), "seed_chosen": (np.bool_, bool),
+}  # fmt: skip
+_TEXTS = ("stage", "status", "reason", "collisions", "versions", "unconfirmed")
+
+
+@dataclass
+class Rows:
+    """Columns that grow: a store appends what is new, and histories are views of what was there.
+
+    Args:
+        names: inputs, in the order of the columns of x.
+    """
+
+    names: tuple[str, ...]
+    count: int = 0
+    _columns: dict[str, NDArray[Any]] = field(default_factory=dict, repr=False)
+    _texts: dict[str, str] = field(default_factory=dict, repr=False)
+
+    def append(self, x: Points, columns: Mapping[str, Sequence[Any]], metrics: Sequence[Mapping[str, float]]) -> None:
+        """Append rows: x (k, d), the other fields of a `Record` by name, and the metrics of each row."""
+        k = len(x)
+        self._put("x", x, np.nan)
+        for name, (dtype, convert) in _NUMBERS.items():
+            values = columns.get(name)
+            if values is None:
+                values = [None] * k if name in ("log_q", "warm_up") else [0] * k
+            self._put(name, np.fromiter((convert(v) for v in values), dtype, k), 0)
+        for name in _TEXTS:
+            shared = [self._texts.setdefault(v, v) for v in columns.get(name, [""] * k)]  # equal texts are kept once
+            texts = np.empty(k, dtype=object)
+            texts[:] = shared
+            self._put(name, texts, "")
+        for name in dict.fromkeys(name for row in metrics for name in row):
+            self._put(f"y.{name}", np.fromiter((row.get(name, np.nan) for row in metrics), np.float64, k), np.nan)
+        for name in self._columns:
+            if name.startswith("y.") and not any(name[2:] in row for row in metrics):
+                self._put(name, np.full(k, np.nan), np.nan)
+        self.count += k
+
+    def _put(self, name: str, values: NDArray[Any], empty: Any) -> None:
+        """Write values behind the rows there are; arrays that were handed out are never written again."""
+        end = self.count + len(values)
+        there = self._columns.get(name)
+        if there is None or len(there) < end:
+            grown = np.empty((max(end, 64, int(1.5 * len(there)) if there is not None else 0), *values.shape[1:]), values.dtype)
+            grown[: self.count] = empty if there is None else there[: self.count]
+            self._columns[name] = there = grown
+        there[self.count : end] = values
+
+    def history(self) -> History:
+        """Return the rows so far."""
+        if not self._columns:
+            self.append(np.empty((0, len(self.names))), {}, [])
+        return History(self.names, {name: column[: self.count] for name, column in self._columns.items()})
+
+
+@dataclass(frozen=True, eq=False)
 class History:
     """Runs with an outcome, in the order of their index.
 
     Args:
         names: inputs, in the order of the columns of `x`.
-        records: finished runs, by increasing index.
+        columns: (n, ...) arrays: `x`, `y.<metric>`, and the other fields of a `Record` by name.
     """
 
     names: tuple[str, ...]
-    records: tuple[Record, ...] = ()
+    columns: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def of(cls, names: Sequence[str], records: Iterable[Record] = ()) -> History:
+        """Return the history of these records."""
+        found, rows = tuple(records), Rows(tuple(names))
+        x = np.array([[r.inputs[name] for name in names] for r in found], dtype=np.float64).reshape(len(found), len(names))
+        fields = {name: [getattr(r, name) for r in found] for name in (*_NUMBERS, *_TEXTS)}
+        rows.append(x, fields, [r.metrics for r in found])
+        return rows.history()
 
     def __len__(self) -> int:
         """Return the number of finished runs."""
-        return len(self.records)
+        return len(self.columns["x"])
 
-    @cached_property
+    @property
     def x(self) -> Points:
         """(n, d) inputs in their units."""
-        rows = [[r.inputs[name] for name in self.names] for r in self.records]
-        return np.array(rows, dtype=np.float64).reshape(len(rows), len(self.names))
+        return self.columns["x"]
+
+    @property
+    def index(self) -> NDArray[np.int64]:
+        """(n,) index of each run in the campaign, from 0."""
+        return self.columns["index"]
+
+    @property
+    def iteration(self) -> NDArray[Any]:
+        """(n,) iteration of each run, from 0."""
+        return self.columns["iteration"]
+
+    @property
+    def seed(self) -> NDArray[np.int64]:
+        """(n,) seed of each run."""
+        return self.columns["seed"]
+
+    @property
+    def seconds(self) -> Vector:
+        """(n,) wall-clock time of each run."""
+        return self.columns["seconds"]
+
+    @property
+    def log_q(self) -> Vector:
+        """(n,) log density that the inputs were drawn with, NaN where they were chosen."""
+        return self.columns["log_q"]
+
+    @property
+    def reason(self) -> NDArray[Any]:
+        """(n,) why a run has no metrics, "" where it has."""
+        return self.columns["reason"]
+
+    @property
+    def versions(self) -> NDArray[Any]:
+        """(n,) versions of the software that ran it."""
+        return self.columns["versions"]
+
+    @cached_property
+    def stage(self) -> NDArray[np.str_]:
+        """(n,) names of the stages that asked for the runs."""
+        return self.columns["stage"].astype(np.str_)
+
+    @cached_property
+    def status(self) -> NDArray[np.str_]:
+        """(n,) status of each run."""
+        return self.columns["status"].astype(np.str_)
 
     @cached_property
     def ok(self) -> Mask:
         """(n,) the run gave metrics."""
-        return np.array([r.status == Status.OK for r in self.records], dtype=bool)
-
-    @cached_property
-    def stage(self) -> Any:
-        """(n,) names of the stages that asked for the runs."""
-        return np.array([r.stage for r in self.records], dtype=np.str_)
-
-    @cached_property
-    def iteration(self) -> Any:
-        """(n,) iteration of each run, from 0."""
-        return np.array([r.iteration for r in self.records], dtype=np.int64)
-
-    @cached_property
-    def index(self) -> Any:
-        """(n,) index of each run in the campaign, from 0."""
-        return np.array([r.index for r in self.records], dtype=np.int64)
+        return np.asarray(self.status == str(Status.OK), dtype=bool)
 
     @property
     def metrics(self) -> tuple[str, ...]:
         """Names of the metrics, in the order of the first run that has them."""
-        return next((tuple(r.metrics) for r in self.records if r.metrics), ())
+        return tuple(name[2:] for name in self.columns if name.startswith("y."))
 
     def y(self, metric: str) -> Vector:
         """Return (n,) values of a metric, NaN where the run has none."""
-        return np.array([r.metrics.get(metric, np.nan) for r in self.records], dtype=np.float64)
+        found = self.columns.get(f"y.{metric}")
+        return np.full(len(self), np.nan) if found is None else found
 
     def where(self, mask: Mask) -> History:
         """Return the runs where `mask` holds."""
-        return History(self.names, tuple(r for r, keep in zip(self.records, mask, strict=True) if keep))
+        keep = np.asarray(mask, dtype=bool)
+        return History(self.names, {name: column[keep] for name, column in self.columns.items()})
+
+    def extended(self, other: History) -> History:
+        """Return these runs and, behind them, the others."""
+        columns = {}
+        for name in {**self.columns, **other.columns}:
+            parts = [h.y(name[2:]) if name.startswith("y.") else h.columns[name] for h in (self, other)]
+            columns[name] = np.concatenate(parts)
+        return History(self.names, columns)
+
+    def record(self, row: int) -> Record:
+        """Return one row, counted from 0 among these runs."""
+        c = self.columns
+        log_q, warm_up = float(c["log_q"][row]), int(c["warm_up"][row])
+        return Record(
+            int(c["index"][row]), str(c["stage"][row]), int(c["iteration"][row]), self.inputs(row), int(c["seed"][row]),
+            str(c["status"][row]), {name: float(self.y(name)[row]) for name in self.metrics} if self.ok[row] else {},
+            str(c["reason"][row]), None if np.isnan(log_q) else log_q, float(c["seconds"][row]), str(c["collisions"][row]),
+            str(c["versions"][row]), bool(c["seed_chosen"][row]), int(c["level"][row]), None if warm_up < 0 else warm_up,
+            str(c["unconfirmed"][row]),
+        )  # fmt: skip
+
+    def inputs(self, row: int) -> dict[str, float]:
+        """Return the inputs of one row by name."""
+        return dict(zip(self.names, map(float, self.x[row]), strict=True))
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """All rows, one object each: for a few of them, or where every field is wanted."""
+        return tuple(self.record(row) for row in range(len(self)))
 
     @property
     def training(self) -> History:
@@ -111,14 +264,30 @@ class History:
         """Runs that no metamodel learns from."""
         return self.where(self.ok & (self.stage == VALIDATION))
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return a tidy frame: index, stage, iteration, x.<input>, y.<metric>, status, seed, log_q, ..."""
+    def to_frame(self, requirement: Requirement | None = None) -> pd.DataFrame:
+        """Return a tidy frame, a row a run.
+
+        Args:
+            requirement: gives the verdict: `critical` (nullable boolean, NA where a run has no metric) and `margin`
+                (in the metric's unit, <= 0 critical).
+
+        Returns:
+            Columns index, stage, iteration, x.<input>, y.<metric>, critical, margin, log_q, status, reason, seed, ...
+        """
         import pandas as pd
 
-        data: dict[str, Any] = {"index": self.index, "stage": self.stage, "iteration": self.iteration}
+        data: dict[str, Any] = {"index": self.index, "stage": self.columns["stage"], "iteration": self.iteration}
         data |= {f"x.{name}": self.x[:, k] for k, name in enumerate(self.names)}
         data |= {f"y.{name}": self.y(name) for name in self.metrics}
-        data["log_q"] = np.array([np.nan if r.log_q is None else r.log_q for r in self.records], dtype=np.float64)
+        if requirement is not None:
+            margin = requirement.margins(self)
+            data["critical"] = pd.arrays.BooleanArray(requirement.critical_runs(self), np.isnan(margin))
+            data["margin"] = margin
+        data["log_q"] = self.log_q
         for column in ("status", "reason", "seed", "collisions", "seconds", "versions"):
-            data[column] = [getattr(r, column) for r in self.records]
+            data[column] = self.columns[column]
+        warm_up = self.columns["warm_up"]
+        data["seed_chosen"], data["level"] = self.columns["seed_chosen"], self.columns["level"]
+        data["warm_up"] = pd.arrays.IntegerArray(warm_up, warm_up < 0)
+        data["unconfirmed"] = self.columns["unconfirmed"]
         return pd.DataFrame(data)

@@ -20,7 +20,7 @@ import numpy as np
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Pool
 from sbt.problem.space import ParameterSpace
 from sbt.store.history import History
@@ -62,7 +62,7 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     pool = Pool(x, {column: rows[column][kept] for column in outputs})
     title, text = str(described.get("title", path.name)), str(described.get("logical_scenario", ""))
     return LogicalScenario(
-        name=f"table:{name}", space=space, requirement=Requirement(next(iter(outputs)), CriticalInterval(high=0.0)),
+        name=f"table:{name}", space=space, requirement=Requirement(next(iter(outputs)), high=0.0),
         evaluate=_Lookup(space.names, pool), metric_names=tuple(outputs), description=f"{title} (recorded)\n{text}", pool=pool,
     )  # fmt: skip
 

@@ -1,1 +1,1 @@
-"""How it runs: the only room that knows libsumo."""
+"""Execution of concrete scenarios in SUMO; the only package that imports libsumo and traci."""

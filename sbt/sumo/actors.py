@@ -1,8 +1,8 @@
-"""Actors of a concrete scenario and the door for their controllers.
+"""Actors of a concrete scenario and the interface of their controllers.
 
-A controller is called once a step with the time, its own state and the other actors' states, and
-returns an `Action`. States are rectangle centres in the network's plane (m, rad, m/s), the same as
-in a `Trace`.
+A controller is called once per step with the time, its own state and the states of the other actors, and
+returns an `Action`. States refer to the centre of an actor's rectangle in the coordinates of the network
+(m, rad, m/s), as in a `Trace`.
 """
 
 from __future__ import annotations
@@ -14,18 +14,20 @@ from typing import NamedTuple, Protocol
 
 from sbt.errors import InputError
 
-__all__ = ["KEEP", "Action", "Actor", "Controller", "Obstacle", "Pose", "Scene", "State", "Until", "VehicleType"]
+__all__ = ["KEEP", "Action", "Actor", "Controller", "EndCondition", "Obstacle", "Pose", "Scene", "State", "VehicleType"]
 
 Pose = tuple[float, float, float]
 """x and y of the centre (m) and heading (rad)."""
 
 
 class Action(NamedTuple):
-    """What an actor does until the next step; None leaves it as commanded before.
+    """Command of a controller until the next step; None leaves a quantity as commanded before.
 
-    `acceleration` (m/s^2) over the step, or `speed` (m/s) at its end, or both: accelerate until that
-    speed; `lane` starts a continuous change to that lane of the edge; `pose` (x, y, heading of the
-    centre) puts the actor there, off the lanes too, `speed` with it says how fast it is.
+    Attributes:
+        acceleration: over the step (m/s^2); together with `speed`, until that speed is reached.
+        speed: at the end of the step (m/s); together with `pose`, the speed to record.
+        lane: index on the current edge; starts a continuous lane change.
+        pose: x, y (m) and heading (rad) of the centre at the end of the step, on or off the lanes.
     """
 
     acceleration: float | None = None
@@ -35,19 +37,21 @@ class Action(NamedTuple):
 
 
 KEEP = Action()
-"""Change nothing: SUMO holds the speed that was commanded last."""
+"""Changes nothing: SUMO keeps the speed that was commanded last."""
 
 
 class State:
-    """State of one actor now; the object is updated in place, so copy what must be kept.
+    """Current state of one actor; updated in place, so a controller must copy what it wants to remember.
 
     Attributes:
         x, y: centre (m).
-        heading: radians, counter-clockwise from +x; `cos` and `sin` are its direction.
+        heading: radians, counter-clockwise from +x.
+        cos, sin: of the heading.
+        angle: heading as SUMO gives it (degrees, clockwise from north).
         speed, acceleration: along the heading (m/s, m/s^2).
         length, width: of the rectangle (m).
-        steered: the speed commanded with a pose (SUMO does not keep it), None for lane-bound actors.
-        step: time until its controller is asked again (s).
+        steered: speed commanded together with a pose, which SUMO does not report; None for lane-bound actors.
+        step: time until the controller is called again (s).
     """
 
     __slots__ = (
@@ -65,26 +69,31 @@ class State:
         self.steered: float | None = None
 
     def turn(self, angle: float) -> None:
-        """Take over SUMO's angle (degrees clockwise from north)."""
+        """Set the heading from SUMO's angle (degrees, clockwise from north)."""
         self.angle = angle
         self.heading = math.radians(90.0 - angle)
         self.cos, self.sin = math.cos(self.heading), math.sin(self.heading)
 
 
 class Controller(Protocol):
-    """Drives one actor through one run; may keep what it remembers."""
+    """Controls one actor during one run; may have internal state."""
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the action from `t` (s) to the next step."""
+        """Return the action from time `t` (s) until the next step."""
         ...
 
 
 @dataclass(frozen=True)
 class VehicleType:
-    """A SUMO vehicle type: its rectangle, and any other vType attribute by SUMO's name.
+    """A SUMO vehicle type.
+
+    Args:
+        length: of the rectangle (m).
+        width: of the rectangle (m).
+        attributes: other vType attributes, (SUMO's name, value) pairs.
 
     Raises:
-        InputError: a length or width that is not positive.
+        InputError: a length or width is not positive.
     """
 
     length: float = 5.0
@@ -98,24 +107,25 @@ class VehicleType:
 
 @dataclass(frozen=True)
 class Actor:
-    """One vehicle or person and where it starts.
+    """One vehicle or person and its initial state.
 
     Args:
-        name: unique in the scene, also SUMO's id.
-        route: edges, the first is where it starts.
-        lane: index on that edge, 0 is the right one.
+        name: unique in the scene, also its id in SUMO.
+        route: edges; the actor starts on the first one.
+        lane: index on that edge, 0 is the rightmost one.
         position: of the front bumper on that lane (m).
         speed: at the start (m/s).
-        driver: its controller; None lets SUMO's models drive it.
-        type: its SUMO type.
-        pose: where it starts instead, on or off the lanes; its controller then gives a pose at every
-            step, and `lane` and `position` only say where SUMO lets it in.
-        person: a SUMO person, round, `type.width` wide. With a pose its controller moves it; without one it
-            walks along `route` at `speed` by SUMO's model, on the pavements and crossings of the network.
-        lane_changes: SUMO changes its lanes (for its route, and safely) although a controller drives.
+        driver: its controller; None: SUMO's own models drive it.
+        type: its vehicle type.
+        pose: initial x, y (m) and heading (rad) of the centre, on or off the lanes. The controller must then
+            return a pose at every step; `lane` and `position` only tell SUMO where to insert the actor.
+        person: a SUMO person, a circle of diameter `type.width`. With a pose its controller moves it; without
+            one it walks along `route` at `speed` by SUMO's pedestrian model, on pavements and crossings.
+        lane_changes: let SUMO change lanes (strategically and safely) although a controller sets the speed.
 
     Raises:
-        InputError: numbers that are not finite, a pose without a controller, a controller of a person without one.
+        InputError: a number is not finite, a pose is given without a controller, or a person has a
+            controller but no pose.
     """
 
     name: str
@@ -144,10 +154,10 @@ class Actor:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A rectangle that stands and hides what is behind it; shown in SUMO and in the trace, in nobody's way.
+    """A static rectangle that blocks the line of sight; part of the trace, but never collided with.
 
     Args:
-        name: unique in the scene, also the id of SUMO's polygon.
+        name: unique in the scene, also the id of the polygon in SUMO.
         pose: of its centre.
         length, width: along and across its heading (m).
     """
@@ -159,28 +169,28 @@ class Obstacle:
 
     @property
     def corners(self) -> tuple[tuple[float, float], ...]:
-        """Four (x, y), counter-clockwise from the front left."""
-        x, y, heading = self.pose
-        cos, sin, a, b = math.cos(heading), math.sin(heading), 0.5 * self.length, 0.5 * self.width
+        """The four corners (x, y) in m, counter-clockwise from the front left."""
+        x, y, heading = map(float, self.pose)
+        cos, sin, a, b = math.cos(heading), math.sin(heading), 0.5 * float(self.length), 0.5 * float(self.width)
         return tuple((x + u * cos - v * sin, y + u * sin + v * cos) for u, v in ((a, b), (-a, b), (-a, -b), (a, -b)))
 
 
-Until = Callable[[float, Mapping[str, State]], str | None]
-"""Called every step; the word it returns ends the run and says why, None goes on."""
+EndCondition = Callable[[float, Mapping[str, State]], str | None]
+"""Called every step with the time (s) and the states by name; returns why the run ends, or None to go on."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One concrete scenario: who takes part, and when it is over (apart from collision and duration).
+    """A concrete scenario: its actors and the end of the run (besides a collision and the duration).
 
     Args:
         actors: the first one is the ego.
-        until: ends the run.
-        obstacles: what stands around.
-        signals: name to a function that is read after every step's actions, into `Trace.signals`.
+        until: end condition of the run; None: only collision and duration.
+        obstacles: static rectangles.
+        signals: name to a function that is sampled after the actions of every step, recorded in `Trace.signals`.
     """
 
     actors: tuple[Actor, ...]
-    until: Until | None = None
+    until: EndCondition | None = None
     obstacles: tuple[Obstacle, ...] = ()
     signals: Mapping[str, Callable[[], float]] = field(default_factory=dict)

@@ -1,9 +1,9 @@
-"""Several runs at once in one simulation: isolation level `replicas`.
+"""Several runs in one simulation: isolation level `replicas`.
 
-The simulation holds copies of the network that know nothing of each other; each takes a run, and the next
-one as soon as its run is over, so that one step of SUMO serves many runs. What a run gives is what it gives
-alone, to the last bit. Whatever goes wrong ends the whole batch, and every run that was not over is run
-alone instead: that decides what its error is, and costs no other run more than time.
+The simulation holds independent copies of the network; each takes a run, and the next one as soon as its run
+is over, so that every step of SUMO advances many runs. The result of a run is bit-identical to that of the run
+alone. An error ends the whole batch, and all runs that were not over are repeated one by one: this attributes
+the error to its run, and costs the others nothing but time.
 """
 
 from __future__ import annotations
@@ -11,31 +11,31 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from sbt import interruption
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import Scene
-from sbt.sumo.copies import prefix
-from sbt.sumo.driving import Drive
-from sbt.sumo.placing import insert, verify
-from sbt.sumo.session import Setup, direct, session
+from sbt.sumo.insertion import insert, verify
+from sbt.sumo.replicas import id_prefix
+from sbt.sumo.session import Setup, session, unwrapped
+from sbt.sumo.sumo_run import SumoRun
 
-__all__ = ["COPIES", "simulate_many"]
+__all__ = ["REPLICAS", "simulate_many"]
 
-COPIES = 16
-"""Of the network in one simulation: from about 10 to 100 the rate hardly changes."""
-_LOOK = 64
-"""The wall clock is looked at, and life is shown, once in so many steps."""
+REPLICAS = 16
+"""Number of copies of the network; between about 10 and 100 the throughput hardly changes."""
+_REPORT_STEPS = 64
+"""Steps between two looks at the wall clock and two reports of what is running."""
 
-AtWork = Callable[[Sequence[int]], None]
+Report = Callable[[Sequence[int]], None]
 
 
 class _Simulation(Protocol):
-    """What a batch needs to know of a `SumoSimulation`."""
+    """What a batch needs of a `SumoSimulation`."""
 
     @property
     def step_length(self) -> float: ...
@@ -47,102 +47,113 @@ class _Simulation(Protocol):
     def batched(self) -> bool: ...
 
     def __call__(self, values: Mapping[str, float], seed: int) -> Trace: ...
-    def built(self, values: Mapping[str, float], seed: int) -> Scene: ...
-    def setup(self, scene: Scene, copies: int = 1) -> Setup: ...
+    def build_scene(self, values: Mapping[str, float], seed: int) -> Scene: ...
+    def setup(self, scene: Scene, replicas: int = 1) -> Setup: ...
 
 
 @dataclass
-class _Slot:
-    """A run in one copy of the network."""
+class _ReplicaRun:
+    """A run in one replica."""
 
     prefix: str
     index: int
     scene: Scene
     start: float
-    drive: Drive
+    run: SumoRun
     advance: Callable[[], bool]
 
 
 def simulate_many(
-    simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], at_work: AtWork
-) -> list[Trace | Exception]:
-    """Run concrete scenarios, in copies of the network where allowed; see `SumoSimulation.simulate_many`."""
-    found: dict[int, Trace | Exception] = {}
+    simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], at_work: Report
+) -> list[Trace | BaseException]:
+    """Run concrete scenarios, in replicas of the network where allowed; see `SumoSimulation.simulate_many`."""
+    results: dict[int, Trace | BaseException] = {}
     if simulation.batched and len(work) > 1:
-        with suppress(Exception):  # whose it is and what it says, the runs that are missing show alone
-            _together(simulation, work, found, at_work)
+        try:
+            _simulate_in_replicas(simulation, work, results, at_work)
+        except BaseException as error:  # the missing runs are repeated below, where the error is attributed to its run
+            if interruption.is_interruption(error):
+                raise
     for index, (values, seed) in enumerate(work):
-        if index not in found:
+        if index not in results:
             at_work((index,))
             try:
-                found[index] = simulation(values, seed)
-            except Exception as error:  # a user's scenario may raise anything
-                found[index] = error
-    return [found[index] for index in range(len(work))]
+                results[index] = simulation(values, seed)
+            except BaseException as error:  # a user's scenario may raise anything
+                if interruption.is_interruption(error):
+                    raise
+                results[index] = error
+    return [results[index] for index in range(len(work))]
 
 
-def _together(
-    simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], found: dict[int, Trace | Exception], at_work: AtWork
+def _simulate_in_replicas(
+    simulation: _Simulation,
+    work: Sequence[tuple[Mapping[str, float], int]],
+    results: dict[int, Trace | BaseException],
+    at_work: Report,
 ) -> None:
-    """Fill `found` with the traces of the runs that can share a simulation."""
+    """Add to `results` the traces of the runs that can share a simulation."""
     scenes: dict[int, Scene] = {}
     for index, (values, seed) in enumerate(work):
         at_work((index,))
-        scenes[index] = simulation.built(values, seed)
-    setup = simulation.setup(scenes[0], COPIES)
-    waiting = [k for k, s in scenes.items() if simulation.setup(s, COPIES) == setup and all(a.pose is None for a in s.actors)]
+        scenes[index] = simulation.build_scene(values, seed)
+    setup = simulation.setup(scenes[0], REPLICAS)
+    shared = {
+        index: scene
+        for index, scene in scenes.items()
+        if simulation.setup(scene, REPLICAS) == setup and all(actor.pose is None for actor in scene.actors)
+    }
     with session().run(setup, 0, "replicas") as sumo:
-        _roll(sumo, simulation, {index: scenes[index] for index in waiting}, found, at_work)
+        _step_until_done(sumo, simulation, shared, results, at_work)
 
 
-def _roll(
-    sumo: Any, simulation: _Simulation, waiting: dict[int, Scene], found: dict[int, Trace | Exception], at_work: AtWork
+def _step_until_done(
+    sumo: Any, simulation: _Simulation, scenes: dict[int, Scene], results: dict[int, Trace | BaseException], at_work: Report
 ) -> None:
-    """Keep every copy busy until no run is left."""
-    step, colliding = direct(sumo, "simulation", "step"), direct(sumo, "simulation", "getCollidingVehiclesNumber")
-    free, queue = [prefix(copy) for copy in range(COPIES)], deque(waiting)
-    busy: list[_Slot] = []
+    """Step, and start the next run in every replica that becomes free, until all scenes have been run."""
+    step, colliding = unwrapped(sumo, "simulation", "step"), unwrapped(sumo, "simulation", "getCollidingVehiclesNumber")
+    free, queue = [id_prefix(replica) for replica in range(REPLICAS)], deque(scenes)
+    running: list[_ReplicaRun] = []
     steps = 0
-    while queue or busy:
-        new: list[_Slot] = []
+    while queue or running:
+        new: list[_ReplicaRun] = []
         while queue and free:
-            new.append(_begin(sumo, simulation, free.pop(), queue[0], waiting[queue.popleft()]))
-        busy += new
-        if new or steps % _LOOK == 0:
-            at_work([slot.index for slot in busy])
-            _check_time(busy, simulation.timeout)
+            new.append(_start(sumo, simulation, free.pop(), queue[0], scenes[queue.popleft()]))
+        running += new
+        if new or steps % _REPORT_STEPS == 0:
+            at_work([entry.index for entry in running])
+            _check_clock(running, simulation.timeout)
         step()
         steps += 1
-        for slot in new:
-            verify(sumo, slot.scene, slot.prefix)
+        for entry in new:
+            verify(sumo, entry.scene, entry.prefix)
         if colliding():
-            _tell(sumo, busy)
-        over = [slot for slot in busy if slot.advance()]
-        for slot in over:
-            found[slot.index] = slot.drive.trace()
-            session().remove(slot.prefix)
-            busy.remove(slot)
-            free.append(slot.prefix)
+            _record_collisions(sumo, running)
+        for entry in [entry for entry in running if entry.advance()]:
+            results[entry.index] = entry.run.trace()
+            session().remove(entry.prefix)
+            running.remove(entry)
+            free.append(entry.prefix)
 
 
-def _begin(sumo: Any, simulation: _Simulation, prefix: str, index: int, scene: Scene) -> _Slot:
-    """Insert the actors of a run into a copy."""
+def _start(sumo: Any, simulation: _Simulation, prefix: str, index: int, scene: Scene) -> _ReplicaRun:
+    """Insert the actors of a run into a replica."""
     insert(sumo, scene, prefix)
-    drive = Drive(sumo, scene, simulation.step_length, simulation.duration, prefix)
-    return _Slot(prefix, index, scene, time.monotonic(), drive, drive.advance)
+    run = SumoRun(sumo, scene, simulation.step_length, simulation.duration, prefix)
+    return _ReplicaRun(prefix, index, scene, time.monotonic(), run, run.advance)
 
 
-def _check_time(busy: list[_Slot], timeout: float | None) -> None:
-    """Give up where a run has had its time, of which the others took their shares."""
-    if timeout is not None and time.monotonic() - min(slot.start for slot in busy) > timeout * len(busy):
+def _check_clock(running: list[_ReplicaRun], timeout: float | None) -> None:
+    """Raise an error where a run exceeds its limit; the time is shared by all runs."""
+    if timeout is not None and time.monotonic() - min(entry.start for entry in running) > timeout * len(running):
         raise RunError(Status.TIMEOUT, f"a run must take at most {timeout:g} s")
 
 
-def _tell(sumo: Any, busy: list[_Slot]) -> None:
-    """Pass SUMO's collisions on to the runs in which one began in this step, as a simulation of that run alone tells them."""
+def _record_collisions(sumo: Any, running: list[_ReplicaRun]) -> None:
+    """Record SUMO's collisions in the runs in which one began in this step, as in a simulation of that run alone."""
     begun = {name.partition(".")[0] + "." for name in sumo.simulation.getCollidingVehiclesIDList()}
-    drives = {slot.prefix: slot.drive for slot in busy if slot.prefix in begun}
-    for found in sumo.simulation.getCollisions():
-        copy = found.collider.partition(".")[0] + "."
-        if copy in drives:
-            drives[copy].heard_of(found.collider.removeprefix(copy), found.victim.removeprefix(copy))
+    runs = {entry.prefix: entry.run for entry in running if entry.prefix in begun}
+    for collision in sumo.simulation.getCollisions():
+        prefix = collision.collider.partition(".")[0] + "."
+        if prefix in runs:
+            runs[prefix].record_collision(collision.collider.removeprefix(prefix), collision.victim.removeprefix(prefix))

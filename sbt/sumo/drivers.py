@@ -12,7 +12,7 @@ from sbt.sumo.actors import KEEP, Action, Pose, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, Gust
 from sbt.sumo.sensors import PERIOD, RangeSensor, Target
 
-__all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stand", "Walk"]
+__all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stationary", "Walk"]
 
 _as_action = partial(tuple.__new__, Action)
 """An `Action` of its four parts, without the default values that take most of the time to make one."""
@@ -60,7 +60,7 @@ class AccAeb:
         for name, value in given.items():
             if name == "aeb_reserve" and value is None:
                 continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= 0:
+            if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating) or not value >= 0:
                 raise InputError(f"ego.{name} must be a number >= 0, but got {value!r}")
         self._set_speed = set_speed
         self._time_gap, self._distance_min = time_gap, distance_min
@@ -203,7 +203,7 @@ class Walk:
         )
 
 
-class Stand:
+class Stationary:
     """Stands where it is."""
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:

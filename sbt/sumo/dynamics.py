@@ -1,4 +1,4 @@
-"""Parts of motion: dead time, lag, braking with limited jerk, kinematic single-track model, gusts of wind."""
+"""Elements of vehicle motion: dead time, lag, jerk-limited braking, kinematic single-track model, wind gusts."""
 
 from __future__ import annotations
 
@@ -7,15 +7,26 @@ from collections import deque
 
 import numpy as np
 
-__all__ = ["DeadTime", "FirstOrderLag", "Gust", "JerkLimitedStop", "SingleTrack"]
+__all__ = ["MAX_SPEED", "DeadTime", "FirstOrderLag", "Gust", "JerkLimitedStop", "SingleTrack", "next_speed"]
+
+MAX_SPEED = 1e4
+"""Commanded speeds must be below this (m/s): no road user comes near it, NaN and infinity are excluded."""
+
+
+def next_speed(speed: float, acceleration: float, target: float | None, dt: float) -> float:
+    """Return the speed after a step of constant acceleration that ends at the target speed and at standstill (m/s)."""
+    reached = speed + acceleration * dt
+    if target is not None:
+        reached = max(reached, target) if acceleration < 0 else min(reached, target)
+    return 0.0 if reached < 0.0 else reached
 
 
 class DeadTime:
-    """Gives back what was put in `delay` seconds ago, linearly between samples.
+    """Delays a signal by a constant time; linear interpolation between samples.
 
     Args:
         delay: dead time (s), >= 0.
-        initial: output until the first input has come through.
+        initial: output until the first input has passed.
     """
 
     def __init__(self, delay: float, initial: float = 0.0):
@@ -24,7 +35,7 @@ class DeadTime:
         self._before = (-math.inf, initial)
 
     def __call__(self, t: float, value: float) -> float:
-        """Put `value` in at time t and return the value of t - delay; t must not decrease."""
+        """Add the sample (t, value) and return the signal at t - delay; t must not decrease."""
         samples = self._samples
         samples.append((t, value))
         then = t - self._delay + 1e-9
@@ -38,7 +49,12 @@ class DeadTime:
 
 
 class FirstOrderLag:
-    """Follows its input with time constant `constant` (s): exact for an input held over the step."""
+    """First-order lag (PT1), exact for an input that is constant over the step.
+
+    Args:
+        constant: time constant (s).
+        initial: output at the start.
+    """
 
     def __init__(self, constant: float, initial: float = 0.0):
         self._constant = constant
@@ -46,7 +62,7 @@ class FirstOrderLag:
         self._step = self._share = 0.0
 
     def __call__(self, value: float, dt: float) -> float:
-        """Return the output after dt seconds of the input `value`."""
+        """Return the output after the input has been `value` for dt seconds."""
         if dt != self._step:
             self._step = dt
             self._share = -math.expm1(-dt / self._constant) if self._constant > 0 else 1.0
@@ -55,13 +71,13 @@ class FirstOrderLag:
 
 
 class JerkLimitedStop:
-    """Braking to a stop whose deceleration grows with a limited jerk: exact at any time.
+    """Closed-form braking to a standstill: the deceleration ramps up with constant jerk and is then constant.
 
     Args:
-        speed: before (m/s).
-        onset: time at which the deceleration begins to grow (s).
-        jerk: rate at which it grows (m/s^3), positive.
-        braking: what it grows to (m/s^2), positive.
+        speed: before braking (m/s).
+        onset: time at which the ramp begins (s).
+        jerk: slope of the ramp (m/s^3), positive.
+        braking: deceleration at the end of the ramp (m/s^2), positive.
     """
 
     def __init__(self, speed: float, onset: float, jerk: float, braking: float):
@@ -84,16 +100,16 @@ class JerkLimitedStop:
         return ahead + self._speed_after(ramp) * rest - 0.5 * self._braking * rest**2
 
     def _times(self, t: float) -> tuple[float, float]:
-        """Return how long the deceleration has grown and has been constant (s)."""
+        """Return the time spent on the ramp and at constant deceleration until t (s)."""
         since = max(t - self.onset, 0.0)
         return min(since, self._ramp), min(max(since - self._ramp, 0.0), self._rest)
 
 
 class SingleTrack:
-    """Kinematic single-track model (tyres roll without side slip), about the middle of the vehicle.
+    """Kinematic single-track (bicycle) model without tyre slip; the reference point is midway between the axles.
 
     Args:
-        wheelbase: axle distance (m), the middle is in the middle of it.
+        wheelbase: distance of the axles (m).
         steering_max: largest steering angle (rad).
 
     Source:
@@ -105,18 +121,15 @@ class SingleTrack:
         self._wheelbase, self._steering_max = wheelbase, steering_max
 
     def steering(self, curvature: float) -> float:
-        """Return the steering angle for a curvature of the path (1/m), within the limit."""
+        """Return the steering angle (rad) for a path curvature (1/m), limited to `steering_max`."""
         return max(-self._steering_max, min(math.atan(self._wheelbase * curvature), self._steering_max))
 
     def slip(self, steering: float) -> float:
-        """Return the angle from the vehicle's heading to the course of its middle (rad)."""
+        """Return the slip angle (rad): from the heading to the direction of motion of the reference point."""
         return math.atan(0.5 * math.tan(steering))
 
     def move(self, x: float, y: float, heading: float, steering: float, distance: float) -> tuple[float, float, float]:
-        """Return x, y (m) and heading (rad) after `distance` at a constant steering angle: an arc.
-
-        The heading is the vehicle's; its middle moves along it turned by the slip angle.
-        """
+        """Return x, y (m) and heading (rad) after travelling `distance` (m) on an arc of constant steering angle."""
         slip = self.slip(steering)
         turn = distance * math.cos(slip) * math.tan(steering) / self._wheelbase
         chord = distance * (math.sin(0.5 * turn) / (0.5 * turn) if abs(turn) > 1e-9 else 1.0)
@@ -125,16 +138,16 @@ class SingleTrack:
 
 
 class Gust:
-    """A random speed that varies smoothly in time, the same whatever the step: a sum of waves.
+    """A random speed over time, independent of the simulation step: a sum of harmonics.
 
     Args:
         rng: source of phases and frequencies.
         deviation: standard deviation (m/s).
-        duration: typical time of one gust (s).
-        waves: number of waves.
+        duration: typical duration of a gust (s).
+        waves: number of harmonics.
 
     Source:
-        spectral representation of a Gaussian process, Shinozuka and Deodatis (1991), doi 10.1115/1.3119501.
+        Spectral representation of a Gaussian process, Shinozuka and Deodatis (1991), doi 10.1115/1.3119501.
     """
 
     def __init__(self, rng: np.random.Generator, deviation: float, duration: float = 2.0, waves: int = 6):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from sbt.errors import InputError
 from sbt.problem.parameter import Parameter
 from sbt.seeds import stream
 from sbt.sumo.actors import Controller, VehicleType
-from sbt.sumo.models import checked, unit_of
+from sbt.sumo.formatting import format_number, plain
+from sbt.sumo.models import unit_of, vtype_attributes
 
 __all__ = ["SUMO", "Ego"]
 
@@ -44,11 +46,10 @@ class Ego:
     @classmethod
     def of(cls, kind: str = "acc_aeb", **settings: Any) -> Ego:
         """Return the ego of this kind, its settings tried out once, ranges at their centre."""
-        given = ((name, _input(name, value) if isinstance(value, Mapping) else value) for name, value in sorted(settings.items()))
-        ego = cls(kind, tuple(given))
+        ego = cls(kind, tuple((name, _setting(name, value)) for name, value in sorted(settings.items())))
         trial = ego.bound({p.name: p.centre for p in ego.inputs})
         if kind == SUMO:
-            checked(dict(trial.settings))
+            vtype_attributes(dict(trial.settings))
         elif not callable(getattr(trial.driver(stream(0, "ego"), 1.0), "act", None)):
             raise InputError(f"ego.kind must name a controller with act(t, own, others), but '{kind}' has none")
         return ego
@@ -98,15 +99,17 @@ class Ego:
         """Return the SUMO type of the ego: `base`, with SUMO's models where they drive."""
         if self.kind != SUMO:
             return base
-        given = checked(dict(self.settings))
+        given = vtype_attributes(dict(self.settings))
         length, width = float(given.pop("length", base.length)), float(given.pop("width", base.width))
-        attributes = {"maxSpeed": repr(set_speed), **_DEFAULTS, **dict(base.attributes), **given}
+        attributes = {"maxSpeed": format_number(set_speed), **_DEFAULTS, **dict(base.attributes), **given}
         return replace(base, length=length, width=width, attributes=tuple(sorted(attributes.items())))
 
 
-def _input(name: str, value: Mapping[str, Any]) -> Parameter:
-    """Return the input that a range given as an ego setting is."""
-    numbers = all(isinstance(value.get(key), (int, float)) and not isinstance(value.get(key), bool) for key in ("min", "max"))
+def _setting(name: str, value: Any) -> Any:
+    """Return a setting with its number plain, or the scenario input that a range such as `{min: 0.5, max: 2.0}` declares."""
+    if not isinstance(value, Mapping):
+        return plain(value)
+    numbers = all(isinstance(value.get(key), Real) and not isinstance(value.get(key), bool) for key in ("min", "max"))
     if set(value) not in _RANGE or not numbers:
         raise InputError(f"ego.{name} must be a value or a range such as {{min: 0.5, max: 2.0}}, but got {dict(value)}")
     unit = str(value.get("unit", unit_of(name)))

@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.sumo.actors import Action, Obstacle, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, JerkLimitedStop
-from sbt.sumo.sight import Boxes, outline
+from sbt.sumo.occlusion import Occluders, outline
 
 __all__ = ["EmergencyStop", "PedestrianBraking"]
 
@@ -70,7 +70,7 @@ class PedestrianBraking:
         self._set_speed = set_speed
         self._limit = friction * GRAVITY
         self._sight, self._camera = sight, camera
-        self._boxes = Boxes((*o.pose, o.length, o.width) for o in obstacles)
+        self._boxes = Occluders((*o.pose, o.length, o.width) for o in obstacles)
         self._confirmations = confirmations
         self._delay, self._lag = DeadTime(reaction_time), FirstOrderLag(lag)
         self._range = (braking_min, braking_max)
@@ -127,7 +127,7 @@ class PedestrianBraking:
         ahead = 0.5 * own.length - self._camera
         eye = np.array([own.x + ahead * own.cos, own.y + ahead * own.sin])
         middle = np.array([[person.x, person.y]])
-        if math.hypot(person.x - eye[0], person.y - eye[1]) > self._sight or self._boxes.hides(eye, middle)[0]:
+        if math.hypot(person.x - eye[0], person.y - eye[1]) > self._sight or self._boxes.occlude(eye, middle)[0]:
             return None
         n = [a * b for a, b in zip(self._noise(tick), self._deviation, strict=True)]
         dx, dy = person.x - own.x + n[0], person.y - own.y + n[1]
@@ -190,7 +190,7 @@ class EmergencyStop:
         eye = np.array([own.x + 0.5 * own.length * own.cos, own.y + 0.5 * own.length * own.sin])
         points = outline(watched)
         ahead = (points - eye) @ np.array([own.cos, own.sin]) > 0.0
-        seen = ahead & ~Boxes.of(o for o in others if o is not watched).hides(eye, points)
+        seen = ahead & ~Occluders.of(o for o in others if o is not watched).occlude(eye, points)
         if not seen.any():
             return None
         upper = float(points[seen, 1].max()) + self._deviation * self._noise(tick)[0]

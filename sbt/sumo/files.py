@@ -15,7 +15,8 @@ from functools import cached_property
 from pathlib import Path
 
 from sbt.errors import InputError
-from sbt.sumo.template import Hole, Template, Vehicle, fill, holes, template
+from sbt.sumo.formatting import format_number
+from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template
 
 __all__ = ["OWN", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
 
@@ -99,12 +100,12 @@ class SumoFiles:
         _check_net(template(self.net))
         return found
 
-    def holes(self) -> Iterator[Hole]:
+    def placeholders(self) -> Iterator[Placeholder]:
         """Yield every placeholder, in the files and in the options."""
         for one in self.templates:
-            yield from (p.hole for p in one.parts if p.hole is not None)
+            yield from (p.placeholder for p in one.parts if p.placeholder is not None)
         for name, value in self.options.items():
-            yield from holes(value, f"{self.places.get(name, '')}: {name}")
+            yield from placeholders(value, f"{self.places.get(name, '')}: {name}")
 
     def vehicle(self, name: str) -> tuple[Vehicle, Template] | None:
         """Return a vehicle, or the flow that makes it, and its file; None where there is none."""
@@ -131,7 +132,7 @@ class SumoFiles:
             if paths
         }
         given = {k: fill(v, values, self.places.get(k, "")) for k, v in self.options.items()}
-        chosen = {} if step_length is None else {"step-length": repr(step_length)}
+        chosen = {} if step_length is None else {"step-length": format_number(step_length)}
         options = {**_DEFAULTS, **given, **chosen, **OWN, **written}
         options.pop("seed", None)
         return Launch(tuple(part for name, value in options.items() for part in (f"--{name}", value)))

@@ -9,7 +9,7 @@ from scipy.linalg.lapack import dgesv
 
 from sbt.sumo.actors import Action, Obstacle, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, SingleTrack
-from sbt.sumo.sight import Boxes
+from sbt.sumo.occlusion import Occluders
 
 __all__ = ["LaneKeeping", "MarkingSensor"]
 
@@ -59,7 +59,7 @@ class MarkingSensor:
         self._side = np.concatenate([np.full(len(left), 0.5 * lane), np.full(len(right), -0.5 * lane)])
         self._slot = np.concatenate([np.arange(len(left)) % _SLOTS, _SLOTS + np.arange(len(right)) % _SLOTS])
         self._obstacles = [(o, math.hypot(0.5 * o.length, 0.5 * o.width)) for o in obstacles]
-        self._boxes: dict[tuple[Obstacle, ...], Boxes] = {}
+        self._boxes: dict[tuple[Obstacle, ...], Occluders] = {}
         self._fit = np.zeros(4)
         self.seen = (0.0, 0.0)
 
@@ -76,8 +76,8 @@ class MarkingSensor:
         around = tuple([o for o, radius in self._obstacles if self._may_hide(own, o.pose[0] - own.x, o.pose[1] - own.y, radius)])
         if around:
             if around not in self._boxes:
-                self._boxes[around] = Boxes((*o.pose, o.length, o.width) for o in around)
-            seen *= np.maximum(1.0 - self._boxes[around].depth(eye, self._points[near]) / _EDGE, 0.0)
+                self._boxes[around] = Occluders((*o.pose, o.length, o.width) for o in around)
+            seen *= np.maximum(1.0 - self._boxes[around].blocked_length(eye, self._points[near]) / _EDGE, 0.0)
         self.seen = (float(seen[side > 0].sum()), float(seen[side < 0].sum()))
         y += noise[self._slot[near]]
         _, c1, c2, c3 = self._fit

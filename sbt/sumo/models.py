@@ -6,14 +6,16 @@ are told by. Source: SUMO's documentation, "Definition of Vehicles, Vehicle Type
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from sbt.errors import InputError
+import numpy as np
 
-__all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "attributes_of", "checked", "unit_of"]
+from sbt.errors import InputError, did_you_mean
+from sbt.sumo.formatting import format_number
+
+__all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "known_attributes", "unit_of", "vtype_attributes"]
 
 SUBLANE = "SL2015"
 """The lane-change model that needs SUMO's option --lateral-resolution; without it, it never changes lanes."""
@@ -63,7 +65,7 @@ LANE_CHANGE: Mapping[str, Mapping[str, str]] = {
 """Lane-change model to its attributes and their units. SL2015 needs SUMO's option --lateral-resolution."""
 
 
-def attributes_of(model: str, lane_change: str) -> dict[str, str]:
+def known_attributes(model: str, lane_change: str) -> dict[str, str]:
     """Return the attributes that a vehicle of these two models takes, with their units.
 
     Raises:
@@ -78,7 +80,7 @@ def unit_of(name: str) -> str:
     return next((table[name] for table in tables if name in table), "")
 
 
-def checked(settings: Mapping[str, Any]) -> dict[str, str]:
+def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the vType attributes that settings of an ego of kind `sumo` mean, after a check of names and numbers.
 
     `model` and `lane_change` choose the models (SUMO's `carFollowModel` and `laneChangeModel`; Krauss and LC2013).
@@ -86,39 +88,35 @@ def checked(settings: Mapping[str, Any]) -> dict[str, str]:
     Raises:
         InputError: an unknown model, an attribute that these models do not have, or one that is no finite number.
 
-    >>> checked({"model": "IDM", "tau": 1.2})
+    >>> vtype_attributes({"model": "IDM", "tau": 1.2})
     {'carFollowModel': 'IDM', 'laneChangeModel': 'LC2013', 'tau': '1.2'}
     """
     aliases = {"carFollowModel": "model", "laneChangeModel": "lane_change"}
     given = {aliases.get(name, name): value for name, value in settings.items()}
     model, lane_change = str(given.pop("model", "Krauss")), str(given.pop("lane_change", "LC2013"))
-    known = attributes_of(model, lane_change)
+    known = known_attributes(model, lane_change)
     for name, value in given.items():
         if name not in known:
-            hint = _hint(name, known)
+            hint = did_you_mean(name, known)
             owners = [m for m, own in {**CAR_FOLLOWING, **LANE_CHANGE}.items() if name in own]
             of = f"; it belongs to {', '.join(owners)}" if owners else hint
             rule = f"ego settings of kind sumo must be vType attributes of {model} or {lane_change}"
             raise InputError(f"{rule}, but got '{name}'{of}")
         if not _finite(value):
             raise InputError(f"ego.{name} must be a finite number, but got {value!r}")
-    return {"carFollowModel": model, "laneChangeModel": lane_change} | {name: str(value) for name, value in given.items()}
+    return {"carFollowModel": model, "laneChangeModel": lane_change} | {
+        name: value if isinstance(value, str) else format_number(value) for name, value in given.items()
+    }
 
 
 def _of(key: str, table: Mapping[str, Mapping[str, str]], name: str) -> Mapping[str, str]:
     if name not in table:
-        raise InputError(f"ego.{key} must be one of SUMO's {', '.join(table)}, but got '{name}'{_hint(name, table)}")
+        raise InputError(f"ego.{key} must be one of SUMO's {', '.join(table)}, but got '{name}'{did_you_mean(name, table)}")
     return table[name]
-
-
-def _hint(name: str, known: Iterable[str]) -> str:
-    lower = {k.lower(): k for k in known}
-    near = difflib.get_close_matches(name.lower(), lower, 1)
-    return f" (did you mean '{lower[near[0]]}'?)" if near else ""
 
 
 def _finite(value: Any) -> bool:
     try:
-        return not isinstance(value, bool) and math.isfinite(float(value))
+        return not isinstance(value, bool | np.bool_) and math.isfinite(float(value))
     except (TypeError, ValueError):
         return False

@@ -1,12 +1,12 @@
-"""The one SUMO simulation of this process, guarded: every error leaves as a plain `RunError`.
+"""The SUMO simulation of this process; every error of SUMO is raised as a plain `RunError`.
 
-libsumo holds one simulation a process, its exceptions cannot be pickled, and the reason of an error
-is often only on file descriptor 2. All of that stays in here. Three isolation levels:
+libsumo has one simulation per process, its exceptions cannot be pickled, and the cause of an error is
+often written to file descriptor 2 only. This module handles all three. There are three isolation levels:
 
-- `fresh`: SUMO is loaded anew for every run; always right.
-- `reuse`: one simulation lives on, actors are removed and inserted again; bit-identical to `fresh`
-  where SUMO draws no random numbers and nothing else needs a reset.
-- `replicas`: as `reuse`, of a simulation with several copies of the network, a run in each.
+- `fresh`: SUMO is loaded again for every run; always valid.
+- `reuse`: one simulation keeps running, actors are removed and inserted again. Bit-identical to `fresh`
+  where SUMO draws no random numbers and nothing else has a state to reset.
+- `replicas`: like `reuse`, in a simulation with several copies of the network and one run in each.
 """
 
 from __future__ import annotations
@@ -26,13 +26,17 @@ from xml.sax.saxutils import quoteattr
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
+from sbt.processes import scratch
 from sbt.sumo.actors import VehicleType
-from sbt.sumo.copies import copied
+from sbt.sumo.formatting import format_number
+from sbt.sumo.replicas import replicated_net
 
-__all__ = ["ABSENT", "Loadable", "Session", "Setup", "check_options", "direct", "libsumo", "session"]
+__all__ = [
+    "INVALID_DOUBLE", "Loadable", "Session", "Setup", "check_options", "libsumo", "scratch_folder", "session", "unwrapped",
+]  # fmt: skip
 
-ABSENT = -1073741824.0
-"""What SUMO answers for an actor that is not on the road (it does not raise)."""
+INVALID_DOUBLE = -1073741824.0
+"""SUMO's INVALID_DOUBLE_VALUE: what its getters return for an actor that is not on the road."""
 
 _DEFAULTS = {"minGap": "0", "maxSpeed": "100", "speedFactor": "1", "speedDev": "0", "sigma": "0",
              "accel": "10", "decel": "10", "emergencyDecel": "10"}  # fmt: skip
@@ -45,28 +49,28 @@ _OPTIONS = (
 
 @cache
 def libsumo() -> Any:
-    """Import libsumo once, keeping what it prints off standard output (0.8 s)."""
+    """Import libsumo once (0.8 s), without its message on standard output."""
     with contextlib.redirect_stdout(io.StringIO()):
         import libsumo as module
     return module
 
 
-def direct(sumo: Any, domain: str, name: str) -> Any:
-    """Return a libsumo function without its Python wrapper, which costs a third of a short call.
+def unwrapped(sumo: Any, domain: str, name: str) -> Any:
+    """Return a function of libsumo without its Python wrapper, which takes a third of the time of a short call.
 
-    Of a module that has no such function (traci), the public one.
+    Of any other module, such as traci, the public function is returned.
     """
-    return _binary(domain, name) if sumo is libsumo() else getattr(getattr(sumo, domain), name)
+    return _compiled(domain, name) if sumo is libsumo() else getattr(getattr(sumo, domain), name)
 
 
 @cache
-def _binary(domain: str, name: str) -> Any:
+def _compiled(domain: str, name: str) -> Any:
     module = libsumo()
     return getattr(module.libsumo._libsumo, f"{domain}_{name}", None) or getattr(getattr(module, domain), name)
 
 
 class Loadable(Protocol):
-    """What a simulation is loaded with."""
+    """What a simulation is loaded from."""
 
     def command(self, seed: int) -> list[str]:
         """Return SUMO's arguments without the program's name."""
@@ -75,15 +79,15 @@ class Loadable(Protocol):
 
 @dataclass(frozen=True)
 class Setup:
-    """What a simulation is loaded with; equal setups can share one simulation.
+    """What a simulation is loaded from; runs with equal setups can share a simulation.
 
     Args:
         net: network file.
         types: vehicle types by id.
-        step_length: of SUMO (s).
-        lane_change_duration: time of a continuous lane change (s), 0: at once.
+        step_length: SUMO's step (s).
+        lane_change_duration: of continuous lane changes (s); 0: instantaneous.
         options: further SUMO options, as on its command line.
-        copies: of the network, each with ids of its own; 1: the network as it is.
+        replicas: number of copies of the network, each with its own ids; 1: the network itself.
     """
 
     net: str
@@ -91,59 +95,64 @@ class Setup:
     step_length: float
     lane_change_duration: float = 0.0
     options: tuple[str, ...] = ()
-    copies: int = 1
+    replicas: int = 1
 
     def command(self, seed: int) -> list[str]:
         """Return SUMO's arguments without the program's name."""
-        net = self.net if self.copies == 1 else _copies_file(self.net, self.copies)
+        net = self.net if self.replicas == 1 else _replicas_file(self.net, self.replicas)
         return [
             "--net-file", net, "--additional-files", _types_file(self.types),
-            "--step-length", repr(self.step_length), "--lanechange.duration", repr(self.lane_change_duration),
+            "--step-length", format_number(self.step_length), "--lanechange.duration", format_number(self.lane_change_duration),
             "--seed", str(seed), *_OPTIONS, *self.options,
         ]  # fmt: skip
 
 
 @cache
 def _scratch() -> tempfile.TemporaryDirectory[str]:
-    """Return a folder of this process that goes away with it."""
-    return tempfile.TemporaryDirectory(prefix="sbt-")
+    return scratch("sumo")
+
+
+def scratch_folder() -> Path:
+    """Return a temporary folder of this process, which is removed when the process ends."""
+    return Path(_scratch().name)
 
 
 def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
-    """Write the vehicle types of the next load and return the file's name; SUMO reads it while it loads, never again."""
+    """Write the vehicle types of the next load and return the file; SUMO reads it only while it loads."""
     lines = []
     for name, kind in types:
-        attributes = {**_DEFAULTS, "length": repr(kind.length), "width": repr(kind.width), **dict(kind.attributes)}
+        size = {"length": format_number(kind.length), "width": format_number(kind.width)}
+        attributes = {**_DEFAULTS, **size, **dict(kind.attributes)}
         lines.append(f"<vType id={quoteattr(name)} " + " ".join(f"{k}={quoteattr(v)}" for k, v in attributes.items()) + "/>")
-    path = Path(_scratch().name) / "types.add.xml"
+    path = scratch_folder() / "types.add.xml"
     path.write_text("<additional>\n" + "\n".join(lines) + "\n</additional>\n")
     return str(path)
 
 
 @cache
-def _copies_file(net: str, copies: int) -> str:
-    """Write the copies of a network once a process and return the file's name."""
-    path = Path(_scratch().name) / f"{copies}-{hashlib.blake2b(net.encode(), digest_size=8).hexdigest()}.net.xml"
-    path.write_text(copied(Path(net), copies))
+def _replicas_file(net: str, replicas: int) -> str:
+    """Write the replicated network once per process and return the file."""
+    path = scratch_folder() / f"{replicas}-{hashlib.blake2b(net.encode(), digest_size=8).hexdigest()}.net.xml"
+    path.write_text(replicated_net(Path(net), replicas))
     return str(path)
 
 
 class Session:
-    """The process's simulation; use the one that `session()` returns."""
+    """The simulation of this process; use the instance that `session()` returns."""
 
     def __init__(self) -> None:
         self._sumo = libsumo()
         self._setup: Loadable | None = None
         self._routes: set[tuple[str, ...]] = set()
-        self._inside: list[tuple[str, str]] = []
+        self._inserted: list[tuple[str, str]] = []
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
 
     @contextlib.contextmanager
     def run(self, setup: Loadable, seed: int, isolation: str) -> Iterator[Any]:
-        """Give libsumo with an empty simulation of this setup at hand, for one run, or for one in each copy.
+        """Provide libsumo with an empty simulation of this setup, for one run or for one run per replica.
 
         Raises:
-            RunError: SUMO raised; the reason carries what it wrote to file descriptor 2.
+            RunError: SUMO raised an error; the reason includes what it wrote to file descriptor 2.
         """
         with self._captured():
             try:
@@ -159,16 +168,16 @@ class Session:
                 raise
 
     @contextlib.contextmanager
-    def through(self, client: Any) -> Iterator[None]:
-        """Let runs go through another client than libsumo for a while: traci, or what looks like it."""
-        own, self._sumo, self._setup = self._sumo, client, None
+    def using(self, client: Any) -> Iterator[None]:
+        """Use another client than libsumo for the runs in this context: traci, or an object with its interface."""
+        previous, self._sumo, self._setup = self._sumo, client, None
         try:
             yield
         finally:
-            self._sumo, self._setup = own, None
+            self._sumo, self._setup = previous, None
 
     def route(self, edges: tuple[str, ...]) -> str:
-        """Return the id of the route over these edges, known to SUMO from now on."""
+        """Return the id of the route over these edges, which is added to SUMO on first use."""
         name = "route:" + ">".join(edges)
         if edges not in self._routes:
             self._sumo.route.add(name, list(edges))
@@ -176,36 +185,36 @@ class Session:
         return name
 
     def inserted(self, name: str, domain: str = "vehicle") -> None:
-        """Remember a vehicle, person or polygon that the end of the run has to remove."""
-        self._inside.append((domain, name))
+        """Register a vehicle, person or polygon that is to be removed at the end of the run."""
+        self._inserted.append((domain, name))
 
     def remove(self, prefix: str = "") -> None:
-        """Take out what was inserted, all of it or what has names with this prefix."""
-        for domain, name in [entry for entry in self._inside if entry[1].startswith(prefix)]:
+        """Remove what was inserted; with a prefix, only objects whose names start with it."""
+        for domain, name in [entry for entry in self._inserted if entry[1].startswith(prefix)]:
             getattr(self._sumo, domain).remove(name)
-        self._inside = [entry for entry in self._inside if not entry[1].startswith(prefix)]
+        self._inserted = [entry for entry in self._inserted if not entry[1].startswith(prefix)]
 
     def _load(self, setup: Loadable, seed: int, isolation: str) -> None:
-        kept = isolation != "fresh"
-        if kept and setup == self._setup:
+        persistent = isolation != "fresh"
+        if persistent and setup == self._setup:
             return
-        command = setup.command(0 if kept else seed)
+        command = setup.command(0 if persistent else seed)
         self._routes.clear()
-        self._inside.clear()
+        self._inserted.clear()
         if self._sumo.isLoaded():
             self._sumo.load(command)
         else:
             self._sumo.start(["sumo", *command])
-        self._setup = setup if kept else None
+        self._setup = setup if persistent else None
 
     def _flush(self) -> None:
-        """Step once: SUMO keeps pointers to actors that were moved since the last step, which the next load deletes."""
+        """Step once: SUMO holds pointers to actors moved since the last step, and the next load would free them."""
         with contextlib.suppress(self._sumo.TraCIException, self._sumo.FatalTraCIError):
             self._sumo.simulationStep()
 
     @contextlib.contextmanager
     def _captured(self) -> Iterator[None]:
-        """Send file descriptor 2 to a temporary file while SUMO runs."""
+        """Redirect file descriptor 2 to a temporary file while SUMO runs."""
         sys.stderr.flush()
         self._stderr.seek(0)
         self._stderr.truncate()
@@ -217,13 +226,13 @@ class Session:
             os.dup2(saved, 2)
             os.close(saved)
 
-    def said(self) -> tuple[str, ...]:
-        """Return the lines that SUMO wrote to file descriptor 2 in the last run."""
+    def messages(self) -> tuple[str, ...]:
+        """Return the lines that SUMO wrote to file descriptor 2 during the last run."""
         self._stderr.seek(0)
         return tuple(line.strip() for line in self._stderr.read().decode(errors="replace").splitlines() if line.strip())
 
     def _reason(self, error: Exception) -> str:
-        return "SUMO: " + "; ".join(dict.fromkeys([str(error).strip(), *self.said()[-5:]]))
+        return "SUMO: " + "; ".join(dict.fromkeys([str(error).strip(), *self.messages()[-5:]]))
 
 
 @cache
@@ -233,12 +242,12 @@ def session() -> Session:
 
 
 def check_options(options: Sequence[str]) -> None:
-    """Refuse options that this package sets itself (SUMO takes each only once).
+    """Refuse options that this package sets itself (SUMO accepts each only once).
 
     Raises:
         ValueError: one of them is given.
     """
-    own = {o for o in _OPTIONS if o.startswith("--")} | {"--net-file", "--seed", "--step-length", "--lanechange.duration"}
+    reserved = {o for o in _OPTIONS if o.startswith("--")} | {"--net-file", "--seed", "--step-length", "--lanechange.duration"}
     for option in options:
-        if option in own:
+        if option in reserved:
             raise ValueError(f"SUMO takes each option once, but {option} is set by sbt already")

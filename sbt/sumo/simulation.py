@@ -1,4 +1,4 @@
-"""Runs a scene in SUMO step by step: insert, verify, control, record, stop."""
+"""Runs a scene in SUMO step by step: insert and verify the actors, control, record, and detect the end."""
 
 from __future__ import annotations
 
@@ -17,37 +17,43 @@ from sbt.problem.trace import Trace
 from sbt.seeds import stream
 from sbt.sumo.actors import Scene
 from sbt.sumo.batch import simulate_many
-from sbt.sumo.driving import Drive
 from sbt.sumo.ego import Ego
+from sbt.sumo.formatting import plain_values
+from sbt.sumo.insertion import insert, type_name, verify
 from sbt.sumo.models import SUBLANE
 from sbt.sumo.nets import net_file
-from sbt.sumo.placing import insert, type_name, verify
-from sbt.sumo.session import Setup, check_options, direct, session
+from sbt.sumo.session import Setup, check_options, session, unwrapped
+from sbt.sumo.sumo_run import SumoRun
 
-__all__ = ["DEADLINE_STEPS", "SumoSimulation"]
+__all__ = ["CLOCK_STEPS", "SumoSimulation"]
 
 SceneBuilder = Callable[[Mapping[str, float], Ego, np.random.Generator], Scene]
+"""Values of the inputs, the ego, and the random generator of the run to the scene."""
 
-DEADLINE_STEPS = 256
-"""The wall clock is looked at once in so many steps."""
+CLOCK_STEPS = 256
+"""Steps between two looks at the wall clock."""
 
 
 @dataclass(frozen=True)
 class SumoSimulation:
-    """How one concrete scenario runs in SUMO: callable from values and seed to a `Trace`.
+    """Simulates concrete scenarios in SUMO: a function of values and seed that returns a `Trace`.
 
     Args:
-        net: name of a built-in network or path of a `.net.xml`.
-        scene: values, ego and the run's generator to the actors.
+        net: name of a built-in network, or path of a `.net.xml`.
+        scene: builds the scene of a run.
         duration: longest simulated time (s).
-        step_length: SUMO's step (s); positions follow by the trapezoidal rule.
+        step_length: SUMO's step (s); positions are integrated by the trapezoidal rule.
         ego: the AV under test.
-        lane_change_duration: of SUMO's continuous lane change (s).
-        isolations: allowed levels, the fastest last. `reuse` only where SUMO draws no random numbers;
-            `replicas` (several runs at once in copies of the network) only where nobody moves by pose either.
+        lane_change_duration: of continuous lane changes (s).
+        isolations: allowed isolation levels, the fastest last. `reuse` is valid only where SUMO draws no random
+            numbers, `replicas` (several runs in one simulation) only where, moreover, no actor is moved by pose.
         isolation: the level of this simulation; None: the fastest.
         options: further SUMO options.
-        timeout: wall-clock seconds after which a run ends as `timeout`; None: never.
+        timeout: wall-clock limit of a run (s); None: none.
+
+    Raises:
+        InputError: step and duration do not fit, or the isolation level is not allowed.
+        ValueError: an option is one that this package sets.
     """
 
     net: str
@@ -75,7 +81,11 @@ class SumoSimulation:
     def configured(
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
     ) -> SumoSimulation:
-        """Return a copy with another ego, isolation level or step length."""
+        """Return a copy with another ego, isolation level or step length.
+
+        Raises:
+            InputError: the ego or the isolation level is not possible here.
+        """
         chosen = self.ego if ego is None else Ego.of(**ego)
         if chosen.lane_change == SUBLANE and "--lateral-resolution" not in self.options:
             raise InputError(f"ego.lane_change {SUBLANE} needs SUMO's option --lateral-resolution, which this scenario has not")
@@ -88,11 +98,11 @@ class SumoSimulation:
 
     @property
     def inputs(self) -> tuple[Parameter, ...]:
-        """Inputs that come with the AV under test; the scenario's space has them beside its own."""
+        """Inputs that belong to the AV under test; part of the parameter space of the scenario."""
         return self.ego.inputs
 
     def prepare(self) -> None:
-        """Import libsumo and find the network.
+        """Import libsumo and check the network.
 
         Raises:
             InputError: there is no such network.
@@ -101,68 +111,69 @@ class SumoSimulation:
         session()
 
     def limited(self, timeout: float | None) -> SumoSimulation:
-        """Return a copy whose runs end as `timeout` after so many wall-clock seconds."""
+        """Return a copy with a wall-clock limit of its runs (s)."""
         return replace(self, timeout=timeout)
 
     def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
         """Run one concrete scenario.
 
         Raises:
-            RunError: SUMO fails, an actor vanishes, a controller asks for the impossible, the start is
-                not the one asked for, or it takes too long.
+            RunError: SUMO fails, an actor leaves the road, a controller returns an impossible action, the initial
+                state differs from the specified one, or the run takes too long.
         """
-        scene = self.built(values, seed)
+        scene = self.build_scene(values, seed)
         limit = math.inf if self.timeout is None else self.timeout
-        with session().run(self.setup(scene), seed, self.level) as sumo:
+        with session().run(self.setup(scene), seed, self.isolation_level) as sumo:
             insert(sumo, scene)
             sumo.simulationStep()
             verify(sumo, scene)
-            drive = Drive(sumo, scene, self.step_length, self.duration)
-            step, colliding = direct(sumo, "simulation", "step"), direct(sumo, "simulation", "getCollidingVehiclesNumber")
+            run = SumoRun(sumo, scene, self.step_length, self.duration)
+            step, colliding = unwrapped(sumo, "simulation", "step"), unwrapped(sumo, "simulation", "getCollidingVehiclesNumber")
             deadline = time.monotonic() + limit
             over, steps = False, 0
             while not over:
-                if steps % DEADLINE_STEPS == 1 and time.monotonic() > deadline:
+                if steps % CLOCK_STEPS == 1 and time.monotonic() > deadline:
                     at = steps * self.step_length
                     raise RunError(Status.TIMEOUT, f"a run must take at most {limit:g} s, but it was at t = {at:g} s")
                 if steps:
                     step()
                 if colliding():
                     for c in sumo.simulation.getCollisions():
-                        drive.heard_of(c.collider, c.victim)
-                over = drive.advance()
+                        run.record_collision(c.collider, c.victim)
+                over = run.advance()
                 steps += 1
-            return drive.trace()
+            return run.trace()
 
     def simulate_many(
         self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = lambda _: None
-    ) -> list[Trace | Exception]:
-        """Run several concrete scenarios, each of values and seed, at once where the isolation level allows.
+    ) -> list[Trace | BaseException]:
+        """Run several concrete scenarios, in one simulation where the isolation level allows it.
 
         Args:
             work: values and seed of each run.
-            at_work: told now and then which of them are being run.
+            at_work: called now and then with the indices of the runs in progress.
 
         Returns:
-            What calling one by one would: the traces, or the errors, in the order given.
+            Traces or errors in the given order, the same as from single calls.
         """
         return simulate_many(self, work, at_work)
 
     @property
-    def level(self) -> str:
-        """The isolation level it runs with."""
+    def isolation_level(self) -> str:
+        """The isolation level of the runs."""
         return self.isolation or self.isolations[-1]
 
     @property
     def batched(self) -> bool:
         """Whether several runs share one simulation."""
-        return self.level == "replicas"
+        return self.isolation_level == "replicas"
 
-    def built(self, values: Mapping[str, float], seed: int) -> Scene:
+    def build_scene(self, values: Mapping[str, float], seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
+        values = plain_values(values)
         return self.scene(values, self.ego.bound(values), stream(seed, "scene"))
 
-    def setup(self, scene: Scene, copies: int = 1) -> Setup:
-        """Return what SUMO is loaded with for a scene."""
+    def setup(self, scene: Scene, replicas: int = 1) -> Setup:
+        """Return what SUMO is loaded from for a scene."""
         types = tuple(sorted({type_name(a): a.type for a in scene.actors}.items()))
-        return Setup(str(net_file(self.net)), types, self.step_length, self.lane_change_duration, self.options, copies)
+        return Setup(str(net_file(self.net)), types, self.step_length, self.lane_change_duration, self.options, replicas)

@@ -22,9 +22,9 @@ from sbt.errors import InputError, RunError
 from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
 
-__all__ = ["Hole", "Template", "Vehicle", "fill", "holes", "template"]
+__all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
 
-_HOLE = re.compile(r"\$\{([^{}]*)\}")
+_PLACEHOLDER = re.compile(r"\$\{([^{}]*)\}")
 _TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
 _REFERRING = ("include", "variableSpeedSign", "rerouter")
@@ -33,7 +33,7 @@ _VEHICLES = ("vehicle", "trip", "flow")
 
 
 @dataclass(frozen=True)
-class Hole:
+class Placeholder:
     """One placeholder: its formula, and where it stands (`file:line:column`)."""
 
     formula: Expression
@@ -46,7 +46,7 @@ class _Part:
 
     start: int
     end: int
-    hole: Hole | None = None
+    placeholder: Placeholder | None = None
     target: Path | None = None
 
 
@@ -106,9 +106,9 @@ class Template:
             yield from inner.tree((*above, self.path))
 
     @cached_property
-    def holes(self) -> tuple[Hole, ...]:
+    def placeholders(self) -> tuple[Placeholder, ...]:
         """All placeholders, those of included files too."""
-        return tuple(p.hole for t in self.tree() for p in t.parts if p.hole is not None)
+        return tuple(p.placeholder for t in self.tree() for p in t.parts if p.placeholder is not None)
 
     def write(self, values: Mapping[str, float], folder: Path) -> Path:
         """Return the file with the placeholders filled: a copy in `folder`, or the file itself where it has none.
@@ -116,7 +116,7 @@ class Template:
         Raises:
             RunError: a formula is not finite for these values.
         """
-        if not self.holes:
+        if not self.placeholders:
             return self.path
         copied, at = [], 0
         for part in self.parts:
@@ -129,48 +129,48 @@ class Template:
         return target
 
     def _replaced(self, part: _Part, values: Mapping[str, float], folder: Path) -> bytes:
-        if part.hole is not None:
-            return number(part.hole, values).encode()
+        if part.placeholder is not None:
+            return number(part.placeholder, values).encode()
         if part.target is None:
             raise InputError(f"a part of {self.path} must have a value or a file")
         target = template(part.target).write(values, folder)
         return b'"' + str(target).encode() + b'"'
 
 
-def holes(text: str, place: str) -> tuple[Hole, ...]:
+def placeholders(text: str, place: str) -> tuple[Placeholder, ...]:
     """Return the placeholders of one value.
 
     Raises:
         InputError: one is no formula; the message begins with the place.
     """
-    return tuple(_hole(match.group(1), place) for match in _HOLE.finditer(text))
+    return tuple(_placeholder(match.group(1), place) for match in _PLACEHOLDER.finditer(text))
 
 
 def fill(text: str, values: Mapping[str, float], place: str = "") -> str:
     """Return a value with its placeholders filled."""
-    return _HOLE.sub(lambda match: number(_hole(match.group(1), place), values), text)
+    return _PLACEHOLDER.sub(lambda match: number(_placeholder(match.group(1), place), values), text)
 
 
-def number(hole: Hole, values: Mapping[str, float]) -> str:
+def number(placeholder: Placeholder, values: Mapping[str, float]) -> str:
     """Return the value of a placeholder as SUMO reads it; whole numbers without a point, for lanes and counts.
 
     Raises:
         RunError: it is not finite.
     """
-    value = float(hole.formula(values))
+    value = float(placeholder.formula(values))
     if not math.isfinite(value):
-        raise RunError(Status.INVALID, f"{hole.place}: ${{{hole.formula.text}}} must be finite, but got {value}")
+        raise RunError(Status.INVALID, f"{placeholder.place}: ${{{placeholder.formula.text}}} must be finite, but got {value}")
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 
-def _hole(text: str, place: str) -> Hole:
+def _placeholder(text: str, place: str) -> Placeholder:
     try:
         formula = Expression(text)
     except InputError as error:
         raise InputError(f"{place}: ${{{text}}} must be a formula over inputs, but {error}") from None
     if not formula.names():
         raise InputError(f"{place}: ${{{text}}} must use at least one input, but it uses none")
-    return Hole(formula, place)
+    return Placeholder(formula, place)
 
 
 def _read(path: Path) -> bytes:
@@ -243,6 +243,6 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_
                 raise InputError(f"{place}: an included file must exist, but got '{name}'")
             if target.is_file():
                 taken.append(_Part(at + match.start(2), at + match.end(2), target=target))
-    for match in re.finditer(_HOLE.pattern.encode(), text):
-        taken.append(_Part(at + match.start(), at + match.end(), hole=_hole(match.group(1).decode(), place)))
+    for match in re.finditer(_PLACEHOLDER.pattern.encode(), text):
+        taken.append(_Part(at + match.start(), at + match.end(), placeholder=_placeholder(match.group(1).decode(), place)))
     yield from sorted(taken, key=lambda part: part.start)

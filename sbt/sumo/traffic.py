@@ -14,32 +14,33 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.sumo.actors import Actor, VehicleType
 from sbt.sumo.ego import SUMO, Ego
+from sbt.sumo.formatting import format_number
 
-__all__ = ["DRIVER", "Column", "automated"]
+__all__ = ["DRIVER", "TrafficStream", "ego_type"]
 
 DRIVER = (("carFollowModel", "Krauss"), ("accel", "2.6"), ("decel", "4.5"), ("emergencyDecel", "9"), ("minGap", "2"),
           ("tau", "1"), ("sigma", "0.5"), ("sigmaStep", "1"), ("speedDev", "0"))  # fmt: skip
 """SUMO's default passenger car, every number given: SUMO would draw what is left out. The imperfection is drawn once a
 second, which makes it independent of the step."""
-SHORTEST = 1.0
+MIN_HEADWAY = 1.0
 """Smallest headway from front to front in a column (s) beyond the time a car needs to cover its own length."""
 
 
-def automated(ego: Ego, speed: float, limit: float) -> VehicleType:
+def ego_type(ego: Ego, speed: float, limit: float) -> VehicleType:
     """Return the type of an ego of 5.0 m x 1.8 m that wants to drive at a speed (m/s) where this limit (m/s) holds.
 
     Its driver is perfect (`sigma` 0) unless the ego's settings say otherwise.
     """
     margin = 1.0 + 1e-9  # SUMO refuses a start above the desired speed, which it computes as factor times limit
-    attributes = dict(DRIVER) | {"sigma": "0", "speedFactor": repr(speed / limit * margin)}
+    attributes = dict(DRIVER) | {"sigma": "0", "speedFactor": format_number(speed / limit * margin)}
     if ego.kind != SUMO:
-        return VehicleType(attributes=(("speedFactor", repr(max(speed / limit, 1.0) * margin)),))
+        return VehicleType(attributes=(("speedFactor", format_number(max(speed / limit, 1.0) * margin)),))
     del attributes["carFollowModel"]
     return ego.vehicle_type(VehicleType(attributes=tuple(attributes.items())), speed * margin)
 
 
 @dataclass(frozen=True)
-class Column:
+class TrafficStream:
     """Cars one behind the other in a lane, at random headways of a shifted exponential law.
 
     Args:
@@ -58,9 +59,9 @@ class Column:
     spread: float = 0.1
     type: VehicleType = field(default_factory=lambda: VehicleType(attributes=DRIVER))
 
-    def driven(self, **attributes: float) -> Column:
+    def driven(self, **attributes: float) -> TrafficStream:
         """Return the column with other vType attributes of its drivers, such as `tau`."""
-        changed = dict(self.type.attributes) | {name: repr(float(value)) for name, value in attributes.items()}
+        changed = dict(self.type.attributes) | {name: format_number(value) for name, value in attributes.items()}
         return replace(self, type=replace(self.type, attributes=tuple(changed.items())))
 
     def draw(
@@ -80,7 +81,7 @@ class Column:
             InputError: more cars than fit.
         """
         pace = speed if start is None else start
-        shortest = SHORTEST + self.type.length / pace
+        shortest = MIN_HEADWAY + self.type.length / pace
         mean = 3600.0 / flow
         if mean <= shortest:
             raise InputError(f"a lane at {pace:g} m/s carries less than {3600 / shortest:.0f} cars an hour, but got {flow:g}")
@@ -88,7 +89,7 @@ class Column:
         position = first - pace * mean * rng.random()
         while position > last:
             factor = 1.0 + self.spread * float(np.clip(rng.standard_normal(), -2.0, 2.0))
-            attributes = dict(self.type.attributes) | {"speedFactor": repr(speed * factor / self.limit)}
+            attributes = dict(self.type.attributes) | {"speedFactor": format_number(speed * factor / self.limit)}
             kind = VehicleType(self.type.length, self.type.width, tuple(attributes.items()))
             cars.append(Actor(f"{self.name}_{len(cars)}", self.route, self.lane, position, pace * factor, type=kind))
             position -= pace * (shortest + (mean - shortest) * rng.standard_exponential())

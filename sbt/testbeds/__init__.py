@@ -12,12 +12,11 @@ is the same problem with every input uniform in its box, for searches that ignor
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Points, Vector, as_points, as_vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.testbeds import reliability, search, traffic
@@ -42,8 +41,7 @@ def find(name: str) -> Problem:
     """
     plain = name.removesuffix(_BOX)
     if plain not in _PROBLEMS:
-        near = difflib.get_close_matches(plain, _PROBLEMS, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        hint = did_you_mean(plain, _PROBLEMS)
         raise InputError(f"a testbed must be one of {', '.join(_PROBLEMS)}, or one of them with {_BOX}, but got '{name}'{hint}")
     found = _PROBLEMS[plain]
     return found.in_box() if name.endswith(_BOX) else found

@@ -90,7 +90,7 @@ class Problem:
         """Return the logical scenario `testbed:NAME`."""
         space = ParameterSpace(self.parameters)
         return LogicalScenario(
-            name=f"testbed:{self.name}", space=space, requirement=Requirement(METRIC, self.critical),
+            name=f"testbed:{self.name}", space=space, requirement=Requirement(METRIC, self.critical.low, self.critical.high),
             evaluate=_Pointwise(self.name, space.names, self.function, self.noise), metric_names=(METRIC,),
             description=f"{self.title}\n{_documentation(self.function)}",
         )  # fmt: skip
@@ -134,7 +134,7 @@ def analytic(
         raise InputError(f"noise must be a finite standard deviation >= 0, but got {noise}")
     space = ParameterSpace(parameters_of(inputs), correlation)
     return LogicalScenario(
-        name=name, space=space, requirement=Requirement(METRIC, CriticalInterval(*critical)),
+        name=name, space=space, requirement=Requirement(METRIC, *critical),
         evaluate=_Pointwise(name, space.names, function, noise), metric_names=(METRIC,),
         description=description or _documentation(function) or name,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""A run under sumo-gui, through traci: the same scene and controllers, at the speed of a spectator."""
+"""Runs a concrete scenario under sumo-gui through traci: the same scene and controllers, in real time."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import Any
 from sbt.errors import InputError
 from sbt.sumo.session import session
 
-__all__ = ["gui_program", "watch"]
+__all__ = ["gui_program", "run_in_gui"]
 
-_EGO = (193, 39, 45, 255)
+_EGO_COLOR = (193, 39, 45, 255)
 _ZOOM = 2000.0
 
 
 def gui_program() -> str:
-    """Return the sumo-gui program: on the path, or of the package eclipse-sumo.
+    """Return the sumo-gui program, on the path or in the package eclipse-sumo.
 
     Raises:
-        InputError: there is none, or no display to open it on.
+        InputError: it is not installed, or there is no display.
     """
     found = shutil.which("sumo-gui")
     package = importlib.util.find_spec("sumo")
@@ -36,8 +36,8 @@ def gui_program() -> str:
     return found
 
 
-class _Instead:
-    """Another object with some of its attributes replaced."""
+class _Override:
+    """An object with some attributes of another one replaced."""
 
     def __init__(self, original: Any, **replaced: Any):
         self._original = original
@@ -47,45 +47,45 @@ class _Instead:
         return getattr(self._original, name)
 
 
-def watch(simulate: Any, values: Any, seed: int, program: str, linger: float = 2.0) -> Any:
-    """Run one concrete scenario in another SUMO program, and return its trace.
+def run_in_gui(simulate: Any, values: Any, seed: int, program: str, linger: float = 2.0) -> Any:
+    """Run one concrete scenario in a separate SUMO process and return its trace.
 
     Args:
-        simulate: a simulation that can be `configured` to isolation `fresh`.
+        simulate: a simulation that can be `configured` with isolation `fresh`.
         values: its inputs.
         seed: of the run.
         program: sumo-gui, or sumo.
-        linger: how long the window shows the first and the last instant (s); between them it goes in real time.
+        linger: how long the window shows the first and the last state (s); in between it runs in real time.
 
     Raises:
-        RunError: the program ends, or the run fails.
+        RunError: the program exits, or the run fails.
     """
     import traci
 
-    due: list[float] = []  # when, on the clock, the next step is; empty until the ego is there
-    in_window = "gui" in Path(program).name
+    next_step: list[float] = []  # clock time of the next step; empty until the ego has been inserted
+    has_window = "gui" in Path(program).name
 
     def start(command: list[str]) -> None:
-        shown = ["--start", "--quit-on-end", "--window-size", "1200,800"] if in_window else []
-        traci.start([program, *command[1:], *shown])
+        options = ["--start", "--quit-on-end", "--window-size", "1200,800"] if has_window else []
+        traci.start([program, *command[1:], *options])
 
     def step(*_: Any) -> None:
-        if due:  # SUMO's own delay has no effect when traci makes the steps
-            time.sleep(max(0.0, due[0] - time.monotonic()))
-            due[0] += simulate.step_length
+        if next_step:  # SUMO's own delay has no effect on steps made through TraCI
+            time.sleep(max(0.0, next_step[0] - time.monotonic()))
+            next_step[0] += simulate.step_length
         traci.simulationStep()
-        if in_window and not due and "ego" in traci.vehicle.getIDList():
-            traci.vehicle.setColor("ego", _EGO)
+        if has_window and not next_step and "ego" in traci.vehicle.getIDList():
+            traci.vehicle.setColor("ego", _EGO_COLOR)
             traci.gui.setSchema(traci.gui.DEFAULT_VIEW, "real world")
             traci.gui.trackVehicle(traci.gui.DEFAULT_VIEW, "ego")
             traci.gui.setZoom(traci.gui.DEFAULT_VIEW, _ZOOM)
-            due.append(time.monotonic() + linger)
+            next_step.append(time.monotonic() + linger)
 
-    client = _Instead(traci, simulation=_Instead(traci.simulation, step=step), start=start, simulationStep=step)
-    with session().through(client):
+    client = _Override(traci, simulation=_Override(traci.simulation, step=step), start=start, simulationStep=step)
+    with session().using(client):
         try:
             trace = simulate.configured(isolation="fresh")(values, seed)
-            time.sleep(linger if in_window else 0.0)
+            time.sleep(linger if has_window else 0.0)
             return trace
         finally:
             if traci.isLoaded():

@@ -1,4 +1,4 @@
-"""Line of sight: which points a sensor sees past rectangles that stand or drive in between."""
+"""Line of sight: which points a sensor sees past rectangles, standing or moving, in between."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from sbt.problem.arrays import Mask, Vector
 
-__all__ = ["Boxes", "outline"]
-_NEVER = 1e-300
-"""Keeps a line of sight along a side from a division by zero."""
+__all__ = ["Occluders", "outline"]
+_TINY = 1e-300
+"""Prevents a division by zero for a line of sight parallel to a side."""
 
 
 class _Rectangle(Protocol):
-    """Anything with a centre, a direction and a size: a `State`."""
+    """Anything with a centre, a heading and a size, such as a `State`."""
 
     x: float
     y: float
@@ -25,8 +25,8 @@ class _Rectangle(Protocol):
     width: float
 
 
-class Boxes:
-    """Rectangles that hide what lies behind or inside them; a value.
+class Occluders:
+    """Opaque rectangles, at fixed positions.
 
     Args:
         rectangles: (m, 5) centre x, y (m), heading (rad), length, width (m).
@@ -35,27 +35,27 @@ class Boxes:
     def __init__(self, rectangles: Iterable[tuple[float, float, float, float, float]]):
         boxes = [(x, y, math.cos(a), math.sin(a), 0.5 * length, 0.5 * width) for x, y, a, length, width in rectangles]
         axes = [(cos, sin) for _, _, cos, sin, _, _ in boxes] + [(-sin, cos) for _, _, cos, sin, _, _ in boxes]
-        self._axes = np.array(axes).reshape(-1, 2)  # (2 m, 2): along every box, then across
+        self._axes = np.array(axes).reshape(-1, 2)  # (2 m, 2): the longitudinal axes, then the lateral ones
         middle = [(x, y) for x, y, *_ in boxes] * 2
         self._middle = np.array([x * u + y * v for (x, y), (u, v) in zip(middle, axes, strict=True)])
         self._half = np.array([box[4] for box in boxes] + [box[5] for box in boxes])[:, None]
 
     @classmethod
-    def of(cls, states: Iterable[_Rectangle]) -> Boxes:
-        """Return the rectangles of some actors as they are now."""
+    def of(cls, states: Iterable[_Rectangle]) -> Occluders:
+        """Return the rectangles of some actors in their current states."""
         return cls((s.x, s.y, s.heading, s.length, s.width) for s in states)
 
-    def hides(self, eye: np.ndarray, points: np.ndarray) -> Mask:
-        """Return which points cannot be seen from `eye`: whose line of sight passes through a rectangle.
+    def occlude(self, eye: np.ndarray, points: np.ndarray) -> Mask:
+        """Return (n,) whether each point is hidden from `eye`: its line of sight passes through a rectangle.
 
-        >>> wall = Boxes([(5.0, 0.0, 0.0, 1.0, 4.0)])
-        >>> wall.hides(np.zeros(2), np.array([[10.0, 0.0], [3.0, 0.0], [10.0, 8.0]])).tolist()
+        >>> wall = Occluders([(5.0, 0.0, 0.0, 1.0, 4.0)])
+        >>> wall.occlude(np.zeros(2), np.array([[10.0, 0.0], [3.0, 0.0], [10.0, 8.0]])).tolist()
         [True, False, False]
         """
-        return np.asarray(self.depth(eye, points) > 0.0)
+        return np.asarray(self.blocked_length(eye, points) > 0.0)
 
-    def depth(self, eye: np.ndarray, points: np.ndarray) -> Vector:
-        """Return how much of the line of sight to each point lies inside rectangles.
+    def blocked_length(self, eye: np.ndarray, points: np.ndarray) -> Vector:
+        """Return the length of each line of sight that lies inside rectangles.
 
         Args:
             eye: (2,) x, y of the sensor (m).
@@ -65,10 +65,10 @@ class Boxes:
             (n,) metres, summed over the rectangles; continuous in the eye, the points and the rectangles.
 
         Source:
-            slab test of a segment and a box, Ericson (2005), Real-Time Collision Detection, 5.3.3.
+            Slab test of a segment and a box, Ericson (2005), Real-Time Collision Detection, 5.3.3.
         """
         ways = (points - eye).T
-        pace = 1.0 / (self._axes @ ways + _NEVER)  # (2 m, n): in each box's frame, along and across it
+        pace = 1.0 / (self._axes @ ways + _TINY)  # (2 m, n): along and across each rectangle
         middle, reach = pace * (self._middle - self._axes @ eye)[:, None], np.abs(pace) * self._half
         enter, leave, m = middle - reach, middle + reach, len(self._half) // 2
         inside = np.minimum(np.minimum(leave[:m], leave[m:]), 1.0) - np.maximum(np.maximum(enter[:m], enter[m:]), 0.0)

@@ -1,4 +1,4 @@
-"""Drives one scene that SUMO holds: read every actor, record, look for the end, let the controllers act."""
+"""One run whose actors are in SUMO: reads and records their states, detects the end, and calls the controllers."""
 
 from __future__ import annotations
 
@@ -13,54 +13,55 @@ from sbt.metrics.geometry import contact_index
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
-from sbt.sumo.placing import mover
-from sbt.sumo.session import ABSENT, direct
+from sbt.sumo.dynamics import MAX_SPEED, next_speed
+from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
+from sbt.sumo.session import INVALID_DOUBLE, unwrapped
 
-__all__ = ["Drive"]
+__all__ = ["SumoRun"]
 
-_FASTEST = 1e4
 _COLUMNS = 5
 _SLACK = 1e-6
-"""Rectangles so near to each other (m) are left to the exact test."""
+"""Below this distance (m) of two rectangles the quick separation tests do not decide, but the exact one."""
 _ROW = struct.Struct(f"={_COLUMNS}d")
-"""x, y, heading, speed, acceleration: floats in a list would take four times the memory and the time to read them back"""
+"""x, y, heading, speed, acceleration of one actor; lists of floats would take four times the memory."""
 
 
-class Drive:
-    """One run after its actors are on the road.
+class SumoRun:
+    """One run after its actors have been inserted.
 
     Args:
         sumo: libsumo.
-        scene: who drives, and when it is over.
+        scene: the actors and the end condition.
         dt: SUMO's step (s).
-        duration: longest time (s).
-        prefix: what stands before the actors' names in SUMO.
+        duration: longest simulated time (s).
+        prefix: of the names of the actors in SUMO.
 
     Attributes:
-        advance: to be called after every step of SUMO: records, and lets the controllers act; True once the run is over.
-        instants: returns how many states have been recorded.
+        advance: to be called after every step of SUMO: records the states and calls the controllers; returns
+            True once the run is over.
+        recorded: returns the number of recorded instants.
     """
 
     def __init__(self, sumo: Any, scene: Scene, dt: float, duration: float, prefix: str = ""):
-        self._scene, self._dt = scene, dt
-        self._last = round(duration / dt)
+        self._scene, self._dt = scene, float(dt)
+        self._last = round(duration / self._dt)
         self._rows = bytearray((self._last + 1) * len(scene.actors) * _ROW.size)
-        self._heard: list[tuple[float, ...]] = []
-        self._reported: list[str] = []
+        self._signals: list[tuple[float, ...]] = []
+        self._collisions: list[str] = []
         self._ended = ""
-        self.advance, self.instants = self._bound(sumo, prefix)
+        self.advance, self.recorded = self._functions(sumo, prefix)
 
-    def _bound(self, sumo: Any, prefix: str) -> tuple[Callable[[], bool], Callable[[], int]]:
-        """Return `advance`, for which everything is bound beforehand because it runs at every step, and `instants`."""
-        scene, rows, dt, heard, last = self._scene, self._rows, self._dt, self._heard, self._last
-        states = [State(a.name, a.type.length, a.type.width, dt) for a in scene.actors]
+    def _functions(self, sumo: Any, prefix: str) -> tuple[Callable[[], bool], Callable[[], int]]:
+        """Return `advance` and `recorded`, as closures over local variables because they run at every step."""
+        scene, rows, dt, signals, last = self._scene, self._rows, self._dt, self._signals, self._last
+        states = [State(a.name, float(a.type.length), float(a.type.width), dt) for a in scene.actors]
         for actor, state in zip(scene.actors, states, strict=True):
-            state.steered = None if actor.pose is None else actor.speed
+            state.steered = None if actor.pose is None else float(actor.speed)
         by_name = {s.name: s for s in states}
         until, probes = scene.until, tuple(scene.signals.values())
         observe = _observer(sumo, scene.actors, states, dt, prefix, rows)
-        control = _controls(sumo, scene.actors, states, dt, prefix)
-        touching = _contact(states, [k for k, a in enumerate(scene.actors) if not a.person][1:], rows, dt)
+        control = _control(sumo, scene.actors, states, dt, prefix)
+        touching = _contact_test(states, [k for k, a in enumerate(scene.actors) if not a.person][1:], rows, dt)
         k = -1
 
         def advance() -> bool:
@@ -75,7 +76,7 @@ class Drive:
                 else:
                     ended = "duration"
             if probes:
-                heard.append(tuple([float(probe()) for probe in probes]))
+                signals.append(tuple([float(probe()) for probe in probes]))
             if ended:
                 self._ended = ended
                 return True
@@ -83,14 +84,14 @@ class Drive:
 
         return advance, lambda: k + 1
 
-    def heard_of(self, collider: str, victim: str) -> None:
-        """Take down a collision that SUMO reports in the state that `advance` will read next."""
-        self._reported.append(f"{collider}>{victim}@{self.instants() * self._dt:.3f}")
+    def record_collision(self, collider: str, victim: str) -> None:
+        """Record a collision that SUMO reports for the state that `advance` will read next."""
+        self._collisions.append(f"{collider}>{victim}@{self.recorded() * self._dt:.3f}")
 
     def trace(self) -> Trace:
-        """Return what was recorded, obstacles as actors that stand."""
+        """Return the recorded trace, with the obstacles as standing actors."""
         scene, actors = self._scene, self._scene.actors
-        table = _table(self._rows, 0, self.instants(), len(actors)).copy()
+        table = _table(self._rows, 0, self.recorded(), len(actors)).copy()
         sizes = [(a.type.length, a.type.width) for a in actors]
         names = [a.name for a in actors]
         if scene.obstacles:
@@ -110,26 +111,26 @@ class Drive:
             np.array([a for a, _ in sizes]),
             np.array([b for _, b in sizes]),
             self._ended,
-            tuple(self._reported),
-            {name: np.array([row[k] for row in self._heard]) for k, name in enumerate(scene.signals)},
+            tuple(self._collisions),
+            {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
         )
 
 
-def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str) -> Callable[[float], None]:
-    """Return what asks every controller and passes its action on to SUMO."""
-    set_speed = direct(sumo, "vehicle", "setSpeed")
-    movers = {prefix + a.name: mover(sumo, a, prefix) for a in actors}
+def _control(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str) -> Callable[[float], None]:
+    """Return the function that calls every controller and passes its action on to SUMO."""
+    set_speed = unwrapped(sumo, "vehicle", "setSpeed")
+    pose_setters = {prefix + a.name: pose_setter(sumo, a, prefix) for a in actors}
     driven = [
         (a, s, a.driver.act, tuple(o for o in states if o is not s), prefix + a.name)
         for a, s in zip(actors, states, strict=True)
         if a.driver is not None
     ]
 
-    def put(own: State, name: str, action: Action, speed: float | None) -> None:
+    def apply_pose(own: State, name: str, action: Action, speed: float | None) -> None:
         if action.pose is None:
             raise RunError(Status.FAILED, f"{own.name} moves by pose, but its controller gave {action}")
-        own.steered = own.speed if speed is None else speed
-        movers[name](action.pose)
+        own.steered = own.speed if speed is None else float(speed)
+        pose_setters[name](action.pose)
 
     def control(t: float) -> None:
         for actor, own, act, others, name in driven:
@@ -138,67 +139,61 @@ def _controls(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: flo
                 continue
             acceleration, speed, lane, pose = action
             if acceleration is not None:
-                speed = _reached(own.speed, acceleration, speed, dt)
+                speed = next_speed(own.speed, acceleration, speed, dt)
             if speed is not None:
-                if not -_FASTEST < speed < _FASTEST:
+                if not -MAX_SPEED < speed < MAX_SPEED:
                     raise RunError(Status.FAILED, f"the controller of {actor.name} must give finite numbers, but gave {action}")
                 if not actor.person:
-                    set_speed(name, speed)
+                    set_speed(name, float(speed))
             if lane is not None:
                 _change_lane(sumo, actor, name, lane)
             if pose is not None or own.steered is not None:
-                put(own, name, action, speed)
+                apply_pose(own, name, action, speed)
 
     return control
 
 
 def _change_lane(sumo: Any, actor: Actor, name: str, lane: int) -> None:
-    """Start the change to a lane; SUMO would say nothing where the edge has no such lane."""
+    """Start a lane change; SUMO would silently ignore a lane that the edge does not have."""
     edge = sumo.vehicle.getRoadID(name)
-    lanes = range(sumo.edge.getLaneNumber(edge)) if edge and not edge.startswith(":") else None  # of a junction's inside: any
+    lanes = range(sumo.edge.getLaneNumber(edge)) if edge and not edge.startswith(":") else None  # unchecked inside junctions
     if lanes is not None and lane not in lanes:
         raise RunError(
             Status.FAILED, f"the controller of {actor.name} must give a lane of the edge, 0 to {len(lanes) - 1} on {edge}, "
             f"but gave {lane}",
         )  # fmt: skip
-    sumo.vehicle.changeLane(name, int(lane), 3600.0)
-
-
-def _reached(speed: float, acceleration: float, aim: float | None, dt: float) -> float:
-    """Return the speed after a step of this acceleration, which ends at the aim."""
-    reached = speed + acceleration * dt
-    if aim is not None:
-        reached = max(reached, aim) if acceleration < 0 else min(reached, aim)
-    return 0.0 if reached < 0.0 else reached
+    sumo.vehicle.changeLane(name, int(lane), LANE_REQUEST_DURATION)
 
 
 def _observer(
     sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str, rows: bytearray
 ) -> Callable[[int], None]:
-    """Return what reads every actor from SUMO and writes its x, y, heading, speed and acceleration as row k.
+    """Return the function that reads all actors from SUMO and writes their states as row k.
 
-    SUMO's position is a vehicle's front bumper and a person's centre.
+    SUMO's reference position is the front bumper of a vehicle and the centre of a person; ours is the centre.
     """
     getters = {
-        person: tuple(direct(sumo, "person" if person else "vehicle", name) for name in ("getPosition", "getAngle", "getSpeed"))
+        person: tuple(
+            unwrapped(sumo, "person" if person else "vehicle", name) for name in ("getPosition", "getAngle", "getSpeed")
+        )
         for person in {a.person for a in actors}
     }
-    watched = [
+    read = [
         (s, prefix + s.name, 0.0 if a.person else 0.5 * s.length, *getters[a.person]) for a, s in zip(actors, states, strict=True)
     ]
     rate, size, write = 1.0 / dt, _ROW.size, _ROW.pack_into
 
     def observe(k: int) -> None:
-        at = k * len(watched) * size
-        for state, name, half, position, angle_of, speed_of in watched:
+        at = k * len(read) * size
+        for state, name, half, position, angle_of, speed_of in read:
             try:
                 x, y = position(name)
-            except Exception as error:  # of libsumo or of traci
+            except Exception as error:  # the class depends on the client: libsumo or traci
                 if "is not known" in str(error):
-                    raise _gone(state, k * dt) from None
+                    raise _left(state, k * dt) from None
                 raise
-            if x == ABSENT:
-                raise _gone(state, k * dt)
+            if x == INVALID_DOUBLE:
+                raise _left(state, k * dt)
             angle = angle_of(name)
             if angle != state.angle:
                 state.turn(angle)
@@ -213,21 +208,21 @@ def _observer(
     return observe
 
 
-def _gone(state: State, t: float) -> RunError:
+def _left(state: State, t: float) -> RunError:
     reason = f"{state.name} must stay on the road, but it was gone at t = {t:g} s (its route ended, or SUMO took it away)"
     return RunError(Status.FAILED, reason)
 
 
 def _table(rows: bytearray, first: int, last: int, actors: int) -> np.ndarray:
-    """Return the (last - first, m, 5) states of some instants, a view."""
+    """Return a view of the (last - first, m, 5) states at some instants."""
     numbers = actors * _COLUMNS
     return np.frombuffer(rows, np.float64, (last - first) * numbers, first * numbers * 8).reshape(-1, actors, _COLUMNS)
 
 
-def _contact(states: list[State], solid: list[int], rows: bytearray, dt: float) -> Callable[[int], bool]:
-    """Return what says whether the first actor, the ego, touched another rectangle in the step to row k.
+def _contact_test(states: list[State], solid: list[int], rows: bytearray, dt: float) -> Callable[[int], bool]:
+    """Return the function that tells whether the first actor, the ego, touched another rectangle in the step to row k.
 
-    Exact only when near: the others are too far away for it, however they are turned, or one side of ego's is between them.
+    The exact test is left to pairs that are neither far apart nor separated by an axis of the ego's rectangle.
     """
     ego, near = states[0], 2.0 * max(s.length for s in states)
     width, place = _ROW.size * len(states), struct.Struct("=2d").unpack_from
@@ -259,6 +254,6 @@ def _contact(states: list[State], solid: list[int], rows: bytearray, dt: float) 
 
 
 def _track(rows: np.ndarray, k: int, state: State) -> ActorTrace:
-    """Return one actor's (t,) columns of (t, m, 5) rows."""
+    """Return the (t,) columns of one actor in (t, m, 5) states."""
     x, y, heading, speed, acceleration = rows[:, k].T
     return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width)

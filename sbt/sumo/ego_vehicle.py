@@ -1,0 +1,128 @@
+"""The ego of a user's own simulation: driven as in the files, by another model of SUMO, or by a controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from sbt.errors import InputError, RunError
+from sbt.problem.outcome import Status
+from sbt.sumo.actors import State
+from sbt.sumo.dynamics import MAX_SPEED, next_speed
+from sbt.sumo.ego import SUMO, Ego
+from sbt.sumo.formatting import plain
+from sbt.sumo.insertion import LANE_REQUEST_DURATION, SPEED_MODE
+from sbt.sumo.models import vtype_attributes
+
+__all__ = ["EGO_TYPE", "ControlStep", "EgoVehicle"]
+
+EGO_TYPE = "sbt_ego"
+"""Id of the vehicle type of an ego that another model of SUMO drives."""
+_COPIED = ("Length", "Width", "Height", "VehicleClass", "MaxSpeed", "MinGap", "Accel", "Decel", "EmergencyDecel", "Tau",
+           "Imperfection", "SpeedFactor", "SpeedDeviation", "Color", "MaxSpeedLat", "MinGapLat", "LateralAlignment")  # fmt: skip
+"""Properties that the ego keeps when its type changes, by the names of SUMO's getters and setters."""
+_ATTRIBUTE = {"Imperfection": "sigma", "VehicleClass": "vClass", "SpeedDeviation": "speedDev", "LateralAlignment": "latAlignment"}
+"""vType attributes of the properties whose names differ."""
+_COMFORTABLE_DECELERATION = 3.0
+"""Deceleration up to which the ego stops at a yellow light (m/s^2), about the 10 ft/s^2 behind ITE's yellow times."""
+_STOP_LINE_LENGTH, _STOP_LINE_WIDTH = 0.1, 3.0
+"""Size of the obstacle that stands for a red light (m)."""
+_LANE_CHANGE_MODE = 513
+"""SUMO's lane-change mode with strategic changes only, respecting other vehicles."""
+
+ControlStep = Callable[[float, State, tuple[State, ...]], None]
+"""Called before every step with the time (s), the state of the ego, and the states of the others."""
+
+
+@dataclass(frozen=True)
+class EgoVehicle:
+    """The vehicle under test in a user's own simulation.
+
+    Args:
+        id: its id in SUMO.
+        driver: a controller, or (kind `sumo`) another car-following model; None: as in the user's files.
+        set_speed: desired speed of a controller (m/s); None: the allowed speed where the ego departs.
+        lights: a controller sees a red traffic light as a standing obstacle at the stop line. The controller alone
+            sets the speed (speed mode 32); SUMO changes lanes for the route unless the controller requests a lane.
+        may_leave: arriving at the end of its route before the duration is over is not an error.
+    """
+
+    id: str
+    driver: Ego | None = None
+    set_speed: float | None = None
+    lights: bool = True
+    may_leave: bool = False
+
+    def with_driver(self, driver: Ego) -> EgoVehicle:
+        """Return the same vehicle with another driver."""
+        return replace(self, driver=driver)
+
+    def vehicle_type(self) -> str | None:
+        """Return the XML of the vehicle type for another model of SUMO; None where none is needed."""
+        if self.driver is None or self.driver.kind != SUMO:
+            return None
+        settings = vtype_attributes(dict(self.driver.settings))
+        return '<vType id="{}" {}/>'.format(EGO_TYPE, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
+
+    def take_over(self, sumo: Any, rng: np.random.Generator) -> ControlStep | None:
+        """Give the ego its driver; to be called in the step in which it departs.
+
+        Returns:
+            The function to be called before every step; None where SUMO drives.
+        """
+        if self.driver is None:
+            return None
+        if self.driver.kind == SUMO:
+            self._change_type(sumo)
+            return None
+        allowed = sumo.vehicle.getAllowedSpeed(self.id)
+        controller = self.driver.driver(rng, allowed if self.set_speed is None else self.set_speed)
+        if controller is None:
+            raise InputError(f"ego.kind must name a controller, but got '{self.driver.kind}'")
+        sumo.vehicle.setSpeedMode(self.id, SPEED_MODE)
+        sumo.vehicle.setLaneChangeMode(self.id, _LANE_CHANGE_MODE)
+        act = controller.act
+
+        def control(t: float, own: State, others: tuple[State, ...]) -> None:
+            light = _red_light(sumo, own) if self.lights else None
+            action = act(t, own, others if light is None else (*others, light))
+            if action.pose is not None:
+                raise RunError(Status.FAILED, f"a controller of '{self.id}' must give speeds, but gave the pose {action.pose}")
+            speed = action.speed
+            if action.acceleration is not None:
+                speed = next_speed(own.speed, action.acceleration, speed, own.step)
+            if speed is not None:
+                if not -MAX_SPEED < speed < MAX_SPEED:
+                    raise RunError(Status.FAILED, f"the controller of '{self.id}' must give finite numbers, but gave {action}")
+                sumo.vehicle.setSpeed(self.id, float(speed))
+            if action.lane is not None:
+                sumo.vehicle.changeLane(self.id, plain(action.lane), LANE_REQUEST_DURATION)
+
+        return control
+
+    def _change_type(self, sumo: Any) -> None:
+        """Give the ego the type with the other model; properties that the settings do not mention stay as they are."""
+        given = vtype_attributes(dict(self.driver.settings)) if self.driver is not None else {}
+        for name in _COPIED:
+            attribute = _ATTRIBUTE.get(name, name[0].lower() + name[1:])
+            if attribute not in given:
+                getattr(sumo.vehicletype, f"set{name}")(EGO_TYPE, getattr(sumo.vehicle, f"get{name}")(self.id))
+        factor = given.get("speedFactor", sumo.vehicle.getSpeedFactor(self.id))
+        sumo.vehicle.setType(self.id, EGO_TYPE)
+        sumo.vehicle.setSpeedFactor(self.id, float(factor))
+
+
+def _red_light(sumo: Any, own: State) -> State | None:
+    """Return an obstacle at the stop line of the next traffic light that is red, or yellow with room for a comfortable stop."""
+    for _, _, distance, color in sumo.vehicle.getNextTLS(own.name)[:1]:
+        if color in "ru" or (color == "y" and own.speed**2 < 2.0 * _COMFORTABLE_DECELERATION * distance):
+            line = State("red light", _STOP_LINE_LENGTH, _STOP_LINE_WIDTH, own.step)
+            line.turn(own.angle)
+            ahead = 0.5 * (own.length + _STOP_LINE_LENGTH) + distance
+            line.x, line.y = own.x + ahead * own.cos, own.y + ahead * own.sin
+            return line
+    return None

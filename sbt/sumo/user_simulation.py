@@ -1,0 +1,319 @@
+"""Runs a user's own simulation: their SUMO files as they are, or their TraCI loop.
+
+    def simulate(sumo, values, rng):
+        sumo.start(["sumo", "-c", "my.sumocfg"])
+        while sumo.simulation.getMinExpectedNumber() > 0:
+            sumo.simulationStep()
+            ...
+
+`sumo` is a proxy of libsumo in campaigns and of traci with sumo-gui in replays; the loop is the same. Every
+`simulationStep` is recorded (`sbt.sumo.recorder`) and leaves the loop when the run is over. SUMO's seed is
+that of the run. Where the scenario names files, `sumo.start` has already been called.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sbt import interruption
+from sbt.errors import InputError, RunError
+from sbt.problem.outcome import Status
+from sbt.problem.trace import Trace
+from sbt.seeds import stream
+from sbt.sumo.departures import RequestedDeparture, number_or_none, requested_departures
+from sbt.sumo.ego import Ego
+from sbt.sumo.files import Launch, SumoFiles, options_of_command
+from sbt.sumo.formatting import plain, plain_values
+from sbt.sumo.recorder import Recorder, RecordingSettings, RunEnded
+from sbt.sumo.session import scratch_folder, session
+
+__all__ = ["Loop", "TraciProxy", "UserSimulation", "step_until_over"]
+
+Loop = Callable[[Any, Mapping[str, float], np.random.Generator], object]
+"""The user's `simulate(sumo, values, rng)`."""
+Connect = Callable[[Launch], AbstractContextManager[Any]]
+"""Starts SUMO and provides its client module: libsumo or traci."""
+
+
+def step_until_over(sumo: Any, values: Mapping[str, float], rng: np.random.Generator) -> None:
+    """Step until the run is over: the loop of a scenario without one."""
+    while True:
+        sumo.simulationStep()
+
+
+@dataclass(frozen=True)
+class UserSimulation:
+    """Simulates concrete scenarios with a user's own files or loop.
+
+    Args:
+        recording: the ego, which other road users are recorded, and how long.
+        files: started before the loop; None: the loop calls `sumo.start` itself.
+        loop: the user's; the default only steps.
+        folder: working directory of the loop, to which relative file names refer.
+        step: SUMO's step (s); None: that of the files, or 0.1.
+        timeout: wall-clock limit of a run (s); None: none.
+
+    Raises:
+        InputError: a step is not a whole number of milliseconds, or neither files nor a loop are given.
+    """
+
+    recording: RecordingSettings
+    files: SumoFiles | None = None
+    loop: Loop = step_until_over
+    folder: Path = Path()
+    step: float | None = None
+    timeout: float | None = None
+    isolations: tuple[str, ...] = ("fresh",)
+
+    def __post_init__(self) -> None:
+        if self.files is None and self.loop is step_until_over:
+            raise InputError("a simulation must have files or a loop, but has neither")
+        if self.step is not None and not (self.step > 0 and round(self.step * 1000) / 1000 == self.step):
+            raise InputError(f"SUMO counts time in whole milliseconds, but got step_length {self.step} s")
+
+    @property
+    def step_length(self) -> float:
+        """The step as far as it is known before a run (s); NaN where the loop decides it."""
+        of_files = self.files.step_length() if self.files is not None else math.nan
+        return self.step if self.step is not None else 0.1 if of_files is None else of_files
+
+    def configured(
+        self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
+    ) -> UserSimulation:
+        """Return a copy with another driver of the ego or another step length."""
+        if isolation not in (None, "auto", "fresh"):
+            raise InputError(f"executor.isolation must be auto or fresh here, but got '{isolation}'")
+        recording = self.recording
+        if ego is not None:
+            recording = replace(recording, ego=recording.ego.with_driver(Ego.of(**ego)))
+        return replace(self, recording=recording, step=self.step if step_length is None else step_length)
+
+    def prepare(self) -> None:
+        """Import libsumo, and read and check the files.
+
+        Raises:
+            InputError: a file is not as required.
+        """
+        if self.files is not None:
+            self.files.templates  # noqa: B018  (reads and checks them)
+        session()
+
+    def limited(self, timeout: float | None) -> UserSimulation:
+        """Return a copy with a wall-clock limit of its runs (s)."""
+        return replace(self, timeout=timeout)
+
+    def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
+        """Run one concrete scenario in libsumo.
+
+        Raises:
+            RunError: SUMO or the loop fails, a vehicle departs differently than requested, the ego is absent
+                or leaves, or the run takes too long.
+        """
+        return self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"))
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return SUMO's warnings about the files in the last run of this process, each once."""
+        lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
+        return tuple(dict.fromkeys(line for line in lines if "time=" not in line))  # with a time it is about the traffic
+
+    def run_with_traci(self, values: Mapping[str, float], seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
+        """Run one concrete scenario in a separate SUMO process, such as sumo-gui, through traci.
+
+        Args:
+            values: of the inputs.
+            seed: of the run.
+            traci: the module.
+            program: the SUMO program and options that the run itself does not set, such as
+                `("sumo-gui", "--delay", "100")`.
+
+        Returns:
+            The trace, identical to that of a call.
+        """
+        return self._run(values, seed, lambda launch: _traci_connection(traci, [*program, *launch.command(seed)]))
+
+    def _run(self, values: Mapping[str, float], seed: int, connect: Connect) -> Trace:
+        proxy: TraciProxy | None = None
+        try:
+            with ExitStack() as stack:
+                stack.enter_context(contextlib.chdir(self.folder))
+                proxy = TraciProxy(self, plain_values(values), seed, lambda launch: stack.enter_context(connect(launch)))
+                if self.files is not None:
+                    proxy.start_files(self.files)
+                ended = proxy.run_loop()
+                return proxy.recorder.trace(ended)
+        except RunError as error:
+            raise RunError(error.status, f"{error.reason}{proxy.error_place if proxy is not None else ''}") from None
+
+
+class TraciProxy:
+    """SUMO's client module as the user's loop sees it; starting, stepping and closing are intercepted.
+
+    Args:
+        simulation: what runs.
+        values: inputs of the run.
+        seed: of the run.
+        connect: starts SUMO and returns its client module.
+
+    Attributes:
+        error_place: ` (file:line)` of the user's code where an error was raised, "" without one.
+    """
+
+    def __init__(self, simulation: UserSimulation, values: Mapping[str, float], seed: int, connect: Callable[[Launch], Any]):
+        self._user_simulation, self._values, self._seed, self._connect = simulation, values, seed, connect
+        self._module: Any = None
+        self._recorder: Recorder | None = None
+        self.simulation = _SimulationProxy(self)
+        self.vehicle, self.person = _CommandProxy(self, "vehicle"), _CommandProxy(self, "person")
+        self.error_place = ""
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the attribute of SUMO's client module."""
+        if self._module is None:
+            raise RunError(Status.FAILED, f"sumo.start([...]) must be called before sumo.{name}, but was not")
+        return getattr(self._module, name)
+
+    @property
+    def recorder(self) -> Recorder:
+        """The recorder of the run."""
+        if self._recorder is None:
+            raise RunError(Status.FAILED, "a loop must call sumo.start([...]), but it did not")
+        return self._recorder
+
+    def start(self, command: Sequence[str], *_: Any, **__: Any) -> tuple[int, str]:
+        """Start SUMO as `traci.start` does; the program's name, ports and labels are ignored."""
+        if self._module is not None:
+            raise RunError(
+                Status.FAILED, "sumo.start must be called once, by the loop or (files) by the scenario, but was called again"
+            )
+        folder = self._user_simulation.folder
+        self.start_files(SumoFiles.of(options_of_command(list(command)[1:], folder), folder, "sumo.start"))
+        version: tuple[int, str] = self.__getattr__("getVersion")()
+        return version
+
+    def start_files(self, files: SumoFiles) -> None:
+        """Fill the placeholders of the files, start SUMO with them, and begin to record."""
+        simulation = self._user_simulation
+        ego, folder = simulation.recording.ego, scratch_folder()
+        vehicle_type = ego.vehicle_type()
+        if vehicle_type is not None:
+            path = folder / "ego.add.xml"
+            path.write_text(f"<additional>{vehicle_type}</additional>")
+            files = replace(files, additional=(*files.additional, path))
+        requested = requested_departures(files, self._values, ego.id)
+        self._module = self._connect(files.launch(self._values, folder, simulation.step))
+        rng = stream(self._seed, "ego")
+        self._recorder = Recorder(self._module, simulation.recording, rng, requested, simulation.timeout)
+
+    def simulationStep(self, until: float = 0.0) -> None:  # noqa: N802  (SUMO's name)
+        """Make one step, or all steps until a time (s), and record each."""
+        while True:
+            self.recorder.before_step()
+            self._module.simulationStep()
+            self.recorder.after_step()
+            if self._module.simulation.getTime() >= until - 1e-9:
+                return
+
+    def close(self, *_: Any) -> None:
+        """Do nothing: SUMO is closed at the end of the run."""
+
+    def run_loop(self) -> str:
+        """Run the loop and return why it ended.
+
+        Raises:
+            RunError: the loop raised an error. SUMO's own errors are passed on to the context that started SUMO.
+        """
+        loop = self._user_simulation.loop
+        try:
+            loop(self, dict(self._values), stream(self._seed, "loop"))
+        except RunEnded as end:
+            return end.reason
+        except BaseException as error:  # SystemExit too
+            self.error_place = _place_in_loop(error, loop)
+            if isinstance(error, RunError) or "TraCI" in type(error).__name__ or interruption.is_interruption(error):
+                raise
+            message = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+            raise RunError(Status.FAILED, message) from error
+        if self._recorder is not None and self._recorder.ended:  # a bare `except` in the loop has caught the end
+            return self._recorder.ended
+        if self._module is not None:
+            self._module.simulationStep()  # SUMO holds pointers to actors moved since the last step, which a load would free
+        return "loop"
+
+
+def _place_in_loop(error: BaseException, loop: Loop) -> str:
+    """Return the last line of the user's file in the traceback of an error, as ` (file:line)`."""
+    file = getattr(getattr(loop, "__code__", None), "co_filename", "")
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    return f" ({file}:{lines[-1]})" if lines and loop is not step_until_over else ""
+
+
+class _SimulationProxy:
+    """The `simulation` domain, with a recorded `step`."""
+
+    def __init__(self, proxy: TraciProxy):
+        self._proxy = proxy
+
+    def step(self, until: float = 0.0) -> None:
+        """Make one step, or all steps until a time (s)."""
+        self._proxy.simulationStep(until)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._proxy.__getattr__("simulation"), name)
+
+
+class _CommandProxy:
+    """The `vehicle` or `person` domain; arguments of commands must be finite, and departures of added vehicles are compared."""
+
+    def __init__(self, proxy: TraciProxy, domain: str):
+        self._proxy, self._domain = proxy, domain
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._proxy.__getattr__(self._domain), name)
+        if name.startswith("get"):
+            return function
+        return partial(self._command, name, function)
+
+    def _command(self, name: str, function: Any, *args: Any, **kwargs: Any) -> Any:
+        args, kwargs = tuple(map(plain, args)), {key: plain(value) for key, value in kwargs.items()}
+        for value in (*args, *kwargs.values()):
+            if isinstance(value, float) and not math.isfinite(value):  # SUMO accepts it silently
+                shown = ", ".join(map(repr, (*args, *kwargs.values())))
+                raise RunError(Status.FAILED, f"a loop must give finite numbers, but called sumo.{self._domain}.{name}({shown})")
+        result = function(*args, **kwargs)
+        if self._domain == "vehicle" and name == "add":
+            self._expect(*args, **kwargs)
+        elif self._domain == "vehicle" and name.startswith(("moveTo", "remove")) and args:
+            self._proxy.recorder.ignore_departure(str(args[0]))
+        return result
+
+    def _expect(
+        self, vehID: str, routeID: str = "", typeID: str = "", depart: Any = None, departLane: Any = "first",  # noqa: N803
+        departPos: Any = "base", departSpeed: Any = "0", *_: Any, **__: Any,  # noqa: N803
+    ) -> None:  # fmt: skip
+        """Register the departure that `vehicle.add` requests; the parameters have SUMO's names."""
+        when = self._proxy.simulation.getTime() if depart in (None, "now") else number_or_none(depart)
+        requested = RequestedDeparture("", when, *map(number_or_none, (departPos, departSpeed, departLane)))
+        self._proxy.recorder.expect_departure(vehID, requested)
+
+
+@contextlib.contextmanager
+def _traci_connection(traci: Any, command: list[str]) -> Iterator[Any]:
+    """Start a SUMO program, provide traci connected to it, and close it in the end."""
+    try:
+        traci.start(command)
+        yield traci
+    except (traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError) as error:
+        raise RunError(Status.FAILED, f"SUMO: {error}") from None
+    finally:
+        with contextlib.suppress(traci.exceptions.FatalTraCIError, traci.exceptions.TraCIException, KeyError):
+            traci.close()
