@@ -17,6 +17,7 @@ from sbt.benchmark.compare import compare, table
 from sbt.campaigns.falsification import CONFIRM, METHODS
 from sbt.cli import app
 from sbt.config.load import parse
+from sbt.errors import InputError
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
@@ -233,8 +234,8 @@ def test_constraints_hold_for_every_run(falsified: Run):
 def test_a_budget_below_the_first_design_is_a_design_alone(falsified: Run):
     result = falsified("TWO", budget=4, initial=4)
     assert (result["stopped"], [row[1] for row in rows(result)][:4]) == ("budget", ["initial"] * 4)
-    if result["conclusion"]["first_critical_run"] is None:
-        assert result["conclusion"]["bound"]["space_filling_runs"] == 4
+    assert result["conclusion"]["first_critical_run"] is None
+    assert result["conclusion"]["bound"]["space_filling_runs"] == 4
     one = falsified("NOTHING", "one", budget=1, initial=1)
     assert one["conclusion"]["bound"]["box_fraction"] == pytest.approx(0.95)
     hit = falsified("EVERYTHING", "hit", budget=1, initial=1)
@@ -244,7 +245,7 @@ def test_a_budget_below_the_first_design_is_a_design_alone(falsified: Run):
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "portfolio"] + ["even", "boundary"])
 def test_every_method_finds_a_hole(falsified: Run, method: str):
     if method == "cma_es" and importlib.util.find_spec("cma") is None:
-        with pytest.raises(Exception, match=r"needs the library cma, .* pip install 'sumo-sbt\[compare\]'"):
+        with pytest.raises(InputError, match=r"needs the library cma, .* pip install 'sumo-sbt\[compare\]'"):
             falsified("TWO", acquisition={"kind": method})
         return
     result = falsified("TWO", budget=50, acquisition={"kind": method}, stop={"failures": 1})

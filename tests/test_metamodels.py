@@ -117,8 +117,11 @@ def test_wrong_metamodels_are_refused(flaw, rule):
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_rows_that_cannot_be_learned_from_are_refused(name):
     u, y = rows(5)
-    for bad_u, bad_y in ((u[:1], y[:1]), (u, y[:3]), (u, y * np.nan), (u * np.inf, y), (u[:, :0], y)):
-        with pytest.raises(InputError):
+    for bad_u, bad_y, message in (
+        (u[:1], y[:1], "n >= 2 rows, but got 1"), (u, y[:3], r"but got \(5, 3\) and \(3,\)"), (u, y * np.nan, "finite u and y"),
+        (u * np.inf, y, "finite u and y"), (u[:, :0], y, r"but got \(5, 0\) and \(5,\)"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
             BUILT_IN[name].fit(bad_u, bad_y, np.random.default_rng(0))
 
 
