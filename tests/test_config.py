@@ -337,7 +337,7 @@ def test_without_changes_the_scenario_is_the_plugins_own(folder: Path):
         ("metamodel: {kind: gq}", "f.yaml:3:19: metamodel.kind: metamodels must be one of"),
         ("metamodel: {kind: et, tres: 3}", "f.yaml:3:12: metamodel: ExtraTrees takes a setting of"),
         ("metamodel: {kind: et, preset: papr}", "f.yaml:3:12: metamodel: ExtraTrees takes a preset of paper, but got 'papr'"),
-        ("metamodel: {kind: 'plugin.py:my_acquisition'}", "metamodel.kind: a metamodel must be a class with fit(u, y, rng)"),
+        ("metamodel: {kind: 'plugin.py:my_acquisition'}", "metamodel.kind: a metamodel must be a class (or an object) with fit(u, y, rng)"),
         ("acquisition: {kind: bondary}", "f.yaml:3:21: acquisition.kind: acquisitions must be one of"),
         ("acquisition: {kind: 'plugin.py:NOT_A_SCENARIO'}", "acquisition.kind: an acquisition must be a function"),
     ],

@@ -22,7 +22,8 @@ from sbt.plugins import load
 from sbt.problem.requirement import CriticalInterval
 from sbt.store.database import Store
 from sbt.testing import ContractError, check_acquisition, check_metamodel
-from sbt.workflows.running import run_campaign
+from sbt.workflows.running import Summary, run_study
+from sbt.workflows.study import Study
 
 PLUGINS = '''
 import numpy as np
@@ -101,7 +102,7 @@ PLANE = analytic(
     lambda x: 3 * (x[:, 0] - 0.5) + x[:, 1] ** 2, inputs={"a": (0.0, 0.5), "b": (0.0, 0.5)}, critical=(-np.inf, 0.0), name="plane"
 )
 '''
-Run = Callable[..., tuple[dict[str, Any], np.ndarray]]
+Run = Callable[..., tuple[Summary, np.ndarray]]
 
 
 @pytest.fixture
@@ -114,11 +115,11 @@ def folder(tmp_path: Path) -> Path:
 def run(folder: Path) -> Run:
     """Run a campaign; return its result and x of the runs (n, d)."""
 
-    def runner(store: str = "s", **keys: Any) -> tuple[dict[str, Any], np.ndarray]:
+    def runner(store: str = "s", **keys: Any) -> tuple[Summary, np.ndarray]:
         settings = {"campaign": "boundary", "scenario": "own.py:PLANE", "budget": 60, "initial": 20, "batch": 20, "seed": 1,
                     "executor": {"kind": "serial"}, "store": str(folder / store), **keys}  # fmt: skip
         text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in settings.items())
-        result = run_campaign(parse(text, folder=folder), report=False)
+        result = run_study(Study(parse(text, folder=folder)), report=False)
         with Store.read(folder / store) as written:
             return result, written.history().x
 
@@ -201,12 +202,12 @@ def test_a_plain_class_runs_a_campaign(run, campaign):
     assert len(x) >= 60  # confirmations come beside the budget
     again, same = run("again", campaign=campaign, metamodel=metamodel)
     np.testing.assert_array_equal(x, same)
-    assert again["conclusion"] == result["conclusion"]
+    assert again.conclusion == result.conclusion
 
 
 def test_objects_and_recalibration_work_in_campaigns(run, folder):
     result, _ = run(metamodel={"kind": "own.py:QUADRATIC", "recalibrate": True})
-    assert result["runs"] == 60
+    assert result.runs == 60
     points = folder / "points.csv"
     points.write_text("a,b\n0.1,0.1\n0.4,0.4\n")
     done = CliRunner().invoke(app, ["predict", str(folder / "s"), "--inputs", str(points), "--json"])
