@@ -28,7 +28,7 @@ from sbt.metamodels.recalibrated import Recalibrated
 from sbt.metamodels.scores import scores
 from sbt.metamodels.sigma_point import DeepSigmaPointProcess
 from sbt.metamodels.sparse_gp import SparseGaussianProcess
-from sbt.metamodels.stacking import Bins, stacked
+from sbt.metamodels.stacking import Bins, stacking_weights
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import device_of, minibatches
 from sbt.plugins import load, names
@@ -336,13 +336,13 @@ def test_students_widths_follow_the_tails():
 def test_weights_are_those_of_largest_likelihood():
     rng = np.random.default_rng(0)
     log_density = rng.normal(size=(2, 400))
-    weights = stacked(log_density, prior=0.0)
+    weights = stacking_weights(log_density, prior=0.0)
     grid = np.linspace(0.001, 0.999, 999)
     likelihood = [np.logaddexp(log_density[0] + np.log(w), log_density[1] + np.log1p(-w)).sum() for w in grid]
     assert weights[0] == pytest.approx(grid[int(np.argmax(likelihood))], abs=0.01)
-    np.testing.assert_allclose(stacked(log_density, prior=1e9), [0.5, 0.5], atol=1e-3)
+    np.testing.assert_allclose(stacking_weights(log_density, prior=1e9), [0.5, 0.5], atol=1e-3)
     hopeless = np.array([[-1e308, -1e308], [0.0, 0.0]])
-    np.testing.assert_allclose(stacked(hopeless, prior=0.0), [0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(stacking_weights(hopeless, prior=0.0), [0.0, 1.0], atol=1e-6)
 
 
 def test_auto_says_what_it_chose_and_why():

@@ -17,7 +17,7 @@ from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.stacking import Bins, held_out, mixture_score, stacked, surely_better
+from sbt.metamodels.stacking import Bins, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.torch_tools import check_device
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -107,8 +107,8 @@ class Auto:
         else:
             rows = rng.permutation(n)[:compared] if compared < n else slice(None)
             rivals = self._models(n, compared, target_aware=target_aware).values()
-            scores = held_out(rivals, u[rows], y[rows], self.folds, rng, bins)
-            weights = stacked(scores, self.prior)
+            scores = held_out_scores(rivals, u[rows], y[rows], self.folds, rng, bins)
+            weights = stacking_weights(scores, self.prior)
         comparison = _explain(list(models), weights, scores, compared, self, bins)
         weight = {name: comparison.weights[name] for name in models if comparison.weights[name] > 0.0}
         predictors = tuple(models[name].fit(u, y, rng) for name in weight)
@@ -210,7 +210,7 @@ def _explain(
     """Return the comparison, with weight 0 for models that have little."""
     mixture = np.where(weights >= _LEAST, weights, 0.0)
     mixture /= mixture.sum()
-    alone = held is not None and bins is not None and not surely_better(held, mixture)
+    alone = held is not None and bins is not None and not is_surely_better(held, mixture)
     final = np.eye(len(names))[0] if alone else mixture
     by_name = {name: float(w) for name, w in zip(names, final, strict=True)}
     mixed = ", ".join(f"{100 * w:.0f} % {name}" for name, w in by_name.items() if w > 0.0)

@@ -35,8 +35,8 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "checked", "log_ambiguity_bound", "named_errors",
-    "sample_paths", "simplest", "split_validation", "standardise", "with_target",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "log_ambiguity_bound",
+    "named_errors", "sample_paths", "simplest", "split_validation", "standardise", "with_target",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -201,7 +201,7 @@ def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
         raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {described(error)}") from error
 
 
-def checked(prediction: Prediction, n: int) -> Prediction:
+def check_prediction(prediction: Prediction, n: int) -> Prediction:
     """Return what a predictor returned for n points.
 
     Raises:

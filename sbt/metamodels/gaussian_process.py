@@ -23,7 +23,7 @@ from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, diagonal, host, like, native, placed, solve, solve_right
-from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative
+from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative_variance
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import check_device, device_of, single_threaded
 from sbt.problem.arrays import Points, Vector
@@ -135,7 +135,7 @@ def _fit_noise_spread(
         forest = _FOREST.fit(u[rest], log_ratio[rest], rng)
         at_rows[~rest] = forest.mu(u[~rest])
         forests.append(forest)
-    return NoiseSpread(tuple(forests)), relative(at_rows)
+    return NoiseSpread(tuple(forests)), relative_variance(at_rows)
 
 
 def _factor(hyper: Hyperparameters, u: Points, noise: Vector, device: torch.device) -> Matrix:

@@ -17,7 +17,7 @@ from sbt.metamodels.torch_tools import device_of, single_threaded
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative"]
+__all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative_variance"]
 
 _CHUNK = 512  # points predicted at once: 2 MB a 500 rows
 _QUICK = 128  # points bounded at once: intermediate arrays stay in the cache
@@ -181,13 +181,13 @@ class NoiseSpread:
     @cached_property
     def largest(self) -> float:
         """Upper bound of the relative noise variance, at points and at the rows that were cross-fitted."""
-        return float(relative(np.array([max(forest.largest_mu for forest in self.forests)]))[0])
+        return float(relative_variance(np.array([max(forest.largest_mu for forest in self.forests)]))[0])
 
     def __call__(self, u: Points) -> Vector:
         """Return the (n,) relative noise variance at u (n, d)."""
-        return relative(np.mean([forest.mu(u) for forest in self.forests], axis=0))
+        return relative_variance(np.mean([forest.mu(u) for forest in self.forests], axis=0))
 
 
-def relative(log_ratio: Vector) -> Vector:
+def relative_variance(log_ratio: Vector) -> Vector:
     """Return noise variances relative to the common one, from mean log squared residuals."""
     return np.exp(np.clip(log_ratio + _LOG_CHI2, -_CLIP, _CLIP))

@@ -13,7 +13,7 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Bins", "held_out", "mixture_score", "stacked", "surely_better"]
+__all__ = ["Bins", "held_out_scores", "is_surely_better", "mixture_score", "stacking_weights"]
 
 _SURE = 3.0  # standard errors: with two, mixtures were taken that lost on whole campaigns (docs/boundary.md)
 _ROUNDS, _MOVED = 500, 1e-6  # of expectation maximisation: at most, and the change of a weight at which it ends
@@ -63,7 +63,7 @@ class Bins:
         return score
 
 
-def held_out(
+def held_out_scores(
     models: Iterable[Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator, bins: Bins | None
 ) -> Points:
     """Return (k, n) log scores of each row under k models fitted to the other folds: of its bin, or its log density."""
@@ -77,7 +77,7 @@ def held_out(
     return score
 
 
-def stacked(log_score: Points, prior: float) -> Vector:
+def stacking_weights(log_score: Points, prior: float) -> Vector:
     """Return the (k,) weights of the mixture of largest likelihood, by expectation maximisation.
 
     Args:
@@ -87,7 +87,7 @@ def stacked(log_score: Points, prior: float) -> Vector:
     Source:
         Yao et al. (2018), Using stacking to average Bayesian predictive distributions.
 
-    >>> stacked(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
+    >>> stacking_weights(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
     [1.0, 0.0]
     """
     k = len(log_score)
@@ -109,10 +109,10 @@ def mixture_score(log_score: Points, weights: Vector) -> Vector:
         return np.asarray(np.logaddexp.reduce(log_score + np.log(weights)[:, None], axis=0))
 
 
-def surely_better(log_score: Points, weights: Vector) -> bool:
+def is_surely_better(log_score: Points, weights: Vector) -> bool:
     """Return whether the mixture is better than the first of the k models by three standard errors of (k, n) scores.
 
-    >>> surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
+    >>> is_surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
     True
     """
     gain = mixture_score(log_score, weights) - log_score[0]
