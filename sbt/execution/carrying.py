@@ -19,8 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sbt.errors import InputError
-from sbt.execution.worker import described
+from sbt.errors import InputError, described
 from sbt.problem.scenario import LogicalScenario
 
 __all__ = ["carry", "delivered"]

@@ -1,4 +1,4 @@
-"""What is believed: metamodels and their predictions; the only place with torch and scikit-learn."""
+"""Metamodels and their predictions; the only place with torch and scikit-learn."""
 
 from __future__ import annotations
 
