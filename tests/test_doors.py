@@ -23,7 +23,7 @@ from sbt.cli import app
 from sbt.config.load import load
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
-from sbt.metrics.geometry import part
+from sbt.metrics.geometry import select_instants
 from sbt.sumo.files import options_of_command
 from sbt.sumo.template import template
 from sbt.workflows.running import run_campaign
@@ -112,7 +112,7 @@ def test_numpy_scalars_are_numbers_in_files_and_loops(study):
 def test_what_is_recorded_follows_the_motion(study):
     _, trace = simulated(study(), gap=60.0, v_lead=10.0)
     for name in trace.actors:
-        actor = part(trace.actor(name), slice(int(trace.present[:, trace.actors.index(name)].sum())))  # who leaves stays away
+        actor = select_instants(trace.actor(name), slice(int(trace.present[:, trace.actors.index(name)].sum())))  # who leaves stays away
         moved = np.hypot(np.diff(actor.x), np.diff(actor.y))
         forward = np.abs(np.diff(actor.y)) < 0.1  # SUMO changes lanes in a jump
         assert moved[forward] == pytest.approx(actor.speed[1:][forward] * 0.1, abs=1e-6)

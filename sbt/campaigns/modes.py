@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sbt.metrics.encounter import NAME as CONFLICT_TYPE
-from sbt.metrics.encounter import conflict_type_in_words
+from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
+from sbt.metrics.conflict_types import describe_conflict_type
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import WarpedModel
@@ -125,7 +125,7 @@ def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed
     likely = history.records[mode.most_likely]
     told = {
         "representative": record.index, "inputs": dict(record.inputs), "metric": record.metrics[metric], "size": len(mode.rows),
-        "conflict": conflict_type_in_words(record.metrics.get(CONFLICT_TYPE, -1.0)),
+        "conflict": describe_conflict_type(record.metrics.get(CONFLICT_TYPE, -1.0)),
         "runs": [history.records[k].index for k in mode.rows],
         "confirmed": float(critical.contains(confirmed).mean()) if len(confirmed) else None, "confirmation_runs": len(confirmed),
         "most_likely": {"run": likely.index, "inputs": dict(likely.inputs), "metric": likely.metrics[metric]},

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sbt.errors import InputError, PluginError
-from sbt.metrics.encounter import conflict_type
+from sbt.metrics.conflict_types import conflict_type
 from sbt.plugins import load
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric

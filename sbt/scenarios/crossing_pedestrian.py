@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -98,6 +98,6 @@ SCENARIO = LogicalScenario(
         )
     ),
     simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",)),
-    metrics=(nearest_ttc(), nearest_distance(), struck(), struck_speed()),
+    metrics=(ttc_path_min(), nearest_distance(), any_collision(), any_impact_speed()),
     requirement=Requirement("ttc_path_min", high=0.5),
 )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -82,6 +82,13 @@ SCENARIO = LogicalScenario(
         isolations=("fresh",),
         lane_change_duration=LANE_CHANGE,
     ),
-    metrics=(nearest_ttc(), time_left(horizon=HORIZON), nearest_distance(), struck(), struck_speed(), others_braking()),
+    metrics=(
+        ttc_path_min(),
+        pet_ego_first(horizon=HORIZON),
+        nearest_distance(),
+        any_collision(),
+        any_impact_speed(),
+        others_braking_max(),
+    ),
     requirement=Requirement("ttc_path_min", high=2.0),
 )

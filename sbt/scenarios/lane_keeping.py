@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metrics.lateral import Curve, lateral_metrics
+from sbt.metrics.reference_line import Curve, lateral_metrics
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
@@ -71,7 +71,7 @@ def bars(values: Mapping[str, float]) -> tuple[Obstacle, ...]:
     """Return the four bars, turned as the inputs say."""
     placed = []
     for k, (s, left) in enumerate(BARS, start=1):
-        x, y = ROAD.beside(np.array([BEFORE + s]), left)[0]
+        x, y = ROAD.offset_points(np.array([BEFORE + s]), left)[0]
         placed.append(Obstacle(f"bar_{k}", (float(x), float(y), math.radians(values[f"theta_obs_{k}"])), *BAR))
     return tuple(placed)
 
@@ -79,7 +79,7 @@ def bars(values: Mapping[str, float]) -> tuple[Obstacle, ...]:
 def markings() -> tuple[np.ndarray, np.ndarray]:
     """Return the (n, 2) points of the dashed left and of the continuous right marking."""
     s = np.arange(0.0, ROAD.length, SPACING)
-    return ROAD.beside(s[s % (DASH + DASH_GAP) <= DASH], 0.5 * LANE), ROAD.beside(s, -0.5 * LANE)
+    return ROAD.offset_points(s[s % (DASH + DASH_GAP) <= DASH], 0.5 * LANE), ROAD.offset_points(s, -0.5 * LANE)
 
 
 LEFT, RIGHT = markings()

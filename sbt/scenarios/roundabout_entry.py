@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -81,12 +81,12 @@ SCENARIO = LogicalScenario(
     ),
     simulate=SumoSimulation(net="roundabout", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
     metrics=(
-        time_left(horizon=HORIZON, zone=ENTRY),
-        nearest_ttc(),
+        pet_ego_first(horizon=HORIZON, zone=ENTRY),
+        ttc_path_min(),
         nearest_distance(),
-        struck(),
-        struck_speed(),
-        others_braking(),
+        any_collision(),
+        any_impact_speed(),
+        others_braking_max(),
     ),
     requirement=Requirement("pet_ego_first", high=1.5),
 )

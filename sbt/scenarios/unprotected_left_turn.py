@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -77,6 +77,13 @@ SCENARIO = LogicalScenario(
         )
     ),
     simulate=SumoSimulation(net="left_turn", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
-    metrics=(time_left(horizon=HORIZON), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
+    metrics=(
+        pet_ego_first(horizon=HORIZON),
+        ttc_path_min(),
+        nearest_distance(),
+        any_collision(),
+        any_impact_speed(),
+        others_braking_max(),
+    ),
     requirement=Requirement("pet_ego_first", high=1.5),
 )
