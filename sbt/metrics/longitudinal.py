@@ -22,7 +22,8 @@ from sbt.problem.trace import Trace
 
 __all__ = [
     "BESIDE", "DRAC_LIMIT", "FAR", "HORIZON", "OVERTAKEN", "Encounter", "collision", "d_min", "drac_max", "encounter",
-    "first_contact", "impact_speed", "relative_speed_at_contact", "thw_min", "time_to_collision", "ttc_min",
+    "first_contact", "impact_speed", "longitudinal_metrics", "relative_speed_at_contact", "thw_min", "time_to_collision",
+    "ttc_min",
 ]  # fmt: skip
 
 HORIZON = 10.0
@@ -213,6 +214,18 @@ def impact_speed(ego: str = "ego", other: str = "co") -> Metric:
         "impact_speed", lambda trace: relative_speed_at_contact(trace, ego, other), "m/s", "high", 0.0,
         "relative speed at the first contact",
     )  # fmt: skip
+
+
+def longitudinal_metrics(margin: float = 0.0) -> tuple[Metric, ...]:
+    """Return the metrics of this module for the actors `ego` and `co`, with a margin of the path (m)."""
+    return (
+        ttc_min(margin=margin),
+        d_min(margin=margin),
+        collision(),
+        impact_speed(),
+        thw_min(margin=margin),
+        drac_max(margin=margin),
+    )
 
 
 TTC_MIN = ttc_min()
