@@ -1,3 +1,100 @@
-"""Scenario-based testing of automated vehicles on SUMO with probabilistic metamodels."""
+"""Scenario-based testing of automated vehicles on SUMO with probabilistic metamodels.
+
+>>> import sbt
+>>> scenario = sbt.Scenario("disc", [sbt.Parameter("a", -1, 1, "m")], sbt.Requirement("gap", high=0.0),
+...                         evaluate=lambda values, seed: {"gap": values["a"] ** 2 - 0.5})
+>>> sbt.simulate(scenario, {"a": 0.5}).critical
+True
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from sbt import acquisitions, campaigns, metamodels, metrics, testing
+    from sbt.campaigns.settings import CampaignKind
+    from sbt.errors import InputError, PluginError, RunError, SbtError, StoreError
+    from sbt.loop.stages import Batch, Campaign, Log, Progress
+    from sbt.metamodels.prediction import Prediction
+    from sbt.problem.distribution import (
+        Beta,
+        Distribution,
+        Empirical,
+        Exponential,
+        Gumbel,
+        LogNormal,
+        Normal,
+        SciPy,
+        Triangular,
+        Uniform,
+        Weibull,
+    )
+    from sbt.problem.parameter import Parameter
+    from sbt.problem.requirement import CriticalInterval, Requirement
+    from sbt.problem.scenario import LogicalScenario as Scenario
+    from sbt.problem.scenario import Metric, Roles
+    from sbt.problem.space import ParameterSpace
+    from sbt.problem.trace import Trace
+    from sbt.store.database import PlannedRun
+    from sbt.workflows.front import Run
+    from sbt.workflows.front import check_target as check
+    from sbt.workflows.front import installed as list  # noqa: A004
+    from sbt.workflows.front import open_result as open  # noqa: A004
+    from sbt.workflows.front import run_campaign as run
+    from sbt.workflows.front import simulate_scenario as simulate
+    from sbt.workflows.result import Film, Result
+
+_FROM = {
+    "sbt.campaigns.settings": ("CampaignKind",),
+    "sbt.errors": ("InputError", "PluginError", "RunError", "SbtError", "StoreError"),
+    "sbt.loop.stages": ("Batch", "Campaign", "Log", "Progress"),
+    "sbt.metamodels.prediction": ("Prediction",),
+    "sbt.problem.distribution": (
+        "Beta", "Distribution", "Empirical", "Exponential", "Gumbel", "LogNormal", "Normal", "SciPy", "Triangular", "Uniform",
+        "Weibull",
+    ),
+    "sbt.problem.parameter": ("Parameter",),
+    "sbt.problem.requirement": ("CriticalInterval", "Requirement"),
+    "sbt.problem.scenario": ("LogicalScenario Scenario", "Metric", "Roles"),
+    "sbt.problem.space": ("ParameterSpace",),
+    "sbt.problem.trace": ("Trace",),
+    "sbt.store.database": ("PlannedRun",),
+    "sbt.workflows.front": (
+        "Run", "check_target check", "installed list", "open_result open", "run_campaign run", "simulate_scenario simulate",
+    ),
+    "sbt.workflows.result": ("Film", "Result"),
+}  # fmt: skip
+"""Where the names are defined; `a b`: a is called b here."""
+_PARTS = ("acquisitions", "campaigns", "metamodels", "metrics", "testing")
+"""Modules that hold the parts by the names of `list`, and the checkers of plug-ins."""
+_NAMES = {name.split()[-1]: (module, name.split()[0]) for module, names in _FROM.items() for name in names}
+
+__all__ = [  # noqa: RUF022  (by use)
+    "run", "open", "simulate", "list", "check", "Scenario", "Parameter", "ParameterSpace", "Requirement", "CriticalInterval",
+    "Metric", "Roles", "Trace", "Distribution", "Uniform", "Normal", "LogNormal", "Exponential", "Gumbel", "Weibull", "Beta",
+    "Triangular", "SciPy", "Empirical", "Prediction", "Result", "Run", "Film", "Progress", "CampaignKind", "Campaign", "Batch",
+    "Log", "PlannedRun", "SbtError", "InputError", "PluginError", "RunError", "StoreError", "acquisitions", "campaigns",
+    "metamodels", "metrics", "testing", "__version__",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for when it is asked for (PEP 562): nothing heavy before."""
+    if name in _PARTS:
+        return import_module(f"sbt.{name}")
+    if name not in _NAMES:
+        from sbt.errors import did_you_mean
+
+        raise AttributeError(f"module 'sbt' has no attribute '{name}'{did_you_mean(name, __all__)}")
+    module, attribute = _NAMES[name]
+    found = globals()[name] = getattr(import_module(module), attribute)
+    return found
+
+
+def __dir__() -> Any:
+    """Return what a user needs."""
+    return sorted(__all__)

@@ -1,31 +1,89 @@
-"""Acquisition functions: how much a candidate is worth, as a log score.
+"""Acquisition functions: what a run at a candidate is worth, as a log score.
 
-(belief at n candidates, M_c, log p(x)) -> (n,) log scores, larger is better. Samplers draw with a
-density proportional to exp(score). A plug-in is any function of this signature.
+(prediction at n candidates, M_c, log p(x)) -> (n,) log scores, larger is better. A plug-in is any function of this
+signature. How a campaign uses the scores is up to the function:
+
+- drawn (the default): points are drawn with a density proportional to exp(score). The scores may have any finite
+  upper bound; a bound of 0 (a probability of acceptance) spares the sampler the search for the largest one.
+- greedy (declared with `greedy`): the candidates of the highest scores that lie apart. Any unit, any scale.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import ndtr
 
+from sbt.errors import InputError, place_of
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Acquisition", "boundary", "even", "expected_feasibility", "importance", "straddle"]
+__all__ = [
+    "Acquisition", "boundary", "even", "expected_feasibility", "greedy", "importance", "is_greedy", "log_scores", "straddle", "u",
+]  # fmt: skip
 
 Acquisition = Callable[[Prediction, CriticalInterval, Vector], Vector]
 """(prediction, critical, log_density (n,)) -> (n,) log scores."""
 
+A = TypeVar("A", bound=Acquisition)
+_STRADDLE_WIDTH = 1.96  # standard deviations: a central interval of 95 %, as Bryan et al. (2005) take it
+_FEASIBILITY_WIDTH = 2.0  # standard deviations: epsilon of Bichon et al. (2008)
+
+
+def greedy(acquisition: A) -> A:
+    """Declare that an acquisition is for greedy selection; it is returned with the attribute `selection`.
+
+    Without the decorator (an object with `__call__`, say) an attribute `selection = "greedy"` does the same.
+
+    >>> @greedy
+    ... def uncertainty(prediction, critical, log_density):
+    ...     return np.log(prediction.sigma)
+    >>> is_greedy(uncertainty), is_greedy(boundary)
+    (True, False)
+    """
+    acquisition.selection = "greedy"  # type: ignore[attr-defined]
+    return acquisition
+
+
+def is_greedy(acquisition: Acquisition) -> bool:
+    """Return whether an acquisition is declared greedy.
+
+    Raises:
+        InputError: its attribute `selection` is neither `draw` nor `greedy`.
+    """
+    selection = getattr(acquisition, "selection", "draw")
+    if selection not in ("draw", "greedy"):
+        raise InputError(f"selection of an acquisition must be 'draw' or 'greedy', but {_name(acquisition)} has {selection!r}")
+    return bool(selection == "greedy")
+
+
+def log_scores(acquisition: Acquisition, prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
+    """Return the (n,) checked log scores of an acquisition; its own errors name it and the line.
+
+    Raises:
+        InputError: it raises, or returns another shape, NaN or +inf.
+    """
+    n, name = len(prediction), _name(acquisition)
+    try:
+        found = np.asarray(acquisition(prediction, critical, log_density), dtype=np.float64)
+    except Exception as error:
+        raised = f"{type(error).__name__}: {error} ({place_of(error)})"
+        raise InputError(f"acquisition {name} must score {n} points, but raised {raised}") from error
+    if found.shape != (n,):
+        raise InputError(f"acquisition {name} must return shape ({n},), but returned {found.shape}")
+    if not (found < np.inf).all():  # also NaN
+        raise InputError(f"acquisition {name} must return scores < inf, but returned {found[~(found < np.inf)][0]}")
+    return found
+
 
 def even(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
-    """Even coverage: log 1, whatever is believed.
+    """Even coverage: log 1, whatever is predicted.
 
     Args:
-        prediction: belief about y at n points; only n is used.
+        prediction: of y at n points; only n is used.
         critical: M_c; not used.
         log_density: (n,) log p(x); not used.
 
@@ -49,7 +107,7 @@ def boundary(prediction: Prediction, critical: CriticalInterval, log_density: Ve
     log 2 + min(log P, log(1 - P)), which is the same and does not round to -inf.
 
     Args:
-        prediction: belief about y at n points.
+        prediction: of y at n points.
         critical: M_c, in the unit of y.
         log_density: (n,) log p(x) at the same points; not used.
 
@@ -59,8 +117,8 @@ def boundary(prediction: Prediction, critical: CriticalInterval, log_density: Ve
     Source:
         Winkelmann et al. (2022), eq. (3).
 
-    >>> belief = Prediction.gaussian(mu=np.array([0.1, 3.0]), sigma=np.ones(2))
-    >>> near, far = boundary(belief, CriticalInterval(high=0.0), np.zeros(2))
+    >>> prediction = Prediction.gaussian(mu=np.array([0.1, 3.0]), sigma=np.ones(2))
+    >>> near, far = boundary(prediction, CriticalInterval(high=0.0), np.zeros(2))
     >>> bool(near > far)
     True
     """
@@ -72,10 +130,10 @@ def boundary(prediction: Prediction, critical: CriticalInterval, log_density: Ve
 def importance(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
     """Probable criticality under the inputs' distribution: log P(y in M_c) + log p(x).
 
-    The score is not bounded by 0 where p(x) exceeds 1; rejection needs it shifted by the largest log p(x).
+    The upper bound is the largest log p(x), which exceeds 0 on a small space.
 
     Args:
-        prediction: belief about y at n points.
+        prediction: of y at n points.
         critical: M_c, in the unit of y.
         log_density: (n,) log p(x) at the same points.
 
@@ -85,25 +143,44 @@ def importance(prediction: Prediction, critical: CriticalInterval, log_density: 
     Source:
         Winkelmann et al. (2022), eq. (4), after Dubourg et al. (2013).
 
-    >>> belief = Prediction.gaussian(mu=np.array([0.0, 0.0]), sigma=np.ones(2))
-    >>> importance(belief, CriticalInterval(high=0.0), np.log([1.0, 0.5])).round(3).tolist()
+    >>> prediction = Prediction.gaussian(mu=np.array([0.0, 0.0]), sigma=np.ones(2))
+    >>> importance(prediction, CriticalInterval(high=0.0), np.log([1.0, 0.5])).round(3).tolist()
     [-0.693, -1.386]
     """
     return prediction.log_probability(critical)[0] + log_density
 
 
-def straddle(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
-    """Ambiguity and uncertainty in one: log of max(1.96 sigma - |mu - z|, 0), z the nearest end of M_c.
+@greedy
+def u(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
+    """Probability of misclassification, greedily: the score of `boundary`, the highest first.
 
-    In the unit of y and so not bounded by 0: for greedy choices, not for rejection.
+    For a Gaussian prediction and an interval with one end the order is that of the learning function U = |mu - z| / sigma.
 
     Args:
-        prediction: belief about y at n points; its moments are used.
+        prediction: of y at n points.
         critical: M_c, in the unit of y.
         log_density: (n,) log p(x); not used.
 
     Returns:
-        (n,) log scores; -inf where the 95 % interval holds no end of M_c.
+        (n,) log scores <= 0.
+
+    Source:
+        Echard et al. (2011), AK-MCS, doi 10.1016/j.strusafe.2011.01.002.
+    """
+    return boundary(prediction, critical, log_density)
+
+
+@greedy
+def straddle(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
+    """Ambiguity and uncertainty in one, greedily: log of max(1.96 sigma - |mu - z|, 0), z the nearest end of M_c.
+
+    Args:
+        prediction: of y at n points; its moments are used.
+        critical: M_c, in the unit of y.
+        log_density: (n,) log p(x); not used.
+
+    Returns:
+        (n,) log scores, in the unit of y; -inf where the 95 % interval holds no end of M_c.
 
     Source:
         Bryan et al. (2005), Active learning for identifying function threshold boundaries, eq. (5).
@@ -111,21 +188,20 @@ def straddle(prediction: Prediction, critical: CriticalInterval, log_density: Ve
     del log_density
     gap = np.min([np.abs(prediction.mu - z) for z in _ends(critical)], axis=0)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.maximum(1.96 * prediction.sigma - gap, 0.0)))
+        return np.asarray(np.log(np.maximum(_STRADDLE_WIDTH * prediction.sigma - gap, 0.0)))
 
 
+@greedy
 def expected_feasibility(prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
-    """Expected feasibility: log E[max(2 sigma - |y - z|, 0)], the largest over the ends z of M_c.
-
-    In the unit of y and so not bounded by 0: for greedy choices, not for rejection.
+    """Expected feasibility, greedily: log E[max(2 sigma - |y - z|, 0)], the largest over the ends z of M_c.
 
     Args:
-        prediction: belief about y at n points; its moments are used.
+        prediction: of y at n points; its moments are used.
         critical: M_c, in the unit of y.
         log_density: (n,) log p(x); not used.
 
     Returns:
-        (n,) log scores.
+        (n,) log scores, in the unit of y.
 
     Source:
         Bichon et al. (2008), doi 10.2514/1.34321, eq. (17), with epsilon = 2 sigma.
@@ -135,11 +211,15 @@ def expected_feasibility(prediction: Prediction, critical: CriticalInterval, log
     best = np.zeros(len(mu))
     for z in _ends(critical):
         t = (z - mu) / sigma
-        (at, below, above), (p_at, p_below, p_above) = _normal(t, t - 2.0, t + 2.0)
-        value = 2.0 * (p_above - p_below) - (2.0 * at - below - above) - t * (2.0 * p_at - p_below - p_above)
+        (at, below, above), (p_at, p_below, p_above) = _normal(t, t - _FEASIBILITY_WIDTH, t + _FEASIBILITY_WIDTH)
+        value = _FEASIBILITY_WIDTH * (p_above - p_below) - (2.0 * at - below - above) - t * (2.0 * p_at - p_below - p_above)
         best = np.maximum(best, sigma * value)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(np.maximum(best, 0.0)))
+
+
+def _name(acquisition: Acquisition) -> str:
+    return str(getattr(acquisition, "__name__", type(acquisition).__name__))
 
 
 def _normal(*t: Vector) -> tuple[list[Vector], list[Vector]]:

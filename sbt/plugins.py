@@ -9,18 +9,50 @@ from __future__ import annotations
 import importlib.util
 import sys
 import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
+from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
 
-__all__ = ["KINDS", "load", "names"]
+__all__ = ["KINDS", "OBJECT", "Scope", "load", "names"]
+
+OBJECT = "object:"
+"""Before the name of an object that was given in Python, where a name is asked for."""
 
 KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns", "sources")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Where the names of a configuration are looked up: its folder, and the objects that were given beside it.
+
+    Args:
+        folder: where a relative `file.py:NAME` is looked up.
+        objects: (kind, name) -> object, such as ("scenarios", "object:disc").
+    """
+
+    folder: Path = field(default_factory=Path.cwd)
+    objects: Mapping[tuple[str, str], Any] = field(default_factory=dict)
+
+    def load(self, kind: str, name: str) -> Any:
+        """Return the object with this name; as `load`, and the objects of the scope.
+
+        Raises:
+            PluginError: nothing has this name, or it was defined in Python and is not given here.
+        """
+        if not name.startswith(OBJECT):
+            return load(kind, name, self.folder)
+        if (kind, name) not in self.objects:
+            one, own = kind.removesuffix("s"), name.removeprefix(OBJECT)
+            raise PluginError(f"the {one} '{own}' was defined in Python and must be given again: {one}={own}")
+        return self.objects[kind, name]
 
 
 @cache
@@ -62,8 +94,10 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
         return entries[name].load()
     except InputError:
         raise
-    except Exception as error:
-        raise PluginError(f"{kind[:-1]} '{name}' cannot be imported: {type(error).__name__}: {error}") from error
+    except BaseException as error:  # SystemExit too: it would end the program without a word
+        if interruption.is_interruption(error):
+            raise
+        raise PluginError(f"{kind[:-1]} '{name}' cannot be imported: {_what(error)}") from error
 
 
 @cache
@@ -77,11 +111,17 @@ def _module(path: str) -> Any:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except BaseException as error:  # SystemExit too: it would end the program without a word
         del sys.modules[name]
-        line = _line_of(error, path)
-        raise PluginError(f"plug-in file {path}{line} raised on import: {type(error).__name__}: {error}") from error
+        if interruption.is_interruption(error):
+            raise
+        raise PluginError(f"plug-in file {path}{_line_of(error, path)} raised on import: {_what(error)}") from error
     return module
+
+
+def _what(error: BaseException) -> str:
+    """Return type and message of an error."""
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _line_of(error: BaseException, path: str) -> str:

@@ -33,6 +33,7 @@ _INTERVALS = (
     CriticalInterval(-0.5, 0.5),
     CriticalInterval(high=-1e6),
 )
+_SINGLE = 1e-5  # relative: networks predict in single precision (eps 1.2e-7), and another shape adds in another order
 
 
 class ContractError(SbtError, AssertionError):
@@ -43,12 +44,12 @@ def check_metamodel(metamodel: Metamodel, *, dimensions: tuple[int, ...] = (1, 2
     """Check a metamodel against the laws that campaigns rely on.
 
     Shapes and finiteness; sigma > 0; the same rng gives the same bits; the order of rows, the scale and
-    the shift of y hardly matter; few rows, constant y, duplicates and an outlier are survived; a belief
-    at a point does not depend on the other points asked about; predictors can be pickled; a smooth
-    function is learned better than by its mean.
+    the shift of y hardly matter; few rows, constant y, duplicates and an outlier are survived; a prediction
+    at a point does not depend on the other points; a pickled copy of the predictor, where it can be pickled, predicts
+    the same; a smooth function is learned better than by its mean.
 
     Args:
-        metamodel: settings with `fit`.
+        metamodel: an object with `fit`.
         dimensions: numbers of inputs to try.
         seed: seed >= 0 of the rows and of the fits.
 
@@ -57,27 +58,33 @@ def check_metamodel(metamodel: Metamodel, *, dimensions: tuple[int, ...] = (1, 2
     """
     for d in dimensions:
         rng = stream(seed, "check_metamodel", d)
-        u, asked = rng.random((30 + 10 * d, d)), rng.random((25, d))
+        u, at = rng.random((30 + 10 * d, d)), rng.random((25, d))
         y = _smooth(u)
 
         def fit(u: Points, y: Vector, d: int = d) -> Predictor:
             return metamodel.fit(u.copy(), y.copy(), stream(seed, "check_metamodel", "fit", d))
 
-        predictor = fit(u, y)
-        belief = predictor(asked)
-        _check_belief(belief, len(asked), f"d = {d}")
-        _check_predictor(predictor, fit(u, y), asked, belief)
-        _check_learning(predictor, u, y, asked)
-        _check_rows(fit, u, y, asked, belief)
-        _check_awkward_rows(fit, u, y, asked)
+        try:
+            predictor, same = fit(u, y), fit(u, y)
+            prediction = predictor(at)
+        except Exception as error:
+            raise ContractError(f"a metamodel must learn from {len(y)} rows and predict, but raised {error!r}") from error
+        _check_prediction(prediction, len(at), f"d = {d}")
+        _check_predictor(predictor, same, at, prediction)
+        _check_learning(predictor, u, y, at)
+        _check_rows(fit, u, y, at, prediction)
+        _check_awkward_rows(fit, u, y, at)
 
 
 def check_acquisition(acquisition: Acquisition, *, seed: int = 0) -> None:
-    """Check an acquisition function: (n,) scores without NaN, each from its own point alone.
+    """Check an acquisition function: (n,) scores < inf without NaN, each from its own point alone.
+
+    Scores may exceed 0, but must be finite from above: points are drawn in proportion to exp(score), or taken in the
+    order of the scores where the acquisition is declared greedy.
 
     Args:
         acquisition: (prediction, critical, log_density) -> (n,) log scores.
-        seed: seed >= 0 of the beliefs.
+        seed: seed >= 0 of the predictions.
 
     Raises:
         ContractError: a law is broken.
@@ -90,18 +97,27 @@ def check_acquisition(acquisition: Acquisition, *, seed: int = 0) -> None:
     gaussian = Prediction.gaussian(mixture.mu, mixture.sigma, mixture.noise)
     log_density = rng.normal(0.0, 3.0, n)
     order = rng.permutation(n)
+    selection = getattr(acquisition, "selection", "draw")
+    _require(selection in ("draw", "greedy"), "selection of an acquisition must be 'draw' or 'greedy'", repr(selection))
     for critical in _INTERVALS:
-        for belief in (gaussian, mixture):
-            score = np.asarray(acquisition(belief, critical, log_density))
+        for prediction in (gaussian, mixture):
+            score = _scored(acquisition, prediction, critical, log_density)
             _require(score.shape == (n,), "an acquisition must return shape (n,)", f"{score.shape} for {n} points")
             _require(not np.isnan(score).any(), "an acquisition must not return NaN", f"NaN for {critical}")
             _require(not np.isposinf(score).any(), "an acquisition must be < inf", f"inf for {critical}")
-            permuted = acquisition(belief.take(order), critical, log_density[order])
+            permuted = acquisition(prediction.take(order), critical, log_density[order])
             _close(permuted, score[order], 1e-9, "an acquisition must not depend on the order of the points")
-            one = [acquisition(belief.take(np.array([i])), critical, log_density[[i]])[0] for i in range(n)]
+            one = [acquisition(prediction.take(np.array([i])), critical, log_density[[i]])[0] for i in range(n)]
             _close(np.array(one), score, 1e-9, "a score must not depend on the other points scored")
-    nothing = acquisition(gaussian.take(slice(0)), _INTERVALS[0], log_density[:0])
-    _require(np.shape(nothing) == (0,), "an acquisition must take n = 0 points", f"shape {np.shape(nothing)}")
+    nothing = _scored(acquisition, gaussian.take(slice(0)), _INTERVALS[0], log_density[:0])
+    _require(nothing.shape == (0,), "an acquisition must take n = 0 points", f"shape {nothing.shape}")
+
+
+def _scored(acquisition: Acquisition, prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
+    try:
+        return np.asarray(acquisition(prediction, critical, log_density), dtype=np.float64)
+    except Exception as error:
+        raise ContractError(f"an acquisition must score {len(prediction)} points, but raised {error!r}") from error
 
 
 def check_sampler(propose: Callable[[int, int], Points], *, dimension: int, seed: int = 0) -> None:
@@ -175,60 +191,68 @@ def _apart() -> Trace:
     return Trace(t, ("ego", "co"), 20.0 * t[:, None] * both, y, zero, 20.0 * both, zero, np.full(2, 5.0), np.full(2, 1.8))
 
 
-def _check_belief(belief: Prediction, n: int, case: str) -> None:
+def _check_prediction(prediction: Prediction, n: int, case: str) -> None:
     """Check shapes, finiteness, positive sigma and probabilities."""
-    _require(isinstance(belief, Prediction), "a predictor must return a Prediction", f"{type(belief)} ({case})")
-    _require(len(belief) == n, "a prediction must have one belief a point", f"{len(belief)} of {n} ({case})")
-    finite = np.isfinite(belief.mu).all() and np.isfinite(belief.sigma).all()
+    _require(isinstance(prediction, Prediction), "a predictor must return a Prediction", f"{type(prediction)} ({case})")
+    _require(len(prediction) == n, "a prediction must have one value a point", f"{len(prediction)} of {n} ({case})")
+    finite = np.isfinite(prediction.mu).all() and np.isfinite(prediction.sigma).all()
     _require(bool(finite), "mu and sigma must be finite", f"NaN or infinity ({case})")
-    _require(bool((belief.sigma > 0).all()), "sigma must be > 0", f"{belief.sigma.min()} ({case})")
+    _require(bool((prediction.sigma > 0).all()), "sigma must be > 0", f"{prediction.sigma.min()} ({case})")
     most = 1.0 + 1e-6
-    _require(bool((belief.noise <= most * belief.sigma).all()), "noise is a part of sigma", f"noise > sigma ({case})")
+    _require(bool((prediction.noise <= most * prediction.sigma).all()), "noise is a part of sigma", f"noise > sigma ({case})")
     for critical in _INTERVALS:
-        p = belief.probability(critical)
+        p = prediction.probability(critical)
         _require(bool(((p >= 0) & (p <= 1)).all()), "P(y in M_c) must be in [0, 1]", f"{p} ({case})")
 
 
-def _check_predictor(predictor: Predictor, same: Predictor, asked: Points, belief: Prediction) -> None:
-    """Check that a predictor is a pure, picklable function that the rng decides."""
-    _same_bits(same(asked), belief, "the same rng must give the same predictor, bit by bit")
-    _same_bits(predictor(asked), belief, "a predictor must return the same belief when asked again")
+def _check_predictor(predictor: Predictor, same: Predictor, at: Points, prediction: Prediction) -> None:
+    """Check that a predictor is a pure function that the rng decides."""
+    _same_bits(same(at), prediction, "the same rng must give the same predictor, bit by bit")
+    _same_bits(predictor(at), prediction, "a predictor must return the same prediction when called again")
     try:
-        copy = pickle.loads(pickle.dumps(predictor))
+        pickled = pickle.dumps(predictor)
+    except Exception:  # it holds a local function, say; campaigns do not need it
+        pickled = None
+    if pickled is not None:
+        _same_bits(_predicted(pickle.loads(pickled), at), prediction, "a pickled predictor must predict the same")
+    single = [_predicted(predictor, at[i : i + 1]) for i in range(len(at))]
+    rule = "a prediction must not depend on the other points"
+    scale = float(prediction.sigma.max())
+    _close(np.array([s.mu[0] for s in single]), prediction.mu, _SINGLE, rule, scale)
+    _close(np.array([s.sigma[0] for s in single]), prediction.sigma, _SINGLE, rule, scale)
+    _require(len(_predicted(predictor, at[:0])) == 0, "a predictor must take n = 0 points", "another number of predictions")
+
+
+def _predicted(predictor: Predictor, at: Points) -> Prediction:
+    try:
+        return predictor(at)
     except Exception as error:
-        raise ContractError(f"a predictor must survive pickling, but got {error!r}") from error
-    _same_bits(copy(asked), belief, "a predictor must survive pickling")
-    single = [predictor(asked[i : i + 1]) for i in range(len(asked))]
-    rule = "a belief must not depend on the other points asked about"
-    scale = float(belief.sigma.max())
-    _close(np.array([s.mu[0] for s in single]), belief.mu, 1e-6, rule, scale)
-    _close(np.array([s.sigma[0] for s in single]), belief.sigma, 1e-6, rule, scale)
-    _require(len(predictor(asked[:0])) == 0, "a predictor must take n = 0 points", "another number of beliefs")
+        raise ContractError(f"a predictor must take n = {len(at)} points, but raised {error!r}") from error
 
 
-def _check_learning(predictor: Predictor, u: Points, y: Vector, asked: Points) -> None:
+def _check_learning(predictor: Predictor, u: Points, y: Vector, at: Points) -> None:
     """Check that a smooth function is learned better than by the mean of y."""
-    near = np.clip(u + 0.01 * (asked.mean() - 0.5), 0.0, 1.0)
+    near = np.clip(u + 0.01 * (at.mean() - 0.5), 0.0, 1.0)
     error = float(np.sqrt(np.mean((predictor(near).mu - _smooth(near)) ** 2)))
     limit = 0.8 * float(y.std())
     rule = "near its rows a metamodel must predict a smooth function better than the mean does"
     _require(error < limit, rule, f"RMSE {error:.3g} for a standard deviation of {y.std():.3g}")
 
 
-def _check_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y: Vector, asked: Points, belief: Prediction) -> None:
+def _check_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y: Vector, at: Points, prediction: Prediction) -> None:
     """Check that scale, shift and order of the rows hardly matter."""
-    scaled = fit(u, 1e6 * y + 3e6)(asked)
-    size = float(belief.sigma.max())
-    rule = "scaling and shifting y must scale and shift the belief"
-    _close((scaled.mu - 3e6) / 1e6, belief.mu, 0.05, rule, size)
-    _close(scaled.sigma / 1e6, belief.sigma, 0.05, rule, size)
+    scaled = fit(u, 1e6 * y + 3e6)(at)
+    size = float(prediction.sigma.max())
+    rule = "scaling and shifting y must scale and shift the prediction"
+    _close((scaled.mu - 3e6) / 1e6, prediction.mu, 0.05, rule, size)
+    _close(scaled.sigma / 1e6, prediction.sigma, 0.05, rule, size)
     order = np.random.Generator(np.random.PCG64(0)).permutation(len(y))
-    other = fit(u[order], y[order])(asked)
-    rule = "the order of the rows must not change the belief beyond its own doubt"
-    _require(float(np.median(np.abs(other.mu - belief.mu) / belief.sigma)) < 2.0, rule, "a shift > 2 sigma")
+    other = fit(u[order], y[order])(at)
+    rule = "the order of the rows must not change the prediction beyond its own sigma"
+    _require(float(np.median(np.abs(other.mu - prediction.mu) / prediction.sigma)) < 2.0, rule, "a shift > 2 sigma")
 
 
-def _check_awkward_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y: Vector, asked: Points) -> None:
+def _check_awkward_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y: Vector, at: Points) -> None:
     """Check that few rows, constant y, duplicates, an outlier and a plateau are survived."""
     few = u.shape[1] + 2
     outlier, plateau = y.copy(), np.clip(y, np.median(y), None)
@@ -245,13 +269,13 @@ def _check_awkward_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y
     }
     for case, (rows, values) in cases.items():
         try:
-            belief = fit(rows, values)(asked)
+            prediction = fit(rows, values)(at)
         except Exception as error:
             raise ContractError(f"a metamodel must learn from {case}, but got {error!r}") from error
-        _check_belief(belief, len(asked), case)
-    constant = fit(u, np.full(len(y), 10.0))(asked)
+        _check_prediction(prediction, len(at), case)
+    constant = fit(u, np.full(len(y), 10.0))(at)
     off = float(np.abs(constant.mu - 10.0).max())
-    _require(off < 1.0, "where all y are 10 the belief must be about 10", f"off by {off}")
+    _require(off < 1.0, "where all y are 10 the prediction must be about 10", f"off by {off}")
 
 
 def _smooth(u: Points) -> Vector:

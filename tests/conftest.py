@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
-import sqlite3
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -111,7 +111,7 @@ def awkward(values, seed):
     if kind == 3:
         raise KeyError("no such thing")  # marked
     if kind == 4:
-        return {"y": float("nan")}
+        return {"y": float("nan"), "noise": 0.0}
     if kind == 5:
         time.sleep(0.1)
     return disc(values, seed)
@@ -216,19 +216,14 @@ def campaign(configured: Callable[..., Path]) -> Callable[..., dict[str, Any]]:
 
 @pytest.fixture
 def rows() -> Callable[[Path | str], dict[str, list[Any]]]:
-    """Read what a store must hold bit by bit, however it came about: everything but seconds."""
+    """Read what a store must hold bit by bit, however it came about: everything but seconds and versions."""
+    from sbt.store.database import Store
 
     def read(folder: Path | str) -> dict[str, list[Any]]:
-        columns = "idx, stage, iteration, inputs, seed, log_q, status, metrics, reason, collisions"
-        db = sqlite3.connect(Path(folder) / "campaign.sqlite")
-        try:
-            assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        with Store.read(Path(folder)) as store:
             return {
-                "runs": db.execute(f"SELECT {columns} FROM runs ORDER BY idx").fetchall(),
-                "iterations": db.execute("SELECT * FROM iterations ORDER BY iteration").fetchall(),
-                "fits": db.execute("SELECT * FROM fits ORDER BY runs").fetchall(),
-            }
-        finally:
-            db.close()
+                "runs": [dataclasses.replace(record, seconds=0.0, versions="") for record in store.history().records],
+                "planned": store.unfinished(), "iterations": store.iterations(), "fits": store.fits(),
+            }  # fmt: skip
 
     return read

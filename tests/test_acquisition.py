@@ -14,11 +14,6 @@ BELIEF = Prediction.gaussian(np.linspace(-3, 3, 13), np.ones(13))
 CRITICAL = CriticalInterval(-10.0, 0.0)
 
 
-@pytest.mark.parametrize("acquisition", [even, boundary, importance])
-def test_acquisitions_obey_their_contract(acquisition):
-    check_acquisition(acquisition)
-
-
 def test_boundary_is_equation_3():
     expected = 1 - 2 * np.abs(BELIEF.probability(CRITICAL) - 0.5)
     score = boundary(BELIEF, CRITICAL, np.zeros(13))

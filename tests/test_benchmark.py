@@ -18,6 +18,7 @@ from sbt.benchmark.table import COLUMNS, read_table, rows_of, write_table
 from sbt.cli import app
 from sbt.config.benchmark import LoadedBenchmark, load_benchmark
 from sbt.config.source import ConfigError
+from sbt.errors import StoreError
 from sbt.store.database import Store
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -143,7 +144,7 @@ def test_a_store_of_other_settings_is_refused(analytic):
 
 
 def test_missing_reference_runs_are_said(analytic):
-    with pytest.raises(Exception, match="there is none in"):
+    with pytest.raises(StoreError, match="there is none in"):
         run_cell(next(written(analytic.parent).cells()))
 
 

@@ -9,7 +9,6 @@ import json
 import os
 import re
 import shutil
-import sqlite3
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +23,7 @@ from sbt.config.load import load
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.geometry import select_instants
+from sbt.store.database import Store
 from sbt.sumo.files import options_of_command
 from sbt.sumo.template import template
 from sbt.workflows.running import run_campaign
@@ -77,11 +77,8 @@ def rows_of(path: Path) -> list[tuple[str, str]]:
                 "store": str(store)}  # fmt: skip
     config.write_text(json.dumps(settings))
     run_campaign(load(config), report=False)
-    db = sqlite3.connect(store / "campaign.sqlite")
-    try:
-        return db.execute("SELECT status, reason FROM runs ORDER BY idx").fetchall()
-    finally:
-        db.close()
+    with Store.read(store) as found:
+        return [(record.status, record.reason) for record in found.history().records]
 
 
 CARS, ROAD, YAML = "cars.rou.xml", "road.net.xml", "scenario.yaml"

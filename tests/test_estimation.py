@@ -103,18 +103,34 @@ def test_a_budget_without_a_counted_draw_gives_no_number(campaign: Run):
     assert "no draw counts" in found["warnings"][0]
 
 
-@pytest.mark.parametrize("critical", [(0.0, 0.005), (0.45, 9.0)], ids=["thin ring", "four corners"])
-def test_thin_and_separated_regions(campaign: Run, critical):
-    """Of the square: the ring 0.3 < r < 0.305, and what is farther than 0.75 from the middle: nothing."""
-    low, high = critical
-    found = campaign(**QUICK | {"budget": 120, "requirement": {"critical": [low, high]}})["conclusion"]
-    p = np.pi * (0.305**2 - 0.3**2) if high < 1 else 0.0
-    assert found["low"] <= p <= found["high"]
+def test_a_thin_region(campaign: Run):
+    """The ring 0.3 < r < 0.305 of the square."""
+    found = campaign(**QUICK | {"budget": 120, "requirement": {"critical": [0.0, 0.005]}})["conclusion"]
+    assert found["low"] <= np.pi * (0.305**2 - 0.3**2) <= found["high"]
 
 
-def test_an_input_without_influence(campaign: Run):
-    found = campaign(**QUICK | {"budget": 100, "requirement": {"metric": "y", "critical": [-9.0, -0.25]}})["conclusion"]
-    assert found["low"] <= np.pi * 0.05**2 <= found["high"]
+def test_separated_regions(campaign: Run):
+    """The four corners of the square that are farther than 0.6 from its middle."""
+    result = campaign(**QUICK | {"budget": 120, "requirement": {"critical": [0.3, 9.0]}})
+    segment = 0.36 * np.arccos(0.5 / 0.6) - 0.5 * np.sqrt(0.36 - 0.25)  # of the circle beyond one side of the square
+    p = 1.0 - (np.pi * 0.36 - 4.0 * segment)
+    assert p == pytest.approx(0.0491, abs=1e-4)
+    found = result["conclusion"]
+    assert found["low"] <= p <= found["high"] < 0.2
+    assert found["probability"] == pytest.approx(p, rel=0.5)
+    with Store.read(Path(result["store"])) as store:
+        history = store.history()
+    corners = {(bool(a > 0.5), bool(b > 0.5)) for a, b in history.x[history.y("y") >= 0.3]}
+    assert corners == {(i, j) for i in (False, True) for j in (False, True)}
+
+
+def test_an_input_without_influence(campaign: Run, analytic: Path):
+    with analytic.open("a") as file:
+        file.write("\n\nIDLE = scenario(line)\n")  # a < 0.25 of the square, whatever b is
+    metamodel = {"kind": "gp", "nu": 2.5, "input_noise": False}
+    found = campaign(scenario="IDLE", **QUICK | {"metamodel": metamodel})["conclusion"]
+    assert found["low"] <= 0.25 <= found["high"]
+    assert found["probability"] == pytest.approx(0.25, abs=0.01)
 
 
 def test_crude_monte_carlo(campaign: Run):

@@ -52,14 +52,17 @@ def test_the_papers_process_obeys_its_contract_in_other_dimensions():
 
 @dataclasses.dataclass(frozen=True)
 class WrongPredictor:
-    """A predictor whose belief `change` (mu, sigma, noise) spoils; None: not a Prediction."""
+    """A predictor with one flaw."""
 
     right: Callable[[np.ndarray], Prediction]
     flaw: str
 
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state | ({"flaw": "mean"} if state["flaw"] == "pickle" else {}))
+
     def __call__(self, u: np.ndarray) -> Prediction | None:
-        belief = self.right(u)
-        mu, sigma, noise = belief.mu, belief.sigma, belief.noise
+        right = self.right(u)
+        mu, sigma, noise = right.mu, right.sigma, right.noise
         if self.flaw == "type":
             return None
         if self.flaw == "number":
@@ -70,7 +73,9 @@ class WrongPredictor:
             return Prediction.gaussian(mu + len(u), sigma, noise)
         if self.flaw == "mean":
             return Prediction.gaussian(np.full(len(u), 0.7), sigma, noise)
-        return belief
+        if self.flaw == "empty" and len(u) == 0:
+            raise IndexError("no points")
+        return right
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,21 +90,22 @@ class Wrong:
         if self.flaw == "scale":
             y = np.clip(y, -100.0, 100.0)
         right = ExtraTrees().fit(u, y, np.random.default_rng() if self.flaw == "bits" else rng)
-        return (lambda v: right(v)) if self.flaw == "pickle" else WrongPredictor(right, self.flaw)
+        return WrongPredictor(right, self.flaw)
 
 
 @pytest.mark.parametrize(
     ("flaw", "rule"),
     [
         ("type", "must return a Prediction"),
-        ("number", "one belief a point"),
+        ("number", "one value a point"),
         ("noise", "noise is a part of sigma"),
         ("batch", "other points"),
         ("mean", "smooth function"),
         ("few", "learn from n = d"),
         ("scale", "scaling and shifting"),
         ("bits", "bit by bit"),
-        ("pickle", "pickling"),
+        ("pickle", "a pickled predictor must predict the same"),
+        ("empty", "must take n = 0 points, but raised IndexError"),
     ],
 )
 def test_wrong_metamodels_are_refused(flaw, rule):
@@ -111,8 +117,11 @@ def test_wrong_metamodels_are_refused(flaw, rule):
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_rows_that_cannot_be_learned_from_are_refused(name):
     u, y = rows(5)
-    for bad_u, bad_y in ((u[:1], y[:1]), (u, y[:3]), (u, y * np.nan), (u * np.inf, y), (u[:, :0], y)):
-        with pytest.raises(InputError):
+    for bad_u, bad_y, message in (
+        (u[:1], y[:1], "n >= 2 rows, but got 1"), (u, y[:3], r"but got \(5, 3\) and \(3,\)"), (u, y * np.nan, "finite u and y"),
+        (u * np.inf, y, "finite u and y"), (u[:, :0], y, r"but got \(5, 0\) and \(5,\)"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
             BUILT_IN[name].fit(bad_u, bad_y, np.random.default_rng(0))
 
 

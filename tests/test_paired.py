@@ -72,4 +72,4 @@ def test_egos_of_sumo(tmp_path):
     a, b = config("a", {}), config("b", {"ego": {"kind": "acc_aeb", "reaction_time": 1.5}})
     done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both"), "--json"])
     found = json.loads(done.stdout)
-    assert found["after"]["critical"] >= found["before"]["critical"] > 0
+    assert found["after"]["critical"] > found["before"]["critical"] > 0

@@ -67,7 +67,6 @@ def test_the_film_is_small_and_plays_in_real_time(name: str, stored: dict[str, R
     assert blue > 100  # ego is there, in its colour
 
 
-@pytest.mark.sumo
 @pytest.mark.parametrize("name", [n for n in names("scenarios") if load("scenarios", n).simulate is not None])
 def test_a_metric_so_far_ends_with_the_metric_and_never_recovers(name: str):
     """Otherwise a film would show a run violate a requirement that it met."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 import shlex
 import time
@@ -60,7 +59,7 @@ def fill(folder, scenario, runs=60, held_out=50, *, fail=False, fits=True, reaso
     """Return a store as a campaign leaves it."""
     space = scenario.space
     extra = {"campaign": "boundary", "scenario": "wedge", "seed": 7, "budget": runs + held_out, **(configuration or {})}
-    store = Store.open(folder, {"names": list(space.names), **extra})
+    store = Store.open(folder, {"names": list(space.names), **extra}, durable=False)  # the disk is not what is tested
     rng = np.random.default_rng(3)
     for iteration, (stage, n) in enumerate([(VALIDATION, held_out), ("initial", runs // 2), ("boundary", runs - runs // 2)]):
         if n == 0:
@@ -69,33 +68,15 @@ def fill(folder, scenario, runs=60, held_out=50, *, fail=False, fits=True, reaso
         start, y = store.planned, metric(space.to_unit(x))
         planned = [PlannedRun(stage, dict(zip(space.names, map(float, row), strict=True))) for row in x]
         store.plan(iteration, stage, planned, list(range(start, start + n)), {"acceptance": 0.25, "sobol": [0, n]})
-        with store._transaction() if n > 1000 else _nothing():  # thousands of durable commits are not what is tested
-            for k in range(n):
-                lost = fail or k == 7
-                metrics = {} if lost else {"ttc_min": float(y[k]), "speed": 3.0}
-                status = Status.FAILED if lost else Status.OK
-                outcome = Outcome(start + k, status, metrics, reason if lost else "", 0.01)
-                (store.append if n <= 1000 else _append(store))(outcome, "sbt 0, libsumo 1.28")
+        for k in range(n):
+            lost = fail or k == 7
+            metrics = {} if lost else {"ttc_min": float(y[k]), "speed": 3.0}
+            outcome = Outcome(start + k, Status.FAILED if lost else Status.OK, metrics, reason if lost else "", 0.01)
+            store.append(outcome, "sbt 0, libsumo 1.28")
     if fits:
         store.add_fit(60, 1, SCORES)
         store.add_fit(110, 2, {**SCORES, "log_likelihood": -0.2})
     return store
-
-
-class _nothing:
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-
-def _append(store):
-    def write(outcome, versions):
-        row = (str(outcome.status), json.dumps(dict(outcome.metrics)), outcome.reason, 0.01, versions, outcome.index)
-        store._db.execute("UPDATE runs SET status=?, metrics=?, reason=?, seconds=?, versions=? WHERE idx=?", row)
-
-    return write
 
 
 class Page(HTMLParser):
@@ -173,7 +154,7 @@ def test_hostile_text_stays_text(tmp_path):
     evil = "<script>alert(1)</script>\n</style><img src=http://x.invalid/a onerror=alert(2)> ${x} {{ 7*7 }}"
     space = ParameterSpace((Parameter("a", 0, 1, "$<b>&\\frac"), Parameter("b", 0, 1, "--><script>", description=evil)))
     scenario = LogicalScenario(
-        "evil", space, Requirement("m", CRITICAL.low, CRITICAL.high), description=evil, evaluate=lambda v, s: {}, metric_names=("m",)
+        "evil", space, Requirement("m", CRITICAL.low, CRITICAL.high), description=evil, evaluate=lambda v, s: {},
     )
     configuration = {"names": ["a", "b"], "scenario": "my; rm -rf <x>.yaml", "campaign": evil}
     with Store.open(tmp_path, configuration) as store:
@@ -368,7 +349,9 @@ def test_svgs_of_a_page_share_no_id():
     first, second = (set(re.findall(r' id="([^"]+)"', text)) for text in texts)
     assert first
     assert not first & second
-    assert all(f"#{ref}" in f"#{' #'.join(first)}" for ref in re.findall(r'href="#([^"]+)"', texts[0]))
+    references = set(re.findall(r'href="#([^"]+)"', texts[0]))
+    assert references
+    assert references <= first
 
 
 def test_user_settings_of_matplotlib_are_left_alone():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 
 import numpy as np
@@ -12,7 +13,7 @@ from sbt.acquisitions import even
 from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
-from sbt.samplers.roi import rejection
+from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.sobol import SobolSequence
 from sbt.testing import check_sampler
 
@@ -49,7 +50,12 @@ def test_sequence_is_balanced():
 
 
 def test_far_positions_cost_little_and_stay_inside():
-    far = SobolSequence(20, seed=0).points(5_000_000, 5_000_010)
+    sequence = SobolSequence(20, seed=0)
+    sequence.points(0, 10)
+    start = time.process_time()
+    far = sequence.points(50_000_000, 50_000_010)
+    assert time.process_time() - start < 1.0  # 0.01 s; the points before them would be 8 GB
+    assert far.shape == (10, 20)
     assert ((far > 0) & (far < 1)).all()
 
 
@@ -154,8 +160,8 @@ def test_nothing_asked_nothing_drawn():
 
 
 def test_bad_scores_and_constraints_are_refused():
-    for value in (np.nan, 0.5):
-        with pytest.raises(InputError, match="must be <= 0"):
+    for value in (np.nan, np.inf):
+        with pytest.raises(InputError, match="must be < inf and not NaN"):
             rejection(lambda u, v=value: np.full(len(u), v), SOBOL, 3, start=0, seed=0, label=0)
     with pytest.raises(InputError, match="shape"):
         rejection(lambda u: u, SOBOL, 3, start=0, seed=0, label=0)
@@ -166,6 +172,67 @@ def test_bad_scores_and_constraints_are_refused():
         )  # fmt: skip
     with pytest.raises(InputError, match="max_candidates"):
         rejection(hill, SOBOL, 3, start=0, seed=0, label=0, max_candidates=2)
+
+
+@pytest.mark.parametrize("shift", [0.5, 3.0, 40.0])
+def test_scores_above_zero_have_the_density_of_the_score(shift):
+    """The constant is unknown: the largest score seen takes the place of the bound."""
+    draw = rejection(lambda u: hill(u) + shift, SOBOL, 4000, start=100, seed=5, label="law")
+    counts, x, y = np.histogram2d(draw.u[:, 0], draw.u[:, 1], bins=5, range=[[0, 1], [0, 1]])
+    mass = np.outer(np.diff(x**2), -np.diff((1 - y) ** 3))
+    assert stats.chisquare(counts.ravel(), 4000 * mass.ravel()).pvalue > 0.01
+    assert draw.method == "rejection"
+    assert shift - 0.05 < draw.log_bound <= shift
+    assert draw.acceptance == pytest.approx(1 / 6, rel=0.1)
+
+
+def test_few_points_of_an_unbounded_score_are_no_worse_than_many():
+    """The first candidates are not taken for want of a bound: 300 draws of 5 points have the mean of the density."""
+    draws = [rejection(lambda u: 2 + hill(u), SOBOL, 5, start=0, seed=s, label="few", chunk=512).u for s in range(300)]
+    mean = np.concatenate(draws).mean(axis=0)  # of u_0 (1 - u_1)^2: 2/3 and 1/4
+    np.testing.assert_allclose(mean, [2 / 3, 1 / 4], atol=0.03)
+
+
+@pytest.mark.parametrize("chunk", [1, 37, 512, 100_000])
+def test_chunks_do_not_change_the_draw_of_scores_above_zero(chunk):
+    def rising(u: np.ndarray) -> np.ndarray:
+        """Records come late: the bound rises again and again."""
+        return np.where(u[:, 0] > 0.999, 3 + 1000 * (u[:, 0] - 0.999), np.where(u[:, 0] > 0.9, 1.0, -1.0))
+
+    n = 5 if chunk == 1 else 150
+    draws = [rejection(rising, SOBOL, n, start=7, seed=5, label=2, chunk=c) for c in (4096, chunk)]
+    for name in ("u", "positions", "next_position", "candidates", "method", "acceptance", "log_bound"):
+        np.testing.assert_array_equal(getattr(draws[0], name), getattr(draws[1], name))
+    assert draws[0].log_bound > 3
+
+
+def test_a_score_above_zero_that_is_seen_too_late_does_not_matter():
+    score = np.full(2000, -1.0)
+    score[1500] = 2.0
+
+    class Line:
+        dimension = 1
+
+        def points(self, start: int, stop: int) -> np.ndarray:
+            return np.arange(start, min(stop, 2000))[:, None] / 2000
+
+    def at(values: np.ndarray, n: int) -> RoiDraw:
+        return rejection(
+            lambda u: values[np.rint(u[:, 0] * 2000).astype(int)], Line(), n, start=0, seed=0, label=0, max_candidates=2000
+        )
+
+    draws = [at(values, 100) for values in (score, np.minimum(score, -1.0))]
+    np.testing.assert_array_equal(draws[0].positions, draws[1].positions)
+    assert (draws[0].log_bound, draws[0].positions[-1] < 1500) == (0.0, True)
+    many = at(score, 1000)
+    assert (many.method, many.log_bound, 1500 in many.positions) == ("pool", 2.0, True)
+
+
+def test_a_bound_of_zero_and_one_from_the_candidates_draw_alike():
+    """Shifting a score by its largest value over the candidates is what the sampler does itself."""
+    shifted = rejection(lambda u: hill(u) + 1.0, SOBOL, 200, start=7, seed=5, label=2)
+    by_hand = rejection(lambda u: hill(u) + 1.0 - shifted.log_bound, SOBOL, 200, start=7, seed=5, label=2)
+    np.testing.assert_array_equal(shifted.positions, by_hand.positions)
 
 
 def test_samplers_obey_their_contract():

@@ -68,8 +68,8 @@ def test_merged_shards_are_the_campaign_row_for_row(
 
 def test_every_run_is_in_one_shard_with_its_own_index(configured: Configured, rows: Rows):
     parts = [rows(folder)["runs"] for folder in sharded(configured, 3, **COVERAGE)]
-    assert [{row[0] % 3 for row in part} for part in parts] == [{2}, {1}, {0}]
-    assert sorted(row[0] for part in parts for row in part) == list(range(53))
+    assert [{run.index % 3 for run in part} for part in parts] == [{2}, {1}, {0}]
+    assert sorted(run.index for part in parts for run in part) == list(range(53))
 
 
 def test_a_merged_store_is_a_store(configured: Configured, rows: Rows, tmp_path: Path):

@@ -132,9 +132,6 @@ def test_what_was_acknowledged_survives_a_kill(tmp_path: Path):
     acknowledged += [int(line) for line in writer.stdout.read().splitlines()]
     writer.wait()
     writer.stdout.close()
-    db = sqlite3.connect(tmp_path / "s" / DATABASE)
-    assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
-    db.close()
     with Store.open(tmp_path / "s", {}) as store:  # the lock went with the process
         history = store.history()
         assert store.planned == 100_000
@@ -185,20 +182,53 @@ def test_one_writer_any_number_of_readers(tmp_path: Path):
 
 def test_a_store_of_another_version_is_refused_and_untouched(tmp_path: Path):
     planned(tmp_path).close()
-    db = sqlite3.connect(tmp_path / DATABASE)
-    db.execute("PRAGMA user_version = 99")
-    db.close()
+    with (tmp_path / DATABASE).open("r+b") as file:
+        file.seek(60)  # "user version" in the header of SQLite's files
+        file.write((99).to_bytes(4, "big"))
+    before = (tmp_path / DATABASE).read_bytes()
     for way in (Store.read, lambda folder: Store.open(folder, CONFIGURATION)):
-        with pytest.raises(StoreError, match="reads stores of version 1, but got version 99"):
-            way(tmp_path)
-        with pytest.raises(StoreError, match="version 99"):  # and not: another process is writing
-            way(tmp_path)
+        for _ in range(2):  # and not, the second time: another process is writing
+            with pytest.raises(StoreError, match=r"reads stores of version \d+, but got version 99"):
+                way(tmp_path)
+    assert (tmp_path / DATABASE).read_bytes() == before
 
 
-@pytest.mark.parametrize("content", [b"", b"SQLite format 3\x00" + b"\x00" * 50, b"not a database at all" * 400])
-def test_a_file_that_is_no_store_is_told(tmp_path: Path, content: bytes):
+def read_everything(folder: Path) -> None:
+    with Store.read(folder) as store:
+        _ = store.configuration, store.iterations(), store.fits(), store.history()
+
+
+@pytest.mark.parametrize(
+    ("written", "damaged", "what"),
+    [
+        (b'{"y":3.1', b'{"y":3.2', "the outcome of run 3 is damaged"),
+        (b"[0.4,0.3", b"[0.5,0.3", "run 4 is damaged"),
+        (b'"rejection"', b'"rejectiom"', "iteration 0 is damaged"),
+        (b'"seed":3', b'"seed":4', "the configuration is damaged"),
+    ],
+)
+def test_damage_is_told_and_never_read_as_a_result(tmp_path: Path, written: bytes, damaged: bytes, what: str):
+    with planned(tmp_path) as store:
+        for k in range(5):
+            store.append(outcome(k))
+    content = (tmp_path / DATABASE).read_bytes()
+    assert content.count(written) == 1
+    (tmp_path / DATABASE).write_bytes(content.replace(written, damaged))
+    with pytest.raises(StoreError, match=what):
+        read_everything(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "there is none in"),
+        (b"SQLite format 3\x00" + b"\x00" * 50, "is not a database"),
+        (b"not a database at all" * 400, "is not a database"),
+    ],
+)
+def test_a_file_that_is_no_store_is_told(tmp_path: Path, content: bytes, message: str):
     (tmp_path / DATABASE).write_bytes(content)
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match=message):
         Store.read(tmp_path)
 
 

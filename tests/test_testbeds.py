@@ -265,12 +265,18 @@ def test_analytic_makes_a_scenario_of_a_function() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"noise": -1.0}, {"noise": math.nan}, {"critical": (1.0, 0.0)}, {"inputs": {"a": (1.0, 0.0)}}, {"inputs": {}},
-     {"correlation": ((1.0,), (0.0,))}],
-)  # fmt: skip
-def test_analytic_refuses_what_cannot_be(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError):
+    ("wrong", "message"),
+    [
+        ({"noise": -1.0}, "noise must be a finite standard deviation >= 0, but got -1.0"),
+        ({"noise": math.nan}, "noise must be a finite standard deviation >= 0, but got nan"),
+        ({"critical": (1.0, 0.0)}, "needs low <= high"),
+        ({"inputs": {"a": (1.0, 0.0)}}, "input a: low < high must hold"),
+        ({"inputs": {}}, "at least one input"),
+        ({"correlation": ((1.0,), (0.0,))}, r"symmetric \(1, 1\) matrix"),
+    ],
+)
+def test_analytic_refuses_what_cannot_be(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         testbeds.analytic(
             **({"function": lambda x: x[:, 0], "inputs": {"a": (0.0, 1.0)}, "critical": (0.0, 1.0), "name": "f"} | wrong)
         )

@@ -15,13 +15,14 @@ import numpy as np
 from sbt.acquisitions import Acquisition, boundary
 from sbt.benchmark.keeping import opened
 from sbt.benchmark.reference import reference_rows
+from sbt.campaigns.settings import PlainConclusion
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
 from sbt.errors import SbtError
 from sbt.execution.protocol import SerialExecutor
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel, Learner
-from sbt.loop.stages import Batch, Campaign, Fit, Log, Progress, run_stages
+from sbt.loop.stages import Batch, Campaign, Log, Progress, run_stages
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
@@ -31,11 +32,10 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import History
 
-__all__ = ["PREDICTIONS", "is_done", "run_cell"]
+__all__ = ["PREDICTIONS", "CellProposal", "is_done", "run_cell"]
 
 PREDICTIONS = "predictions.npz"
 """In the folder of a finished cell: y, mu, sigma and log odds of P(critical) at the reference runs."""
-_POSITION = "next_position"
 _CHUNK = 4096
 
 
@@ -67,27 +67,46 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
     acquisition = parts.acquisition if cell.acquisition != "even" else None
     stage = _BenchmarkStage(scenario, learner, acquisition, config.seed, cell.iterations, cell.batch, cell.max_candidates)
 
-    def conclude(log: Log) -> tuple[dict[str, Any], Fit | None]:
-        belief = learner.fit(log.history)
-        if belief is None:
+    def conclude(log: Log) -> tuple[PlainConclusion, FittedMetamodel]:
+        fitted = learner.fit(log.history)
+        if fitted is None:
             raise SbtError(f"{cell.name}: a metamodel needs two runs that went well, but got fewer")
-        _keep_predictions(cell.folder, learner, belief, log.history)
-        return {}, Fit(belief.scores, belief.seconds)
+        _keep_predictions(cell.folder, learner, fitted, log.history)
+        return PlainConclusion({}), fitted
 
     with opened(cell.folder, cell.loaded, scenario, reference=n, max_candidates=cell.max_candidates) as store:
         limit = None if config.executor.timeout == float("inf") else config.executor.timeout
         with _Recalling(SerialExecutor(parts.spec, limit), _known_runs(cell)) as executor:
-            stopped, conclusion, seconds = run_stages(
+            finished = run_stages(
                 Campaign((stage,), conclude), store, executor, seed=config.seed, budget=config.budget,
                 requirement=scenario.requirement, versions="", listener=progress or (lambda _: None),
             )  # fmt: skip
         history = store.history()
-        critical = scenario.requirement.critical.contains(history.y(scenario.requirement.metric))
+        critical = scenario.requirement.critical_runs(history)
         store.conclude({
             "campaign": config.campaign, "scenario": config.scenario, "store": str(cell.folder), "runs": len(history),
             "ok": int(history.ok.sum()), "failed": int((~history.ok).sum()), "critical": int(critical.sum()),
-            "iterations": len(store.iterations()), "stopped": stopped, "seconds": seconds, "conclusion": conclusion,
+            "iterations": len(store.iterations()), "stopped": finished.stopped, "seconds": dict(finished.seconds), "conclusion": {},
         })  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CellProposal:
+    """How a batch of a cell was chosen.
+
+    Attributes:
+        method: rejection, or pool where too few candidates were accepted.
+        next_position: in the Sobol sequence.
+        candidates: points that were scored.
+        acceptance: share of them that rejection accepted.
+        sampling_seconds: the choice took.
+    """
+
+    method: str
+    next_position: int
+    candidates: int
+    acceptance: float | None
+    sampling_seconds: float
 
 
 @dataclass(frozen=True)
@@ -101,13 +120,13 @@ class _ReferenceLearner(Learner):
         return super().unseen(history) if self.rows is None else self.rows
 
     def fit(self, history: History) -> FittedMetamodel | None:
-        """Return the belief, the seconds of fit and of scoring among its scores."""
+        """Return the fitted, the seconds of fit and of scoring among its scores."""
         start = time.perf_counter()
-        belief = super().fit(history)
-        if belief is None:
+        fitted = super().fit(history)
+        if fitted is None:
             return None
-        spent = {"fit_seconds": belief.seconds, "scoring_seconds": time.perf_counter() - start - belief.seconds}
-        return replace(belief, scores={**belief.scores, "learned": belief.runs, **spent})
+        scoring = time.perf_counter() - start - fitted.seconds
+        return replace(fitted, record=replace(fitted.record, fit_seconds=fitted.seconds, scoring_seconds=scoring))
 
 
 @dataclass(frozen=True)
@@ -136,26 +155,24 @@ class _BenchmarkStage:
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch, and the scores of the metamodel that chose it."""
-        belief = self.learner.fit(log.history) if log.iteration > 0 else None
+        fitted = self.learner.fit(log.history) if log.iteration > 0 else None
         start = time.perf_counter()
-        draw, x = self._draw(belief, log)
+        draw, x = self._draw(fitted, log)
         names = self.scenario.space.names
         runs = tuple(PlannedRun(self.name, dict(zip(names, map(float, row), strict=True))) for row in x)
-        how = {
-            "method": draw.method, "candidates": draw.candidates, "acceptance": draw.acceptance,
-            _POSITION: draw.next_position, "sampling_seconds": time.perf_counter() - start,
-        }  # fmt: skip
-        return Batch(runs, how, None if belief is None else Fit(belief.scores, belief.seconds))
+        seconds = time.perf_counter() - start
+        proposal = CellProposal(draw.method, draw.next_position, draw.candidates, draw.acceptance, seconds)
+        return Batch(runs, proposal, fitted)
 
-    def _draw(self, belief: FittedMetamodel | None, log: Log) -> tuple[RoiDraw, Points]:
+    def _draw(self, fitted: FittedMetamodel | None, log: Log) -> tuple[RoiDraw, Points]:
         """Return the draw and its points in the inputs' units, exactly as recorded where they are."""
         space, critical = self.scenario.space, self.scenario.requirement.critical
         acquisition = self.acquisition
 
         def score(u: Points) -> Vector:
-            if belief is None or acquisition is None:
+            if fitted is None or acquisition is None:
                 return np.zeros(len(u))
-            return acquisition(belief.predict(u), critical, space.log_density(space.from_unit(u)))
+            return acquisition(fitted.predict(u), critical, space.log_density(space.from_unit(u)))
 
         admissible = (lambda u: space.feasible(space.from_unit(u))) if space.constraints else None
         if self.scenario.pool is not None:
@@ -164,12 +181,13 @@ class _BenchmarkStage:
             n = min(self.batch, len(pool))
             draw = rejection(score, pool, n, start=0, seed=self.seed, label=log.iteration, max_candidates=len(pool))
             return draw, self.scenario.pool.x[pool.rows[draw.positions]]
+        last = log.last(CellProposal)
         draws = partial(
             rejection, score, SobolSequence(space.dimension, self.seed), self.batch,
-            start=int(log.iterations[-1][_POSITION]) if log.iterations else 0, seed=self.seed, label=log.iteration,
+            start=0 if last is None else last.next_position, seed=self.seed, label=log.iteration,
             max_candidates=max(self.max_candidates, self.batch), accept_filter=admissible,
         )  # fmt: skip
-        screen = belief.log_ambiguity_bound if belief is not None and acquisition is boundary else None
+        screen = fitted.log_ambiguity_bound if fitted is not None and acquisition is boundary else None
         draw = draws(bound=screen, fill=False)
         if draw.method == "short":
             draw = draws()  # the pool ranks what was rejected, so all of it has to be scored
@@ -215,13 +233,13 @@ def _known_runs(cell: Cell) -> dict[tuple[int, tuple[float, ...]], Outcome]:
     return known
 
 
-def _keep_predictions(folder: Path, learner: _ReferenceLearner, belief: FittedMetamodel, history: History) -> None:
+def _keep_predictions(folder: Path, learner: _ReferenceLearner, fitted: FittedMetamodel, history: History) -> None:
     """Write what the last metamodel believes about the reference runs, for the figures."""
     x, y = learner.unseen(history)
     u, critical = learner.scenario.space.to_unit(x), learner.scenario.requirement.critical
     columns = []
     for k in range(0, len(u), _CHUNK):
-        part = belief.predict(u[k : k + _CHUNK])
+        part = fitted.predict(u[k : k + _CHUNK])
         log_p, log_not = part.log_probability(critical)
         columns.append(np.stack([part.mu, part.sigma, np.exp(log_p), log_p - log_not]))
     mu, sigma, p, odds = np.concatenate(columns, axis=1)

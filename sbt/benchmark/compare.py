@@ -15,6 +15,7 @@ from scipy.spatial.distance import cdist
 
 from sbt.benchmark.outside import OUTSIDE
 from sbt.campaigns.falsification import CONFIRM, METHODS
+from sbt.config.assemble import assemble, scenario_of
 from sbt.config.load import Loaded
 from sbt.errors import InputError
 from sbt.execution.protocol import SerialExecutor
@@ -23,7 +24,8 @@ from sbt.problem.outcome import Job, Status
 from sbt.samplers.search import DEFLATION
 from sbt.seeds import run_seed
 from sbt.store.database import Store
-from sbt.workflows.running import assembly_of, run_campaign
+from sbt.workflows.running import run_study
+from sbt.workflows.study import Study
 
 __all__ = ["SAMPLERS", "Cell", "compare", "table"]
 
@@ -38,7 +40,7 @@ class Cell:
     Args:
         scenario, sampler, seed, budget: what was run.
         runs: until it stopped, confirmations aside.
-        first: number of the first critical run, from 1; None: there was none.
+        runs_to_first: runs it took to the first critical one; None: there was none.
         critical: runs.
         distinct: critical runs that are farther than the deflation radius from all earlier ones so counted.
         seconds: wall clock.
@@ -49,7 +51,7 @@ class Cell:
     seed: int
     budget: int
     runs: int
-    first: int | None
+    runs_to_first: int | None
     critical: int
     distinct: int
     seconds: float
@@ -76,7 +78,7 @@ def compare(
     for name in samplers:
         if name not in SAMPLERS:
             raise InputError(f"a sampler must be one of {', '.join(SAMPLERS)}, but got '{name}'")
-    if assembly_of(loaded).scenario.pool is not None:
+    if scenario_of(loaded).pool is not None:
         raise InputError("compare needs a scenario that can be simulated, but got recorded rows")
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "compare.jsonl"
@@ -129,17 +131,17 @@ def _own(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
         store = str(Path(folder) / "store")
         acquisition = loaded.config.acquisition.model_copy(update={"kind": name})
         config = loaded.config.model_copy(update={"seed": seed, "store": store, "acquisition": acquisition})
-        run_campaign(replace(loaded, config=config), report=False)
+        run_study(Study(replace(loaded, config=config)), report=False)
         with Store.read(Path(store)) as kept:
             history = kept.history()
     runs = history.where(history.stage != CONFIRM)
-    scenario = assembly_of(loaded).scenario
-    return scenario.space.to_unit(runs.x), np.asarray(scenario.requirement.critical.margin(runs.y(scenario.requirement.metric)))
+    scenario = scenario_of(loaded)
+    return scenario.space.to_unit(runs.x), scenario.requirement.margins(runs)
 
 
 def _outside(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
     """Return points and margins of another sampler, in batches of the configured size."""
-    config, parts = loaded.config, assembly_of(loaded)
+    config, parts = loaded.config, assemble(loaded)
     space, requirement = parts.scenario.space, parts.scenario.requirement
     limit = None if config.executor.timeout == float("inf") else config.executor.timeout
     sampler = OUTSIDE[name](space.dimension, seed, config.initial)
@@ -180,7 +182,7 @@ def table(cells: Sequence[Cell]) -> str:
     for name in dict.fromkeys(cell.sampler for cell in cells):
         mine = [cell for cell in cells if cell.sampler == name]
         budget = mine[0].budget
-        first = np.array([1e9 if c.first is None else c.first for c in mine])
+        first = np.array([1e9 if c.runs_to_first is None else c.runs_to_first for c in mine])
         shown = [f"{v:.0f}" if v <= budget else f"> {budget}" for v in np.quantile(first, (0.5, 0.9))]
         found, distinct = np.mean(first <= budget), np.mean([c.distinct for c in mine])
         seconds = np.median([c.seconds for c in mine])

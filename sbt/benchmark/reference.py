@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sbt.benchmark.keeping import opened
+from sbt.campaigns.settings import PlainConclusion
 from sbt.config.assemble import assemble
 from sbt.config.load import Loaded
 from sbt.errors import InputError
@@ -81,7 +82,7 @@ def make_reference(loaded: Loaded, workers: int, progress: Callable[[Progress], 
         executor: Executor = SerialExecutor(parts.spec, limit) if workers == 1 else LocalExecutor(parts.spec, workers, limit)
         with executor:
             run_stages(
-                Campaign((stage,), lambda log: ({}, None)), store, executor, seed=config.seed, budget=config.budget,
+                Campaign((stage,), lambda log: (PlainConclusion({}), None)), store, executor, seed=config.seed, budget=config.budget,
                 requirement=parts.scenario.requirement, versions="", listener=progress or (lambda _: None),
             )  # fmt: skip
     return folder

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sbt.benchmark.cell import CellProposal
 from sbt.config.benchmark import Cell
 from sbt.files import write_atomically
 from sbt.store.database import Store
@@ -18,10 +19,9 @@ KEYS = ("scenario", "metamodel", "acquisition", "seed", "iteration", "runs", "le
 SCORES = (
     "log_likelihood", "likelihood", "log_likelihood_mixture", "rmse", "crps", "log_likelihood_critical", "rmse_critical",
     "average_precision", "precision_at_recall_90", "f1", "calibration_error", "coverage_95", "base_rate", "n", "n_critical",
-    "critical_fraction",
 )  # fmt: skip
 TIMES = ("fit_seconds", "scoring_seconds", "sampling_seconds", "sampled", "candidates", "method")
-COLUMNS = (*KEYS, *SCORES, *TIMES)
+COLUMNS = (*KEYS, *SCORES, "critical_fraction", *TIMES)
 """Of the table. `sampling_seconds`, `sampled`, `candidates` and `method` tell of the batch that was drawn
 from the metamodel of this row; they are empty in the last iteration."""
 
@@ -31,17 +31,19 @@ def rows_of(cell: Cell) -> Iterator[dict[str, Any]]:
     if not Store.begun(cell.folder):
         return
     with Store.read(cell.folder) as store:
-        history, drawn = store.history(), {entry["iteration"]: entry for entry in store.iterations()}
+        history, drawn = store.history(), {batch.number: batch.read(CellProposal) for batch in store.iterations()}
         fits = store.fits()
     for fit in fits:
-        k = fit["iteration"]
-        batch = drawn.get(k, {})
+        k = fit.iteration
+        batch = drawn.get(k)
         yield {
             "scenario": cell.scenario, "metamodel": cell.metamodel, "acquisition": cell.acquisition, "seed": cell.seed,
-            "iteration": k, "runs": fit["runs"], "learned": fit["learned"],
-            **{key: fit.get(key) for key in SCORES}, "fit_seconds": fit["fit_seconds"], "scoring_seconds": fit["scoring_seconds"],
-            "sampling_seconds": batch.get("sampling_seconds"), "candidates": batch.get("candidates"),
-            "sampled": int((history.iteration == k).sum()) if batch else None, "method": batch.get("method"),
+            "iteration": k, "runs": fit.runs, "learned": fit.learned,
+            **{key: fit.score(key) for key in SCORES}, "critical_fraction": fit.critical_fraction,
+            "fit_seconds": fit.fit_seconds, "scoring_seconds": fit.scoring_seconds,
+            "sampling_seconds": None if batch is None else batch.sampling_seconds,
+            "candidates": None if batch is None else batch.candidates,
+            "sampled": None if batch is None else int((history.iteration == k).sum()), "method": None if batch is None else batch.method,
         }  # fmt: skip
 
 

@@ -1,38 +1,71 @@
-"""Boundary identification: runs where the metamodel doubts whether a concrete scenario is critical."""
+"""Boundary identification: runs where the metamodel is uncertain whether a concrete scenario is critical."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from sbt.acquisitions import boundary, expected_feasibility, straddle
-from sbt.campaigns.choices import Choice, from_roi, greedily, mixed
-from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
+from sbt.acquisitions import is_greedy
+from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
+from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
+from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.wording import mixture_shares, percent
 from sbt.errors import InputError
-from sbt.loop.stages import Campaign, Fit, Log
+from sbt.loop.learner import FittedMetamodel
+from sbt.loop.stages import Campaign, Facts, Log
 from sbt.problem.arrays import Points
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
 from sbt.store.history import VALIDATION, History
+from sbt.store.records import Validation, optional, to_json
 
-__all__ = ["boundary_points", "recipe", "validation_of"]
+__all__ = ["BOUNDARY", "BoundaryConclusion", "boundary_points", "recipe"]
 
-_VOLUMES = ("critical_fraction", "expected_misclassified", "ambiguous_volume")
-_INTERNAL = ("sides", "believed", "weights", *_VOLUMES)
-_GREEDY = {"u": boundary, "straddle": straddle, "expected_feasibility": expected_feasibility}
+
+@dataclass(frozen=True)
+class BoundaryConclusion:
+    """Shares of the input space as the metamodel sees them, and how much that is worth.
+
+    Attributes:
+        critical_fraction: mean P(critical); None: there is no metamodel yet.
+        expected_misclassified: mean of min(P, 1 - P).
+        ambiguous_volume: share of the space with P between 0.05 and 0.95.
+        validation: scores on held-out runs; None without such runs.
+        weights: of a metamodel that mixes others, the share of each.
+        chosen_because: and why.
+        held_out_fraction: critical share of the held-out random runs, free of any model.
+    """
+
+    critical_fraction: float | None
+    expected_misclassified: float | None
+    ambiguous_volume: float | None
+    validation: Validation | None
+    weights: Mapping[str, float] | None = optional()
+    chosen_because: str | None = optional()
+    held_out_fraction: CriticalShare | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON of the command line."""
+        found: dict[str, Any] = to_json(self)
+        return found
+
+    def sentences(self, facts: Facts) -> list[str]:
+        """Return what was found in words: as measured, then as the metamodel sees it."""
+        measured = self.held_out_fraction if self.held_out_fraction is not None else share_among_held_out(facts)
+        found = measured.sentence()
+        if self.critical_fraction is not None:
+            found.append(f"The metamodel takes {percent(self.critical_fraction)} of the parameter space to be critical.")
+        if self.weights is not None:
+            found.append(f"The metamodel is {mixture_shares(self.weights)}: {self.chosen_because}.")
+        return found
 
 
 def recipe(settings: Settings) -> Campaign:
     """Return the campaign: even first, then batches from the acquisition's region of interest.
 
     The acquisition decides how: `mix` (exploration where critical runs are rare, representative of a_BI,
-    greedy, space filling), `u`, `straddle` and `expected_feasibility` greedily, any acquisition function
-    by rejection (`boundary`: the paper's).
-
-    The conclusion holds shares of the input space as the metamodel sees them: `critical_fraction`, the
-    mean P(critical), `expected_misclassified`, the mean of min(P, 1 - P), and `ambiguous_volume`,
-    where P lies between 0.05 and 0.95; `held_out_fraction`, the critical share from the held-out random
-    runs with its interval and free of any model; and the validation scores on those runs.
+    greedy, space filling), a greedy acquisition one by one, any other by rejection (`boundary`: the paper's).
 
     Raises:
         InputError: no metamodel.
@@ -44,25 +77,24 @@ def recipe(settings: Settings) -> Campaign:
     if learner is None:
         raise InputError("campaign boundary needs a metamodel, but got none")
 
-    def conclude(log: Log) -> tuple[dict[str, Any], Fit | None]:
-        belief = learner.fit(log.history)
-        held_out = log.history.where(log.history.stage == VALIDATION)
-        conclusion: dict[str, Any] = {**dict.fromkeys(_VOLUMES), "validation": None}
-        if belief is not None:
-            conclusion |= {name: belief.scores[name] for name in _VOLUMES}
-            conclusion["validation"] = validation_of(belief.scores)
-            conclusion |= {name: belief.scores[name] for name in ("believed", "weights") if name in belief.scores}
-        conclusion["held_out_fraction"] = critical_share(held_out, settings.scenario)
-        return conclusion, fit_of(belief)
+    def conclude(log: Log) -> tuple[BoundaryConclusion, FittedMetamodel | None]:
+        fitted = learner.fit(log.history)
+        held_out = critical_share(log.history.where(log.history.stage == VALIDATION), settings.scenario)
+        if fitted is None:
+            return BoundaryConclusion(None, None, None, None, held_out_fraction=held_out), None
+        r = fitted.record
+        return BoundaryConclusion(
+            r.critical_fraction, r.expected_misclassified, r.ambiguous_volume, r.validation, r.weights, r.chosen_because, held_out
+        ), fitted
 
-    return Campaign((BatchStage("boundary", *_choice(settings)),), conclude)
+    return Campaign((BatchStage("boundary", settings, _rule(settings)),), conclude)
 
 
-def _choice(settings: Settings) -> tuple[Settings, Choice]:
-    """Return the rule that chooses batches, and the settings with its criterion."""
-    if settings.method in _GREEDY:
-        return replace(settings, acquisition=_GREEDY[settings.method]), greedily
-    return settings, from_roi if settings.acquisition is not None else mixed
+def _rule(settings: Settings) -> ChoiceRule:
+    """Return the rule that chooses batches."""
+    if settings.acquisition is None:
+        return mixed
+    return greedily if is_greedy(settings.acquisition) else from_roi
 
 
 def boundary_points(settings: Settings, history: History, most: int = 500) -> Points:
@@ -81,7 +113,7 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
     return x[space.feasible(x)]
 
 
-def validation_of(scores: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the scores on held-out runs; None where there were none."""
-    found = {k: v for k, v in scores.items() if k not in _INTERNAL}
-    return found or None
+BOUNDARY = CampaignKind(
+    "identify where critical meets uncritical", recipe, BoundaryConclusion, acquisition="mix", methods=("mix",),
+    stop={"stable": None, "misclassified": None}, metamodel={"kind": "auto", "preset": "quick"},
+)  # fmt: skip

@@ -1,37 +1,35 @@
 """Ways to choose the runs of a batch: evenly, from the region of interest, and the boundary's mix.
 
-A choice is a function of the settings, the belief, the log and the number of runs wanted: nothing is
+A rule is a function of the settings, the fitted metamodel, the log and the number of runs wanted: nothing is
 remembered between batches but what the log says.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from sbt.acquisitions import boundary, even
-from sbt.campaigns.exploration import EXPLORATION_SHARE, EXPLORED, explore, should_explore
+from sbt.acquisitions import boundary, even, log_scores
+from sbt.campaigns.exploration import EXPLORATION_SHARE, explore, should_explore
+from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.samplers.greedy import influence_on_mean, refine_diverse, select_diverse, select_representative
+from sbt.samplers.greedy import influence_on_mean, propose_greedily, select_diverse, select_representative
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.smc import smc
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 
-__all__ = ["Choice", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
+__all__ = ["ChoiceRule", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 
-_POSITION = "next_position"
-_FEW = 2**14  # candidates that the mix looks at by rejection before it turns to particles
-_CANDIDATES = 4096
+_MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to particles: about a second with a GP
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
@@ -39,23 +37,24 @@ _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chose
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """The runs chosen, (n, d) in the inputs' units, and how (JSON)."""
+    """The runs chosen, (n, d) in the inputs' units, and how."""
 
     x: Points
-    how: Mapping[str, Any]
+    proposal: BatchProposal
 
 
-Choice = Callable[[Settings, FittedMetamodel | None, Log, int], Chosen]
+ChoiceRule = Callable[[Settings, FittedMetamodel | None, Log, int], Chosen]
+"""(settings, fitted metamodel, log, n) -> n runs."""
 
 
-def evenly(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
+def evenly(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return the next n points of the Sobol sequence, or of a table's random order."""
-    del belief
+    del fitted
     draw, x = _draw(settings, None, even, log, n)
-    return Chosen(x, _how(draw))
+    return Chosen(x, _proposal(draw))
 
 
-def from_roi(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
+def from_roi(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return n points with a density proportional to the acquisition, by rejection from the Sobol sequence.
 
     Where that takes more than half a million candidates the points are particles of a sequential Monte
@@ -65,63 +64,61 @@ def from_roi(settings: Settings, belief: FittedMetamodel | None, log: Log, n: in
         Winkelmann et al. (2022), section V-A.
     """
     acquisition = settings.acquisition if settings.acquisition is not None else boundary
-    draw, x = _draw(settings, belief, acquisition, log, n)
-    return Chosen(x, _how(draw))
+    draw, x = _draw(settings, fitted, acquisition, log, n)
+    return Chosen(x, _proposal(draw))
 
 
-def greedily(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
+def greedily(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return the n candidates of the highest acquisition that are far from each other and from earlier runs."""
-    if belief is None:
-        return evenly(settings, belief, log, n)
+    if fitted is None:
+        return evenly(settings, fitted, log, n)
     acquisition = settings.acquisition if settings.acquisition is not None else boundary
     start = _position(log)
-    x, looked = _greedy(settings, belief, acquisition, log, n, np.empty((0, settings.scenario.space.dimension)))
+    x, looked = _greedy(settings, fitted, acquisition, log, n, np.empty((0, settings.scenario.space.dimension)))
     if len(x) == n:
-        return Chosen(x, {"method": "greedy", "candidates": looked, "acceptance": None, _POSITION: start})
-    draw, rest = _draw(settings, belief, even, log, n - len(x), taken=x)
-    how = {"method": "greedy", "candidates": looked, "acceptance": None, _POSITION: draw.next_position, "even": len(rest)}
-    return Chosen(np.concatenate([x, rest]), how)
+        return Chosen(x, BatchProposal("greedy", start, looked))
+    draw, rest = _draw(settings, fitted, even, log, n - len(x), taken=x)
+    return Chosen(np.concatenate([x, rest]), BatchProposal("greedy", draw.next_position, looked, even=len(rest)))
 
 
-def mixed(settings: Settings, belief: FittedMetamodel | None, log: Log, n: int) -> Chosen:
+def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return a batch of parts: exploration where critical runs are rare, representative, greedy and space-filling runs.
 
     Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
     least doubt far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
     nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
-    less than 1 % of the space is believed critical, half of the batch explores first (see `explore`).
+    the mean P(critical) is below 1 %, half of the batch explores first (see `explore`).
     """
-    if belief is None:
-        return evenly(settings, belief, log, n)
-    looking = explore(settings, log, _rounded(EXPLORATION_SHARE * n, log) if should_explore(settings, belief, log) else 0)
-    filling = min(_rounded(max(_FILLING - settings.share, 0.0) * n, log), n - len(looking))
-    first, fill = _draw(settings, belief, even, log, filling, taken=looking)
+    if fitted is None:
+        return evenly(settings, fitted, log, n)
+    looking = explore(settings, log, _rounded(EXPLORATION_SHARE * n, log) if should_explore(settings, fitted, log) else 0)
+    filling = min(_rounded(max(_FILLING - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
+    first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
-    second, typical = _typical(settings, belief, log, _rounded(_TYPICAL * (n - len(so_far)), log), so_far, first.next_position)
+    second, typical = _typical(settings, fitted, log, _rounded(_TYPICAL * (n - len(so_far)), log), so_far, first.next_position)
     so_far = np.concatenate([so_far, typical])
-    greedy, looked = _greedy(settings, belief, boundary, log, n - len(so_far), so_far)
+    greedy, looked = _greedy(settings, fitted, boundary, log, n - len(so_far), so_far)
     so_far, last = np.concatenate([so_far, greedy]), second
     if len(so_far) < n:  # nothing is in doubt
-        last, more = _draw(settings, belief, even, log, n - len(so_far), taken=so_far, start=second.next_position)
+        last, more = _draw(settings, fitted, even, log, n - len(so_far), taken=so_far, start=second.next_position)
         so_far = np.concatenate([so_far, more])
-    how = {
-        "method": "mix", "random": second.method, "candidates": second.candidates + looked,
-        "acceptance": second.acceptance, _POSITION: last.next_position, EXPLORED: len(looking), "filling": len(fill),
-        "representative": len(typical), "greedy": len(greedy),
-    }  # fmt: skip
-    return Chosen(so_far, how)
+    proposal = BatchProposal(
+        "mix", last.next_position, second.candidates + looked, second.acceptance, random=second.method, explored=len(looking),
+        filling=len(fill), representative=len(typical), greedy=len(greedy),
+    )  # fmt: skip
+    return Chosen(so_far, proposal)
 
 
 def _typical(
-    settings: Settings, belief: FittedMetamodel, log: Log, n: int, taken: Points, start: int
+    settings: Settings, fitted: FittedMetamodel, log: Log, n: int, taken: Points, start: int
 ) -> tuple[RoiDraw, Points]:
     """Return a draw from a_BI, and the n of its points that represent it best beside the runs there are."""
     space = settings.scenario.space
     drawn = max(n, min(_DRAWN + 2 * n, _MOST_DRAWN)) if n else 0
-    draw, x = _draw(settings, belief, boundary, log, drawn, taken=taken, start=start, most=_FEW)
+    draw, x = _draw(settings, fitted, boundary, log, drawn, taken=taken, start=start, most=_MAX_REJECTION_CANDIDATES)
     u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.history.x, taken])))
-    scale = influence_on_mean(belief.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
-    weight = np.exp(_score(settings, belief, boundary)(u))  # a_BI once more: sharper than it was drawn
+    scale = influence_on_mean(fitted.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
+    weight = np.exp(_score(settings, fitted, boundary)(u))  # a_BI once more: sharper than it was drawn
     return draw, x[select_representative(u, weight, there, n, scale)]
 
 
@@ -130,24 +127,23 @@ def _rounded(wanted: float, log: Log) -> int:
     return math.floor(wanted * (log.iteration + 1)) - math.floor(wanted * log.iteration)
 
 
-def _how(draw: RoiDraw) -> dict[str, Any]:
-    return {
-        "method": draw.method, "candidates": draw.candidates, "acceptance": draw.acceptance, _POSITION: draw.next_position,
-    }  # fmt: skip
+def _proposal(draw: RoiDraw) -> BatchProposal:
+    return BatchProposal(draw.method, draw.next_position, draw.candidates, draw.acceptance)
 
 
 def _position(log: Log) -> int:
     """Return where the Sobol sequence goes on."""
-    return int(log.iterations[-1][_POSITION]) if log.iterations else 0
+    last = log.last(BatchProposal)
+    return 0 if last is None else last.next_position
 
 
-def _score(settings: Settings, belief: FittedMetamodel | None, acquisition: Acquisition) -> Callable[[Points], Vector]:
+def _score(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acquisition) -> Callable[[Points], Vector]:
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
 
     def score(u: Points) -> Vector:
-        if belief is None or acquisition is even:
+        if fitted is None or acquisition is even:
             return np.zeros(len(u))
-        return acquisition(belief.predict(u), critical, space.log_density(space.from_unit(u)))
+        return log_scores(acquisition, fitted.predict(u), critical, space.log_density(space.from_unit(u)))
 
     return score
 
@@ -158,7 +154,7 @@ def _admissible(settings: Settings) -> Callable[[Points], Mask] | None:
 
 
 def _draw(
-    settings: Settings, belief: FittedMetamodel | None, acquisition: Acquisition, log: Log, n: int, *,
+    settings: Settings, fitted: FittedMetamodel | None, acquisition: Acquisition, log: Log, n: int, *,
     taken: Points | None = None, start: int | None = None, most: int = 2**19,
 ) -> tuple[RoiDraw, Points]:  # fmt: skip
     """Return n points drawn by an acquisition, and their values exactly as recorded where they are.
@@ -167,7 +163,7 @@ def _draw(
     sequence (None: where the last batch ended), `most` the candidates to look at before particles are used.
     """
     scenario = settings.scenario
-    score, label = _score(settings, belief, acquisition), f"{log.iteration}/{0 if taken is None else len(taken)}"
+    score, label = _score(settings, fitted, acquisition), f"{log.iteration}/{0 if taken is None else len(taken)}"
     if scenario.pool is not None:
         rows = _rows(settings, log, taken)
         n = min(n, len(rows))
@@ -178,7 +174,7 @@ def _draw(
         return draw, scenario.pool.x[rows.rows[draw.positions]]
     sobol = SobolSequence(scenario.space.dimension, settings.seed)
     begin = _position(log) if start is None else start
-    bound = belief.log_ambiguity_bound if belief is not None and acquisition is boundary else None
+    bound = fitted.log_ambiguity_bound if fitted is not None and acquisition is boundary else None
     draw = rejection(
         score, sobol, n, start=begin, seed=settings.seed, label=label, max_candidates=max(most, n),
         accept_filter=_admissible(settings), bound=bound, fill=False,
@@ -186,7 +182,7 @@ def _draw(
     if draw.method == "short" and acquisition is not even:
         draw = _particles(settings, score, bound, draw, label, n)
         if draw.method == "short":  # the score is -inf wherever one looks
-            return _draw(settings, belief, even, log, n, taken=taken, start=begin)
+            return _draw(settings, fitted, even, log, n, taken=taken, start=begin)
     if len(draw.u) < n:
         raise InputError(f"the constraints must admit {n} of {draw.candidates} candidates, but admitted {len(draw.u)}")
     return draw, scenario.space.from_unit(draw.u)
@@ -226,21 +222,22 @@ def _rows(settings: Settings, log: Log, taken: Points | None) -> PoolSequence:
 
 
 def _greedy(
-    settings: Settings, belief: FittedMetamodel, acquisition: Acquisition, log: Log, n: int, taken: Points
+    settings: Settings, fitted: FittedMetamodel, acquisition: Acquisition, log: Log, n: int, taken: Points
 ) -> tuple[Points, int]:
     """Return up to n points in the inputs' units, and the number of candidates looked at."""
     scenario, space = settings.scenario, settings.scenario.space
     rng = stream(settings.seed, "greedy", log.iteration)
-    score, admissible = _score(settings, belief, acquisition), _admissible(settings)
-    scale = influence_on_mean(belief.predict, space.dimension, rng)
+    score, admissible = _score(settings, fitted, acquisition), _admissible(settings)
+    scale = influence_on_mean(fitted.predict, space.dimension, rng)
     there = np.clip(space.to_unit(np.concatenate([log.history.x, taken])), 0.0, 1.0)
     if scenario.pool is not None:
         rows = _rows(settings, log, taken)
         u = rows.points(0, len(rows))
         picks = select_diverse(u, score(u), there, n, scale)
         return scenario.pool.x[rows.rows[picks]], len(u)
-    u, value = refine_diverse(score, rng.random((_CANDIDATES, space.dimension)), scale, rng)
-    u = np.clip(space.to_unit(space.from_unit(u)), 0.0, 1.0)  # integers are what will be run
-    if admissible is not None:
-        value = np.where(admissible(u), value, -np.inf)
-    return space.from_unit(u[select_diverse(u, value, there, n, scale)]), len(u)
+
+    def snap(v: Points) -> Points:  # integers are what will be run
+        return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
+
+    u, looked = propose_greedily(score, there, n, scale, rng, snap=snap, admissible=admissible)
+    return space.from_unit(u), looked

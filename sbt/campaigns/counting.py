@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.campaigns.parts import Settings
+from sbt.campaigns.records import CountedDraws, EstimationProposal, PoolSummary
+from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Vector
 
-__all__ = ["DRAWN", "Seen", "counted_batches", "drawn_shares"]
+__all__ = ["DRAWN", "Seen", "counted_batches", "counted_iterations", "drawn_shares"]
 
 DRAWN = "estimation"
 """Stage of runs that were drawn with a known density."""
 _DENIED = 0.01
+"""P(critical) below which a critical draw is a surprise to the metamodel."""
 
 
 def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = False) -> list[CountedBatch]:
@@ -25,29 +28,39 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
     Raises:
         InputError: a counted run has no proposal density.
     """
-    found, requirement = [], settings.scenario.requirement
-    critical = requirement.critical.contains(log.history.y(requirement.metric))
-    critical = critical | (failed_critical & ~log.history.ok)
-    drawn = log.history.stage == DRAWN
-    for how in log.iterations:
-        if how.get("phase") != "count":
-            continue
-        rows = np.flatnonzero(drawn & (log.history.iteration == how["iteration"]))
-        if len(rows) < how["draws"]:
+    history = log.history
+    critical = settings.scenario.requirement.critical_runs(history) | (failed_critical & ~history.ok)
+    found, drawn = [], history.stage == DRAWN
+    for iteration, pool, draws in _counted(log):
+        rows = np.flatnonzero(drawn & (history.iteration == iteration))
+        if len(rows) < len(draws.coefficient):
             continue  # a batch counts only when it is complete
-        if any(log.history.records[k].log_q is None for k in rows):
+        if np.isnan(history.log_q[rows]).any():
             raise InputError("an estimate needs runs with a known proposal density, but a counted run has none")
         found.append(CountedBatch(
-            how["prior"], how["anticipated"], how["pool_variance"], np.array(how["coefficient"]), np.array(how["believed"]),
+            pool.probability, pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
             critical[rows].astype(np.float64),
         ))  # fmt: skip
     return found
 
 
+def _counted(log: Log) -> Iterator[tuple[int, PoolSummary, CountedDraws]]:
+    """Yield number, pool and draws of the batches that count."""
+    for batch in log.iterations:
+        proposal = batch.read(EstimationProposal)
+        if proposal.counted is not None and proposal.pool is not None:
+            yield batch.number, proposal.pool, proposal.counted
+
+
 def drawn_shares(log: Log) -> Vector:
-    """Return the share in proportion to the nominal law of every counted draw, in their order."""
-    shares = [np.full(i["draws"], i["nominal"]) for i in log.iterations if i.get("phase") == "count"]
+    """Return the share in proportion to the inputs' distribution of every counted draw, in their order."""
+    shares = [np.full(len(draws.coefficient), draws.nominal) for _, _, draws in _counted(log)]
     return np.concatenate(shares) if shares else np.empty(0)
+
+
+def counted_iterations(log: Log) -> list[int]:
+    """Return the numbers of the batches that count."""
+    return [number for number, _, _ in _counted(log)]
 
 
 @dataclass(frozen=True)
@@ -62,12 +75,11 @@ class Seen:
     @classmethod
     def of(cls, log: Log, settings: Settings) -> Seen:
         """Count the runs of a log."""
-        history, requirement = log.history, settings.scenario.requirement
-        critical = requirement.critical.contains(history.y(requirement.metric))
+        history = log.history
+        critical = settings.scenario.requirement.critical_runs(history)
         surprises = 0
-        for how in log.iterations:
-            if how.get("phase") == "count":
-                rows = (history.stage == DRAWN) & (history.iteration == how["iteration"])
-                surprises += int((critical[rows] & (np.array(how["pi"]) < _DENIED)).sum())
+        for iteration, _, draws in _counted(log):
+            rows = (history.stage == DRAWN) & (history.iteration == iteration)
+            surprises += int((critical[rows] & (np.array(draws.pi) < _DENIED)).sum())
         failed = int((~history.ok & (history.stage == DRAWN)).sum())
         return cls(int(critical.sum()), int((history.ok & ~critical).sum()), failed, surprises)

@@ -2,28 +2,63 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-from sbt.campaigns.boundary import validation_of
 from sbt.campaigns.choices import evenly
-from sbt.campaigns.parts import BatchStage, Settings, critical_share, fit_of
-from sbt.loop.stages import Campaign, Fit, Log
+from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share
+from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.loop.learner import FittedMetamodel
+from sbt.loop.stages import Campaign, Facts, Log
+from sbt.store.records import Validation, optional, to_json
 
-__all__ = ["recipe"]
+__all__ = ["COVERAGE", "CoverageConclusion", "recipe"]
+
+
+@dataclass(frozen=True)
+class CoverageConclusion:
+    """The share of critical runs of an even design.
+
+    Attributes:
+        critical_fraction: of the runs that gave a metric; None: there are none.
+        low, high: ends of its exact binomial interval; failed runs count as uncritical for the low end and as critical for the
+            high end.
+        confidence: of the interval.
+        counted: runs.
+        validation: scores of the metamodel on held-out runs, where one is configured.
+    """
+
+    critical_fraction: float | None
+    low: float
+    high: float
+    confidence: float = 0.95
+    counted: int = 0
+    validation: Validation | None = optional()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON of the command line."""
+        found: dict[str, Any] = to_json(self)
+        return found
+
+    def sentences(self, facts: Facts) -> list[str]:
+        """Return what was found in words."""
+        del facts
+        return CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted).sentence()
 
 
 def recipe(settings: Settings) -> Campaign:
-    """Return the campaign: one Sobol sequence in batches, a share held out where there is a metamodel.
+    """Return the campaign: one Sobol sequence in batches, a share held out where there is a metamodel."""
 
-    The conclusion holds the share of critical runs with its interval and, with a metamodel, its
-    scores on the held-out runs.
-    """
-
-    def conclude(log: Log) -> tuple[dict[str, Any], Fit | None]:
-        conclusion = critical_share(log.history, settings.scenario)
-        belief = settings.learner.fit(log.history) if settings.learner is not None else None
-        if belief is not None:
-            conclusion["validation"] = validation_of(belief.scores)
-        return conclusion, fit_of(belief)
+    def conclude(log: Log) -> tuple[CoverageConclusion, FittedMetamodel | None]:
+        fitted = settings.learner.fit(log.history) if settings.learner is not None else None
+        share = critical_share(log.history, settings.scenario)
+        validation = None if fitted is None else fitted.record.validation
+        found = CoverageConclusion(share.critical_fraction, share.low, share.high, share.confidence, share.counted, validation)
+        return found, fitted
 
     return Campaign((BatchStage("even", settings, evenly),), conclude, depends=None)
+
+
+COVERAGE = CampaignKind(
+    "evenly distributed points: the baseline, and data sets", recipe, CoverageConclusion, adaptive=False, target_aware=False
+)

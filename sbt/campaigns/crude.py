@@ -1,4 +1,4 @@
-"""Stages that need no metamodel: draws from the law itself, and subset simulation in repeats."""
+"""Stages that need no metamodel: draws from the inputs' distribution, and subset simulation in repeats."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.campaigns.parts import Settings
+from sbt.campaigns.records import COUNT, EstimationProposal
+from sbt.campaigns.settings import Settings
 from sbt.estimators.monte_carlo import Proportion
 from sbt.estimators.subset import SubsetRun
 from sbt.loop.stages import Batch, Log
@@ -15,20 +16,20 @@ from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 
-__all__ = ["MonteCarloStage", "SubsetStage", "law_share", "repeats_of"]
+__all__ = ["MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of"]
 
-_LAW = "monte_carlo"
-_REPEATS = 5
-_FEWEST_HITS = 10
-_FEWEST_BATCHES = 4
+_NOMINAL = "monte_carlo"
+_REPEATS = 5  # independent runs of subset simulation: their spread is the error
+_FEWEST_HITS = 10  # before the coefficient of variation is believed: its own error is a sixth then
+_FEWEST_BATCHES = 4  # likewise
 
 
 @dataclass(frozen=True)
 class MonteCarloStage:
-    """Independent draws from the law of the inputs."""
+    """Independent draws from the distribution of the inputs."""
 
     settings: Settings
-    name: str = _LAW
+    name: str = _NOMINAL
 
     def stop(self, log: Log) -> str | None:
         """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
@@ -36,7 +37,7 @@ class MonteCarloStage:
             return "budget"
         target = self.settings.stop.get("cov")
         if target is not None and log.iteration >= _FEWEST_BATCHES:
-            share = law_share(log, self.settings)
+            share = nominal_proportion(log, self.settings)
             if share.hits >= _FEWEST_HITS and share.cov is not None and share.cov <= target:
                 return "cov"
         return None
@@ -46,7 +47,7 @@ class MonteCarloStage:
         s, space = self.settings, self.settings.scenario.space
         size = min(s.batch if log.iterations else s.initial, s.budget - len(log.history))
         x = space.sample(size, stream(s.seed, "monte_carlo", log.iteration))
-        return Batch(_runs(space, x, _LAW, space.log_density(x)), {"method": "monte_carlo", "phase": "count"})
+        return Batch(_runs(space, x, _NOMINAL, space.log_density(x)), EstimationProposal(COUNT, "monte_carlo"))
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class SubsetStage:
                 x = space.from_normal(z)
                 log_q = space.log_density(x) if repeat.levels == 0 and not space.constraints else None
                 runs += _runs(space, x, stage, log_q)
-        return Batch(tuple(runs), {"method": "subset", "phase": "subset"})
+        return Batch(tuple(runs), EstimationProposal("subset", "subset"))
 
 
 def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:
@@ -87,12 +88,12 @@ def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:
     if settings.budget < _REPEATS * level:
         level = max(settings.budget // _REPEATS, 1)
     repeats = [SubsetRun(level, space.dimension) for _ in range(_REPEATS)]
-    margin = requirement.critical.margin(log.history.y(requirement.metric))
-    for how in log.iterations:
-        rows, start = np.flatnonzero(log.history.iteration == how["iteration"]), 0
+    margin = requirement.margins(log.history)
+    for batch in log.iterations:
+        rows, start = np.flatnonzero(log.history.iteration == batch.number), 0
         for k, repeat in enumerate(repeats):
             if not repeat.finished:
-                z = repeat.ask(stream(settings.seed, "subset", k, how["iteration"]))
+                z = repeat.ask(stream(settings.seed, "subset", k, batch.number))
                 told = _outcomes(margin[rows[start : start + len(z)]], z, space)
                 repeats[k], start = repeat.tell(z, told), start + len(z)
     return repeats
@@ -114,9 +115,8 @@ def _runs(space: ParameterSpace, x: Points, stage: str, log_q: Vector | None) ->
     )
 
 
-def law_share(log: Log, settings: Settings, stage: str = _LAW) -> Proportion:
-    """Return the hits among the runs of a stage that were drawn from the law."""
-    requirement = settings.scenario.requirement
+def nominal_proportion(log: Log, settings: Settings, stage: str = _NOMINAL) -> Proportion:
+    """Return the hits among the runs of a stage that were drawn from the inputs' distribution."""
     runs = log.history.where(log.history.stage == stage)
-    hits = int(requirement.critical.contains(runs.y(requirement.metric)).sum())
+    hits = int(settings.scenario.requirement.critical_runs(runs).sum())
     return Proportion(len(runs), hits, int((~runs.ok).sum()))

@@ -2,26 +2,107 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
-from sbt.campaigns.counting import Seen, counted_batches, drawn_shares
-from sbt.campaigns.crude import MonteCarloStage, SubsetStage, law_share, repeats_of
-from sbt.campaigns.gate import Limits, gate_verdict
-from sbt.campaigns.parts import Settings
+from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, drawn_shares
+from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of
+from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
 from sbt.campaigns.sequential import FEWEST_BATCHES, SequentialStage
+from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.wording import number, percent
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates, few_hits_bound
 from sbt.estimators.subset import combine_repeats
-from sbt.loop.stages import Campaign, Fit, Log, Stage
+from sbt.loop.stages import Campaign, Facts, Log, Stage
+from sbt.store.records import optional, to_json
 
-__all__ = ["recipe"]
+__all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "recipe"]
 
-_HIGH_DIMENSION = 20
+_HIGH_DIMENSION = 20  # inputs from which on the metamodels learn less than the chains of subset simulation find
 _CONFIDENCE = 0.95
-_HEAVY = 0.25
-_NOTHING = "nothing critical was met: the probability is only bounded from above, by the draws from the law"
-Conclusion = dict[str, Any]
+_HEAVY = 0.25  # share of the weight that one draw may carry before the reader is warned
+_NOTHING = "nothing critical was met: the probability is only bounded from above, by the draws from the inputs' distribution"
+
+
+@dataclass(frozen=True)
+class EstimateStep:
+    """Estimate and interval after a number of runs."""
+
+    runs: int
+    probability: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class EstimationConclusion:
+    """The probability of a critical run under the inputs' distribution.
+
+    Attributes:
+        probability: the estimate, failed runs counted as safe; None: no draw counts.
+        low, high: ends of its interval, or one-sided bounds where there are few hits; failed runs count as safe for the low end
+            and as critical for the high end.
+        confidence: of the interval.
+        cov: coefficient of variation.
+        effective_sample_size: of the weighted draws.
+        hits: critical runs that count.
+        failed_as_safe, failed_as_critical: the estimate, by how failed runs are read.
+        undetected_mass_bound: what a critical region that no run has met may hold at most.
+        warnings: what limits the estimate.
+        largest_weight_share: of one draw.
+        convergence: the estimate after each counted batch but the first.
+        counted: draws that count.
+        exact_bound: where nothing was critical, the exact upper bound.
+        gate: its verdict, where there is one.
+    """
+
+    probability: float | None
+    low: float
+    high: float
+    confidence: float = _CONFIDENCE
+    cov: float | None = None
+    effective_sample_size: float = 0.0
+    hits: int = 0
+    failed_as_safe: float | None = None
+    failed_as_critical: float | None = None
+    undetected_mass_bound: float = 1.0
+    warnings: tuple[str, ...] = ()
+    largest_weight_share: float | None = optional()
+    convergence: tuple[EstimateStep, ...] | None = optional()
+    counted: int | None = optional()
+    exact_bound: float | None = optional()
+    gate: GateVerdict | None = optional()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON of the command line."""
+        found: dict[str, Any] = to_json(self)
+        return found
+
+    def sentences(self, facts: Facts) -> list[str]:
+        """Return the probability with its interval, or the bound where nothing was critical."""
+        del facts
+        verdict = [] if self.gate is None else [f"Gate: {self.gate.verdict}; {self.gate.statement}."]
+        confidence = percent(self.confidence)
+        if self.exact_bound is not None:
+            bound = number(self.exact_bound)
+            return [f"No critical run was drawn: with {confidence} confidence, the probability of one is at most {bound}.", *verdict]
+        if self.probability is None:
+            return verdict
+        found = [
+            f"Probability of a critical run under the inputs' distribution: {number(self.probability)}"
+            f" ({confidence} interval {number(self.low)} to {number(self.high)})."
+        ]
+        details = {"coefficient of variation": self.cov, "effective sample size": self.effective_sample_size, "hits": self.hits}
+        found.append(f"Behind it: {', '.join(f'{k} {number(v, 3)}' for k, v in details.items() if v is not None)}.")
+        if self.failed_as_critical is not None and self.failed_as_critical != self.probability:
+            found.append(f"If every failed run were critical, it would be {number(self.failed_as_critical)}.")
+        found.append(f"A critical region that no run has met may hold up to {number(self.undetected_mass_bound, 3)} more.")
+        return [*found, *verdict]
+
+
+Concluded = tuple[EstimationConclusion, Limits]
 
 
 def recipe(settings: Settings) -> Campaign:
@@ -30,7 +111,7 @@ def recipe(settings: Settings) -> Campaign:
     `auto` is `subset` from 20 inputs on, `difference` below.
 
     Raises:
-        InputError: recorded rows, which have no law to draw from, or an unknown method.
+        InputError: recorded rows, which have no distribution to draw from, or an unknown method.
     """
     if settings.scenario.pool is not None:
         raise InputError("estimation needs a scenario that can be run anywhere, but recorded rows have no proposal density")
@@ -40,7 +121,7 @@ def recipe(settings: Settings) -> Campaign:
     if method == "monte_carlo":
         cov = settings.stop.get("cov")
         depends = None if cov is None else f"stop.cov = {cov:g} ends it where the results say (null: the whole budget is run)"
-        return replace(_campaign(settings, MonteCarloStage(settings), _from_law), depends=depends)
+        return replace(_campaign(settings, MonteCarloStage(settings), _from_nominal), depends=depends)
     if method == "subset":
         return _campaign(settings, SubsetStage(settings), _from_repeats)
     if method == "difference":
@@ -48,33 +129,26 @@ def recipe(settings: Settings) -> Campaign:
     raise InputError(f"estimation draws by auto, difference, monte_carlo or subset, but got '{method}'")
 
 
-def _campaign(settings: Settings, stage: Stage, concluded: Any) -> Campaign:
-    def conclude(log: Log) -> tuple[Conclusion, Fit | None]:
+def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settings], Concluded]) -> Campaign:
+    def conclude(log: Log) -> tuple[EstimationConclusion, None]:
         found, limits = concluded(log, settings)
         failed = int((~log.history.ok).sum())
         if failed:
-            found["warnings"].insert(0, (
-                f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
-            ))  # fmt: skip
-        if settings.gate is not None:
-            found["gate"] = gate_verdict(limits, **settings.gate)
-        return found, None
+            warning = f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
+            found = replace(found, warnings=(warning, *found.warnings))
+        return replace(found, gate=None if settings.gate is None else gate_verdict(limits, settings.gate)), None
 
     return Campaign((stage,), conclude)
 
 
-def _conclusion(probability: float | None, limits: Limits, **rest: Any) -> Conclusion:
-    """Return the keys of an estimation in their order."""
+def _conclusion(probability: float | None, limits: Limits, **rest: Any) -> EstimationConclusion:
+    """Return the conclusion with the interval that the limits give."""
     tail = 0.5 * (1.0 + _CONFIDENCE)
-    found: Conclusion = {
-        "probability": probability, "low": limits.lower(tail), "high": limits.upper(tail), "confidence": _CONFIDENCE,
-        "cov": None, "effective_sample_size": 0.0, "hits": 0, "failed_as_safe": probability, "failed_as_critical": probability,
-        "undetected_mass_bound": 1.0, "warnings": [],
-    }  # fmt: skip
-    return found | rest
+    given = {"failed_as_safe": probability, "failed_as_critical": probability} | rest
+    return EstimationConclusion(probability, limits.lower(tail), limits.upper(tail), **given)
 
 
-def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
+def _from_batches(log: Log, settings: Settings) -> Concluded:
     """Return what the sequential estimator says."""
     safe, critical = counted_batches(log, settings), counted_batches(log, settings, failed_critical=True)
     if not safe:
@@ -83,15 +157,15 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
     hits, misses = _hits(safe), sum(len(b.critical) for b in critical) - _hits(critical)
     counted = drawn_shares(log)
     undetected = few_hits_bound(seen.surprises, counted, _CONFIDENCE)
-    value, rest = _clipped(low.value), {}
+    value, exact_bound = _clipped(low.value), None
     limits, warnings = Limits(lambda c: low.limit(c, side=-1), lambda c: high.limit(c, side=1)), []
     if not seen.critical:
         limits, value = _nothing_critical(log, seen), 0.0
-        rest["exact_bound"] = limits.upper(_CONFIDENCE)
+        exact_bound = limits.upper(_CONFIDENCE)
         warnings.append(_NOTHING)
     elif not seen.safe:
         limits = Limits(lambda c: 1.0 - few_hits_bound(seen.failed_draws, counted, c), lambda _: 1.0)
-        warnings.append("everything was critical: the probability is only bounded from below, by the draws from the law")
+        warnings.append("everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution")
     elif hits < FEWEST_HITS:
         limits = Limits(lambda _: 0.0, lambda c: few_hits_bound(_hits(critical), counted, c))
         warnings.append(f"only {hits} counted draws were critical, fewer than {FEWEST_HITS}: only an upper bound is given")
@@ -110,32 +184,32 @@ def _from_batches(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
     return _conclusion(
         value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,
         effective_sample_size=low.effective_sample_size, failed_as_critical=max(_clipped(high.value), value),
-        undetected_mass_bound=undetected, warnings=warnings, largest_weight_share=low.largest_share,
+        undetected_mass_bound=undetected, warnings=tuple(warnings), largest_weight_share=low.largest_share,
         convergence=_convergence(log, safe, critical),
-        counted=int(sum(len(b.critical) for b in safe)), **rest,
+        counted=int(sum(len(b.critical) for b in safe)), exact_bound=exact_bound,
     ), limits  # fmt: skip
 
 
-def _convergence(log: Log, safe: list[CountedBatch], critical: list[CountedBatch]) -> list[dict[str, float]]:
+def _convergence(log: Log, safe: list[CountedBatch], critical: list[CountedBatch]) -> tuple[EstimateStep, ...]:
     """Return estimate and interval after each counted batch but the first, whose spread is not known."""
-    counted = [how["iteration"] for how in log.iterations if how.get("phase") == "count"]
+    counted = counted_iterations(log)
     tail, steps = 0.5 * (1.0 + _CONFIDENCE), []
     for k in range(2, len(safe) + 1):
         low, high = combine_estimates(safe[:k]), combine_estimates(critical[:k])
         runs = int((log.history.iteration <= counted[k - 1]).sum())
-        steps.append({
-            "runs": runs, "probability": _clipped(low.value), "low": low.limit(tail, side=-1), "high": high.limit(tail, side=1)
-        })  # fmt: skip
-    return steps
+        steps.append(EstimateStep(runs, _clipped(low.value), low.limit(tail, side=-1), high.limit(tail, side=1)))
+    return tuple(steps)
 
 
-def _uncounted(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
+def _uncounted(log: Log, settings: Settings) -> Concluded:
     """Return what is known before any draw counts: the bound by the draws there are."""
-    seen, told = Seen.of(log, settings), []
-    limits = _nothing_critical(log, seen) if not seen.critical else Limits(lambda _: 0.0, lambda _: 1.0)
-    told.append(f"no draw counts: {len(log.history)} runs are too few for hunting, learning and counting")
-    rest = {} if seen.critical else {"exact_bound": limits.upper(_CONFIDENCE)}
-    return _conclusion(None, limits, warnings=told + ([] if seen.critical else [_NOTHING]), **rest), limits
+    seen = Seen.of(log, settings)
+    few = f"no draw counts: {len(log.history)} runs are too few to search, to learn and to count"
+    if seen.critical:
+        limits = Limits(lambda _: 0.0, lambda _: 1.0)
+        return _conclusion(None, limits, warnings=(few,)), limits
+    limits = _nothing_critical(log, seen)
+    return _conclusion(None, limits, warnings=(few, _NOTHING), exact_bound=limits.upper(_CONFIDENCE)), limits
 
 
 def _nothing_critical(log: Log, seen: Seen) -> Limits:
@@ -143,13 +217,13 @@ def _nothing_critical(log: Log, seen: Seen) -> Limits:
     return Limits(lambda _: 0.0, lambda c: few_hits_bound(seen.failed_draws, drawn_shares(log), c))
 
 
-def _from_law(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
+def _from_nominal(log: Log, settings: Settings) -> Concluded:
     """Return what crude Monte Carlo says; its interval is exact, with few hits too."""
-    share = law_share(log, settings)
+    share = nominal_proportion(log, settings)
     limits = Limits(share.lower, share.upper)
-    rest: Conclusion = {"warnings": []}
+    rest: dict[str, Any] = {}
     if share.hits == 0:
-        rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": [_NOTHING]}
+        rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": (_NOTHING,)}
     return _conclusion(
         share.value if share.n else None, limits, cov=share.cov, effective_sample_size=float(share.n), hits=share.hits,
         failed_as_safe=share.value, failed_as_critical=(share.hits + share.failed) / max(share.n, 1),
@@ -157,32 +231,32 @@ def _from_law(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
     ), limits  # fmt: skip
 
 
-def _from_repeats(log: Log, settings: Settings) -> tuple[Conclusion, Limits]:
+def _from_repeats(log: Log, settings: Settings) -> Concluded:
     """Return what the repeats of subset simulation say."""
     repeats = repeats_of(log, settings)
     unfinished = sum(not r.finished for r in repeats)
     n = len(log.history)
-    first = law_share(log, settings, stage="subset level 0")
+    first = nominal_proportion(log, settings, stage="subset level 0")
     undetected = 1.0 - (1.0 - _CONFIDENCE) ** (1.0 / max(first.n, 1))
     hits = int(sum(r.hits for r in repeats))
     if unfinished:
         limits = Limits(lambda _: 0.0, first.upper)
-        told = (
+        warning = (
             f"{unfinished} of {len(repeats)} repeats of subset simulation did not reach the critical interval in {n} runs: "
-            "only the draws from the law bound the probability; give a larger budget"
+            "only the draws from the inputs' distribution bound the probability; give a larger budget"
         )
         rest = {"exact_bound": limits.upper(_CONFIDENCE)} if hits == 0 else {}
-        return _conclusion(None, limits, hits=hits, undetected_mass_bound=undetected, warnings=[told], **rest), limits
+        return _conclusion(None, limits, hits=hits, undetected_mass_bound=undetected, warnings=(warning,), **rest), limits
     found = combine_repeats([r.share for r in repeats])
     if found.value == 0.0:
         limits = Limits(lambda _: 0.0, first.upper)
-        told = _NOTHING + "; subset simulation came to a level from which no run got lower"
+        warning = _NOTHING + "; subset simulation came to a level from which no run got lower"
         return _conclusion(
-            0.0, limits, undetected_mass_bound=undetected, exact_bound=limits.upper(_CONFIDENCE), warnings=[told]
+            0.0, limits, undetected_mass_bound=undetected, exact_bound=limits.upper(_CONFIDENCE), warnings=(warning,)
         ), limits  # fmt: skip
     failed = int((~log.history.ok).sum())
     limits = Limits(lambda c: found.limit(c, side=-1), lambda c: first.upper(c) if failed else found.limit(c, side=1))
-    caution = ["the interval is that of independent repeats: it cannot see a region that no chain has met"]
+    caution = ("the interval is that of independent repeats: it cannot see a region that no chain has met",)
     return _conclusion(
         found.value, limits, cov=found.std_error / found.value, hits=hits, effective_sample_size=float(found.repeats),
         failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected,
@@ -196,3 +270,10 @@ def _clipped(value: float) -> float:
 
 def _hits(batches: list[CountedBatch]) -> int:
     return int(sum(b.critical.sum() for b in batches))
+
+
+ESTIMATION = CampaignKind(
+    "probability of a critical scenario under the inputs' distribution", recipe, EstimationConclusion, acquisition="auto",
+    methods=("auto", "difference", "monte_carlo", "subset"), stop={"cov": 0.1}, metamodel_free=("monte_carlo", "subset"),
+    takes_gate=True,
+)  # fmt: skip

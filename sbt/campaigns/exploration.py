@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.settings import Settings
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
@@ -19,23 +20,21 @@ from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION
 
-__all__ = ["EXPLORATION_SHARE", "EXPLORED", "explore", "fruitless_runs", "should_explore"]
+__all__ = ["EXPLORATION_SHARE", "explore", "fruitless_runs", "should_explore"]
 
-EXPLORED = "hunted"
-"""Key of the iteration record: how many runs of the batch explored; they are its first ones."""
 EXPLORATION_SHARE = 0.5
 """Share of a batch that explores."""
 _RARE = 0.01  # critical share of the space below which a region is easily missed
 _PATIENCE = 0.2  # of the budget: exploratory runs without a new region that end the exploration
 
 
-def should_explore(settings: Settings, belief: FittedMetamodel, log: Log) -> bool:
+def should_explore(settings: Settings, fitted: FittedMetamodel, log: Log) -> bool:
     """Return whether the next batch explores: critical runs seem rare, and the exploration still finds new regions.
 
     Rare: the mean P(critical) is below 1 %. Exploration ends when runs worth 20 % of the budget have found no new
     region. Recorded tables are never explored.
     """
-    rare = belief.scores["critical_fraction"] < _RARE and settings.scenario.pool is None
+    rare = fitted.record.critical_fraction < _RARE and settings.scenario.pool is None
     return rare and fruitless_runs(settings, log) < _PATIENCE * settings.budget
 
 
@@ -45,15 +44,15 @@ def fruitless_runs(settings: Settings, log: Log) -> int:
     Apart: by more than the half side of a deflated box, 0.22 in the unit cube. Zero as long as there is no critical run.
     """
     scenario, history = settings.scenario, log.history
-    hit = scenario.requirement.critical.contains(history.y(scenario.requirement.metric))
+    hit = scenario.requirement.critical_runs(history)
     if not hit.any():
         return 0
     u, iteration, spent = scenario.space.to_unit(history.x), history.iteration, 0
-    for k, how in enumerate(log.iterations):
+    for k, batch in enumerate(log.iterations):
         before = u[hit & (iteration < k)]
         if len(before) == 0:
             continue
-        first = np.flatnonzero(iteration == k)[: how.get(EXPLORED, 0)]
+        first = np.flatnonzero(iteration == k)[: batch.read(BatchProposal).explored or 0]
         met = first[hit[first]]
         new = len(met) > 0 and bool((cdist(u[met], before, "chebyshev").min(axis=1) > DEFLATION).any())
         spent = 0 if new else spent + len(first)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-__all__ = ["Limits", "gate_verdict"]
+from sbt.campaigns.settings import Gate
+
+__all__ = ["GateVerdict", "Limits", "gate_verdict"]
 
 
 @dataclass(frozen=True)
@@ -17,27 +18,39 @@ class Limits:
     upper: Callable[[float], float]
 
 
-def gate_verdict(limits: Limits, *, probability: float, confidence: float) -> dict[str, Any]:
+@dataclass(frozen=True)
+class GateVerdict:
+    """The verdict of a gate.
+
+    Attributes:
+        verdict: pass, fail or undecided.
+        probability, confidence: what was asked.
+        lower, upper: the one-sided limits that it rests on.
+        statement: the verdict in words.
+    """
+
+    verdict: str
+    probability: float
+    confidence: float
+    lower: float
+    upper: float
+    statement: str
+
+
+def gate_verdict(limits: Limits, gate: Gate) -> GateVerdict:
     """Return the verdict: `pass`, `fail` or `undecided`, with the limits it rests on and a sentence.
 
     `pass`: the one-sided upper limit (failed runs as critical) is at most the threshold. `fail`: the one-sided
     lower limit (failed runs as safe) is above it. Each is wrong with probability 1 - confidence at most,
     as far as the interval is right. Otherwise nothing is decided, and a larger budget may help.
-
-    Args:
-        limits: of the estimate.
-        probability: the threshold.
-        confidence: of each of the two limits.
     """
-    low, high = limits.lower(confidence), limits.upper(confidence)
-    sure = f"with {confidence:.3g} confidence"
-    if high <= probability:
-        verdict, told = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {probability:.3g}"
-    elif low > probability:
-        verdict, told = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {probability:.3g}"
+    low, high = limits.lower(gate.confidence), limits.upper(gate.confidence)
+    sure, allowed = f"with {gate.confidence:.3g} confidence", f"{gate.probability:.3g}"
+    if high <= gate.probability:
+        verdict, statement = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {allowed}"
+    elif low > gate.probability:
+        verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:
         verdict = "undecided"
-        told = f"{sure} the probability is between {low:.3g} and {high:.3g}: whether it is within {probability:.3g} is open"
-    return {
-        "verdict": verdict, "probability": probability, "confidence": confidence, "lower": low, "upper": high, "statement": told,
-    }  # fmt: skip
+        statement = f"{sure} the probability is between {low:.3g} and {high:.3g}: whether it is within {allowed} is open"
+    return GateVerdict(verdict, gate.probability, gate.confidence, low, high, statement)

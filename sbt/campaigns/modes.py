@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
 
-__all__ = ["Mode", "connected", "described", "modes_of"]
+__all__ = ["FailureMode", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of"]
 
 _PROBES = 9  # on the segment between two runs
 _MOST = 200  # critical runs that are compared with each other; further ones join the nearest
@@ -43,11 +43,58 @@ class Mode:
     safe: int | None
 
 
-def connected(belief: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]:
+@dataclass(frozen=True)
+class RunPoint:
+    """A run, its inputs and its metric."""
+
+    run: int
+    inputs: Mapping[str, float]
+    metric: float
+
+
+@dataclass(frozen=True)
+class NearestSafe:
+    """The uncritical run nearest to a failure, and the change of each input that differs."""
+
+    run: int
+    inputs: Mapping[str, float]
+    metric: float
+    change: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class FailureMode:
+    """A distinct way to fail, as the conclusion tells it.
+
+    Attributes:
+        representative: index of its run deepest in the critical interval.
+        inputs, metric: of the representative.
+        size: critical runs of the search in it.
+        conflict: how ego and the nearest other met; None where it is not measured.
+        runs: their indices.
+        confirmed: share of the repetitions of the representative with fresh seeds that were critical; None: not repeated.
+        confirmation_runs: repetitions.
+        most_likely: its run of largest density.
+        nearest_safe: the uncritical run nearest to the representative; None: there is none.
+    """
+
+    representative: int
+    inputs: Mapping[str, float]
+    metric: float
+    size: int
+    conflict: str | None
+    runs: tuple[int, ...]
+    confirmed: float | None
+    confirmation_runs: int
+    most_likely: RunPoint
+    nearest_safe: NearestSafe | None
+
+
+def connected(fitted: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
 
     Args:
-        belief: of the metamodel.
+        fitted: of the metamodel.
         u: (n, d) critical runs in the unit cube.
         kind: (n,) only runs of the same kind are joined.
     """
@@ -68,30 +115,30 @@ def connected(belief: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]
         if len(a) == 0:
             break
         probes = u[a][:, None, :] * (1.0 - steps) + u[b][:, None, :] * steps  # (pairs, 9, d)
-        inside = (belief.probability(probes.reshape(-1, u.shape[1])) > 0.5).reshape(len(a), _PROBES).all(axis=1)
+        inside = (fitted.probability(probes.reshape(-1, u.shape[1])) > 0.5).reshape(len(a), _PROBES).all(axis=1)
         for i, j in zip(a[inside], b[inside], strict=True):
             group[group == group[j]] = group[i]
     return group
 
 
-def modes_of(belief: WarpedModel, history: History, scenario: LogicalScenario) -> list[Mode]:
+def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -> list[Mode]:
     """Return the failure modes, the one with the deepest run first.
 
     Args:
-        belief: learned from these runs.
+        fitted: learned from these runs.
         history: runs; only finished ones count.
         scenario: with the campaign's space and requirement.
     """
     critical = scenario.requirement.critical
     y = history.y(scenario.requirement.metric)
-    hits = np.flatnonzero(critical.contains(y))
+    hits = np.flatnonzero(scenario.requirement.critical_runs(history))
     if len(hits) == 0:
         return []
     u = scenario.space.to_unit(history.x)
     depth = critical.margin(y)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
     kind = _kind(history)
-    group = connected(belief, u[chosen], kind[chosen])
+    group = connected(fitted, u[chosen], kind[chosen])
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(u[hits], u[chosen]) + _FAR * apart).argmin(axis=1)]
     log_p = scenario.space.log_density(history.x[hits])
@@ -111,8 +158,8 @@ def _kind(history: History) -> Vector:
     return np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED)
 
 
-def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed: Vector) -> dict[str, Any]:
-    """Return a mode as JSON.
+def describe(mode: Mode, history: History, scenario: LogicalScenario, confirmed: Vector) -> FailureMode:
+    """Return what is said of a mode.
 
     Args:
         mode: rows of the history.
@@ -121,20 +168,21 @@ def described(mode: Mode, history: History, scenario: LogicalScenario, confirmed
         confirmed: (k,) metric of the representative's runs with fresh seeds, NaN where one failed.
     """
     metric, critical = scenario.requirement.metric, scenario.requirement.critical
-    record = history.records[mode.representative]
-    likely = history.records[mode.most_likely]
-    told = {
-        "representative": record.index, "inputs": dict(record.inputs), "metric": record.metrics[metric], "size": len(mode.rows),
-        "conflict": describe_conflict_type(record.metrics.get(CONFLICT_TYPE, -1.0)),
-        "runs": [history.records[k].index for k in mode.rows],
-        "confirmed": float(critical.contains(confirmed).mean()) if len(confirmed) else None, "confirmation_runs": len(confirmed),
-        "most_likely": {"run": likely.index, "inputs": dict(likely.inputs), "metric": likely.metrics[metric]},
-        "nearest_safe": None,
-    }  # fmt: skip
-    if mode.safe is not None:
-        safe = history.records[mode.safe]
-        change = {k: safe.inputs[k] - v for k, v in record.inputs.items() if abs(safe.inputs[k] - v) > _NOT_WITHIN * abs(v)}
-        told["nearest_safe"] = {
-            "run": safe.index, "inputs": dict(safe.inputs), "metric": safe.metrics[metric], "change": change,
-        }  # fmt: skip
-    return told
+    y, at, likely = history.y(metric), mode.representative, mode.most_likely
+    inputs = history.inputs(at)
+    conflict = history.y(CONFLICT_TYPE)[at]
+    return FailureMode(
+        int(history.index[at]), inputs, float(y[at]), len(mode.rows),
+        describe_conflict_type(-1.0 if np.isnan(conflict) else float(conflict)),
+        tuple(int(history.index[k]) for k in mode.rows),
+        float(critical.contains(confirmed).mean()) if len(confirmed) else None, len(confirmed),
+        RunPoint(int(history.index[likely]), history.inputs(likely), float(y[likely])),
+        None if mode.safe is None else _nearest_safe(mode.safe, inputs, history, y),
+    )  # fmt: skip
+
+
+def _nearest_safe(row: int, inputs: Mapping[str, float], history: History, y: Vector) -> NearestSafe:
+    """Return an uncritical run, and how it differs from these inputs."""
+    safe = history.inputs(row)
+    change = {k: safe[k] - v for k, v in inputs.items() if abs(safe[k] - v) > _NOT_WITHIN * abs(v)}
+    return NearestSafe(int(history.index[row]), safe, float(y[row]), change)

@@ -3,28 +3,53 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from sbt.campaigns.choices import Choice, evenly
+from sbt.campaigns.choices import ChoiceRule, evenly
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.wording import percent, plural
 from sbt.estimators.binomial import interval
-from sbt.loop.learner import FittedMetamodel, changed_share
-from sbt.loop.stages import Batch, Fit, Log
+from sbt.loop.learner import changed_share
+from sbt.loop.stages import Batch, Facts, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 from sbt.store.history import VALIDATION, History
+from sbt.store.records import FitRecord
 
-__all__ = [
-    "BatchStage", "Settings", "critical_share", "fit_of", "held_out_runs", "named_inputs",
-]  # fmt: skip
+__all__ = ["BatchStage", "CriticalShare", "critical_share", "held_out_runs", "named_inputs", "share_among_held_out"]
+
+
+@dataclass(frozen=True)
+class CriticalShare:
+    """The share of critical runs of an even or random design.
+
+    Attributes:
+        critical_fraction: of the runs that gave a metric; None: there are none.
+        low, high: ends of its exact binomial interval; failed runs count as uncritical for the low end and as critical for the
+            high end.
+        confidence: of the interval.
+        counted: runs.
+    """
+
+    critical_fraction: float | None
+    low: float
+    high: float
+    confidence: float = 0.95
+    counted: int = 0
+
+    def sentence(self) -> list[str]:
+        """Return the share in words; nothing where it is not known."""
+        if self.critical_fraction is None:
+            return []
+        interval = f"{percent(self.confidence)} interval {percent(self.low)} to {percent(self.high)}"
+        counted = f", from {plural(self.counted, 'run')} spread over it" if self.counted else ""
+        return [f"Critical share of the parameter space: {percent(self.critical_fraction)} ({interval}){counted}."]
 
 
 @dataclass(frozen=True)
@@ -41,7 +66,7 @@ class BatchStage:
 
     name: str
     settings: Settings
-    choose: Choice
+    choose: ChoiceRule
 
     def stop(self, log: Log) -> str | None:
         """Return why the stage is over: `budget`, `no rows left`, `stable` or `misclassified`; None: go on."""
@@ -50,36 +75,37 @@ class BatchStage:
             return "budget"
         if s.scenario.pool is not None and len(log.history) >= len(s.scenario.pool.x):
             return "no rows left"
-        chose = [fit for fit in log.fits if fit["iteration"] < log.iteration]  # a concluding fit chose no batch
+        chose = [fit for fit in log.fits if fit.iteration < log.iteration]  # a concluding fit chose no batch
         stable = s.stop.get("stable")
         if stable is not None and len(chose) >= 3:
-            sides = [fit["sides"] for fit in chose[-3:]]
+            sides = [fit.sides for fit in chose[-3:]]
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
             if max(moved) < stable:
                 return "stable"
         return "misclassified" if chose and self._sure(chose[-1]) else None
 
-    def _sure(self, fit: Mapping[str, Any]) -> bool:
+    def _sure(self, fit: FitRecord) -> bool:
         """Say whether so little of the space is expected on the wrong side, and held-out runs do not deny it."""
         target = self.settings.stop.get("misclassified")
-        if target is None or fit["expected_misclassified"] > target or not fit.get("n"):
+        validation = fit.validation
+        if target is None or fit.expected_misclassified > target or validation is None or validation.error_rate is None:
             return False
-        wrong = round(fit["error_rate"] * fit["n"])
-        return bool(interval(wrong, fit["n"])[0] <= target)
+        wrong = round(validation.error_rate * validation.n)
+        return bool(interval(wrong, validation.n)[0] <= target)
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
         s, first = self.settings, log.iteration == 0
         spent = len(log.history) - (0 if first else s.reference)
         size = min(s.initial if first else s.batch, s.budget - spent)
-        held_out = math.floor(s.share * (spent + size)) - math.floor(s.share * spent)
+        held_out = math.floor(s.holdout_fraction * (spent + size)) - math.floor(s.holdout_fraction * spent)
         held_out = min(held_out, size - 1) if size > 1 else 0
-        belief = s.learner.fit(log.history) if s.learner is not None and not first else None
-        found = (evenly if first else self.choose)(s, belief, log, size - held_out)
+        fitted = s.learner.fit(log.history) if s.learner is not None and not first else None
+        found = (evenly if first else self.choose)(s, fitted, log, size - held_out)
         stage = "initial" if first else self.name
         chosen = [PlannedRun(stage, named_inputs(s.scenario, row)) for row in found.x]
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
-        return Batch((*chosen, *random), {**found.how, "held_out": len(random)}, fit_of(belief))
+        return Batch((*chosen, *random), replace(found.proposal, held_out=len(random)), fitted)
 
 
 def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun]:
@@ -114,19 +140,20 @@ def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
     return {name: float(value) for name, value in zip(scenario.space.names, row, strict=True)}
 
 
-def fit_of(belief: FittedMetamodel | None) -> Fit | None:
-    """Return what the store keeps of a belief."""
-    return None if belief is None else Fit({**belief.scores, "learned": belief.runs}, belief.seconds)
-
-
-def critical_share(history: History, scenario: LogicalScenario) -> dict[str, Any]:
+def critical_share(history: History, scenario: LogicalScenario) -> CriticalShare:
     """Return the share of critical runs of an even or random design with its 95 % interval.
 
-    Failed runs count both ways: as uncritical for the low end, as critical for the high end. For
-    Sobol points the interval is that of random ones, which is wider than it needs to be.
+    For Sobol points the interval is that of random ones, which is wider than it needs to be.
     """
-    y = history.y(scenario.requirement.metric)
-    hits, n, failed = int(scenario.requirement.critical.contains(y).sum()), len(history), int((~history.ok).sum())
+    hits, n, failed = int(scenario.requirement.critical_runs(history).sum()), len(history), int((~history.ok).sum())
     ok = n - failed
     low, high = float(interval(hits, n)[0]), float(interval(hits + failed, n)[1])
-    return {"critical_fraction": hits / ok if ok else None, "low": low, "high": high, "confidence": 0.95, "counted": n}
+    return CriticalShare(hits / ok if ok else None, low, high, 0.95, n)
+
+
+def share_among_held_out(facts: Facts) -> CriticalShare:
+    """Return the critical share among the held-out runs, which are uniform in the ranges."""
+    held_out = facts.history.where(facts.history.stage == VALIDATION)
+    hits, n, ok = int(facts.requirement.critical_runs(held_out).sum()), len(held_out), int(held_out.ok.sum())
+    low, high = float(interval(hits, n)[0]), float(interval(hits + n - ok, n)[1])
+    return CriticalShare(hits / ok if ok else None, low, high, 0.95, n)

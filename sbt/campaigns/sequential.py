@@ -7,6 +7,7 @@ one. Up to a stopping time the draws only teach; from then on they count, with w
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,7 +18,8 @@ from scipy.special import ndtr, ndtri
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN, counted_batches
-from sbt.campaigns.parts import Settings
+from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, PoolSummary
+from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators.importance import BLIND, SHARES, Plan, draw_systematic, plan_batch
 from sbt.estimators.intervals import combine_estimates
@@ -32,25 +34,50 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 from sbt.store.history import History
+from sbt.store.records import Iteration
 
 __all__ = ["FEWEST_BATCHES", "SequentialStage"]
 
-_SEARCH_STAGE, _LEARN = "hunt", "learn"
+_SEARCH_STAGE, _LEARN_STAGE = "hunt", "learn"
+"""Stages of runs that search for modes, and of draws that only teach."""
+
+# Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/estimation.md).
 _POOL = 10_000
+"""Points of a pool: its own variance is a hundredth of what 100 draws leave."""
 _PARTICLES = 800
+"""Particles that the mixture is fitted to, per cloud."""
 _CANDIDATES = 6_000
-_PHASE_0 = 0.4
-_EVEN_SHARE = 0.1
+"""Points that the particles are resampled from."""
 _PROBES = 9
+"""Points on the segment between two critical runs, at which P must stay above 0.5 for them to be one mode."""
+
+# When the search for modes ends.
+_SEARCH_BUDGET = 0.4
+"""Largest share of the budget that it takes."""
 _COMMON = 0.02
-_STALLED, _USABLE = 1.5, 0.5
-_LATEST = 0.6
-_FEWEST_LEARNED = 3
+"""P(critical) under the inputs' distribution above which draws from it meet every region that counts."""
+_EVEN_SHARE = 0.1
+"""Of the search picks, those that are spread evenly: they do not depend on the metamodel."""
 _SEARCH_SHARE = (0.2, 0.1)
-_LOST, _MEMORY, _SURPRISE = 10.0, 4, 0.01
-FEWEST_BATCHES = 4
-"""Batches that must count before a target is believed to be met."""
+"""Of later batches, the share that still searches: before and after the count has begun."""
+
+# When the count begins.
+_LATEST = 0.6
+"""At the latest after this share of the budget: fewer batches would say little about their own spread."""
+_FEWEST_LEARNED = 3
+"""Batches that only teach, at least: stalling shows in three values."""
+_STALLED, _USABLE = 1.5, 0.5
+"""Learning has stalled where the anticipated coefficient of variation of three batches varies by less than the factor; it is
+usable below the value."""
 _TARGET = 0.02
+"""Anticipated coefficient of variation that is good enough where `stop.cov` sets none."""
+FEWEST_BATCHES = 4
+"""Batches that must count before their spread is taken for a measure of the error."""
+
+# When an earlier metamodel is preferred to the newest one.
+_LOST, _MEMORY, _SURPRISE = 10.0, 4, 0.01
+"""Loss of precision by this factor against one of so many batches before, although no critical run since then lay where that
+metamodel's P was below the value."""
 
 
 @dataclass(frozen=True)
@@ -93,25 +120,25 @@ class SequentialStage:
 
     def _proposed(self, log: Log) -> Batch:
         s = self.settings
-        if log.iteration == 0 and (s.earlier is None or len(s.earlier.training) < 2):
+        if log.iteration == 0 and (s.prior_runs is None or len(s.prior_runs.training) < 2):
             return self._initial(min(s.initial, s.budget))
         size = min(s.batch, s.budget - len(log.history))
         known = _Known.of(log.history, self._coordinates, s)
-        belief = known.learn(stream(s.seed, "fit", log.iteration))
-        modes = self._modes_while_searching(log, known, belief)
+        log_probability = known.learn(stream(s.seed, "fit", log.iteration))
+        modes = self._modes_while_searching(log, known, log_probability)
         if modes is not None:
             rows = self._search_modes(known, log.iteration, size)
-            return Batch(self._runs(rows, _SEARCH_STAGE), {"method": "hunt", "phase": "hunt", "modes": modes})
-        return self._drawn(log, known, belief, size)
+            return Batch(self._runs(rows, _SEARCH_STAGE), EstimationProposal(EXPLORE, "explore", modes=modes))
+        return self._drawn(log, known, log_probability, size)
 
     def _initial(self, n: int) -> Batch:
-        """Return an even design over the wide law."""
+        """Return an even design over the wide distribution."""
         sobol = SobolSequence(self.settings.scenario.space.dimension, self.settings.seed)
         z = ndtri(sobol.points(0, n)) * self._wide
-        return Batch(self._runs(self._feasible(z, 0), "initial"), {"method": "sobol", "phase": "initial"})
+        return Batch(self._runs(self._feasible(z, 0), "initial"), EstimationProposal("initial", "sobol"))
 
     def _feasible(self, z: Points, iteration: int) -> Points:
-        """Return the points with those outside of the constraints replaced by draws of the law."""
+        """Return the points with those outside of the constraints replaced by draws of the inputs' distribution."""
         space = self.settings.scenario.space
         bad = ~space.feasible(space.from_normal(z))
         if bad.any():
@@ -128,27 +155,27 @@ class SequentialStage:
             for row, density in zip(rows, densities, strict=True)
         )
 
-    def _modes_while_searching(self, log: Log, known: _Known, belief: LogProbability | None) -> int | None:
+    def _modes_while_searching(self, log: Log, known: _Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
         It ends with 40 % of the budget, after two batches without a new mode, and where failures are common:
-        draws from the law meet every region that counts.
+        draws from the inputs' distribution meet every region that counts.
         """
-        phases = [i.get("phase") for i in log.iterations]
-        if len(log.history) >= _PHASE_0 * self.settings.budget or {"learn", "count"} & set(phases):
+        proposals = [batch.read(EstimationProposal) for batch in log.iterations]
+        if len(log.history) >= _SEARCH_BUDGET * self.settings.budget or any(p.phase in (LEARN, COUNT) for p in proposals):
             return None
-        modes = [int(i["modes"]) for i in log.iterations if i.get("phase") == "hunt"] + [known.modes(belief)]
+        modes = [p.modes or 0 for p in proposals if p.phase == EXPLORE] + [known.modes(log_probability)]
         if modes[-1] > 0 and len(modes) >= 3 and modes[-1] <= modes[-3]:
             return None
-        return None if modes[-1] > 0 and self._common(belief, log.iteration) else modes[-1]
+        return None if modes[-1] > 0 and self._common(log_probability, log.iteration) else modes[-1]
 
-    def _common(self, belief: LogProbability | None, iteration: int) -> bool:
-        """Return whether the metamodel takes more than 1 in 50 draws from the law to be critical."""
+    def _common(self, log_probability: LogProbability | None, iteration: int) -> bool:
+        """Return whether the metamodel takes more than 1 in 50 draws from the inputs' distribution to be critical."""
         z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
-        return belief is not None and float(np.exp(belief(z)[0]).mean()) > _COMMON
+        return log_probability is not None and float(np.exp(log_probability(z)[0]).mean()) > _COMMON
 
     def _search_modes(self, known: _Known, iteration: int, n: int) -> Points:
-        """Return n search picks (n, d): the falsification portfolio in the cube of the wide law, some spread evenly."""
+        """Return n search picks (n, d): the falsification portfolio in the cube of the wide distribution, some spread evenly."""
         s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", iteration)
         even = round(_EVEN_SHARE * n)
         spread = rng.random((even, space.dimension))
@@ -162,43 +189,39 @@ class SequentialStage:
         return self._feasible(self._scores(spread), iteration)
 
     def _scores(self, v: Points) -> Points:
-        """Return normal scores of points of the cube in which the wide law is uniform."""
+        """Return normal scores of points of the cube in which the wide distribution is uniform."""
         return ndtri(np.clip(v, 1e-9, 1.0 - 1e-9)) * self._wide
 
-    def _drawn(self, log: Log, known: _Known, belief: LogProbability | None, size: int) -> Batch:
+    def _drawn(self, log: Log, known: _Known, log_probability: LogProbability | None, size: int) -> Batch:
         """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         shares = BLIND if known.one_sided else SHARES
-        pool = self._pooled(belief, known, shares, rng)
-        earlier = self._earlier(log, known, _relative(pool.plan.anticipated, pool.plan.prior))
-        if earlier is not None:
-            pool = self._pooled(earlier, known, shares, rng)
-        mixture, z, x, plan, log_pi, log_not = pool.mixture, pool.z, pool.x, pool.plan, pool.log_pi, pool.log_not
-        doubt = {
-            "pool": _POOL, "prior": plan.prior, "anticipated": plan.anticipated, "components": len(mixture.shares),
-            "earlier": earlier is not None,
-        }  # fmt: skip
+        pool = self._pooled(log_probability, known, shares, rng)
+        fallback = self._fallback(log, known, _relative_error(pool.plan.anticipated, pool.plan.prior))
+        if fallback is not None:
+            pool = self._pooled(fallback, known, shares, rng)
+        z, x, plan, log_pi, log_not = pool.z, pool.x, pool.plan, pool.log_pi, pool.log_not
+        summary = PoolSummary(_POOL, plan.prior, plan.anticipated, len(pool.mixture.shares), fallback is not None)
         counts = known.one_sided or self._counts(log, size)
         searched = min(round(_SEARCH_SHARE[counts] * size), size - 1)
         n = size - searched
         picks = self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)
         if not counts:
             rows = draw_systematic(plan, n, log_pi - log_not, rng).rows
-            how = {"method": "doubt", "phase": "learn", **doubt}
-            return Batch((*self._runs(z[rows], _LEARN, None), *picks), how)
+            return Batch((*self._runs(z[rows], _LEARN_STAGE), *picks), EstimationProposal(LEARN, "uncertainty", pool=summary))
         draws = draw_systematic(plan, n, log_pi - log_not, rng)
         log_q = s.scenario.space.log_density(x[draws.rows]) - np.log(draws.coefficient)
-        how = {
-            "method": plan.form, "phase": "count", "draws": n, **doubt, "pool_variance": plan.pool_variance,
-            "nominal": plan.nominal, "coefficient": draws.coefficient.tolist(), "believed": draws.control_variate.tolist(),
-            "pi": np.exp(log_pi[draws.rows]).tolist(),
-        }  # fmt: skip
-        return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), how)
+        counted = CountedDraws(
+            plan.pool_variance, plan.nominal, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()),
+            tuple(np.exp(log_pi[draws.rows]).tolist()),
+        )  # fmt: skip
+        proposal = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted)
+        return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), proposal)
 
-    def _pooled(self, belief: LogProbability | None, known: _Known, shares: tuple[float, ...], rng: np.random.Generator) -> _Pool:
-        """Return a fresh pool and how a batch would be drawn from it with this belief."""
+    def _pooled(self, log_probability: LogProbability | None, known: _Known, shares: tuple[float, ...], rng: np.random.Generator) -> _Pool:
+        """Return a fresh pool and how a batch would be drawn from it with this metamodel."""
         space = self.settings.scenario.space
-        mixture = self._mixture(belief, known, rng)
+        mixture = self._mixture(log_probability, known, rng)
         z, stratum = mixture.sample(_POOL, rng)
         x = space.from_normal(z)
         log_w = log_normal(z) - mixture.log_density(z)
@@ -206,60 +229,59 @@ class SequentialStage:
             log_w = np.where(space.feasible(x), log_w - np.log(space.feasible_mass), -np.inf)
         log_wide = log_normal(z, self._wide) - mixture.log_density(z)
         unsure = np.full(len(z), np.log(0.5))
-        log_pi, log_not = (unsure, unsure) if belief is None else belief(z)
+        log_pi, log_not = (unsure, unsure) if log_probability is None else log_probability(z)
         plan = plan_batch(log_pi, log_not, log_w, log_wide, stratum, shares)
         return _Pool(mixture, z, x, plan, log_pi, log_not)
 
-    def _earlier(self, log: Log, known: _Known, doubt: float) -> LogProbability | None:
-        """Return an earlier belief to draw with, where the newest one has lost its precision for no reason.
+    def _fallback(self, log: Log, known: _Known, error: float) -> LogProbability | None:
+        """Return an earlier metamodel to draw with, where the newest one has lost its precision for no reason.
 
-        A fit can fail: hyperparameters of another mode of their posterior. That shows in a doubt ten times as large
-        as that of an earlier batch, although no critical run since then lay where that batch denied it. The estimate
-        is unbiased with any belief that knows only earlier runs.
+        A fit can fail: hyperparameters of another mode of their posterior. That shows in an anticipated error ten times as
+        large as that of an earlier batch, although no critical run since then lay where that batch denied it. The estimate
+        is unbiased with any metamodel that knows only earlier runs.
         """
-        drawn = [i for i in log.iterations if i.get("phase") in ("learn", "count") and not i.get("earlier")]
+        drawn = [(batch.number, pool) for batch, pool in _pools(log) if not pool.fallback]
         if not drawn:
             return None
-        best = min(drawn[-_MEMORY:], key=lambda i: _relative(i["anticipated"], i["prior"]))
-        if doubt <= _LOST * _relative(best["anticipated"], best["prior"]):
+        iteration, best = min(drawn[-_MEMORY:], key=lambda item: _error_of(item[1]))
+        if error <= _LOST * _error_of(best):
             return None
-        iteration = int(best["iteration"])
         before = _Known.of(log.history.where(log.history.iteration < iteration), self._coordinates, self.settings)
-        belief = before.learn(stream(self.settings.seed, "fit", iteration))
+        log_probability = before.learn(stream(self.settings.seed, "fit", iteration))
         since = known.batch >= iteration
-        if belief is None or not since.any():
+        if log_probability is None or not since.any():
             return None
         met = known.z[since & known.critical]
-        surprised = len(met) > 0 and bool((np.exp(belief(met)[0]) < _SURPRISE).any())
-        return None if surprised else belief
+        surprised = len(met) > 0 and bool((np.exp(log_probability(met)[0]) < _SURPRISE).any())
+        return None if surprised else log_probability
 
-    def _mixture(self, belief: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
+    def _mixture(self, log_probability: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
         """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
-        if belief is None or not known.critical.any():
+        if log_probability is None or not known.critical.any():
             return Mixture(self._wide)
         z, log_q = Mixture(self._wide).sample_near(_CANDIDATES, known.z[known.critical], rng)
 
-        at_start = belief(z)  # both clouds begin there
+        at_start = log_probability(z)  # both clouds begin there
 
         def mass(points: Points) -> Vector:
-            log_pi, _ = at_start if points is z else belief(points)
+            log_pi, _ = at_start if points is z else log_probability(points)
             return log_normal(points) + log_pi
 
-        def doubt(points: Points) -> Vector:
-            log_pi, log_not = at_start if points is z else belief(points)
+        def boundary(points: Points) -> Vector:
+            log_pi, log_not = at_start if points is z else log_probability(points)
             return log_normal(points) + 0.5 * (log_pi + log_not)
 
-        clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, doubt))
+        clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, boundary))
         return fit_mixture(clouds, self._wide, rng)
 
     def _counts(self, log: Log, size: int) -> bool:
         """Return whether this batch counts: from the stopping time on.
 
-        It looks only at earlier batches. Were it to look at this batch's pool, pools in which much is believed
-        critical would begin the count more often, and the estimate would be too high.
+        It looks only at earlier batches. Were it to look at this batch's pool, pools whose points are mostly
+        taken for critical would begin the count more often, and the estimate would be too high.
         """
-        drawn = [i for i in log.iterations if i.get("phase") in ("learn", "count")]
-        if any(i["phase"] == "count" for i in drawn):
+        drawn = list(_pools(log))
+        if any(batch.read(EstimationProposal).counted is not None for batch, _ in drawn):
             return True
         s, spent = self.settings, len(log.history)
         if spent + size > _LATEST * s.budget:
@@ -267,16 +289,16 @@ class SequentialStage:
         if len(drawn) < _FEWEST_LEARNED:
             return False
         left = math.sqrt((1.0 - _SEARCH_SHARE[True]) * (s.budget - spent))
-        doubts = [_relative(i["anticipated"], i["prior"]) / left for i in drawn[-3:]]
-        if max(doubts) < _STALLED * min(doubts) and doubts[-1] < _USABLE:
+        errors = [_error_of(pool) / left for _, pool in drawn[-3:]]
+        if max(errors) < _STALLED * min(errors) and errors[-1] < _USABLE:
             return True  # learning no longer pays
         target = s.stop.get("cov")
-        return doubts[-1] <= (_TARGET if target is None else target)
+        return errors[-1] <= (_TARGET if target is None else target)
 
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """A pool: points z (N, d) and x (N, d), how a batch is drawn from it, and what is believed there."""
+    """A pool: points z (N, d) and x (N, d), how a batch is drawn from it, and what the metamodel says there."""
 
     mixture: Mixture
     z: Points
@@ -286,7 +308,19 @@ class _Pool:
     log_not: Vector
 
 
-def _relative(anticipated: float, prior: float) -> float:
+def _pools(log: Log) -> Iterator[tuple[Iteration, PoolSummary]]:
+    """Yield the batches that were drawn from a pool, with the pool."""
+    for batch in log.iterations:
+        pool = batch.read(EstimationProposal).pool
+        if pool is not None:
+            yield batch, pool
+
+
+def _error_of(pool: PoolSummary) -> float:
+    return _relative_error(pool.anticipated, pool.probability)
+
+
+def _relative_error(anticipated: float, prior: float) -> float:
     """Return the anticipated coefficient of variation of one draw."""
     return math.sqrt(anticipated) / max(prior, 1e-300)
 
@@ -305,12 +339,12 @@ class _Known:
 
     @classmethod
     def of(cls, history: History, coordinates: Coordinates, settings: Settings) -> _Known:
-        """Return what the history teaches, and what an earlier campaign does."""
+        """Return what the history teaches, and what another campaign does."""
         runs, space = history.training, settings.scenario.space
         requirement = settings.scenario.requirement
         x, y, batch = runs.x, runs.y(requirement.metric), runs.iteration
-        if settings.earlier is not None:
-            first = settings.earlier.training
+        if settings.prior_runs is not None:
+            first = settings.prior_runs.training
             x, y = np.vstack([first.x, x]), np.concatenate([first.y(requirement.metric), y])
             batch = np.concatenate([np.full(len(first), -1), batch])
         z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
@@ -321,25 +355,25 @@ class _Known:
         """Whether all runs are critical, or none is."""
         return not self.critical.any() or bool(self.critical.all())
 
-    def modes(self, belief: LogProbability | None) -> int:
+    def modes(self, log_probability: LogProbability | None) -> int:
         """Return the number of groups of critical runs that the metamodel's critical region does not connect."""
         hits = self.z[self.critical]
-        if belief is None or len(hits) < 2:
+        if log_probability is None or len(hits) < 2:
             return len(hits)
         i, j = np.triu_indices(len(hits), 1)
         along = np.linspace(0.1, 0.9, _PROBES)[:, None, None]
         probes = hits[i] * along + hits[j] * (1.0 - along)  # (probes, pairs, d)
-        inside = belief(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
+        inside = log_probability(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
         joined = inside.all(axis=0)
         graph = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(hits), len(hits)))
         return int(connected_components(graph, directed=False)[0])
 
     def cube(self, wide: Vector) -> Points:
-        """Return the runs in the cube in which the wide law is uniform."""
+        """Return the runs in the cube in which the wide distribution is uniform."""
         return np.asarray(ndtr(self.z / wide))
 
     def learn(self, rng: np.random.Generator) -> LogProbability | None:
-        """Return the belief; None with too few runs."""
+        """Return the log_probability; None with too few runs."""
         if len(self.y) < 2:
             return None
         interval = self.settings.scenario.requirement.critical

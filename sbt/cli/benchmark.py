@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 
 __all__ = ["benchmark"]
 
@@ -34,20 +34,16 @@ def benchmark(
     if workers is not None:
         overrides.append(f"workers={workers}")
     silent = quiet or as_json
-    try:
-        with clean_stdout(), ProgressDisplay(silent=silent) as show:
-            from sbt.config.benchmark import load_benchmark
+    with resumable("*", "run again to go on") as work, clean_stdout(), ProgressDisplay(silent=silent) as show:
+        from sbt.config.benchmark import load_benchmark
 
-            loaded = load_benchmark(config, overrides)
-            from sbt.benchmark.experiment import Listener, run_benchmark
+        loaded = load_benchmark(config, overrides)
+        from sbt.benchmark.experiment import Listener, run_benchmark
 
-            listener = Listener(lambda line: None if silent else print(line, file=sys.stderr, flush=True), show)
-            simulate = not (reference_only or figures_only)
-            result = run_benchmark(
-                loaded, listener, reference=not figures_only, cells=simulate, figures=not reference_only
-            )
-    except KeyboardInterrupt:
-        raise fail("interrupted, run again to go on", Exit.INTERRUPTED) from None
+        listener = Listener(lambda line: None if silent else print(line, file=sys.stderr, flush=True), show)
+        simulate = not (reference_only or figures_only)
+        work.folder = Path(loaded.config.store)
+        result = run_benchmark(loaded, listener, reference=not figures_only, cells=simulate, figures=not reference_only)
     if as_json:
         print_json(result)
     else:

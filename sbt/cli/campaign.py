@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 from sbt.errors import InputError
-from sbt.files import write_atomically
 
 if TYPE_CHECKING:
-    from sbt.config.load import Loaded
-    from sbt.store.database import Store
+    from sbt.store.records import FitRecord
 
 __all__ = ["export", "merge", "report", "run", "status"]
 
@@ -55,32 +53,17 @@ def run(
         overrides.append(f"store={json.dumps(str(store))}")
     if workers is not None:
         overrides.append(f"executor.workers={workers}")
-    try:
-        with clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
-            from sbt.config.load import load
+    with resumable() as work, clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
+        from sbt.loop.stages import Shard
+        from sbt.workflows.running import run_study
+        from sbt.workflows.study import Study
 
-            loaded = load(config, overrides)
-            from sbt.workflows.running import run_campaign  # after the configuration, which is wrong more often
-
-            if shard is None:
-                result = run_campaign(loaded, progress=show)
-            else:
-                result = _run_shard(loaded, shard, show, own_folder=store is None)
-    except KeyboardInterrupt:
-        raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+        study, part = Study.from_file(config, overrides), None if shard is None else Shard.parse(shard)
+        if part is not None and store is None:
+            study = study.with_store(Path(study.config.store) / f"shard-{part.number}-of-{part.of}")
+        work.folder = Path(study.config.store)
+        result = run_study(study, progress=show, shard=part).to_dict()
     _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
-
-
-def _run_shard(loaded: Loaded, text: str, show: ProgressDisplay, *, own_folder: bool) -> dict[str, Any]:
-    """Run one shard, in a folder inside the campaign's where the user names none."""
-    from sbt.loop.stages import Shard
-    from sbt.workflows.running import run_campaign
-
-    shard = Shard.parse(text)
-    if own_folder:
-        folder = Path(loaded.config.store) / f"shard-{shard.number}-of-{shard.of}"
-        loaded = replace(loaded, config=loaded.config.model_copy(update={"store": str(folder)}))
-    return run_campaign(loaded, progress=show, shard=shard)
 
 
 def merge(
@@ -93,9 +76,9 @@ def merge(
 ) -> None:
     """Join the stores of shards (run --shard) into the one that a run without shards would have written."""
     with clean_stdout():
-        from sbt.workflows.merging import merge as merged
+        from sbt.workflows.merging import merge_shards
 
-        result = merged([_with_store(folder) for folder in folders], into)
+        result = merge_shards([_with_store(folder) for folder in folders], into).to_dict()
     _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
 
 
@@ -166,7 +149,7 @@ def status(
     """Say how far a campaign is, also while it runs."""
     found = _status(folder)
     try:
-        while watch and found["conclusion"] is None:
+        while watch and found["conclusion"] is None and not getattr(sys.stdout, "gone", False):
             if not as_json:
                 print("\n".join(_status_lines(found)), flush=True)
             time.sleep(2.0)
@@ -189,10 +172,17 @@ def _status(folder: Path) -> dict[str, Any]:
             "store": str(folder),
             "runs": store.counts,
             "iterations": len(iterations),
-            "stage": iterations[-1]["stage"] if iterations else None,
-            "validation": {k: v for k, v in fits[-1].items() if not isinstance(v, str)} if fits else None,
+            "stage": iterations[-1].stage if iterations else None,
+            "validation": _validation(fits[-1]) if fits else None,
             "conclusion": store.conclusion,
         }
+
+
+def _validation(fit: FitRecord) -> dict[str, Any]:
+    """Return the numbers of the last fit."""
+    shares = {name: getattr(fit, name) for name in ("critical_fraction", "expected_misclassified", "ambiguous_volume")}
+    scores = {} if fit.validation is None else fit.validation.to_dict()
+    return {"runs": fit.runs, "iteration": fit.iteration, "learned": fit.learned, **scores, **shares}
 
 
 def _status_lines(found: Mapping[str, Any]) -> list[str]:
@@ -224,52 +214,11 @@ def export(
     ] = "csv",
 ) -> None:
     """Write the runs of a campaign as a table."""
-    import importlib.util
+    with clean_stdout():
+        from sbt.workflows.exporting import export_store
 
-    from sbt.store.database import Store
-
-    forms = {"csv": _as_csv, "parquet": _as_parquet, "dsiod": _as_data_set, "boundary": _as_boundary}
-    if form not in forms:
-        raise InputError(f"--format must be {', '.join(forms)}, but got '{form}'")
-    if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise InputError("--format parquet needs pyarrow: pip install 'sumo-sbt[parquet]', or choose csv")
-    with clean_stdout(), Store.read(_with_store(folder)) as store:
-        path = forms[form](store)
+        path = export_store(_with_store(folder), form)
     print(path)
-
-
-def _as_csv(store: Store) -> Path:
-    """Write one row a run."""
-    frame = store.history().to_frame()
-    return write_atomically(store.folder / "exports" / "runs.csv", lambda part: frame.to_csv(part, index=False))
-
-
-def _as_parquet(store: Store) -> Path:
-    """Write one row a run."""
-    frame = store.history().to_frame()
-    return write_atomically(store.folder / "exports" / "runs.parquet", lambda part: frame.to_parquet(part, index=False))
-
-
-def _as_boundary(store: Store) -> Path:
-    """Write points of the inputs' space where the metamodel says P(critical) = 0.5."""
-    import pandas as pd
-
-    from sbt.campaigns.boundary import boundary_points
-    from sbt.workflows.running import assembly_of, loaded_from, settings_of
-
-    loaded = loaded_from(store)
-    settings = settings_of(loaded, assembly_of(loaded))
-    points = pd.DataFrame(boundary_points(settings, store.history()), columns=list(settings.scenario.space.names))
-    return write_atomically(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
-
-
-def _as_data_set(store: Store) -> Path:
-    """Write the runs in the layout of the public data set, which `table:FOLDER` reads."""
-    from sbt.store.tables import to_folder
-    from sbt.workflows.running import assembly_of, loaded_from
-
-    scenario = assembly_of(loaded_from(store)).scenario
-    return to_folder(store.history(), scenario, store.folder / "exports" / "dsiod")
 
 
 def _with_store(folder: Path) -> Path:

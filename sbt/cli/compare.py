@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sbt.cli.console import Exit, clean_stdout, fail, print_json
+from sbt.cli.console import clean_stdout, print_json, resumable
 
 __all__ = ["compare"]
 
@@ -28,18 +28,16 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print the cells as one JSON object.")] = False,
 ) -> None:
     """Compare samplers; run again to continue where it was interrupted."""
-    try:
-        with clean_stdout():
-            from sbt.config.load import load
+    with resumable("*") as work, clean_stdout():
+        from sbt.config.load import load
 
-            loaded = load(config, list(changes or []))
-            from sbt.benchmark import compare as room
+        loaded = load(config, list(changes or []))
+        from sbt.benchmark import compare as room
 
-            folder = into if into is not None else Path(f"{loaded.config.store}_compare")
-            names = [name.strip() for name in samplers.split(",") if name.strip()]
-            cells = room.compare(loaded, names, seeds, folder)
-    except KeyboardInterrupt:
-        raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+        folder = into if into is not None else Path(f"{loaded.config.store}_compare")
+        names = [name.strip() for name in samplers.split(",") if name.strip()]
+        work.folder = folder
+        cells = room.compare(loaded, names, seeds, folder)
     if as_json:
         print_json({"cells": [vars(cell) for cell in cells]})
     else:

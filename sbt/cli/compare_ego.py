@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 
 __all__ = ["compare_ego"]
 
@@ -26,13 +26,11 @@ def compare_ego(
 ) -> None:
     """Run both on the same draws: did the probability fall, which failures were fixed, which are new."""
     folder = store if store is not None else Path("runs") / f"compare_{first.stem}_{second.stem}"
-    try:
-        with clean_stdout(), ProgressDisplay(silent=as_json) as show:
-            from sbt.workflows.paired import compare_egos
+    with resumable("*/campaign.sqlite") as work, clean_stdout(), ProgressDisplay(silent=as_json) as show:
+        from sbt.workflows.paired import compare_egos
 
-            result = compare_egos(first, second, store=folder, runs=runs, progress=show)
-    except KeyboardInterrupt:
-        raise fail("interrupted, run again to resume", Exit.INTERRUPTED) from None
+        work.folder = folder
+        result = compare_egos(first, second, store=folder, runs=runs, progress=show)
     if as_json:
         print_json(result)
     else:

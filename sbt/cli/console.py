@@ -13,20 +13,26 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from enum import IntEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 import typer
 
+from sbt import interruption
 from sbt.errors import InputError, SbtError
+from sbt.execution.streams import SteadyStream, open_missing
 
 if TYPE_CHECKING:
     from sbt.loop.stages import Progress
 
-__all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "print_json", "verb"]
+__all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "prepare_streams", "print_json", "resumable", "verb"]
 
 P = ParamSpec("P")
 _QUIET_SECONDS = 10.0
 """Without a terminal, a line of progress appears at most this often within an iteration."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_ONCE = 0.5
+"""Signals within so many seconds are one: a terminal that closes, or `timeout`, sends it twice."""
 
 
 class Exit(IntEnum):
@@ -47,48 +53,115 @@ def fail(message: str, code: Exit) -> typer.Exit:
 
 
 def verb(function: Callable[P, None]) -> Callable[P, None]:
-    """Return the verb with errors turned into exit codes; SIGTERM is an interruption like Ctrl-C."""
+    """Return the verb with errors turned into exit codes; SIGTERM, SIGHUP and SIGQUIT are interruptions like Ctrl-C."""
 
     @functools.wraps(function)
     def reported(*args: P.args, **kwargs: P.kwargs) -> None:
-        with _terminable():
+        with _Interruptions():
             try:
                 function(*args, **kwargs)
-            except (typer.Exit, BrokenPipeError):
+            except typer.Exit:
                 raise
-            except KeyboardInterrupt:
-                raise fail("interrupted", Exit.INTERRUPTED) from None
-            except Exception as error:
-                if os.environ.get("SBT_DEBUG"):
+            except BaseException as error:
+                if os.environ.get("SBT_DEBUG") and not interruption.requested():
                     traceback.print_exc()
                 raise fail(*_verdict(error)) from None
 
     return reported
 
 
-def _verdict(error: Exception) -> tuple[str, Exit]:
+def _verdict(error: BaseException) -> tuple[str, Exit]:
     """Return what to say of an error, and its exit code."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", Exit.INTERRUPTED
     if isinstance(error, InputError):
         return str(error), Exit.INPUT
     if isinstance(error, SbtError):
         return str(error), Exit.INTERNAL
-    return f"internal error: {type(error).__name__}: {error} (SBT_DEBUG=1 shows where)", Exit.INTERNAL
+    what = f"{type(error).__name__}: {error}".removesuffix(": ")
+    return f"internal error: {what} (SBT_DEBUG=1 shows where)", Exit.INTERNAL
+
+
+class _Interruptions:
+    """What the command line does when a signal ends it: says so at once, and ends at once where it is asked again."""
+
+    def __init__(self) -> None:
+        self._stack = contextlib.ExitStack()
+        self._first = math.inf
+        self._stderr = -1
+
+    def __enter__(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stderr = os.dup(2)  # SUMO's own output takes the place of descriptor 2 during a run
+        self._stack.enter_context(interruption.handled(*_SIGNALS, notify=self._notify))
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+        with contextlib.suppress(OSError):
+            os.close(self._stderr)
+
+    def _notify(self, number: int) -> bool:
+        """Return whether a signal interrupts; the second one ends the process, whose workers end with it."""
+        now = time.monotonic()
+        if self._first == math.inf:
+            self._first = now
+            if _resumable:
+                name = signal.Signals(number).name
+                self._say(f"stopping ({name}): {_resumable[-1].consequence()}; a second signal stops at once")
+            return True
+        if now - self._first > _ONCE:
+            self._say("stopped at once")
+            os._exit(int(Exit.INTERRUPTED))
+        return False
+
+    def _say(self, text: str) -> None:
+        with contextlib.suppress(OSError):  # nobody is there to read it
+            start = "\n" if os.isatty(self._stderr) else ""
+            os.write(self._stderr, f"{start}{text}\n".encode())
+
+
+class _Resumable:
+    """Work that can be resumed as soon as there is something in its folder."""
+
+    def __init__(self, pattern: str, again: str):
+        self.folder: Path | None = None
+        self._pattern, self._again = pattern, again
+
+    def consequence(self) -> str:
+        """Return what an interruption means now."""
+        if self.folder is not None and any(self.folder.glob(self._pattern)):
+            return self._again
+        return "nothing was run yet"
+
+
+_resumable: list[_Resumable] = []
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
+def resumable(pattern: str = "campaign.sqlite", again: str = "run again to resume") -> Iterator[_Resumable]:
+    """End interrupted work with exit code 130, and say what resumes it; before there are results, that there are none.
 
+    Args:
+        pattern: of a file that is in the folder of the results as soon as there are some.
+        again: what to do to resume.
+
+    Yields:
+        An object whose `folder` has to be set once it is known.
+    """
+    work = _Resumable(pattern, again)
+    _resumable.append(work)
     try:
-        before = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:  # not the main thread: somebody else's signals
-        yield
-        return
-    try:
-        yield
+        yield work
+    except KeyboardInterrupt:
+        raise fail(f"interrupted, {work.consequence()}", Exit.INTERRUPTED) from None
     finally:
-        signal.signal(signal.SIGTERM, before)
+        _resumable.pop()
+
+
+def prepare_streams() -> None:
+    """Let nobody's closed terminal or pipe end a command: what can no longer be written is dropped."""
+    open_missing()
+    sys.stdout, sys.stderr = SteadyStream(sys.stdout), SteadyStream(sys.stderr, any_error=True)
 
 
 @contextlib.contextmanager

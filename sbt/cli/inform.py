@@ -43,9 +43,9 @@ def _entries(kind: str) -> list[dict[str, str]]:
     from sbt.plugins import load, names
 
     if kind == "campaigns":
-        from sbt.config.model import CAMPAIGNS
+        from sbt.config.kinds import kinds
 
-        return [{"name": name, "summary": campaign.description} for name, campaign in CAMPAIGNS.items()]
+        return [{"name": name, "summary": kind.description} for name, kind in kinds().items()]
     if kind == "sources":
         return _sources()
     entries = []

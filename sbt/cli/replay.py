@@ -34,14 +34,15 @@ def replay(
 ) -> None:
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
-        from sbt.workflows.running import replay as execute
+        from sbt.workflows.running import replay_run
 
-        record, outcome, states, scenario = execute(folder, run)
+        again = replay_run(folder, run)
+        record, outcome, states = again.record, again.outcome, again.trace
         if gui or gif or export or trace:
             if states is None:
                 raise InputError(f"only a run with a trace can be shown or written out, but run {run} has none: {outcome.reason}")
-            _show(scenario, record, states, gui=gui, gif=gif, export=export, trace=trace)
-    same = str(outcome.status) == record.status and dict(outcome.metrics) == dict(record.metrics)
+            _show(again.scenario, record, states, gui=gui, gif=gif, export=export, trace=trace)
+    same = again.identical
     if as_json:
         print_json({
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import time
-import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sbt.cli.console import Exit, clean_stdout, fail, print_json
-from sbt.errors import InputError, RunError
+from sbt.errors import InputError
 
 if TYPE_CHECKING:
     from sbt.execution.spec import ScenarioSpec
@@ -66,29 +63,19 @@ def _run(
     """Return status, metrics, verdict, reason and seconds of one run, and its trace where there is one."""
     if with_trace and logical.simulate is None:
         raise InputError(f"--trace needs a scenario that is simulated, but {logical.name} gives its metrics directly")
-    start, states = time.perf_counter(), None
-    status, reason, metrics = "ok", "", {}
-    try:
-        if logical.simulate is None:
-            metrics = logical.run(values, seed)
-        else:
-            states = logical.simulate(values, seed)
-            metrics = logical.measure(states)
-    except RunError as error:
-        status, reason = str(error.status), error.reason
-    except Exception as error:
-        if os.environ.get("SBT_DEBUG"):
-            traceback.print_exc()
-        status, reason = "failed", f"{type(error).__name__}: {error}"
+    from sbt.execution.worker import run_traced
+    from sbt.problem.outcome import Job
+
+    outcome, states = run_traced(logical, Job(0, values, seed))
+    metrics = dict(outcome.metrics)
     need = logical.requirement
     critical = need.critical.low <= metrics[need.metric] <= need.critical.high if metrics else None
-    seconds = time.perf_counter() - start
     return {
-        "status": status,
+        "status": str(outcome.status),
         "metrics": metrics,
         "critical": critical,
-        "reason": reason,
-        "seconds": seconds,
+        "reason": outcome.reason,
+        "seconds": outcome.seconds,
     }, states
 
 

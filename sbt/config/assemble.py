@@ -8,20 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from sbt.acquisitions import Acquisition, even
 from sbt.config.load import Loaded
-from sbt.config.model import CAMPAIGNS, Choice
-from sbt.config.source import Key, Problems, must_be_one_of
+from sbt.config.model import Choice
+from sbt.config.source import Problems, must_be_one_of
 from sbt.config.space import configured_space
+from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.recalibrated import Recalibrated
-from sbt.plugins import load
+from sbt.plugins import OBJECT
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, metric_from
 
 __all__ = ["Assembly", "acquisition_of", "assemble", "metamodel_of", "scenario_of", "spec_of"]
 
@@ -94,13 +96,21 @@ def _without_problems(loaded: Loaded, make: Callable[[Loaded, Problems], T]) -> 
 
 
 def spec_of(loaded: Loaded) -> ScenarioSpec:
-    """Return the scenario as plain data for other processes; files are absolute."""
-    config = loaded.config
+    """Return the scenario as plain data for other processes; files are absolute, objects given in Python are carried by value."""
+    config, scope = loaded.config, loaded.scope
     ego = None if config.ego is None else _plain_ego(config.ego, loaded.folder)
-    folder = str(loaded.folder.resolve())
-    step, formula = config.simulation.step_length, config.requirement.stl
     types = config.campaign == "falsification"  # its failure modes are told apart by them
-    return ScenarioSpec(config.scenario, folder, ego, config.executor.isolation, step, formula, types)
+    named = tuple(name for name in config.metrics if not name.startswith(OBJECT))
+    own = tuple(metric_from(scope.load("metrics", name)) for name in config.metrics if name.startswith(OBJECT))
+    carried = b""
+    if own or config.scenario.startswith(OBJECT):
+        scenario: LogicalScenario = scope.load("scenarios", config.scenario)
+        kept = tuple(m for m in scenario.metrics if m.name not in {metric.name for metric in own})
+        carried = carry(replace(scenario, metrics=(*kept, *own)) if own else scenario)
+    return ScenarioSpec(
+        config.scenario, str(loaded.folder.resolve()), ego, config.executor.isolation, config.simulation.step_length,
+        config.requirement.stl, types, named, carried,
+    )  # fmt: skip
 
 
 def _plain_ego(ego: Choice, folder: Path) -> dict[str, Any]:
@@ -110,21 +120,12 @@ def _plain_ego(ego: Choice, folder: Path) -> dict[str, Any]:
 
 def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
     """Return the configured scenario, as far as the problems allow; raise them where there is none at all."""
-    config, spec = loaded.config, spec_of(loaded)
-    base = problems.attempt(("scenario",), ScenarioSpec(spec.name, spec.folder).resolve)
-    if base is None:
+    config, spec = loaded.config, problems.attempt(("scenario",), partial(spec_of, loaded))
+    if spec is None:
         raise problems.error()
-    scenario = base
-    steps: tuple[tuple[Key, ScenarioSpec], ...] = (
-        (("ego",), replace(spec, step_length=None, isolation="auto", formula=None)),
-        (("simulation", "step_length"), replace(spec, ego=None, isolation="auto", formula=None)),
-        (("requirement", "stl"), replace(spec, ego=None, step_length=None, isolation="auto")),
-        (("executor", "isolation"), spec),
-    )
-    before = len(problems.found)
-    for path, chosen in steps:
-        if path[0] != "executor" or len(problems.found) == before:
-            scenario = problems.attempt(path, chosen.resolve) or scenario
+    scenario = spec.resolve_at(problems.attempt)
+    if scenario is None:
+        raise problems.error()
     space = configured_space(config, scenario.space, problems, loaded.folder)
     requirement = _requirement(loaded, scenario, problems)
     return replace(scenario, space=space, requirement=requirement)
@@ -149,13 +150,13 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
     choice = loaded.config.metamodel
     if choice is None:
         return None
-    kind = problems.attempt(("metamodel", "kind"), lambda: load("metamodels", choice.kind, loaded.folder))
+    kind = problems.attempt(("metamodel", "kind"), lambda: loaded.scope.load("metamodels", choice.kind))
     if kind is None:
         return None
-    if not isinstance(kind, type) or not callable(getattr(kind, "fit", None)):
+    if not callable(getattr(kind, "fit", None)):
         problems.add(
             ("metamodel", "kind"),
-            f"a metamodel must be a class with fit(u, y, rng), but '{choice.kind}' is not",
+            f"a metamodel must be a class (or an object) with fit(u, y, rng), but '{choice.kind}' is not",
         )
         return None
     settings = choice.settings
@@ -168,9 +169,9 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
 
 def _acquisition(loaded: Loaded, problems: Problems) -> Acquisition | None:
     kind = loaded.config.acquisition.kind
-    if kind in CAMPAIGNS[loaded.config.campaign].methods:
+    if kind in loaded.kind.methods:
         return None
-    found = problems.attempt(("acquisition", "kind"), lambda: load("acquisitions", kind, loaded.folder))
+    found = problems.attempt(("acquisition", "kind"), lambda: loaded.scope.load("acquisitions", kind))
     if found is not None and not callable(found):
         problems.add(("acquisition", "kind"), f"an acquisition must be a function, but '{kind}' is not")
     return even if found is None else found  # `even` only stands in until the problems are raised

@@ -24,6 +24,7 @@ from sbt.config.model import (
     SimulationChoice,
 )
 from sbt.config.source import ConfigError, Key, Place, SourceMap
+from sbt.plugins import Scope
 
 __all__ = ["ACQUISITIONS", "Benchmark", "Cell", "LoadedBenchmark", "load_benchmark"]
 
@@ -210,7 +211,7 @@ class LoadedBenchmark:
         places: dict[Key, Place] = {}
         for new, old in roots:
             places |= {(*new, *path[len(old) :]): p for path, p in self.source.places.items() if path[: len(old)] == old}
-        return Loaded(config, SourceMap(self.source.name, places), self.folder)
+        return Loaded(config, SourceMap(self.source.name, places), Scope(self.folder))
 
 
 def load_benchmark(path: str | Path, overrides: Sequence[str] = ()) -> LoadedBenchmark:

@@ -21,13 +21,16 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from sbt.campaigns.settings import CampaignKind
+from sbt.config.kinds import kind_of, kinds, looked_up_in
 from sbt.config.model import Configuration
 from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
 from sbt.errors import did_you_mean
+from sbt.plugins import Scope
 
 __all__ = [
-    "ConfigError", "Loaded", "checked", "differences", "dump", "fingerprint", "load", "located", "parse", "read_text", "resolve",
-    "resumed", "schema",
+    "ConfigError", "Loaded", "checked", "differences", "dump", "fingerprint", "from_mapping", "load", "located", "parse", "read_text",
+    "resolve", "resumed", "schema",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=BaseModel)
@@ -49,24 +52,41 @@ _RULES = {
 
 @dataclass(frozen=True)
 class Loaded:
-    """A configuration, where its keys stand, and the folder that its relative `file.py:NAME` start from."""
+    """A configuration, where its keys stand, and where its names are looked up."""
 
     config: Configuration
     source: SourceMap
-    folder: Path
+    scope: Scope
+
+    @property
+    def folder(self) -> Path:
+        """Where relative `file.py:NAME` start from."""
+        return self.scope.folder
+
+    @property
+    def kind(self) -> CampaignKind:
+        """The kind of campaign that is configured."""
+        with looked_up_in(self.scope):
+            return kind_of(self.config.campaign)
 
 
-def load(path: str | Path, overrides: Sequence[str] = ()) -> Loaded:
+def load(
+    path: str | Path, overrides: Sequence[str] = (), *, changes: Mapping[str, Any] | None = None,
+    objects: Mapping[tuple[str, str], Any] | None = None,
+) -> Loaded:  # fmt: skip
     """Read and check a configuration file.
 
     Args:
         path: a YAML file.
         overrides: `key.path=value` texts that replace or add single values, each value in YAML.
+        changes: keys that replace those of the file, with their values as plain data.
+        objects: what was given in Python, by kind and name.
 
     Raises:
         ConfigError: the file cannot be read, or anything in it breaks a rule; all at once.
     """
-    return parse(read_text(path), overrides, name=str(path), folder=Path(path).resolve().parent)
+    folder = Path(path).resolve().parent
+    return parse(read_text(path), overrides, name=str(path), folder=folder, changes=changes, objects=objects)
 
 
 def read_text(path: str | Path) -> str:
@@ -98,13 +118,48 @@ def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wr
     return ConfigError([*wrong, *source.sorted(found)])
 
 
-def parse(text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None) -> Loaded:
-    """Check a configuration given as text; like `load`."""
-    config, source = checked(Configuration, text, overrides, name)
-    return Loaded(config, source, folder or Path.cwd())
+def parse(
+    text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None,
+    changes: Mapping[str, Any] | None = None, objects: Mapping[tuple[str, str], Any] | None = None,
+) -> Loaded:  # fmt: skip
+    """Check a configuration given as text; like `load`.
+
+    Args:
+        text: YAML.
+        overrides: as for `load`.
+        name: of the file, for messages.
+        folder: where relative names are looked up; None: the working directory.
+        changes: as for `load`.
+        objects: what was given in Python, by kind and name.
+    """
+    scope = Scope(folder or Path.cwd(), objects or {})
+    with looked_up_in(scope):
+        config, source = checked(Configuration, text, overrides, name, changes or {})
+    return Loaded(config, source, scope)
 
 
-def checked(model: type[M], text: str, overrides: Sequence[str], name: str) -> tuple[M, SourceMap]:
+def from_mapping(data: Mapping[str, Any], *, name: str, scope: Scope) -> Loaded:
+    """Check a configuration given as plain data.
+
+    Args:
+        data: keys and values as in YAML.
+        name: of what gave it, for messages.
+        scope: where its names are looked up.
+
+    Raises:
+        ConfigError: anything in it breaks a rule; all at once.
+    """
+    source = SourceMap(name)
+    try:
+        with looked_up_in(scope):
+            return Loaded(Configuration.model_validate(dict(data)), source, scope)
+    except ValidationError as error:
+        raise located(source, error, Configuration) from None
+
+
+def checked(
+    model: type[M], text: str, overrides: Sequence[str], name: str, changes: Mapping[str, Any] | None = None
+) -> tuple[M, SourceMap]:
     """Return YAML text as a checked model, and where its keys stand.
 
     Raises:
@@ -119,7 +174,7 @@ def checked(model: type[M], text: str, overrides: Sequence[str], name: str) -> t
     if "campaign" not in data and {"sumo", "simulate"} & set(data):
         rule = "a configuration must name a campaign, but this is a scenario"
         raise ConfigError([f"{name}:1:1: {rule}; run one with scenario: {name}"])
-    data, source, wrong = _overridden(data, source, overrides)
+    data, source, wrong = _overridden({**data, **(changes or {})}, source, overrides)
     wrong = doubled + wrong
     try:
         config = model.model_validate(data)
@@ -176,12 +231,17 @@ def resumed(config: Configuration, stored: Mapping[str, Any]) -> Configuration:
 
 
 def schema() -> dict[str, Any]:
-    """Return the JSON schema of configurations."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "sumo-sbt campaign",
-        **{k: v for k, v in Configuration.model_json_schema().items() if k != "title"},
-    }
+    """Return the JSON schema of configurations, with what the installed campaigns declare."""
+    found = {k: v for k, v in Configuration.model_json_schema().items() if k != "title"}
+    campaigns, keys = kinds(), found["properties"]
+    keys["campaign"]["examples"] = list(campaigns)
+    described = (f"{n}: {kind.description}" for n, kind in campaigns.items())
+    keys["campaign"]["description"] += " Installed: " + "; ".join(described) + "."
+    learns = (f"{n}: {_shown(dict(kind.metamodel)) if kind.adaptive else 'none'}" for n, kind in campaigns.items())
+    keys["metamodel"]["description"] += " Defaults: " + "; ".join(learns) + "."
+    chooses = (f"{n}: {kind.acquisition} ({', '.join(kind.methods) or 'no methods'})" for n, kind in campaigns.items())
+    keys["acquisition"]["description"] += " Defaults, and the methods of each: " + "; ".join(chooses) + "."
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "sumo-sbt campaign", **found}
 
 
 def _overridden(data: dict[str, Any], source: SourceMap, overrides: Sequence[str]) -> tuple[dict[str, Any], SourceMap, list[str]]:

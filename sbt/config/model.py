@@ -6,10 +6,9 @@ name, low < high) are checked in `sbt.config.assemble`, everything else here.
 
 from __future__ import annotations
 
-import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,15 +24,16 @@ from pydantic import (
     field_validator,
 )
 
-from sbt.config.campaigns import CAMPAIGNS, CampaignKind
+from sbt.config.kinds import kind_of
 from sbt.errors import did_you_mean
+from sbt.plugins import OBJECT
 from sbt.problem.expression import Expression
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "CAMPAIGNS", "EXECUTORS", "AcquisitionChoice", "CampaignKind", "Choice", "Configuration",
+    "EXECUTORS", "AcquisitionChoice", "Choice", "Configuration",
     "CorrelationEntry", "ExecutorChoice", "GateChoice", "InputChange", "MetamodelChoice", "RequirementChange",
-    "SimulationChoice", "StopRules", "ValidationChoice",
+    "SimulationChoice", "StopRules", "ValidationChoice", "WarmStart",
 ]  # fmt: skip
 
 
@@ -84,7 +84,12 @@ def _not_blank(text: str) -> str:
     return text
 
 
-CampaignName = Annotated[str, AfterValidator(_one_of(tuple(CAMPAIGNS))), Field(json_schema_extra={"enum": [*CAMPAIGNS]})]
+def _campaign(name: str) -> str:
+    kind_of(name)  # raises where there is none
+    return name
+
+
+CampaignName = Annotated[str, AfterValidator(_campaign)]
 ExecutorName = Annotated[str, AfterValidator(_one_of(EXECUTORS)), Field(json_schema_extra={"enum": [*EXECUTORS]})]
 Name = Annotated[str, AfterValidator(_not_blank)]
 Condition = Annotated[str, AfterValidator(_formula(condition=True))]
@@ -153,8 +158,7 @@ class AcquisitionChoice(_Strict):
     """How runs are chosen: an acquisition function, or a method of the campaign."""
 
     kind: Name = Field(
-        description="even, boundary, importance, another installed function, file.py:NAME, or a method of the campaign: "
-        + "; ".join(f"{name}: {', '.join(kind.methods)}" for name, kind in CAMPAIGNS.items() if kind.methods)
+        description="An installed acquisition function, file.py:NAME, or a method of the campaign."
     )
 
 
@@ -243,39 +247,41 @@ class ExecutorChoice(_Strict):
 
 
 def _tenth(data: dict[str, Any]) -> int:
-    most = CAMPAIGNS[data["campaign"]].most_initial or data["budget"]
+    most = kind_of(data["campaign"]).most_initial or data["budget"]
     return int(min(max(10, data["budget"] // 10), data["budget"], most))
 
 
 def _batch(data: dict[str, Any]) -> int:
-    return CAMPAIGNS[data["campaign"]].batch or int(data["initial"])
+    return kind_of(data["campaign"]).batch or int(data["initial"])
 
 
 def _store(data: dict[str, Any]) -> str:
-    path = Path(data["scenario"].removesuffix(":SCENARIO"))
+    path = Path(data["scenario"].removesuffix(":SCENARIO").removeprefix(OBJECT))
     path = path.parent if path.name in ("scenario.yaml", "scenario.yml") and path.parent.name else path
     name = re.sub(r"[^\w-]+", "_", path.stem if path.suffix in (".py", ".yaml") else path.name)
-    return f"runs/{data['campaign']}_{name}"
+    campaign = data["campaign"].removeprefix(OBJECT).rpartition(":")[2]
+    return f"runs/{campaign}_{name}"
 
 
 def _metamodel(data: dict[str, Any]) -> MetamodelChoice | None:
-    kind = CAMPAIGNS[data["campaign"]]
+    kind = kind_of(data["campaign"])
     return MetamodelChoice.model_validate(dict(kind.metamodel)) if kind.adaptive else None
 
 
 def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
-    return AcquisitionChoice(kind=CAMPAIGNS[data["campaign"]].acquisition)
+    return AcquisitionChoice(kind=kind_of(data["campaign"]).acquisition)
 
 
-def _shown(settings: Mapping[str, Any]) -> str:
-    """Return settings as they are written in YAML."""
-    return "{" + ", ".join(f"{key}: {json.dumps(value).strip(chr(34))}" for key, value in settings.items()) + "}"
+class WarmStart(_Strict):
+    """An earlier campaign to learn from: its runs teach the metamodel, they are never counted."""
+
+    store: Name = Field(description="Store of a finished campaign of the same scenario, ego, step and inputs.")
 
 
 class Configuration(_Strict):
     """A campaign: what is asked, of which scenario, with how many runs."""
 
-    campaign: CampaignName = Field(description="; ".join(f"{name}: {kind.description}" for name, kind in CAMPAIGNS.items()))
+    campaign: CampaignName = Field(description="What is asked: an installed campaign, or file.py:NAME.")
     scenario: Name = Field(
         description="An installed scenario, or file.py:NAME or scenario.yaml (relative to the configuration file)."
     )
@@ -291,6 +297,9 @@ class Configuration(_Strict):
         description="Conditions on inputs that every concrete scenario meets, such as 'v_ego - v_co < 30'.",
     )
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel, name: formula.")
+    metrics: Annotated[tuple[Name, ...], Field(strict=False)] = Field(
+        default=(), description="Further safety metrics: installed names, or file.py:NAME (a Metric or a function of a trace)."
+    )
     ego: Choice | None = Field(
         default=None,
         description="The AV: a controller or SUMO's models; a setting {min, max} is an input; null: the scenario's own.",
@@ -310,13 +319,11 @@ class Configuration(_Strict):
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
         default_factory=_metamodel,
-        description="What learns the safety metric; default: "
-        + "; ".join(f"{name}: {_shown(kind.metamodel) if kind.adaptive else 'none'}" for name, kind in CAMPAIGNS.items()),
+        description="What learns the safety metric; default: that of the campaign.",
     )
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,
-        description="How runs are chosen; default: "
-        + "; ".join(f"{name}: {kind.acquisition}" for name, kind in CAMPAIGNS.items()),
+        description="How runs are chosen; default: that of the campaign.",
     )
     stop: StopRules = Field(
         default_factory=StopRules, validate_default=True, description="When to stop before the budget is used up."
@@ -324,10 +331,9 @@ class Configuration(_Strict):
     gate: GateChoice | None = Field(
         default=None, description="Estimation: pass, fail or undecided about a largest probability; null: no verdict."
     )
-    earlier: Name | None = Field(
-        default=None, alias="from",
-        description="Estimation: store of a finished campaign of the same scenario; its runs teach, they are never counted.",
-    )  # fmt: skip
+    warm_start: WarmStart | None = Field(
+        default=None, description="Estimation: an earlier campaign whose runs teach the metamodel; null: none."
+    )
     executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")
     store: Name = Field(default_factory=_store, description="Folder of the results; default: runs/<campaign>_<scenario>.")
 
@@ -342,7 +348,7 @@ class Configuration(_Strict):
     @classmethod
     def _learns(cls, value: MetamodelChoice | None, info: ValidationInfo) -> MetamodelChoice | None:
         name = info.data.get("campaign")
-        if value is None and name is not None and CAMPAIGNS[name].adaptive:
+        if value is None and name is not None and kind_of(name).adaptive:
             raise ValueError(f"a {name} campaign needs a metamodel, but got null")
         return value
 
@@ -350,15 +356,16 @@ class Configuration(_Strict):
     @classmethod
     def _fits_campaign(cls, value: AcquisitionChoice, info: ValidationInfo) -> AcquisitionChoice:
         name = info.data.get("campaign")
-        if name is not None and not CAMPAIGNS[name].adaptive and value.kind != CAMPAIGNS[name].acquisition:
-            raise ValueError(f"a {name} campaign draws by {CAMPAIGNS[name].acquisition}, but got '{value.kind}'")
+        if name is not None and not kind_of(name).adaptive and value.kind != kind_of(name).acquisition:
+            raise ValueError(f"a {name} campaign draws by {kind_of(name).acquisition}, but got '{value.kind}'")
         return value
 
-    @field_validator("gate", "earlier")
+    @field_validator("gate", "warm_start")
     @classmethod
     def _of_estimation(cls, value: Any, info: ValidationInfo) -> Any:
-        if value is not None and info.data.get("campaign", "estimation") != "estimation":
-            raise ValueError(f"only an estimation campaign takes it, but the campaign is {info.data['campaign']}")
+        name = info.data.get("campaign")
+        if value is not None and name is not None and not kind_of(name).takes_gate:
+            raise ValueError(f"only an estimation campaign takes it, but the campaign is {name}")
         return value
 
     @field_validator("stop")
@@ -368,7 +375,7 @@ class Configuration(_Strict):
         name = info.data.get("campaign")
         if name is None:
             return value
-        default = CAMPAIGNS[name].stop
+        default = kind_of(name).stop
         surplus = [rule for rule, limit in value.model_dump().items() if limit is not None and rule not in default]
         if surplus:
             known = ", ".join(default) or "none"

@@ -5,16 +5,17 @@ is at in a file of its own. After a death the runs that were at work are tried a
 kills its worker again is `crashed`, all others go on as if nothing had happened. A run that hangs
 inside SUMO cannot be stopped from within (the step holds the interpreter's lock): the driver kills
 exactly that process. Runs that share a simulation are suspects together, and tried again one by one.
+The scenario reaches each worker once, through a file; a chunk of work is its jobs only.
 """
 
 from __future__ import annotations
 
 import gc
 import os
+import pickle
 import signal
 import struct
 import tempfile
-import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -24,12 +25,17 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
+from sbt.errors import PluginError, SbtError
+from sbt.execution.pool import broken, close_pool, open_pool
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
-from sbt.execution.worker import run_jobs
+from sbt.execution.streams import open_missing
+from sbt.execution.worker import described, run_jobs
 from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.scenario import LogicalScenario
+from sbt.processes import scratch
 
-__all__ = ["LocalExecutor"]
+__all__ = ["LocalExecutor", "settle"]
 
 _MARK = struct.Struct("<dq")
 """The time of the note, and how many indices of runs follow."""
@@ -37,7 +43,8 @@ _TARGET = 0.05
 """Runs are handed out in chunks of about so many seconds."""
 _TICK = 0.25
 _GRACE = 2.0
-_THREADS = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
+_MARKS = "marks"
+_SCENARIO = "scenario.pickle"
 
 
 class LocalExecutor:
@@ -52,42 +59,47 @@ class LocalExecutor:
     def __init__(self, spec: ScenarioSpec, workers: int, timeout: float | None = None):
         self._spec, self._workers, self._timeout = spec, workers, timeout
         self._pool: Any = None
-        self._marks: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._seconds = _TARGET
 
     def __enter__(self) -> Self:
         """Start the workers and let them load the scenario."""
-        self._marks = tempfile.TemporaryDirectory(prefix="sbt-marks-")
-        self._start()
+        open_missing()
+        self._scratch = scratch("pool")
+        folder = Path(self._scratch.name)
+        (folder / _SCENARIO).write_bytes(pickle.dumps((self._spec, self._timeout)))
+        (folder / _MARKS).mkdir()
+        try:
+            self._start()
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop the workers."""
         self._stop()
-        if self._marks is not None:
-            self._marks.cleanup()
+        if self._scratch is not None:
+            self._scratch.cleanup()
 
     def _start(self) -> None:
-        from joblib.externals.loky.backend import get_context
-        from joblib.externals.loky.process_executor import ProcessPoolExecutor
-
-        self._pool = ProcessPoolExecutor(max_workers=self._workers, context=get_context("loky"), timeout=None, env=_THREADS)
-        ready = [self._pool.submit(_prepare, self._spec, self._folder, self._workers) for _ in range(self._workers)]
+        self._pool = open_pool(self._workers, self._folder)
+        ready = [self._pool.submit(_prepare, self._folder, self._workers) for _ in range(self._workers)]
         wait(ready)
         for future in ready:
-            if not isinstance(future.exception(), _broken()):
+            if not isinstance(future.exception(), broken()):
                 future.result()
 
     def _stop(self) -> None:
         if self._pool is not None:
-            self._pool.shutdown(wait=True, kill_workers=True)
+            close_pool(self._pool)
             self._pool = None
 
     @property
     def _folder(self) -> str:
-        if self._marks is None:
+        if self._scratch is None:
             raise RuntimeError("an executor must be entered before it runs: with executor: ...")
-        return self._marks.name
+        return self._scratch.name
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome a job as they finish."""
@@ -114,25 +126,25 @@ class LocalExecutor:
         """Run what is queued; return the jobs that are missing after a death, and who was at work then."""
         flying: dict[Future[Any], list[Job]] = {}
         overdue: dict[int, Status] = {}
-        broken = False
-        while (queue or flying) and not broken:
-            while queue and len(flying) < 2 * self._workers and not broken:
+        died = False
+        while (queue or flying) and not died:
+            while queue and len(flying) < 2 * self._workers and not died:
                 chunk = chunk_of(queue, _TARGET / max(self._seconds, 1e-4), self._workers)
                 try:
-                    flying[self._pool.submit(_run_chunk, self._spec, chunk, self._folder, self._timeout)] = chunk
-                except _broken():
+                    flying[self._pool.submit(_run_chunk, self._folder, chunk)] = chunk
+                except broken():
                     queue.extendleft(reversed(chunk))
-                    broken = True
+                    died = True
             done, _ = wait(flying, timeout=_TICK, return_when=FIRST_COMPLETED)
             for future in done:
-                if isinstance(future.exception(), _broken()):
-                    broken = True
+                if isinstance(future.exception(), broken()):
+                    died = True
                     continue
                 del flying[future]
                 yield from self._measured(future.result())
             if not done:
                 overdue |= self._kill_overdue()
-        if not broken:
+        if not died:
             return [], {}
         yield from self._rescued(flying)
         missing = [job for chunk in flying.values() for job in chunk] + list(queue)
@@ -156,7 +168,7 @@ class LocalExecutor:
     def _at_work(self) -> list[tuple[tuple[int, ...], int, float]]:
         """Return (indices of the runs, process, time on the monotonic clock) of every worker with runs at work."""
         found = []
-        for path in Path(self._folder).iterdir():
+        for path in Path(self._folder, _MARKS).iterdir():
             data = path.read_bytes()
             if len(data) >= _MARK.size:
                 since, n = _MARK.unpack_from(data)
@@ -176,40 +188,20 @@ class LocalExecutor:
 
     def _restart(self) -> None:
         self._stop()
-        for path in Path(self._folder).iterdir():
+        for path in Path(self._folder, _MARKS).iterdir():
             path.unlink()
         self._start()
-
-
-def _broken() -> type[BaseException]:
-    """Return the error of a pool whose worker died."""
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    error: type[BaseException] = BrokenProcessPool
-    return error
 
 
 @cache
 def _mark_file(folder: str) -> int:
     """Open this worker's own note, once."""
-    return os.open(Path(folder) / str(os.getpid()), os.O_CREAT | os.O_WRONLY)
+    return os.open(Path(folder, _MARKS, str(os.getpid())), os.O_CREAT | os.O_WRONLY)
 
 
 def _mark(folder: str, runs: Sequence[int]) -> None:
     """Note which runs this worker is at, and that it is alive."""
     os.pwrite(_mark_file(folder), _MARK.pack(time.monotonic(), len(runs)) + struct.pack(f"<{len(runs)}q", *runs), 0)
-
-
-@cache
-def _end_with(parent: int) -> None:
-    """End this process when its driver is gone: a killed driver cannot stop its workers."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=watch, name="sbt-driver-watch", daemon=True).start()
 
 
 def settle() -> None:
@@ -218,18 +210,30 @@ def settle() -> None:
     gc.set_threshold(20_000)
 
 
-def _prepare(spec: ScenarioSpec, folder: str, workers: int) -> None:
+@cache
+def _scenario(folder: str) -> LogicalScenario:
+    """Return the scenario that the driver has written down for its workers."""
+    spec, timeout = pickle.loads(Path(folder, _SCENARIO).read_bytes())
+    scenario: LogicalScenario = spec.resolve()
+    try:
+        scenario.prepare()
+        return scenario.limited(timeout)
+    except SbtError:
+        raise
+    except BaseException as error:  # a user's code must not end the driver
+        raise PluginError(f"scenario {scenario.name} must be prepared without an error, but raised {described(error)}") from None
+
+
+def _prepare(folder: str, workers: int) -> None:
     """Load the scenario in a worker, and wait until every worker does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
-    _end_with(os.getppid())
-    spec.resolve().prepare()
+    _scenario(folder)
     settle()
     _mark(folder, ())
-    deadline = time.monotonic() + 20.0
-    while len(os.listdir(folder)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
+    marks, deadline = Path(folder, _MARKS), time.monotonic() + 20.0
+    while len(os.listdir(marks)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
         time.sleep(0.005)
 
 
-def _run_chunk(spec: ScenarioSpec, jobs: list[Job], folder: str, timeout: float | None) -> list[Outcome]:
+def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:
     """Run jobs in a worker, noting which are at work."""
-    return run_jobs(spec.resolve().limited(timeout), jobs, partial(_mark, folder))
+    return run_jobs(_scenario(folder), jobs, partial(_mark, folder))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Protocol, Self
 
+from sbt import interruption
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.streams import open_missing
 from sbt.execution.worker import run_jobs
 from sbt.problem.outcome import Job, Outcome
+from sbt.problem.scenario import Batched
 
 __all__ = ["CHUNK", "Executor", "SerialExecutor", "chunk_of"]
 
@@ -38,18 +42,28 @@ class SerialExecutor:
 
     def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
         self._scenario = spec.resolve().limited(timeout)
+        self._signals = ExitStack()
 
     def __enter__(self) -> Self:
-        """Return the executor."""
+        """Tell Ctrl-C from a KeyboardInterrupt that the scenario's code raises, and return the executor."""
+        open_missing()
+        self._signals.enter_context(interruption.handled())
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Do nothing."""
+        """Leave Ctrl-C to whoever handled it before."""
+        self._signals.close()
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Yield one outcome a job, in order."""
-        for first in range(0, len(jobs), CHUNK):
-            yield from run_jobs(self._scenario, jobs[first : first + CHUNK], lambda _: None)
+        """Yield one outcome a job, in order.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C, after the run that was at work at the latest.
+        """
+        simulate = self._scenario.simulate
+        size = CHUNK if isinstance(simulate, Batched) and simulate.batched else 1
+        for first in range(0, len(jobs), size):
+            yield from run_jobs(self._scenario, jobs[first : first + size], lambda _: None)
 
 
 def chunk_of(queue: deque[Job], size: float, workers: int) -> list[Job]:

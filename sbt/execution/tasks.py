@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
-from sbt.execution.local import _THREADS, _end_with
-from sbt.execution.worker import place_of
+from sbt import interruption
+from sbt.errors import SbtError
+from sbt.execution.pool import broken, close_pool, open_pool
+from sbt.execution.worker import described
+from sbt.processes import scratch
 
-__all__ = ["each"]
+__all__ = ["each", "elsewhere"]
 
+P = ParamSpec("P")
+R = TypeVar("R")
 T = TypeVar("T")
 
 
@@ -28,33 +31,48 @@ def each(function: Callable[[T], None], items: Sequence[T], workers: int) -> Ite
         for item in items:
             yield item, _tried(function, item)
         return
-    from joblib.externals.loky.backend import get_context
-    from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
-
-    context = get_context("loky")
-    pool = ProcessPoolExecutor(
-        max_workers=workers, context=context, timeout=None, env=_THREADS, initializer=_begin, initargs=(os.getpid(),)
-    )
-    try:
-        futures = {pool.submit(_tried, function, item): item for item in items}
-        for future in as_completed(futures):
-            try:
-                yield futures[future], future.result()
-            except BrokenProcessPool:
-                yield futures[future], "a worker process died; run again to go on"
-    finally:
-        pool.shutdown(wait=True, kill_workers=True)
+    with scratch("tasks") as folder:
+        pool = open_pool(workers, folder)
+        try:
+            futures = {pool.submit(_tried, function, item): item for item in items}
+            for future in as_completed(futures):
+                try:
+                    yield futures[future], future.result()
+                except broken():
+                    yield futures[future], "a worker process died; run again to go on"
+        finally:
+            close_pool(pool)
 
 
-def _begin(parent: int) -> None:
-    """Leave Ctrl-C to the driver, and end with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with(parent)
+def elsewhere(seconds: float, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Call a function in a process of its own and return what it returns, or raise what it raises.
+
+    Args:
+        seconds: longest time.
+        function: importable in another process.
+        *args: plain data.
+        **kwargs: plain data.
+
+    Raises:
+        SbtError: the process died.
+        TimeoutError: it took too long.
+    """
+    with scratch("tasks") as folder:
+        pool = open_pool(1, folder)
+        try:
+            result: R = pool.submit(function, *args, **kwargs).result(seconds)
+        except broken():
+            raise SbtError("the worker process died") from None
+        finally:
+            close_pool(pool)
+    return result
 
 
 def _tried(function: Callable[[T], None], item: T) -> str | None:
     try:
         function(item)
-    except Exception as error:
-        return f"{type(error).__name__}: {error} ({place_of(error)})"
+    except BaseException as error:
+        if interruption.is_interruption(error):
+            raise KeyboardInterrupt from None
+        return described(error)
     return None

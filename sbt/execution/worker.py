@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from importlib.metadata import version
 
 import numpy as np
 
-from sbt.errors import InputError, RunError
+from sbt import interruption
+from sbt.errors import InputError, RunError, place_of
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["place_of", "run_job", "run_jobs", "versions"]
+__all__ = ["described", "run_job", "run_jobs", "run_traced", "versions"]
+
+_Measured = tuple[dict[str, float], str]
+"""Metrics, and SUMO's own collision list."""
 
 
 def run_job(scenario: LogicalScenario, job: Job) -> Outcome:
@@ -24,11 +29,32 @@ def run_job(scenario: LogicalScenario, job: Job) -> Outcome:
 
     Returns:
         The outcome: OK with finite metrics, or the status and the reason why there are none.
+
+    Raises:
+        KeyboardInterrupt: a signal asked for it; one that the scenario's code raises is a failed run.
+    """
+    return run_traced(scenario, job)[0]
+
+
+def run_traced(scenario: LogicalScenario, job: Job) -> tuple[Outcome, Trace | None]:
+    """Run one concrete scenario, once, and keep its trace.
+
+    Returns:
+        The outcome as of `run_job`, and the trace; None where the scenario has none or could not be simulated. A run
+        that was simulated and not measured has one.
     """
     simulate = scenario.simulate
     if simulate is None:
-        return _outcome(job, lambda: (scenario.run(job.inputs, job.seed), ""))
-    return _outcome(job, lambda: _measured(scenario, simulate(job.inputs, job.seed)))
+        return _outcome(job, lambda: (_declared(scenario, scenario.run(job.inputs, job.seed)), "")), None
+    traces: list[Trace] = []
+
+    def measured() -> _Measured:
+        trace = simulate(job.inputs, job.seed)
+        if isinstance(trace, Trace):
+            traces.append(trace)
+        return _measured(scenario, trace)
+
+    return _outcome(job, measured), traces[0] if traces else None
 
 
 def run_jobs(scenario: LogicalScenario, jobs: Sequence[Job], at_work: Callable[[Sequence[int]], None]) -> list[Outcome]:
@@ -37,53 +63,94 @@ def run_jobs(scenario: LogicalScenario, jobs: Sequence[Job], at_work: Callable[[
     Args:
         scenario: what to run.
         jobs: its inputs and seeds.
-        at_work: told again and again the indices of the jobs that are being run, none in the end.
+        at_work: called again and again with the indices of the jobs that are being run, none in the end.
 
     Returns:
         The outcomes, which do not depend on what ran at once; of runs at once the mean time.
+
+    Raises:
+        KeyboardInterrupt: a signal asked for it.
     """
-    simulate = scenario.simulate
+    start = time.perf_counter()
+    traces = _together(scenario, jobs, at_work)
+    share = (time.perf_counter() - start) / len(jobs) if jobs else 0.0
     outcomes: list[Outcome] = []
-    if isinstance(simulate, Batched) and simulate.batched and len(jobs) > 1:
-        start = time.perf_counter()
-        found = simulate.simulate_many([(j.inputs, j.seed) for j in jobs], lambda busy: at_work([jobs[k].index for k in busy]))
-        share = (time.perf_counter() - start) / len(jobs)
-        for job, result in zip(jobs, found, strict=True):
-            at_work((job.index,))
-            outcomes.append(_outcome(job, partial(_measured, scenario, result), share))
-    else:
-        for job in jobs:
-            at_work((job.index,))
-            outcomes.append(run_job(scenario, job))
+    for k, job in enumerate(jobs):
+        at_work((job.index,))
+        outcomes.append(
+            run_job(scenario, job) if traces is None else _outcome(job, partial(_measured, scenario, traces[k]), share)
+        )
     at_work(())
     return outcomes
 
 
-def _outcome(job: Job, measured: Callable[[], tuple[dict[str, float], str]], seconds: float = 0.0) -> Outcome:
+def _together(
+    scenario: LogicalScenario, jobs: Sequence[Job], at_work: Callable[[Sequence[int]], None]
+) -> list[Trace | BaseException] | None:
+    """Return the traces, or errors, of jobs that are run at once; None where they have to be run one by one."""
+    simulate = scenario.simulate
+    if len(jobs) < 2 or not isinstance(simulate, Batched):
+        return None
+    try:
+        if not simulate.batched:
+            return None
+        found = simulate.simulate_many([(j.inputs, j.seed) for j in jobs], lambda busy: at_work([jobs[k].index for k in busy]))
+    except BaseException as error:  # whose it is, the runs show when they are run alone
+        if interruption.is_interruption(error):
+            raise KeyboardInterrupt from None
+        return None
+    return list(found) if len(found) == len(jobs) else None
+
+
+def _outcome(job: Job, measured: Callable[[], _Measured], seconds: float = 0.0) -> Outcome:
     """Return what became of a job: the metrics, or the error that is raised instead."""
     start = time.perf_counter() - seconds
     try:
         metrics, reported = measured()
+        interruption.check()  # the code of the run may have caught the KeyboardInterrupt of a signal
         return Outcome(job.index, Status.OK, metrics, "", time.perf_counter() - start, reported)
-    except RunError as error:
-        status, reason = Status(error.status), error.reason
-    except InputError as error:
-        status, reason = Status.FAILED, str(error)
-    except Exception as error:  # a user's scenario may raise anything; the night goes on
-        status, reason = Status.FAILED, f"{type(error).__name__}: {error} ({place_of(error)})"
+    except BaseException as error:  # a user's scenario may raise anything, SystemExit too; the campaign goes on
+        if interruption.is_interruption(error):
+            raise KeyboardInterrupt from None
+        status, reason = _verdict(error)
     return Outcome(job.index, status, {}, reason, time.perf_counter() - start)
 
 
-def _measured(scenario: LogicalScenario, trace: Trace | Exception) -> tuple[dict[str, float], str]:
+def _verdict(error: BaseException) -> tuple[Status, str]:
+    """Return the status of a run that raised, and the reason."""
+    if isinstance(error, RunError) and error.status in set(Status) - {Status.OK}:
+        return Status(error.status), str(error.reason)
+    if os.environ.get("SBT_DEBUG"):
+        traceback.print_exception(error)
+    if isinstance(error, InputError):
+        return Status.FAILED, str(error)
+    return Status.FAILED, described(error)
+
+
+def _measured(scenario: LogicalScenario, trace: Trace | BaseException) -> _Measured:
     """Return the metrics of a run and SUMO's own collision list, or raise its error."""
-    if isinstance(trace, Exception):
+    if isinstance(trace, BaseException):
         raise trace
+    if not isinstance(trace, Trace):
+        raise RunError(Status.FAILED, f"simulate must return a Trace, but returned a {type(trace).__name__}")
     _check_trace(trace)
     return scenario.measure(trace), " ".join(trace.reported)
 
 
+def _declared(scenario: LogicalScenario, metrics: dict[str, float]) -> dict[str, float]:
+    """Return the metrics if they are those that the scenario says it gives."""
+    if metrics.keys() != set(scenario.measured):
+        names = _listed(scenario.measured), _listed(metrics)
+        raise RunError(Status.FAILED, f"a run must give the metrics {names[0]}, but gave {names[1]}")
+    return metrics
+
+
+def _listed(names: Iterable[object]) -> str:
+    return ", ".join(map(str, names)) or "none"
+
+
 def _check_trace(trace: Trace) -> None:
-    """Refuse states that are not finite; NaN in all of them says that an actor is not there, which the first one must be."""
+    """Refuse states that are not finite; NaN in all of them says that an actor is absent, which the first one must not be."""
     for name in ("x", "y", "heading", "speed"):
         values = getattr(trace, name)
         if math.isfinite(float(values.sum())):
@@ -93,10 +160,13 @@ def _check_trace(trace: Trace) -> None:
             raise RunError(Status.FAILED, f"every state must be finite, but trace.{name} is not")
 
 
-def place_of(error: BaseException) -> str:
-    """Return file:line where the error was raised."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "no place"
+def described(error: BaseException) -> str:
+    """Return type, message and place of an error, on one line where its message has one."""
+    try:
+        message = str(error)
+    except BaseException:  # an exception of a user's own
+        message = "(its message cannot be read)"
+    return f"{type(error).__name__}{': ' if message else ''}{message} ({place_of(error)})"
 
 
 def versions() -> str:

@@ -1,19 +1,15 @@
-"""What a campaign believes: fits the metamodel to the history and scores it on runs it had not seen."""
+"""The metamodel of a campaign: fitted to the history, scored on runs that it has not seen."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from hashlib import sha256
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sbt.errors import SbtError
-from sbt.execution.worker import place_of
-from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound, with_target
+from sbt.metamodels.base import Metamodel, Predictor, Screened, checked, log_ambiguity_bound, named_errors, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.arrays import Mask, Points, Vector
@@ -21,11 +17,14 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.history import History
+from sbt.store.records import FitRecord, Validation
 
 __all__ = ["FittedMetamodel", "Learner", "changed_share", "chunked"]
 
 _PROBE = 4096
+"""Points at which shares of the space are measured: their standard error is below 0.8 %."""
 _CHUNK = 4096
+"""Points that are predicted at once: bounds the memory of mixtures."""
 
 
 @dataclass(frozen=True)
@@ -34,72 +33,59 @@ class FittedMetamodel:
 
     Attributes:
         predict: (n, d) unit-cube points of the inputs to a `Prediction`.
-        scores: on held-out runs, empty without them; plus `sides`, the classification of 4,096
-            fixed Sobol points as hexadecimal bits, and over these points `critical_fraction`, the mean
-            P(critical), `expected_misclassified`, the mean of the smaller of P and 1 - P, and
-            `ambiguous_volume`, the share with P between 0.05 and 0.95; of a metamodel that chose among others
-            `believed`, what it chose and why, and `weights`, the share of each.
-        runs: rows it learned from.
+        record: its scores, as the log keeps them.
         seconds: the fit took.
         log_ambiguity_bound: (n, d) points -> (n,) quick upper bounds of log a_BI; None: the metamodel has none.
     """
 
     predict: Callable[[Points], Prediction]
-    scores: dict[str, Any]
-    runs: int
+    record: FitRecord
     seconds: float
     log_ambiguity_bound: Callable[[Points], Vector] | None = None
 
 
 @dataclass(frozen=True)
 class Learner:
-    """Fits and scores one metamodel for one scenario; the same history gives the same belief.
+    """Fits and scores one metamodel for one scenario; the same history gives the same fitted metamodel.
 
     Args:
         scenario: with the campaign's space and requirement.
         metamodel: its settings.
         seed: of the campaign.
         target_aware: the critical edge is what is looked for, and the metamodel is told where it is; otherwise all of y counts.
-        last: the last belief by what it was made from: a campaign's conclusion and its report ask for the same.
     """
 
     scenario: LogicalScenario
     metamodel: Metamodel
     seed: int
     target_aware: bool = True
-    last: dict[bytes, FittedMetamodel] = field(default_factory=dict, repr=False, compare=False)
 
     def fit(self, history: History) -> FittedMetamodel | None:
-        """Return the belief after these runs; None with fewer than two to learn from."""
-        if len(history.training) < 2:
-            return None
-        made_from = [history.x, history.y(self.scenario.requirement.metric), history.stage.astype(str)]
-        key = sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in made_from)).digest()
-        if key not in self.last:
-            self.last.clear()
-            self.last[key] = self._fit(history)
-        return self.last[key]
-
-    def _fit(self, history: History) -> FittedMetamodel:
+        """Return the metamodel fitted to these runs, and scored; None with fewer than two to learn from."""
         training, start = history.training, time.perf_counter()
-        space, predictor = self.scenario.space, self.train(training)
+        if len(training) < 2:
+            return None
+        predictor = self.train(training)
         seconds = time.perf_counter() - start
-
-        def predict(points: Points) -> Prediction:
-            inputs = space.metamodel_inputs(points)
-            with self._named(len(training)):
-                return predictor(inputs)
-
-        bound = None
+        predict, bound = self.on_inputs(predictor, len(training)), None
         if isinstance(predictor, Screened):
-            critical = self.scenario.requirement.critical
+            critical, space = self.scenario.requirement.critical, self.scenario.space
 
             def bound(points: Points) -> Vector:
                 return log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
 
-        chosen = getattr(getattr(predictor, "predictor", predictor), "comparison", None)  # also of a recalibrated one
-        told = {} if chosen is None else {"believed": chosen.reason, "weights": dict(chosen.weights)}
-        return FittedMetamodel(predict, self._scores(predict, history) | told, len(training), seconds, bound)
+        return FittedMetamodel(predict, self._record(predict, predictor, history, len(training)), seconds, bound)
+
+    def on_inputs(self, predictor: Predictor, learned: int) -> Predictor:
+        """Return a predictor as a function of the inputs' (n, d) unit-cube points; derived features are added here."""
+        space = self.scenario.space
+
+        def predict(points: Points) -> Prediction:
+            inputs = space.metamodel_inputs(points)
+            with named_errors(self.metamodel, learned):
+                return checked(predictor(inputs), len(inputs))
+
+        return predict
 
     def train(self, training: History) -> Predictor:
         """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""
@@ -107,7 +93,7 @@ class Learner:
         y = training.y(requirement.metric)
         u = space.metamodel_inputs(space.to_unit(training.x))
         metamodel = with_target(self.metamodel, requirement.critical) if self.target_aware else self.metamodel
-        with self._named(len(training)):
+        with named_errors(self.metamodel, len(training)):
             return metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
 
     def unseen(self, history: History) -> tuple[Points, Vector]:
@@ -118,27 +104,17 @@ class Learner:
         left = ~pool.taken(history.x)
         return pool.x[left], pool.metrics[metric][left]
 
-    @contextmanager
-    def _named(self, n: int) -> Iterator[None]:
-        """Say which metamodel raised, and where: it may be the user's own."""
-        try:
-            yield
-        except SbtError:
-            raise
-        except Exception as error:
-            name, raised = type(self.metamodel).__name__, f"{type(error).__name__}: {error} ({place_of(error)})"
-            raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {raised}") from error
-
-    def _scores(self, predict: Predictor, history: History) -> dict[str, Any]:
-        critical, space = self.scenario.requirement.critical, self.scenario.space
-        x, y = self.unseen(history)
-        found: dict[str, Any] = scores(chunked(predict, space.to_unit(x)), y, critical) if len(y) else {}
+    def _record(self, predict: Predictor, predictor: Predictor, history: History, learned: int) -> FitRecord:
+        """Return the scores of a fitted metamodel, and its classification of fixed points."""
+        (x, y), critical = self.unseen(history), self.scenario.requirement.critical
+        found: Any = scores(chunked(predict, self.scenario.space.to_unit(x)), y, critical) if len(y) else None
         p = self._probe(predict)
-        found["critical_fraction"] = float(p.mean())
-        found["expected_misclassified"] = float(np.minimum(p, 1.0 - p).mean())
-        found["ambiguous_volume"] = float(((p > 0.05) & (p < 0.95)).mean())
-        found["sides"] = np.packbits(p > 0.5).tobytes().hex()
-        return found
+        comparison = getattr(getattr(predictor, "predictor", predictor), "comparison", None)  # also of a recalibrated one
+        return FitRecord(
+            learned, float(p.mean()), float(np.minimum(p, 1.0 - p).mean()), float(((p > 0.05) & (p < 0.95)).mean()),
+            np.packbits(p > 0.5).tobytes().hex(), None if found is None else Validation(**found),
+            None if comparison is None else dict(comparison.weights), None if comparison is None else comparison.reason,
+        )  # fmt: skip
 
     def _probe(self, predict: Predictor) -> Points:
         """Return P(critical) at 4,096 fixed points of the space."""

@@ -8,35 +8,42 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
 
 from sbt.errors import InputError
 from sbt.execution.protocol import Executor
+from sbt.loop.learner import FittedMetamodel
 from sbt.problem.outcome import Status
 from sbt.problem.requirement import Requirement
 from sbt.seeds import run_seed
 from sbt.store.database import PlannedRun, Store
-from sbt.store.history import PLANNED, History, Record
+from sbt.store.history import PLANNED, History, Rows
+from sbt.store.records import FitRecord, Iteration, to_json
 
-__all__ = ["Batch", "Campaign", "Fit", "Log", "Progress", "Shard", "Stage", "check_shard", "run_shard", "run_stages"]
+__all__ = [
+    "Batch", "Campaign", "Conclusion", "Facts", "Finished", "Log", "Progress", "Shard", "ShardConclusion", "Stage", "check_shard",
+    "run_shard", "run_stages",
+]  # fmt: skip
 
-
-@dataclass(frozen=True)
-class Fit:
-    """Scores of a metamodel, to be kept with the number of rows that were there."""
-
-    scores: Mapping[str, Any]
-    seconds: float
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What a stage asks for: runs, and how they were chosen (JSON)."""
+    """What a stage asks for.
+
+    Args:
+        runs: the concrete scenarios.
+        proposal: how they were chosen: a dataclass, written to the log as JSON and read back by `Iteration.read`.
+        fitted: the metamodel that chose them, whose scores the log keeps.
+    """
 
     runs: tuple[PlannedRun, ...]
-    how: Mapping[str, Any] = field(default_factory=dict)
-    fit: Fit | None = None
+    proposal: object
+    fitted: FittedMetamodel | None = None
 
 
 @dataclass(frozen=True)
@@ -50,13 +57,44 @@ class Log:
     """
 
     history: History
-    iterations: tuple[Mapping[str, Any], ...]
-    fits: tuple[Mapping[str, Any], ...]
+    iterations: tuple[Iteration, ...]
+    fits: tuple[FitRecord, ...]
 
     @property
     def iteration(self) -> int:
         """Number of the next batch."""
         return len(self.iterations)
+
+    def last(self, kind: type[T]) -> T | None:
+        """Return how the last batch was chosen; None before the first one."""
+        return self.iterations[-1].read(kind) if self.iterations else None
+
+
+class Conclusion(Protocol):
+    """What a campaign found: a frozen dataclass with typed attributes."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON of the command line."""
+        ...
+
+    def sentences(self, facts: Facts) -> list[str]:
+        """Return what was found in plain words, the most important first."""
+        ...
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What sentences about a conclusion may refer to.
+
+    Attributes:
+        history: finished runs.
+        requirement: metric and critical interval.
+        unit: of the metric.
+    """
+
+    history: History
+    requirement: Requirement
+    unit: str = ""
 
 
 class Stage(Protocol):
@@ -82,13 +120,13 @@ class Campaign:
 
     Args:
         stages: propose the batches.
-        conclude: gives the conclusion, and the scores of a metamodel that was fitted for it.
+        conclude: gives the conclusion, and the metamodel that was fitted for it.
         depends: how batches, or when they end, depend on results; None: not at all, so that all runs
             can be planned ahead and shared out.
     """
 
     stages: tuple[Stage, ...]
-    conclude: Callable[[Log], tuple[dict[str, Any], Fit | None]]
+    conclude: Callable[[Log], tuple[Conclusion, FittedMetamodel | None]]
     depends: str | None = "each batch depends on all results before it"
 
 
@@ -154,26 +192,63 @@ class _Counter:
         if status != Status.OK:
             self.failed += 1
         else:
-            y = metrics[self.requirement.metric]
-            self.critical += self.requirement.critical.low <= y <= self.requirement.critical.high
+            self.critical += self.requirement.is_critical(metrics)
+
+    def count_all(self, history: History) -> None:
+        self.done += len(history)
+        self.failed += int((~history.ok).sum())
+        self.critical += int(np.count_nonzero(self.requirement.critical_runs(history)))
 
     def tell(self, activity: str) -> None:
         self.listener(Progress(self.done, self.budget, self.failed, self.critical, self.iteration, activity))
 
 
+@dataclass(frozen=True)
+class ShardConclusion:
+    """The conclusion of one shard: which one it was, and of how many runs.
+
+    Attributes:
+        shard: I/N.
+        runs_of_the_campaign: of all shards together.
+    """
+
+    shard: str
+    runs_of_the_campaign: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON of the command line."""
+        return {"shard": self.shard, "runs_of_the_campaign": self.runs_of_the_campaign}
+
+    def sentences(self, facts: Facts) -> list[str]:
+        """Return what was run."""
+        return [f"Shard {self.shard}: {len(facts.history):,} of {self.runs_of_the_campaign:,} runs of the campaign."]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """How a campaign ended.
+
+    Attributes:
+        stopped: why the last stage was over.
+        conclusion: what was found.
+        seconds: of `simulate`, `fit` and `propose`.
+        fitted: the metamodel that was fitted for the conclusion.
+    """
+
+    stopped: str
+    conclusion: Conclusion
+    seconds: Mapping[str, float]
+    fitted: FittedMetamodel | None = None
+
+
 def run_stages(
     campaign: Campaign, store: Store, executor: Executor, *, seed: int, budget: int, requirement: Requirement,
     versions: str, listener: Callable[[Progress], None],
-) -> tuple[str, dict[str, Any], dict[str, float]]:  # fmt: skip
-    """Run all stages to their end, resuming what the store holds.
-
-    Returns:
-        Why the last stage stopped, the conclusion, and the seconds of `simulate`, `fit`, `propose`.
-    """
+) -> Finished:  # fmt: skip
+    """Run all stages to their end, resuming what the store holds."""
     seconds = {"simulate": 0.0, "fit": 0.0, "propose": 0.0}
     counter = _Counter(listener, requirement, budget)
-    for record in store.history().records:
-        counter.count(record.status, record.metrics)
+    counter.count_all(store.history())
     reason = ""
     for stage in campaign.stages:
         while True:
@@ -187,28 +262,25 @@ def run_stages(
             counter.tell(f"{stage.name}: choosing")
             start = time.perf_counter()
             batch = _proposed(stage, log)
-            _keep_fit(store, batch.fit, log, seconds)
-            seconds["propose"] += time.perf_counter() - start - (batch.fit.seconds if batch.fit else 0.0)
+            spent = _keep_fit(store, batch.fitted, log, seconds)
+            seconds["propose"] += time.perf_counter() - start - spent
             _plan(store, stage, batch, log, seed)
     log = _log(store)
     counter.tell("concluding")
     start = time.perf_counter()
-    conclusion, fit = campaign.conclude(log)
-    _keep_fit(store, fit, log, seconds)
-    seconds["propose"] += time.perf_counter() - start - (fit.seconds if fit else 0.0)
-    return reason, conclusion, seconds
+    conclusion, fitted = campaign.conclude(log)
+    spent = _keep_fit(store, fitted, log, seconds)
+    seconds["propose"] += time.perf_counter() - start - spent
+    return Finished(reason, conclusion, seconds, fitted)
 
 
 def run_shard(
     campaign: Campaign, shard: Shard, store: Store, executor: Executor, *, seed: int, requirement: Requirement,
     versions: str, listener: Callable[[Progress], None],
-) -> tuple[str, dict[str, Any], dict[str, float]]:  # fmt: skip
+) -> Finished:  # fmt: skip
     """Run one shard's runs of a campaign whose batches depend on no result, resuming what the store holds.
 
     Rows have the index, stage, iteration, inputs and seed that they have in the whole campaign.
-
-    Returns:
-        As `run_stages`; the conclusion is which shard it was, and of how many runs.
 
     Raises:
         InputError: there are fewer runs than shards.
@@ -219,19 +291,18 @@ def run_shard(
     total = sum(len(batch.runs) for _, batch in batches)
     if shard.of > total:
         raise InputError(f"there must be at most as many shards as runs, but got shard {shard} of {total} runs")
-    first, there = 0, len(store.iterations())
+    first, planned = 0, len(store.iterations())
     for iteration, (stage, batch) in enumerate(batches):
         mine = [index for index in range(first, first + len(batch.runs)) if index in shard]
-        if iteration >= there:
+        if iteration >= planned:
             runs, seeds = [batch.runs[index - first] for index in mine], [run_seed(seed, index) for index in mine]
-            store.plan(iteration, stage, runs, seeds, batch.how, indices=mine)
+            store.plan(iteration, stage, runs, seeds, batch.proposal, indices=mine)
         first += len(batch.runs)
     seconds["propose"] = time.perf_counter() - start
     counter = _Counter(listener, requirement, store.planned, iteration=len(batches))
-    for record in store.history().records:
-        counter.count(record.status, record.metrics)
+    counter.count_all(store.history())
     _finish(store, executor, counter, versions, seconds)
-    return "shard", {"shard": str(shard), "runs_of_the_campaign": total}, seconds
+    return Finished("shard", ShardConclusion(str(shard), total), seconds)
 
 
 def check_shard(campaign: Campaign) -> None:
@@ -249,18 +320,20 @@ def check_shard(campaign: Campaign) -> None:
 
 def _ahead(campaign: Campaign, names: tuple[str, ...]) -> list[tuple[str, Batch]]:
     """Return all batches, with the name of their stage; the stages see every run without a result."""
-    records: list[Record] = []
-    iterations: list[dict[str, Any]] = []
+    rows = Rows(names)
+    iterations: list[Iteration] = []
     batches: list[tuple[str, Batch]] = []
     for stage in campaign.stages:
-        while stage.stop(log := Log(History(names, tuple(records)), tuple(iterations), ())) is None:
+        while stage.stop(log := Log(rows.history(), tuple(iterations), ())) is None:
             batch = _proposed(stage, log)
-            start = len(records)
-            records += [
-                Record(start + k, run.stage, log.iteration, run.inputs, 0, PLANNED, {}, "", run.log_q, 0.0, "", "")
-                for k, run in enumerate(batch.runs)
-            ]
-            iterations.append({"iteration": log.iteration, "stage": stage.name, **batch.how})
+            x = np.array([[run.inputs[name] for name in names] for run in batch.runs], dtype=np.float64)
+            n = len(batch.runs)
+            columns = {
+                "index": range(rows.count, rows.count + n), "stage": [run.stage for run in batch.runs],
+                "iteration": [log.iteration] * n, "status": [PLANNED] * n, "log_q": [run.log_q for run in batch.runs],
+            }  # fmt: skip
+            rows.append(x, columns, [{}] * n)
+            iterations.append(Iteration(log.iteration, stage.name, to_json(batch.proposal)))
             batches.append((stage.name, batch))
     return batches
 
@@ -276,16 +349,19 @@ def _log(store: Store) -> Log:
     return Log(store.history(), tuple(store.iterations()), tuple(store.fits()))
 
 
-def _keep_fit(store: Store, fit: Fit | None, log: Log, seconds: dict[str, float]) -> None:
-    if fit is not None:
-        seconds["fit"] += fit.seconds
-        store.add_fit(len(log.history), log.iteration, dict(fit.scores))
+def _keep_fit(store: Store, fitted: FittedMetamodel | None, log: Log, seconds: dict[str, float]) -> float:
+    """Write what the log keeps of a metamodel; return the seconds of its fit."""
+    if fitted is None:
+        return 0.0
+    seconds["fit"] += fitted.seconds
+    store.add_fit(replace(fitted.record, runs=len(log.history), iteration=log.iteration))
+    return fitted.seconds
 
 
 def _plan(store: Store, stage: Stage, batch: Batch, log: Log, seed: int) -> None:
     start = store.planned
     seeds = [run_seed(seed, start + k) for k in range(len(batch.runs))]
-    store.plan(log.iteration, stage.name, batch.runs, seeds, batch.how)
+    store.plan(log.iteration, stage.name, batch.runs, seeds, batch.proposal)
 
 
 def _finish(store: Store, executor: Executor, counter: _Counter, versions: str, seconds: dict[str, float]) -> None:

@@ -1,1 +1,14 @@
 """What is believed: metamodels and their predictions; the only place with torch and scikit-learn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sbt import plugins
+
+
+def __getattr__(name: str) -> Any:
+    """Return an installed one by the name of `sbt.list("metamodels")` (PEP 562)."""
+    if name.startswith("_") or name not in plugins.names("metamodels"):
+        raise AttributeError(f"module 'sbt.metamodels' has no attribute '{name}'; installed: {', '.join(plugins.names('metamodels'))}")
+    return plugins.load("metamodels", name)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sbt.errors import InputError
-from sbt.metrics.longitudinal import FAR, HORIZON, d_min, ttc_min
+from sbt.metrics.pairwise import without_overtaking
 from sbt.plugins import load, names
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
@@ -245,9 +245,8 @@ def _read_table(path: Path) -> tuple[Any, Any, dict[str, Any]]:
 
 
 def catalogue() -> tuple[Metric, ...]:
-    """Return all installed metrics; `ttc_min` and `d_min` report no interaction for an ego that has overtaken."""
-    recorded = {m.name: m for m in (ttc_min(passed=HORIZON), d_min(passed=FAR))}
-    return tuple(recorded.get(name) or load("metrics", name) for name in names("metrics"))
+    """Return all installed metrics for recorded traffic."""
+    return tuple(without_overtaking(load("metrics", name)) for name in names("metrics"))
 
 
 def near_pairs(recording: Recording, within: float) -> list[tuple[int, int]]:

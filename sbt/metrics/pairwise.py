@@ -13,13 +13,13 @@ import numpy as np
 
 from sbt.errors import InputError
 from sbt.metrics.cache import per_trace
-from sbt.metrics.longitudinal import FAR, HORIZON
+from sbt.metrics.longitudinal import D_MIN, FAR, HORIZON, TTC_MIN, d_min, ttc_min
 from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, signal
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
-__all__ = ["in_traffic", "joint_intervals", "worst_signal"]
+__all__ = ["in_traffic", "joint_intervals", "without_overtaking", "worst_signal"]
 
 _ABSENT = {
     "gap": FAR, "ttc": HORIZON, "thw": HORIZON, "mttc": HORIZON, "ttc2d": HORIZON, "distance": FAR,
@@ -85,6 +85,16 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
         return worst(values, default=metric.without)
 
     return replace(metric, name=name or metric.name, function=function)
+
+
+def without_overtaking(metric: Metric) -> Metric:
+    """Return an installed metric; `ttc_min` and `d_min` in the variant that reports no interaction for an overtaking ego.
+
+    In a test, having overtaken before the other enters the path is a result of its own; in traffic it is not.
+    """
+    if metric is TTC_MIN:
+        return ttc_min(passed=HORIZON)
+    return d_min(passed=FAR) if metric is D_MIN else metric
 
 
 def worst_signal(trace: Trace, name: str, ego: str, margin: float = 0.0) -> Vector:

@@ -1,1 +1,1 @@
-"""What is asked: inputs and their law, scenarios, traces, metrics, requirements, outcomes."""
+"""What is asked: inputs and their distribution, scenarios, traces, metrics, requirements, outcomes."""

@@ -1,7 +1,7 @@
-"""The law of one input: a distribution of SciPy, truncated to the input's range.
+"""The distribution of one input: one of SciPy, truncated to the input's range.
 
 Named kinds take the parameters engineers know (mean and standard deviation of the variable itself);
-`kind: scipy` takes any continuous law of `scipy.stats` with its own arguments; `kind: empirical` is the
+`kind: scipy` takes any continuous distribution of `scipy.stats` with its own arguments; `kind: empirical` is the
 kernel density of a recorded sample.
 """
 
@@ -18,7 +18,10 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.problem.arrays import Vector
 
-__all__ = ["KINDS", "Distribution", "TruncatedLaw"]
+__all__ = [
+    "KINDS", "Beta", "Distribution", "Empirical", "Exponential", "Gumbel", "LogNormal", "Normal", "SciPy", "Triangular",
+    "TruncatedDistribution", "Uniform", "Weibull",
+]  # fmt: skip
 
 
 def _lognormal(stats: Any, mean: float, std: float) -> Any:
@@ -47,7 +50,7 @@ KINDS: Mapping[str, tuple[tuple[str, ...], Callable[..., Any]]] = {
 
 @dataclass(frozen=True)
 class Distribution:
-    """A law before truncation; `parameters` are (name, value) pairs.
+    """A distribution before truncation; `parameters` are (name, value) pairs.
 
     Raises:
         InputError: unknown kind, or missing, surplus or impossible parameters.
@@ -62,12 +65,12 @@ class Distribution:
     @classmethod
     def of(cls, kind: str, **parameters: float | str) -> Distribution:
         """Return the distribution of this kind with these parameters, checked."""
-        law = cls(kind, tuple(sorted(parameters.items())))
-        law.frozen()
-        return law
+        distribution = cls(kind, tuple(sorted(parameters.items())))
+        distribution.frozen()
+        return distribution
 
     def frozen(self) -> Any:
-        """Return SciPy's frozen distribution, None for `uniform` (the range itself is the law)."""
+        """Return SciPy's frozen distribution, None for `uniform` (the range itself is the distribution)."""
         from scipy import stats
 
         given = dict(self.parameters)
@@ -79,7 +82,7 @@ class Distribution:
             name = given.pop("name", None)
             family = getattr(stats, str(name), None)
             if not isinstance(family, stats.rv_continuous):
-                raise InputError(f"kind scipy needs the name of a continuous law of scipy.stats, but got {name}")
+                raise InputError(f"kind scipy needs the name of a continuous distribution of scipy.stats, but got {name}")
             return self._checked(family(**given))
         if self.kind not in KINDS:
             known = ", ".join([*KINDS, "scipy", "empirical"])
@@ -94,32 +97,32 @@ class Distribution:
         except (ZeroDivisionError, ValueError) as error:
             raise InputError(f"distribution '{self.kind}' cannot have the parameters {given}: {error}") from None
 
-    def _checked(self, law: Any) -> Any:
-        if law is not None and not np.isfinite(law.ppf(0.5)):
+    def _checked(self, distribution: Any) -> Any:
+        if distribution is not None and not np.isfinite(distribution.ppf(0.5)):
             raise InputError(f"distribution '{self.kind}' cannot have the parameters {dict(self.parameters)}")
-        return law
+        return distribution
 
-    def truncated(self, low: float, high: float) -> TruncatedLaw:
-        """Return this law given that the variable lies in [low, high].
+    def truncated(self, low: float, high: float) -> TruncatedDistribution:
+        """Return this distribution given that the variable lies in [low, high].
 
         Raises:
-            InputError: the law has no mass there, or is uniform on an infinite range.
+            InputError: the distribution has no mass there, or is uniform on an infinite range.
         """
-        law = self.frozen()
-        if law is None:
+        distribution = self.frozen()
+        if distribution is None:
             if not math.isfinite(low + high):
                 raise InputError(f"a uniform input needs a finite range, but got [{low}, {high}]")
             from scipy import stats
 
-            law = stats.uniform(low, high - low)
-        return TruncatedLaw(law, low, high)
+            distribution = stats.uniform(low, high - low)
+        return TruncatedDistribution(distribution, low, high)
 
 
 @dataclass(frozen=True)
-class TruncatedLaw:
-    """A SciPy law given [low, high]; every method maps (n,) to (n,) and keeps precision in both tails."""
+class TruncatedDistribution:
+    """A SciPy distribution given [low, high]; every method maps (n,) to (n,) and keeps precision in both tails."""
 
-    law: Any
+    base: Any
     low: float
     high: float
 
@@ -130,50 +133,100 @@ class TruncatedLaw:
     @cached_property
     def _upper(self) -> bool:
         """Work with survival functions: the range lies above the median."""
-        return bool(self.low > self.law.ppf(0.5))
+        return bool(self.low > self.base.ppf(0.5))
 
     @cached_property
     def _lower(self) -> bool:
         """Work with distribution functions: the range lies below the median."""
-        return bool(self.high < self.law.ppf(0.5))
+        return bool(self.high < self.base.ppf(0.5))
 
     @cached_property
     def mass(self) -> float:
-        """Probability of the range under the law before truncation."""
+        """Probability of the range under the distribution before truncation."""
         if self._upper:
-            return float(self.law.sf(self.low) - self.law.sf(self.high))
-        return float(self.law.cdf(self.high) - self.law.cdf(self.low))
+            return float(self.base.sf(self.low) - self.base.sf(self.high))
+        return float(self.base.cdf(self.high) - self.base.cdf(self.low))
 
     def cdf(self, x: Vector) -> Vector:
         """Return P(X <= x)."""
         x = np.clip(x, self.low, self.high)
-        part = self.law.sf(self.low) - self.law.sf(x) if self._upper else self.law.cdf(x) - self.law.cdf(self.low)
+        part = self.base.sf(self.low) - self.base.sf(x) if self._upper else self.base.cdf(x) - self.base.cdf(self.low)
         return np.clip(part / self.mass, 0.0, 1.0)
 
     def sf(self, x: Vector) -> Vector:
         """Return P(X > x)."""
         x = np.clip(x, self.low, self.high)
-        part = self.law.cdf(self.high) - self.law.cdf(x) if self._lower else self.law.sf(x) - self.law.sf(self.high)
+        part = self.base.cdf(self.high) - self.base.cdf(x) if self._lower else self.base.sf(x) - self.base.sf(self.high)
         return np.clip(part / self.mass, 0.0, 1.0)
 
     def ppf(self, q: Vector) -> Vector:
         """Return the q quantile, q in [0, 1]."""
         if self._upper:
-            x = self.law.isf(self.law.sf(self.low) - np.asarray(q) * self.mass)
+            x = self.base.isf(self.base.sf(self.low) - np.asarray(q) * self.mass)
         else:
-            x = self.law.ppf(self.law.cdf(self.low) + np.asarray(q) * self.mass)
+            x = self.base.ppf(self.base.cdf(self.low) + np.asarray(q) * self.mass)
         return np.clip(x, self.low, self.high)
 
     def isf(self, q: Vector) -> Vector:
         """Return the value that is exceeded with probability q: precise where q is tiny."""
         if self._lower:
-            x = self.law.ppf(self.law.cdf(self.high) - np.asarray(q) * self.mass)
+            x = self.base.ppf(self.base.cdf(self.high) - np.asarray(q) * self.mass)
         else:
-            x = self.law.isf(self.law.sf(self.high) + np.asarray(q) * self.mass)
+            x = self.base.isf(self.base.sf(self.high) + np.asarray(q) * self.mass)
         return np.clip(x, self.low, self.high)
 
     def log_density(self, x: Vector) -> Vector:
         """Return the log density, -inf outside the range."""
         inside = (x >= self.low) & (x <= self.high)
         with np.errstate(divide="ignore"):
-            return np.where(inside, self.law.logpdf(x) - math.log(self.mass), -np.inf)
+            return np.where(inside, self.base.logpdf(x) - math.log(self.mass), -np.inf)
+
+
+def Uniform() -> Distribution:  # noqa: N802  (it stands where a class would)
+    """Return the uniform distribution on the input's range."""
+    return Distribution.of("uniform")
+
+
+def Normal(mean: float, std: float) -> Distribution:  # noqa: N802
+    """Return a normal distribution by mean and standard deviation, truncated to the input's range."""
+    return Distribution.of("normal", mean=float(mean), std=float(std))
+
+
+def LogNormal(mean: float, std: float) -> Distribution:  # noqa: N802
+    """Return a lognormal distribution by mean and standard deviation of the variable itself."""
+    return Distribution.of("lognormal", mean=float(mean), std=float(std))
+
+
+def Exponential(mean: float) -> Distribution:  # noqa: N802
+    """Return an exponential distribution by its mean."""
+    return Distribution.of("exponential", mean=float(mean))
+
+
+def Gumbel(mean: float, std: float) -> Distribution:  # noqa: N802
+    """Return a Gumbel distribution of maxima by mean and standard deviation."""
+    return Distribution.of("gumbel", mean=float(mean), std=float(std))
+
+
+def Weibull(shape: float, scale: float) -> Distribution:  # noqa: N802
+    """Return a Weibull distribution by shape and scale."""
+    return Distribution.of("weibull", shape=float(shape), scale=float(scale))
+
+
+def Beta(a: float, b: float) -> Distribution:  # noqa: N802
+    """Return a beta distribution on [0, 1]."""
+    return Distribution.of("beta", a=float(a), b=float(b))
+
+
+def Triangular(low: float, mode: float, high: float) -> Distribution:  # noqa: N802
+    """Return a triangular distribution."""
+    return Distribution.of("triangular", low=float(low), mode=float(mode), high=float(high))
+
+
+def SciPy(name: str, **parameters: float) -> Distribution:  # noqa: N802
+    """Return any continuous distribution of `scipy.stats` by its name, with SciPy's own parameters."""
+    return Distribution.of("scipy", name=name, **parameters)
+
+
+def Empirical(file: str, **parameters: float | str) -> Distribution:  # noqa: N802
+    """Return the kernel density of a recorded sample; parameters as in configurations (`kind: empirical`)."""
+    return Distribution.of("empirical", file=file, **parameters)

@@ -1,6 +1,6 @@
-"""A law from a recorded sample: a Gaussian kernel density with a stated bandwidth.
+"""A distribution from a recorded sample: a Gaussian kernel density with a stated bandwidth.
 
-The law is that of the kernel density, not of the sample: its tails are those of a normal of one
+The distribution is that of the kernel density, not of the sample: its tails are those of a normal of one
 bandwidth about the outermost values. What was never recorded has a probability by the bandwidth alone.
 """
 
@@ -38,7 +38,7 @@ def silverman(values: Vector) -> float:
 
 @dataclass(frozen=True, eq=False)
 class KernelDensity:
-    """A mixture of equally likely normals about the recorded values, with the methods of a SciPy law.
+    """A mixture of equally likely normals about the recorded values, with the methods of a SciPy distribution.
 
     Args:
         values: (n,) recorded, sorted.
@@ -88,7 +88,7 @@ class KernelDensity:
 
 
 def kernel_density(given: Mapping[str, float | str]) -> KernelDensity:
-    """Return the law that `{kind: empirical, file: speeds.csv, column: v, bandwidth: 0.5}` describes.
+    """Return the distribution that `{kind: empirical, file: speeds.csv, column: v, bandwidth: 0.5}` describes.
 
     Args:
         given: `file` (CSV with a header) and `column`; `bandwidth` in the unit of the values, by default

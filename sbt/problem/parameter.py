@@ -1,4 +1,4 @@
-"""One input of a logical scenario: its range, unit and law."""
+"""One input of a logical scenario: its range, unit and distribution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.special import ndtr, ndtri
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Mask, Vector
-from sbt.problem.distribution import Distribution, TruncatedLaw
+from sbt.problem.distribution import Distribution, TruncatedDistribution
 
 __all__ = ["TAIL", "Parameter"]
 
@@ -22,18 +22,18 @@ TAIL = 1e-6
 
 @dataclass(frozen=True)
 class Parameter:
-    """One input: a range with a unit, and the law of the values in it (None: uniform).
+    """One input: a range with a unit, and the distribution of the values in it (None: uniform).
 
     Args:
         name: an identifier.
         low, high: ends of the range in `unit`, both included; infinite only with a distribution.
         unit: as printed, "" for a pure number.
-        distribution: law of the input, truncated to the range.
+        distribution: distribution of the input, truncated to the range.
         kind: "integer" inputs take the whole numbers of the range.
         description: one line for reports.
 
     Raises:
-        InputError: not low < high, a NaN, an infinite range without a law, or an integer range
+        InputError: not low < high, a NaN, an infinite range without a distribution, or an integer range
             whose ends are not whole numbers.
     """
 
@@ -62,13 +62,13 @@ class Parameter:
 
     @property
     def _support(self) -> tuple[float, float]:
-        """Return the range of the law; whole numbers own half a unit on each side."""
+        """Return the range of the distribution; whole numbers own half a unit on each side."""
         half = 0.5 if self.kind == "integer" else 0.0
         return self.low - half, self.high + half
 
     @cached_property
-    def law(self) -> TruncatedLaw | None:
-        """The truncated law, None where the input is uniform on its range."""
+    def truncated(self) -> TruncatedDistribution | None:
+        """The truncated distribution, None where the input is uniform on its range."""
         if self.distribution is None or self.distribution.kind == "uniform":
             return None
         return self.distribution.truncated(*self._support)
@@ -76,10 +76,10 @@ class Parameter:
     @cached_property
     def bounds(self) -> tuple[float, float]:
         """Finite ends for designs: the range, or its 1e-6 quantiles where it is infinite."""
-        if self.law is None or (math.isfinite(self.low) and math.isfinite(self.high)):
+        if self.truncated is None or (math.isfinite(self.low) and math.isfinite(self.high)):
             return self.low, self.high
-        low = self.low if math.isfinite(self.low) else float(self.law.ppf(np.array(TAIL)))
-        high = self.high if math.isfinite(self.high) else float(self.law.isf(np.array(TAIL)))
+        low = self.low if math.isfinite(self.low) else float(self.truncated.ppf(np.array(TAIL)))
+        high = self.high if math.isfinite(self.high) else float(self.truncated.isf(np.array(TAIL)))
         return low, high
 
     @property
@@ -112,10 +112,10 @@ class Parameter:
         """Map a standard-normal score to the value of the same probability."""
         z = np.asarray(z, dtype=np.float64)
         low, high = self._support
-        if self.law is None:
+        if self.truncated is None:
             x = np.where(z <= 0, low + (high - low) * ndtr(z), high - (high - low) * ndtr(-z))
         else:
-            x = np.where(z <= 0, self.law.ppf(ndtr(z)), self.law.isf(ndtr(-z)))
+            x = np.where(z <= 0, self.truncated.ppf(ndtr(z)), self.truncated.isf(ndtr(-z)))
         if self.kind == "integer":
             return np.clip(np.floor(x + 0.5), self.low, self.high)
         return np.clip(x, self.low, self.high)
@@ -123,10 +123,10 @@ class Parameter:
     def to_normal(self, x: Vector) -> Vector:
         """Map a value to its standard-normal score (integers: of their cell's middle)."""
         low, high = self._support
-        if self.law is None:
+        if self.truncated is None:
             below, above = (x - low) / (high - low), (high - x) / (high - low)
         else:
-            below, above = self.law.cdf(x), self.law.sf(x)
+            below, above = self.truncated.cdf(x), self.truncated.sf(x)
         return np.where(below <= above, ndtri(below), -ndtri(above))
 
     def log_density(self, x: Vector) -> Vector:
@@ -135,16 +135,16 @@ class Parameter:
         with np.errstate(divide="ignore"):
             if self.kind == "integer":
                 log_p = np.log(self._cell_mass(x))
-            elif self.law is None:
+            elif self.truncated is None:
                 log_p = np.full(x.shape, -math.log(self.high - self.low))
             else:
-                log_p = self.law.log_density(x)
+                log_p = self.truncated.log_density(x)
         return np.where(self.contains(x), log_p, -np.inf)
 
     def _cell_mass(self, x: Vector) -> Vector:
         """Return the probability of the whole number x."""
-        if self.law is None:
+        if self.truncated is None:
             return np.full(x.shape, 1.0 / (self.high - self.low + 1))
-        upper = self.law.sf(x - 0.5) - self.law.sf(x + 0.5)
-        lower = self.law.cdf(x + 0.5) - self.law.cdf(x - 0.5)
-        return np.where(self.law.cdf(x) > 0.5, upper, lower)
+        upper = self.truncated.sf(x - 0.5) - self.truncated.sf(x + 0.5)
+        lower = self.truncated.cdf(x + 0.5) - self.truncated.cdf(x - 0.5)
+        return np.where(self.truncated.cdf(x) > 0.5, upper, lower)

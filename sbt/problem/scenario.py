@@ -44,7 +44,7 @@ class Batched(Protocol):
 
     def simulate_many(
         self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = ...
-    ) -> list[Trace | Exception]:
+    ) -> list[Trace | BaseException]:
         """Return the trace, or the error, of each of these values and seeds: the same as one by one.
 
         `at_work` is told, again and again, which of them are being run.
@@ -216,8 +216,8 @@ class LogicalScenario:
         for key, value in values.items():
             object.__setattr__(self, key, value)
         if requirement.metric not in self.measured:
-            near = did_you_mean(requirement.metric, self.measured)
-            raise InputError(f"requirement.metric must be one of {', '.join(self.measured)}, but got '{requirement.metric}'{near}")
+            known, hint = ", ".join(self.measured), did_you_mean(requirement.metric, self.measured)
+            raise InputError(f"requirement.metric must be one of {known}, but got '{requirement.metric}'{hint}")
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -86,7 +86,7 @@ class ParameterSpace:
 
     @cached_property
     def feasible_mass(self) -> float:
-        """Probability of the constraints under the law, by 32,768 Sobol points (1 without constraints)."""
+        """Probability of the constraints under the distribution, by 32,768 Sobol points (1 without constraints)."""
         if not self.constraints:
             return 1.0
         u = qmc.Sobol(self.dimension, scramble=True, rng=0).random(_MASS_POINTS)
@@ -109,7 +109,7 @@ class ParameterSpace:
         return mask
 
     def from_unit(self, u: Points) -> Points:
-        """Map (n, d) unit-cube coordinates to physical values, along the ranges (not the law)."""
+        """Map (n, d) unit-cube coordinates to physical values, along the ranges (not the distribution)."""
         u = as_points(u, self.dimension)
         return np.column_stack([p.from_unit(u[:, k]) for k, p in enumerate(self.parameters)])
 
@@ -119,7 +119,7 @@ class ParameterSpace:
         return np.column_stack([p.to_unit(x[:, k]) for k, p in enumerate(self.parameters)])
 
     def from_normal(self, z: Points) -> Points:
-        """Map (n, d) independent standard-normal scores to physical values under the law."""
+        """Map (n, d) independent standard-normal scores to physical values under the distribution."""
         z = as_points(z, self.dimension)
         if self._factor is not None:
             z = z @ self._factor.T
@@ -155,7 +155,7 @@ class ParameterSpace:
         return log_p
 
     def sample(self, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, d) values drawn from the law, constraints included (by rejection)."""
+        """Return (n, d) values drawn from the distribution, constraints included (by rejection)."""
         kept: list[Points] = []
         missing = n
         while missing > 0:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sbt.campaigns.estimation import EstimationConclusion
+from sbt.campaigns.wording import percent
 from sbt.report.style import CRITICAL, new_figure, to_svg
-from sbt.report.words import Findings, share
+from sbt.report.words import Findings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,19 +18,18 @@ if TYPE_CHECKING:
 __all__ = ["drawing_of_convergence", "plot_convergence"]
 
 
-def plot_convergence(found: Findings, ax: Axes) -> Axes:
+def plot_convergence(conclusion: EstimationConclusion, ax: Axes) -> Axes:
     """Draw the estimate after each counted batch with its interval, and the threshold of the gate where there is one."""
-    steps = found.result["convergence"]
-    runs = np.array([step["runs"] for step in steps], dtype=np.float64)
-    low, value, high = (np.array([step[key] for step in steps]) for key in ("low", "probability", "high"))
-    gate = found.result.get("gate")
+    steps, gate = conclusion.convergence or (), conclusion.gate
+    runs = np.array([step.runs for step in steps], dtype=np.float64)
+    low, value, high = (np.array([getattr(step, key) for step in steps]) for key in ("low", "probability", "high"))
     positive = np.concatenate([v[v > 0] for v in (low, value, high)])
     floor = 0.5 * float(positive.min()) if len(positive) else 1e-9
     low, value, high = (np.maximum(v, floor) for v in (low, value, high))
     ax.fill_between(runs, low, high, color=CRITICAL, alpha=0.2, linewidth=0, label="interval")
     ax.plot(runs, value, color=CRITICAL, marker="o", markersize=3, label="estimate")
     if gate is not None:
-        ax.axhline(gate["probability"], color="black", linestyle="--", linewidth=1.0, label="gate")
+        ax.axhline(gate.probability, color="black", linestyle="--", linewidth=1.0, label="gate")
     ax.set(xlabel="number of runs", ylabel="probability of a critical run", yscale="log")
     ax.legend(loc="best")
     return ax
@@ -36,11 +37,12 @@ def plot_convergence(found: Findings, ax: Axes) -> Axes:
 
 def drawing_of_convergence(found: Findings) -> Iterator[tuple[str, str]]:
     """Yield caption and SVG of the figure; nothing where no batch has counted."""
-    if not found.result.get("convergence"):
+    conclusion = found.conclusion
+    if not isinstance(conclusion, EstimationConclusion) or not conclusion.convergence:
         return
     figure = new_figure(5.4, 3.7)
-    plot_convergence(found, figure.subplots())
-    confidence = share(found.result.get("confidence") or 0.95)
+    plot_convergence(conclusion, figure.subplots())
+    confidence = percent(conclusion.confidence)
     caption = (
         f"The estimate after each batch that counts, with its {confidence} interval. Runs before the first point searched and"
         " taught. The interval should narrow and the estimate stay within the earlier intervals; a jump tells of a critical"

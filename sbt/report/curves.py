@@ -6,7 +6,7 @@ Every function draws data on axes that it is given, and returns them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from sbt.problem.requirement import Requirement
 from sbt.report.axes import reach, shade
 from sbt.report.style import CRITICAL, MODEL, UNCRITICAL, label
 from sbt.store.history import History
+from sbt.store.records import FitRecord
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,11 +47,11 @@ _CURVE = 400
 """A curve over the runs is drawn at no more places than this."""
 
 
-def plot_validation(fits: Sequence[Mapping[str, Any]], panel: str, ax: Axes, *, unit: str = "") -> Axes:
+def plot_validation(fits: Sequence[FitRecord], panel: str, ax: Axes, *, unit: str = "") -> Axes:
     """Draw one of `PANELS` over the number of runs; fits without the score leave a gap."""
-    runs = np.array([fit.get("learned", fit["runs"]) for fit in fits], dtype=np.float64)
+    runs = np.array([fit.learned for fit in fits], dtype=np.float64)
     for (key, name), look in zip(PANELS[panel], ("o-", "s--"), strict=False):
-        values = np.array([np.nan if fit.get(key) is None else fit[key] for fit in fits], dtype=np.float64)
+        values = np.array([fit.score(key) for fit in fits], dtype=np.float64)
         if np.isfinite(values).any():
             colour = MODEL if look == "o-" else CRITICAL
             ax.plot(runs, values, look, color=colour, markersize=3.5, linewidth=1.4, label=name or None)
@@ -151,7 +152,7 @@ def plot_metric_histogram(history: History, requirement: Requirement, ax: Axes, 
 
 def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
     """Draw the number of critical runs so far, stacked by stage, and what random runs would have found."""
-    critical = requirement.critical.contains(history.y(requirement.metric))
+    critical = requirement.critical_runs(history)
     stages = list(dict.fromkeys(history.stage.tolist()))
     at = np.unique(np.linspace(0, len(history) - 1, _CURVE).round().astype(int))
     found = [np.cumsum(critical & (history.stage == stage))[at] for stage in stages]
@@ -164,7 +165,7 @@ def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
         band.set(facecolor=shades[k % 6], hatch=hatches[k % 6])
     held = history.held_out
     if len(held):
-        rate = float(requirement.critical.contains(held.y(requirement.metric)).mean())
+        rate = float(requirement.critical_runs(held).mean())
         ends = np.array([0, history.index[-1] + 1])
         ax.plot(
             ends,

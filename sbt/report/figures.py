@@ -24,7 +24,7 @@ from sbt.store.history import VALIDATION, History
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_belief", "plot_metric", "plot_probability", "plot_runs"]
+__all__ = ["plot_prediction", "plot_metric", "plot_probability", "plot_runs"]
 
 _RASTER = 1500
 """More markers than this become an image inside the SVG, which keeps the file small."""
@@ -82,7 +82,7 @@ def plot_metric(
     return ax
 
 
-def plot_belief(x: Vector, belief: Prediction, ax: Axes) -> Axes:
+def plot_prediction(x: Vector, belief: Prediction, ax: Axes) -> Axes:
     """Draw the metamodel's mean of the metric over one input, and the band of its 5 % to 95 % quantiles."""
     band = ax.fill_between(x, belief.quantile(0.05), belief.quantile(0.95), color=MODEL, alpha=0.18, linewidth=0, zorder=1.5)
     band.set_label("metamodel, 5 % to 95 %")
@@ -152,7 +152,7 @@ def _heat() -> Any:
 
 def _scatter(history: History, requirement: Requirement, x: Vector, y: Vector, ax: Axes, size: float | None = None) -> None:
     """Draw the runs by verdict, the rare kinds on top."""
-    critical, held = requirement.critical.contains(history.y(requirement.metric)), history.stage == VALIDATION
+    critical, held = requirement.critical_runs(history), history.stage == VALIDATION
     rim = 1.0 if size is not None else 1.0 + min(1e-4 * len(history), 1.0)  # hollow markers stand out among many filled ones
     size = float(np.clip(9000 / max(len(history), 1), 7, 30)) if size is None else size
     kinds: list[tuple[str, Mask, dict[str, Any]]] = [

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from sbt.report.projection import Predict, log_probability, most_telling_pairs, 
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words
 from sbt.store.history import VALIDATION
+from sbt.store.records import FitRecord
 
 __all__ = ["Drawing", "draw"]
 
@@ -39,7 +39,7 @@ class Drawing:
 def draw(
     found: Findings,
     space: ParameterSpace,
-    fits: Sequence[Mapping[str, Any]],
+    fits: Sequence[FitRecord],
     predict: Predict | None,
     weights: Vector,
 ) -> list[Drawing]:
@@ -92,7 +92,7 @@ def _runs_over_one(found: Findings, space: ParameterSpace, predict: Predict | No
     caption = f"The safety metric of every run; shaded where critical. {_MARKERS} Failed runs lie on the floor."
     if predict is not None:
         u = np.linspace(0.0, 1.0, 401)[:, None]
-        figures.plot_belief(space.from_unit(u)[:, 0], predict(u), ax)
+        figures.plot_prediction(space.from_unit(u)[:, 0], predict(u), ax)
         caption += " Line and band: the metamodel's mean and its 5 % to 95 % quantiles."
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return Drawing("runs", "Runs in input space", caption, to_svg(figure, "runs"))
@@ -150,11 +150,11 @@ def _held_out(found: Findings, space: ParameterSpace, predict: Predict) -> Itera
     yield Drawing("reliability", "Calibration", caption, to_svg(figure, "reliability"))
 
 
-def _validation(found: Findings, fits: Sequence[Mapping[str, Any]]) -> Iterator[Drawing]:
+def _validation(found: Findings, fits: Sequence[FitRecord]) -> Iterator[Drawing]:
     """Yield the scores over the campaign."""
     panels = [
         panel for panel, lines in curves.PANELS.items()
-        if any(fit.get(key) is not None for fit in fits for key, _ in lines)
+        if any(fit.score(key) is not None for fit in fits for key, _ in lines)
     ]  # fmt: skip
     if not panels:
         return

@@ -9,13 +9,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from sbt.campaigns.wording import NOTHING, number
 from sbt.files import write_atomically
+from sbt.loop.stages import Conclusion
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
 from sbt.report.modes import mode_table
 from sbt.report.projection import Predict, influence_from_runs, influence_on_probability
 from sbt.report.tables import critical_table, failed_table, input_table, iteration_table
-from sbt.report.words import NOTHING, SCORES, Findings, conclusion_sentences, number, requirement_words, warnings_for
+from sbt.report.words import SCORES, Findings, conclusion_sentences, requirement_words, warnings_for
 from sbt.store.database import Store
 
 __all__ = ["REPORT", "write_report"]
@@ -23,20 +25,23 @@ __all__ = ["REPORT", "write_report"]
 REPORT = "report.html"
 
 
-def write_report(store: Store, scenario: LogicalScenario, predict: Predict | None, *, folder: Path | None = None) -> Path:
+def write_report(
+    store: Store, scenario: LogicalScenario, predict: Predict | None, conclusion: Conclusion | None, *, folder: Path | None = None
+) -> Path:
     """Write `report.html` and `figures/*.svg`; works at any moment of a campaign, and gives the same bytes twice.
 
     Args:
         store: open for reading or writing.
         scenario: as the campaign ran it, with the campaign's inputs and requirement.
         predict: the last metamodel as a function of (n, d) points of the unit cube; None: no metamodel.
+        conclusion: what the campaign found; None while it goes on.
         folder: where to write; None: the store's folder.
 
     Returns:
         The path of the page.
     """
     target = Path(folder) if folder is not None else store.folder
-    found, fits = Findings.of(store, scenario), store.fits()
+    found, fits = Findings.of(store, scenario, conclusion), store.fits()
     critical, d = scenario.requirement.critical, scenario.space.dimension
     weights = None if predict is None else influence_on_probability(predict, critical, d)
     order = weights if weights is not None and weights.any() else influence_from_runs(found.history, scenario.requirement)
@@ -105,13 +110,13 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
         ("seed", str(configuration.get("seed", NOTHING))),
         ("store", store.folder.name),
         ("time", _time(found)),
-        ("versions", " | ".join(sorted({r.versions for r in history.records if r.versions})[:5]) or NOTHING),
+        ("versions", " | ".join(sorted({v for v in history.versions if v})[:5]) or NOTHING),
     ]
 
 
 def _time(found: Findings) -> str:
-    simulated = f"{_duration(sum(r.seconds for r in found.history.records))} of simulation, summed over workers"
-    spent = found.conclusion.get("seconds") or {}
+    simulated = f"{_duration(float(found.history.seconds.sum()))} of simulation, summed over workers"
+    spent = found.ended.get("seconds") or {}
     other = [f"{name} {_duration(spent[name])}" for name in ("fit", "propose") if spent.get(name) is not None]
     return ", ".join([simulated, *other])
 
@@ -125,13 +130,14 @@ def _duration(seconds: float) -> str:
 
 def _scores(found: Findings) -> list[tuple[str, str]]:
     """Return the scores of the last metamodel on held-out runs."""
-    given = [(SCORES[key], number(found.scores[key], 3)) for key in SCORES if found.scores.get(key) is not None]
+    scores = {} if found.validation is None else found.validation.to_dict()
+    given = [(SCORES[key], number(scores[key], 3)) for key in SCORES if scores.get(key) is not None]
     counts = (("held-out runs", "n"), ("critical among them", "n_critical"))
-    return given and given + [(name, number(found.scores[key])) for name, key in counts if found.scores.get(key) is not None]
+    return given and given + [(name, number(scores[key])) for name, key in counts if scores.get(key) is not None]
 
 
 def _commands(found: Findings, store: Store) -> dict[str, str]:
-    folder = str(found.conclusion.get("store") or store.folder)
+    folder = str(found.ended.get("store") or store.folder)
     return {
         "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml"]),
         "replay": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN",

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sbt.campaigns.failures import FalsificationConclusion
+from sbt.campaigns.modes import FailureMode
+from sbt.campaigns.wording import NOTHING, number, percent
 from sbt.problem.arrays import Vector
 from sbt.problem.space import ParameterSpace
 from sbt.report.style import new_figure, to_svg
 from sbt.report.tables import Cell, Table
-from sbt.report.words import NOTHING, Findings, number, share
+from sbt.report.words import Findings
 
 __all__ = ["drawing_of_modes", "mode_table"]
 
@@ -28,14 +30,14 @@ _NOTE = (
 def mode_table(found: Findings, space: ParameterSpace) -> Table:
     """Return one row a failure mode; no rows where the campaign found none or does not look for them."""
     modes = _modes(found)
-    rows, typed = [], any(mode.get("conflict") for mode in modes)
+    rows, typed = [], any(mode.conflict for mode in modes)
     for number_of, mode in enumerate(modes, 1):
-        confirmed = NOTHING if mode["confirmed"] is None else f"{share(mode['confirmed'])} of {mode['confirmation_runs']}"
+        confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.confirmation_runs}"
         rows.append((
-            Cell.of(number_of), Cell.of(mode["representative"]), Cell.of(mode["metric"]), Cell.of(mode["size"]), Cell(confirmed),
-            *(() if not typed else (Cell(mode.get("conflict") or NOTHING),)),
-            *(Cell.of(mode["inputs"][name]) for name in space.names), Cell(_change(mode, space)),
-            Cell.of(mode["most_likely"]["run"]),
+            Cell.of(number_of), Cell.of(mode.representative), Cell.of(mode.metric), Cell.of(mode.size), Cell(confirmed),
+            *(() if not typed else (Cell(mode.conflict or NOTHING),)),
+            *(Cell.of(mode.inputs[name]) for name in space.names), Cell(_change(mode, space)),
+            Cell.of(mode.most_likely.run),
         ))  # fmt: skip
     metric = found.requirement.metric
     who = ("other road user",) if typed else ()
@@ -43,23 +45,22 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     return Table(columns, tuple(rows), _NOTE if rows else "")
 
 
-def _modes(found: Findings) -> Sequence[Mapping[str, Any]]:
-    """Return the described failure modes of the conclusion."""
-    told = found.result.get("failure_modes")
-    return [mode for mode in told if "representative" in mode] if isinstance(told, list) else []
+def _modes(found: Findings) -> Sequence[FailureMode]:
+    """Return the failure modes of the conclusion."""
+    return found.conclusion.failure_modes if isinstance(found.conclusion, FalsificationConclusion) else ()
 
 
-def _change(mode: Mapping[str, Any], space: ParameterSpace) -> str:
+def _change(mode: FailureMode, space: ParameterSpace) -> str:
     """Return the largest changes towards the nearest uncritical run, relative to the inputs' ranges."""
-    safe = mode["nearest_safe"]
+    safe = mode.nearest_safe
     if safe is None:
         return "no uncritical run"
     spans = {p.name: p.bounds[1] - p.bounds[0] for p in space.parameters}
     units = {p.name: p.unit for p in space.parameters}
-    ranked = sorted(safe["change"].items(), key=lambda item: -abs(item[1]) / spans[item[0]])[:3]
+    ranked = sorted(safe.change.items(), key=lambda item: -abs(item[1]) / spans[item[0]])[:3]
     told = ", ".join(f"{name} {change:+.3g} {units[name]}".strip() for name, change in ranked)
-    rest = len(safe["change"]) - len(ranked)
-    return f"{told}{f' and {rest} more' if rest > 0 else ''}: {number(safe['metric'])} (run {safe['run']})"
+    rest = len(safe.change) - len(ranked)
+    return f"{told}{f' and {rest} more' if rest > 0 else ''}: {number(safe.metric)} (run {safe.run})"
 
 
 def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) -> Iterator[tuple[str, str]]:
@@ -81,14 +82,14 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
     ax.scatter(history.x[ok, across], vertical[ok], s=9, color="#c3c9cf", linewidths=0, label="other runs", zorder=1)
     where = {int(index): row for row, index in enumerate(history.index)}
     for k, mode in enumerate(modes[:_MOST_COLOURS]):
-        rows = [where[run] for run in mode["runs"] if run in where]
+        rows = [where[run] for run in mode.runs if run in where]
         ax.scatter(
             history.x[rows, across], vertical[rows], s=20, color=_COLOURS[k], linewidths=0, zorder=2, label=f"mode {k + 1}"
         )
-        at, safe = where[mode["representative"]], mode["nearest_safe"]
+        at, safe = where[mode.representative], mode.nearest_safe
         ax.scatter(history.x[at, across], vertical[at], marker="*", s=150, color=_COLOURS[k], edgecolor="white", zorder=4)
-        if safe is not None and safe["run"] in where:
-            to = where[safe["run"]]
+        if safe is not None and safe.run in where:
+            to = where[safe.run]
             ax.annotate(
                 "", (history.x[to, across], vertical[to]), (history.x[at, across], vertical[at]), zorder=3,
                 arrowprops={"arrowstyle": "->", "color": _COLOURS[k], "lw": 1.2},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
 from sbt.problem.arrays import Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
-from sbt.report.words import NOTHING, SCORES, law_words, number, share, shares_in_words
+from sbt.report.words import SCORES, distribution_words
 from sbt.store.history import History, Record
+from sbt.store.records import FitRecord, Iteration
 
 __all__ = [
     "Cell",
@@ -90,33 +91,28 @@ def _input(parameter: Parameter) -> tuple[Cell, ...]:
         Cell(parameter.name),
         Cell(f"[{parameter.low:g}, {parameter.high:g}]{whole}"),
         Cell(parameter.unit or NOTHING),
-        Cell(law_words(parameter.distribution)),
+        Cell(distribution_words(parameter.distribution)),
         Cell(parameter.description),
     )
 
 
 def iteration_table(
-    iterations: Sequence[Mapping[str, Any]],
-    fits: Sequence[Mapping[str, Any]],
-    history: History,
-    requirement: Requirement,
+    iterations: Sequence[Iteration], fits: Sequence[FitRecord], history: History, requirement: Requirement
 ) -> Table:
     """Return how each batch was chosen, what it gave, and the scores of the metamodel fitted then."""
-    critical, by_iteration = (
-        requirement.critical.contains(history.y(requirement.metric)),
-        {fit["iteration"]: fit for fit in fits},
-    )
-    scored = [key for key in _LIST_SCORES if any(fit.get(key) is not None for fit in fits)]
-    chosen = ["believed"] if any(fit.get("weights") for fit in fits) else []
+    critical, by_iteration = requirement.critical_runs(history), {fit.iteration: fit for fit in fits}
+    scored = [key for key in _LIST_SCORES if any(fit.score(key) is not None for fit in fits)]
+    mixes = any(fit.weights for fit in fits)
     rows = []
     for batch in iterations:
-        mine, fit = history.iteration == batch["iteration"], by_iteration.get(batch["iteration"], {})
-        how = {key: value for key, value in batch.items() if key not in ("iteration", "stage")}
+        mine, fit = history.iteration == batch.number, by_iteration.get(batch.number)
+        weights = None if fit is None else fit.weights
         rows.append((
-            Cell.of(batch["iteration"]), Cell(str(batch["stage"])), Cell.of(int(mine.sum())),
+            Cell.of(batch.number), Cell(str(batch.stage)), Cell.of(int(mine.sum())),
             Cell.of(int((mine & critical).sum())), Cell.of(int((mine & ~history.ok).sum())),
-            *(Cell.of(fit.get(key), 3) for key in scored),
-            *(Cell(shares_in_words(fit.get("weights") or {}), fit.get(key, "")) for key in chosen), Cell(_listed(how)),
+            *(Cell.of(None if fit is None else fit.score(key), 3) for key in scored),
+            *([Cell(mixture_shares(weights or {}), "" if fit is None else fit.chosen_because)] if mixes else []),
+            Cell(_listed(batch.proposal)),
         ))  # fmt: skip
     columns = (
         "iteration",
@@ -125,19 +121,21 @@ def iteration_table(
         "critical",
         "failed",
         *(SCORES[key] for key in scored),
-        *chosen,
+        *(["mixture"] if mixes else []),
         "how it was chosen",
     )
     return Table(columns, tuple(rows), "Scores are those of the metamodel that chose the batch." if scored else "")
 
 
-def _listed(how: Mapping[str, Any]) -> str:
-    """Return a proposal's keys and values on one line."""
+def _listed(proposal: Mapping[str, Any]) -> str:
+    """Return the keys and values of how a batch was chosen on one line; arrays as their length."""
 
     def shown(value: Any) -> str:
-        return number(value) if isinstance(value, (int, float, str)) or value is None else json.dumps(value, ensure_ascii=False)
+        if isinstance(value, Mapping):
+            return f"({_listed(value)})"
+        return f"{len(value)} values" if isinstance(value, list) else number(value)
 
-    return ", ".join(f"{key.replace('_', ' ')} {shown(value)}" for key, value in how.items())
+    return ", ".join(f"{key.replace('_', ' ')} {shown(value)}" for key, value in proposal.items() if value is not None)
 
 
 def simulate_command(scenario: str, record: Record) -> str:
@@ -148,12 +146,12 @@ def simulate_command(scenario: str, record: Record) -> str:
 
 def critical_table(history: History, requirement: Requirement, reference: str) -> Table:
     """Return the critical runs, the deepest in the critical interval first, at most 200."""
-    margin = requirement.critical.margin(history.y(requirement.metric))
+    margin = requirement.margins(history)
     found = [int(k) for k in np.argsort(margin, kind="stable") if margin[k] <= 0]
     metrics = sorted(history.metrics, key=lambda name: name != requirement.metric)
     rows = []
     for k in found[:_MOST]:
-        record = history.records[k]
+        record = history.record(k)
         rows.append((
             Cell.of(record.index), Cell.of(float(margin[k])), *(Cell.of(record.inputs[name]) for name in history.names),
             *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
@@ -175,7 +173,7 @@ def failed_table(history: History, reference: str) -> Table:
     rest = len(failed) - len(rows)
     note = f"{rest:,} more failed runs are in the store." if rest else ""
     kinds = "" if not failed else " " + ", ".join(
-        f"{status}: {count:,} ({share(count / len(failed))})" for status, count in _counted(failed)
+        f"{status}: {count:,} ({percent(count / len(failed))})" for status, count in _counted(failed)
     ) + "."  # fmt: skip
     return Table(("run", "stage", "status", "reason", "seconds", "again"), rows, (note + kinds).strip())
 

@@ -1,4 +1,4 @@
-"""Greedy batches: the best candidates that are also far from every run there is, and the most representative.
+"""Greedy batches: the candidates of highest score that lie apart, and the most representative ones.
 
 Distances are measured in the inputs' influence on the metamodel's mean: an input without influence
 separates nothing. `select_diverse` multiplies the score of a candidate by its squared distance to the nearest
@@ -14,19 +14,49 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from sbt.metamodels.prediction import Prediction
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 
-__all__ = ["influence_on_mean", "refine_diverse", "select_diverse", "select_representative"]
+__all__ = ["influence_on_mean", "propose_greedily", "refine_diverse", "select_diverse", "select_representative"]
 
-_KEEP, _CHILDREN, _ROUNDS = 60, 16, 3
-_PROBES = 128
+_CANDIDATES = 4096  # uniform ones; the refinement adds up to 2,880
+_KEEP, _CHILDREN, _ROUNDS = 60, 16, 3  # best candidates of a round, steps from each, rounds
+_STEP, _NARROWER = 0.1, 2.5  # first step in the unit cube, by how much it shrinks from round to round
+_PROBES = 128  # pairs of points that an influence is estimated from: its relative error is about 1 / sqrt(2 x 128)
 _LEAST = 0.05  # of the largest influence: an input the metamodel calls irrelevant may not be
+
+
+def propose_greedily(
+    score: Callable[[Points], Vector],
+    existing: Points,
+    n: int,
+    scale: Vector,
+    rng: np.random.Generator,
+    *,
+    snap: Callable[[Points], Points] = lambda u: u,
+    admissible: Callable[[Points], Mask] | None = None,
+) -> tuple[Points, int]:
+    """Return (<= n, d) points of the highest scores that lie apart, and the number of candidates scored.
+
+    Args:
+        score: (m, d) points -> (m,) log scores; the candidates are uniform ones, refined around the best.
+        existing: (k, d) runs to keep away from.
+        n: how many points.
+        scale: (d,) influence of the inputs.
+        rng: the only source of randomness.
+        snap: points to those that will be run (integers); distances and constraints are those of the latter.
+        admissible: (m, d) points -> (m,) booleans; None: all are.
+    """
+    u, value = refine_diverse(score, rng.random((_CANDIDATES, existing.shape[1])), scale, rng)
+    u = snap(u)
+    if admissible is not None:
+        value = np.where(admissible(u), value, -np.inf)
+    return u[select_diverse(u, value, existing, n, scale)], len(u)
 
 
 def influence_on_mean(predict: Callable[[Points], Prediction], dimension: int, rng: np.random.Generator) -> Vector:
     """Return (d,) how much each input moves the mean, the largest 1 and none below 0.05.
 
-    The root mean squared change of mu when one input is drawn anew, the others kept: the square root of
+    The root mean squared change of mu when one input is drawn anew, the others unchanged: the square root of
     the total effect.
 
     Source:
@@ -47,7 +77,7 @@ def refine_diverse(
 ) -> tuple[Points, Vector]:
     """Return candidates (m, d) and their log scores (m,): the given ones and ever closer ones around good ones.
 
-    What is looked around is good and apart, so that one region does not take all.
+    The candidates that are refined are good and apart, so that one region does not take all.
 
     Args:
         score: (m, d) points -> (m,) log scores.
@@ -56,24 +86,24 @@ def refine_diverse(
         rng: the only source of randomness.
     """
     found, value = u, score(u)
-    width = 0.1 / scale
+    width = _STEP / scale
     for _ in range(_ROUNDS):
         best = found[select_diverse(found, value, np.empty((0, u.shape[1])), _KEEP, scale)]
         step = width * rng.standard_normal((len(best) * _CHILDREN, u.shape[1]))
         near = np.clip(np.repeat(best, _CHILDREN, axis=0) + step, 1e-9, 1 - 1e-9)
         found, value = np.concatenate([found, near]), np.concatenate([value, score(near)])
-        width = width / 2.5
+        width = width / _NARROWER
     return found, value
 
 
-def select_diverse(u: Points, log_score: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
-    """Return the indices (<= n) of candidates chosen one by one by log score plus log squared distance.
+def select_diverse(u: Points, log_score: Vector, existing: Points, n: int, scale: Vector) -> np.ndarray:
+    """Return the indices (<= n) of candidates selected one by one by log score plus log squared distance.
 
     Args:
         u: (m, d) candidates.
-        log_score: (m,) what each is worth by itself.
-        there: (k, d) points that exist already.
-        n: how many to choose.
+        log_score: (m,) of each by itself.
+        existing: (k, d) points that the distance is measured to, beside those selected before.
+        n: how many to select.
         scale: (d,) what a unit of each input counts in the distance.
 
     Returns:
@@ -84,50 +114,50 @@ def select_diverse(u: Points, log_score: Vector, there: Points, n: int, scale: V
         form of the U criterion of Echard et al. (2011), doi 10.1016/j.strusafe.2011.01.002.
     """
     at = u * scale
-    nearest = cKDTree(there * scale).query(at)[0] ** 2 if len(there) else np.full(len(u), float(len(scale)))
-    chosen: list[int] = []
-    while len(chosen) < n:
+    nearest = cKDTree(existing * scale).query(at)[0] ** 2 if len(existing) else np.full(len(u), float(len(scale)))
+    selected: list[int] = []
+    while len(selected) < n:
         with np.errstate(divide="ignore"):
             value = log_score + np.log(nearest)
         best = int(np.argmax(value))
         if np.isneginf(value[best]):
             break
-        chosen.append(best)
+        selected.append(best)
         nearest = np.minimum(nearest, ((at - at[best]) ** 2).sum(axis=1))
-    return np.array(chosen, dtype=np.int64)
+    return np.array(selected, dtype=np.int64)
 
 
-def select_representative(u: Points, weight: Vector, there: Points, n: int, scale: Vector) -> np.ndarray:
-    """Return the indices (<= n) of points chosen one by one so that little weight stays far from a run.
+def select_representative(u: Points, weight: Vector, existing: Points, n: int, scale: Vector) -> np.ndarray:
+    """Return the indices (<= n) of points selected one by one so that little weight stays far from a run.
 
-    Each choice reduces the weighted sum of squared distances to the nearest run the most: the greedy
-    solution of a weighted k-medoids problem in which the runs there are are centres already.
+    Each selection reduces the weighted sum of squared distances to the nearest run the most: the greedy
+    solution of a weighted k-medoids problem in which the existing runs are centres already.
 
     Args:
-        u: (m, d) points that are to be represented, and to choose from.
+        u: (m, d) points that are to be represented, and to select from.
         weight: (m,) >= 0.
-        there: (k, d) runs that exist already, k >= 1.
-        n: how many to choose.
+        existing: (k, d) runs, k >= 1.
+        n: how many to select.
         scale: (d,) what a unit of each input counts in the distance.
 
     Returns:
         (<= n,) distinct indices; fewer where no point reduces the sum any more.
 
     Source:
-        Nemhauser, Wolsey and Fisher (1978), doi 10.1007/BF01588971: the greedy choice reaches at least
+        Nemhauser, Wolsey and Fisher (1978), doi 10.1007/BF01588971: the greedy selection reaches at least
         1 - 1/e of the largest possible reduction.
     """
     if n == 0:
         return np.empty(0, dtype=np.int64)
     at = u * scale
     between = cdist(at, at, "sqeuclidean")
-    nearest = cKDTree(there * scale).query(at)[0] ** 2
-    chosen: list[int] = []
-    while len(chosen) < n:
+    nearest = cKDTree(existing * scale).query(at)[0] ** 2
+    selected: list[int] = []
+    while len(selected) < n:
         gain = weight @ np.maximum(nearest[:, None] - between, 0.0)
         best = int(np.argmax(gain))
         if gain[best] <= 0.0:
             break
-        chosen.append(best)
+        selected.append(best)
         nearest = np.minimum(nearest, between[best])
-    return np.array(chosen, dtype=np.int64)
+    return np.array(selected, dtype=np.int64)

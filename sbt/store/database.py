@@ -25,6 +25,7 @@ import numpy as np
 from sbt.errors import StoreError
 from sbt.problem.outcome import Job, Outcome
 from sbt.store.history import PLANNED, History, Rows
+from sbt.store.records import FitRecord, Iteration, from_json, to_json
 
 __all__ = ["DATABASE", "PlannedRun", "Store"]
 
@@ -90,8 +91,8 @@ class Store:
         self._waited = -_TOGETHER  # when a run last did, on the monotonic clock
         self._rows: Rows | None = None  # finished rows before the first unfinished one: they never change
         self._read_up_to = 0  # index of the first row that is not among them
-        self._iterations: list[dict[str, Any]] = []
-        self._fits: list[dict[str, Any]] = []
+        self._iterations: list[Iteration] = []
+        self._fits: list[FitRecord] = []
 
     @classmethod
     def open(cls, folder: Path, configuration: Mapping[str, Any] | None = None, *, durable: bool = True) -> Store:
@@ -167,7 +168,7 @@ class Store:
     def _check_version(self) -> None:
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
         if version != _VERSION:
-            raise StoreError(f"{self.folder}: this version of sumo-sbt reads stores of version {_VERSION}, but this one has {version}")
+            raise StoreError(f"{self.folder}: this version reads stores of version {_VERSION}, but got version {version}")
 
     def _checked(self, what: str, stored: int, *parts: Any) -> None:
         """Refuse a row that is not what was written."""
@@ -225,7 +226,7 @@ class Store:
             self._set_meta("conclusion", dict(conclusion))
 
     def plan(
-        self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: Mapping[str, Any],
+        self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: object,
         *, indices: Sequence[int] | None = None,
     ) -> None:  # fmt: skip
         """Write a batch before it runs, all of it or nothing.
@@ -235,7 +236,7 @@ class Store:
             stage: what asked for it.
             runs: the batch.
             seeds: one a run.
-            proposal: how the batch was chosen (JSON), such as the position in the Sobol sequence.
+            proposal: how the batch was chosen: a record (dataclass) or JSON data.
             indices: of the runs; None: they continue those of the store.
         """
         start, names = self.planned, self._names
@@ -244,10 +245,10 @@ class Store:
         for k, (index, run) in enumerate(zip(places, runs, strict=True)):
             inputs = _dump([run.inputs[name] for name in names])
             chosen, seed = run.seed is not None, seeds[k] if run.seed is None else run.seed
-            log_q = None if run.log_q is None else float(run.log_q)
+            log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
             row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, run.warm_up, log_q)
             rows.append((*row, _checksum(*row), PLANNED))
-        text = _dump(dict(proposal))
+        text = _dump(proposal if isinstance(proposal, dict) else to_json(proposal))
         with self._transaction():
             self._db.executemany(
                 f"INSERT INTO runs ({', '.join(_PLAN)}, plan_checksum, status) VALUES ({', '.join('?' * (len(_PLAN) + 2))})", rows
@@ -270,13 +271,13 @@ class Store:
                 (*row, _checksum(outcome.index, *row), outcome.index),
             )
 
-    def add_fit(self, runs: int, iteration: int, scores: Mapping[str, Any]) -> None:
-        """Keep the scores of the metamodel that learned from the first `runs` rows."""
-        text = _dump(dict(scores))
+    def add_fit(self, fit: FitRecord) -> None:
+        """Keep what is known of the metamodel that learned from the first `fit.runs` rows."""
+        text = _dump(to_json(fit))
         with self._transaction():
-            row = (runs, iteration, text, _checksum(runs, iteration, text))
+            row = (fit.runs, fit.iteration, text, _checksum(fit.runs, fit.iteration, text))
             self._db.execute("INSERT OR REPLACE INTO fits VALUES (?, ?, ?, ?)", row)
-        self._fits = [fit for fit in self._fits if fit["runs"] < runs]
+        self._fits = [known for known in self._fits if known.runs < fit.runs]
 
     @property
     def planned(self) -> int:
@@ -305,21 +306,21 @@ class Store:
         names = self._names
         return [Job(row[0], dict(zip(names, json.loads(row[3]), strict=True)), row[4]) for row in rows]
 
-    def iterations(self) -> list[dict[str, Any]]:
-        """Return how each batch was chosen: iteration, stage and the proposal's own keys."""
-        last = self._iterations[-1]["iteration"] if self._iterations else -1
+    def iterations(self) -> list[Iteration]:
+        """Return how each batch was chosen."""
+        last = self._iterations[-1].number if self._iterations else -1
         rows = self._db.execute("SELECT * FROM iterations WHERE iteration > ? ORDER BY iteration", (last,))
-        for iteration, stage, text, checksum in rows:
-            self._checked(f"iteration {iteration}", checksum, iteration, stage, text)
-            self._iterations.append({"iteration": iteration, "stage": stage, **json.loads(text)})
+        for number, stage, text, checksum in rows:
+            self._checked(f"iteration {number}", checksum, number, stage, text)
+            self._iterations.append(Iteration(number, stage, json.loads(text)))
         return list(self._iterations)
 
-    def fits(self) -> list[dict[str, Any]]:
-        """Return the metamodel's scores: runs, iteration and what was measured, in the order of the runs."""
-        last = self._fits[-1]["runs"] if self._fits else -1
+    def fits(self) -> list[FitRecord]:
+        """Return what is known of each fitted metamodel, in the order of the runs."""
+        last = self._fits[-1].runs if self._fits else -1
         for runs, iteration, text, checksum in self._db.execute("SELECT * FROM fits WHERE runs > ? ORDER BY runs", (last,)):
             self._checked(f"the fit after {runs} runs", checksum, runs, iteration, text)
-            self._fits.append({"runs": runs, "iteration": iteration, **json.loads(text)})
+            self._fits.append(from_json(FitRecord, json.loads(text)))
         return list(self._fits)
 
     def history(self) -> History:

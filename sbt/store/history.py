@@ -161,7 +161,7 @@ class History:
         return self.columns["index"]
 
     @property
-    def iteration(self) -> NDArray[np.int64]:
+    def iteration(self) -> NDArray[Any]:
         """(n,) iteration of each run, from 0."""
         return self.columns["iteration"]
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from sbt import interruption
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
@@ -65,18 +65,23 @@ class _ReplicaRun:
 
 def simulate_many(
     simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], at_work: Report
-) -> list[Trace | Exception]:
+) -> list[Trace | BaseException]:
     """Run concrete scenarios, in replicas of the network where allowed; see `SumoSimulation.simulate_many`."""
-    results: dict[int, Trace | Exception] = {}
+    results: dict[int, Trace | BaseException] = {}
     if simulation.batched and len(work) > 1:
-        with suppress(Exception):  # the missing runs are repeated below, where the error is attributed to its run
+        try:
             _simulate_in_replicas(simulation, work, results, at_work)
+        except BaseException as error:  # the missing runs are repeated below, where the error is attributed to its run
+            if interruption.is_interruption(error):
+                raise
     for index, (values, seed) in enumerate(work):
         if index not in results:
             at_work((index,))
             try:
                 results[index] = simulation(values, seed)
-            except Exception as error:  # a user's scenario may raise anything
+            except BaseException as error:  # a user's scenario may raise anything
+                if interruption.is_interruption(error):
+                    raise
                 results[index] = error
     return [results[index] for index in range(len(work))]
 
@@ -84,7 +89,7 @@ def simulate_many(
 def _simulate_in_replicas(
     simulation: _Simulation,
     work: Sequence[tuple[Mapping[str, float], int]],
-    results: dict[int, Trace | Exception],
+    results: dict[int, Trace | BaseException],
     at_work: Report,
 ) -> None:
     """Add to `results` the traces of the runs that can share a simulation."""
@@ -103,7 +108,7 @@ def _simulate_in_replicas(
 
 
 def _step_until_done(
-    sumo: Any, simulation: _Simulation, scenes: dict[int, Scene], results: dict[int, Trace | Exception], at_work: Report
+    sumo: Any, simulation: _Simulation, scenes: dict[int, Scene], results: dict[int, Trace | BaseException], at_work: Report
 ) -> None:
     """Step, and start the next run in every replica that becomes free, until all scenes have been run."""
     step, colliding = unwrapped(sumo, "simulation", "step"), unwrapped(sumo, "simulation", "getCollidingVehiclesNumber")

@@ -26,6 +26,7 @@ from xml.sax.saxutils import quoteattr
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
+from sbt.processes import scratch
 from sbt.sumo.actors import VehicleType
 from sbt.sumo.formatting import format_number
 from sbt.sumo.replicas import replicated_net
@@ -108,7 +109,7 @@ class Setup:
 
 @cache
 def _scratch() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="sbt-")
+    return scratch("sumo")
 
 
 def scratch_folder() -> Path:

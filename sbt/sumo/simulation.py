@@ -146,7 +146,7 @@ class SumoSimulation:
 
     def simulate_many(
         self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = lambda _: None
-    ) -> list[Trace | Exception]:
+    ) -> list[Trace | BaseException]:
         """Run several concrete scenarios, in one simulation where the isolation level allows it.
 
         Args:

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from sbt import interruption
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
@@ -236,11 +237,12 @@ class TraciProxy:
             loop(self, dict(self._values), stream(self._seed, "loop"))
         except RunEnded as end:
             return end.reason
-        except Exception as error:
+        except BaseException as error:  # SystemExit too
             self.error_place = _place_in_loop(error, loop)
-            if isinstance(error, RunError) or "TraCI" in type(error).__name__:
+            if isinstance(error, RunError) or "TraCI" in type(error).__name__ or interruption.is_interruption(error):
                 raise
-            raise RunError(Status.FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}") from error
+            message = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+            raise RunError(Status.FAILED, message) from error
         if self._recorder is not None and self._recorder.ended:  # a bare `except` in the loop has caught the end
             return self._recorder.ended
         if self._module is not None:
@@ -248,7 +250,7 @@ class TraciProxy:
         return "loop"
 
 
-def _place_in_loop(error: Exception, loop: Loop) -> str:
+def _place_in_loop(error: BaseException, loop: Loop) -> str:
     """Return the last line of the user's file in the traceback of an error, as ` (file:line)`."""
     file = getattr(getattr(loop, "__code__", None), "co_filename", "")
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]

@@ -6,16 +6,16 @@ import hashlib
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 
 import numpy as np
 
-from sbt.errors import InputError, RunError
+from sbt import interruption
+from sbt.errors import RunError, SbtError
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.tasks import elsewhere
+from sbt.execution.worker import described
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -107,8 +107,8 @@ def _runs(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run]:
     return [_run(scenario, partial(scenario.run, values, seed)) for values, seed in jobs]
 
 
-def _given(trace: Trace | Exception) -> Trace:
-    if isinstance(trace, Exception):
+def _given(trace: Trace | BaseException) -> Trace:
+    if isinstance(trace, BaseException):
         raise trace
     return trace
 
@@ -122,8 +122,10 @@ def _run(scenario: LogicalScenario, execute: Callable[[], Trace | dict[str, floa
         return _Run(tuple(scenario.measure(result).items()), _digest(result))
     except RunError as error:
         return _Run(problem=f"{error.status}: {error.reason}")
-    except Exception as error:
-        return _Run(problem=f"failed: {type(error).__name__}: {error}")
+    except BaseException as error:
+        if interruption.is_interruption(error):
+            raise
+        return _Run(problem=f"failed: {described(error)}")
 
 
 def _digest(trace: Trace) -> str:
@@ -175,19 +177,12 @@ def _in_worker(
 ) -> Finding:
     """Return whether a spawned process, which gets plain data only, gives the same."""
     rule = "same seed, same trace in a worker process"
-    pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
     try:
-        return _equal(rule, first, pool.submit(_runs, spec, jobs).result(_WORKER_DEADLINE), points)
-    except BrokenProcessPool:
-        return Finding(rule, ok=False, detail="the worker process died")
+        return _equal(rule, first, elsewhere(_WORKER_DEADLINE, _runs, spec, jobs), points)
     except TimeoutError:
         return Finding(rule, ok=False, detail=f"the worker process gave no answer within {_WORKER_DEADLINE:g} s")
-    except (InputError, OSError) as error:
+    except (SbtError, OSError) as error:
         return Finding(rule, ok=False, detail=str(error))
-    finally:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: list[dict[str, float]]) -> list[Finding]:

@@ -10,33 +10,21 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
-from sbt import plugins
 from sbt.errors import InputError
 from sbt.files import move_atomically
-from sbt.loop.stages import Campaign, Shard, run_stages
+from sbt.loop.stages import Shard, run_stages
+from sbt.problem.description import is_complete
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import Record
-from sbt.workflows.running import (
-    RESOLVED,
-    assembly_of,
-    keep_configuration,
-    kept_of,
-    loaded_from,
-    rebuild_report,
-    result_of,
-    settings_of,
-    whole_budget,
-)  # fmt: skip
+from sbt.workflows.running import Summary, keep_configuration, rebuild_report, summarise
+from sbt.workflows.study import RESOLVED, Study
 
-if TYPE_CHECKING:
-    from sbt.config.load import Loaded
+__all__ = ["merge_shards"]
 
-__all__ = ["merge"]
-
-_OWN = {"folder", "yaml", "shard"}
+_OWN = {"folder", "yaml", "shard", "described"}
 """What may differ in the configurations of shards."""
 _TOLD = 10
 
@@ -52,7 +40,7 @@ class _Part:
     total: int
 
 
-def merge(folders: Sequence[Path], into: Path, *, report: bool = True) -> dict[str, Any]:
+def merge_shards(folders: Sequence[Path], into: Path, *, report: bool = True) -> Summary:
     """Join the finished stores of all shards of one configuration.
 
     The new store appears in `into` whole or, where the merge is killed, not at all.
@@ -63,7 +51,7 @@ def merge(folders: Sequence[Path], into: Path, *, report: bool = True) -> dict[s
         report: write `report.html` in the end.
 
     Returns:
-        What `run --json` prints of an unsharded campaign; the time to simulate is the sum over all runs.
+        How the campaign ended, as without shards; the time to simulate is the sum over all runs.
 
     Raises:
         InputError: a folder holds no shard, or one that is not finished; configurations or versions differ;
@@ -77,11 +65,10 @@ def merge(folders: Sequence[Path], into: Path, *, report: bool = True) -> dict[s
     _check_same(parts)
     _check_whole(parts)
     with Store.read(parts[0].folder) as first:
-        loaded = loaded_from(first)
-    loaded = replace(loaded, config=loaded.config.model_copy(update={"store": str(into)}))
+        study = Study.from_store(first).with_store(into)
     into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".merge-", dir=into) as folder:
-        result = _run(loaded, parts, Path(folder))
+        result = _run(study, parts, Path(folder))
         for name in (RESOLVED, DATABASE):  # the database last: with it the folder becomes a store
             move_atomically(Path(folder) / name, into / name)
     if report:
@@ -145,22 +132,21 @@ def _listed(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers[:_TOLD])) + rest
 
 
-def _run(loaded: Loaded, parts: Sequence[_Part], folder: Path) -> dict[str, Any]:
+def _run(study: Study, parts: Sequence[_Part], folder: Path) -> Summary:
     """Run the campaign in a folder of its own, with the shards' outcomes."""
-    settings, config = settings_of(loaded, assembly_of(loaded)), loaded.config
-    campaign: Campaign = plugins.load("campaigns", config.campaign)(settings)
+    study = replace(study, live=not is_complete(study.kept["described"]))
     records = [record for part in parts for record in part.records]
-    kept = kept_of(loaded, settings)
-    with Store.open(folder, kept, durable=False) as store:
-        keep_configuration(store, config, kept)
-        stopped, conclusion, seconds = run_stages(
-            campaign, store, _Recalled({r.index: r for r in records}), seed=config.seed, budget=whole_budget(config),
-            requirement=settings.scenario.requirement, versions=records[0].versions, listener=lambda _: None,
+    snapshot = study.snapshot()
+    with Store.open(folder, snapshot, durable=False) as store:
+        keep_configuration(store, study, snapshot)
+        finished = run_stages(
+            study.campaign, store, _Recalled({r.index: r for r in records}), seed=study.config.seed, budget=study.budget,
+            requirement=study.scenario.requirement, versions=records[0].versions, listener=lambda _: None,
         )  # fmt: skip
-        seconds["simulate"] = sum(record.seconds for record in records)
-        result = result_of(store, settings, config, stopped, conclusion, seconds)
-        store.conclude(result)
-    return result
+        finished = replace(finished, seconds={**finished.seconds, "simulate": sum(record.seconds for record in records)})
+        summary = summarise(store, study, finished)
+        store.conclude(summary.to_dict())
+    return summary
 
 
 class _Recalled:

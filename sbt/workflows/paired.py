@@ -21,7 +21,8 @@ from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask
 from sbt.store.database import Store
 from sbt.store.history import History
-from sbt.workflows.running import run_campaign, scenario_of_run
+from sbt.workflows.running import run_study
+from sbt.workflows.study import Study
 
 __all__ = ["Pairs", "compare_egos"]
 
@@ -83,25 +84,28 @@ def compare_egos(
         `undecided`), and the runs that were fixed and that are new, with inputs and seed.
 
     Raises:
-        InputError: the configurations ask for different inputs, laws or requirements.
+        InputError: the configurations ask for different inputs, distributions or requirements.
     """
-    loaded = load(first)
-    budget = loaded.config.budget if runs is None else runs
-    common = [
-        "campaign=estimation", "acquisition={kind: monte_carlo}", "metamodel={kind: gp}", "stop={cov: null}", "gate=null",
-        "from=null", f"seed={loaded.config.seed}", f"budget={budget}", f"initial={min(budget, 200)}", f"batch={min(budget, 200)}",
-    ]  # fmt: skip
-    pair = [load(path, [*common, f"store='{store / name}'"]) for path, name in ((first, "a"), (second, "b"))]
-    one, other = (scenario_of_run(p) for p in pair)
-    if one.space != other.space:
-        raise InputError(f"compare-ego needs the same inputs with the same laws, but {first} and {second} differ in them")
-    if one.requirement != other.requirement:
-        told = f"{one.requirement} in {first}, {other.requirement} in {second}"
-        raise InputError(f"compare-ego needs one requirement, but got {told}")
-    for config in pair:
-        run_campaign(config, progress=progress, report=False)
+    config = load(first).config
+    budget = config.budget if runs is None else runs
+    size = min(budget, 200)
+    common = {
+        "campaign": "estimation", "acquisition": {"kind": "monte_carlo"}, "metamodel": {"kind": "gp"}, "stop": {"cov": None},
+        "gate": None, "warm_start": None, "seed": config.seed, "budget": budget, "initial": size, "batch": size,
+    }  # fmt: skip
+    one, other = (
+        Study.from_file(path, changes={**common, "store": str(store / name)}) for path, name in ((first, "a"), (second, "b"))
+    )
+    if one.scenario.space != other.scenario.space:
+        raise InputError(f"compare-ego needs the same inputs with the same distributions, but {first} and {second} differ in them")
+    requirement = one.scenario.requirement
+    if requirement != other.scenario.requirement:
+        found = f"{requirement} in {first}, {other.scenario.requirement} in {second}"
+        raise InputError(f"compare-ego needs one requirement, but got {found}")
+    for study in (one, other):
+        run_study(study, progress=progress, report=False)
     histories = [_history(store / name) for name in ("a", "b")]
-    return _result(histories[0], histories[1], one.requirement)
+    return _result(histories[0], histories[1], requirement)
 
 
 def _history(folder: Path) -> History:
@@ -111,10 +115,10 @@ def _history(folder: Path) -> History:
 
 def _result(first: History, second: History, requirement: Any) -> dict[str, Any]:
     """Return the comparison of two histories of the same draws."""
-    same = [(r.inputs, r.seed) for r in first.records] == [(r.inputs, r.seed) for r in second.records]
+    same = np.array_equal(first.x, second.x) and np.array_equal(first.seed, second.seed)
     if not same:
         raise InputError("compare-ego needs the same draws in both stores, but they differ: give another --store")
-    critical = [requirement.critical.contains(h.y(requirement.metric)) for h in (first, second)]
+    critical = [requirement.critical_runs(h) for h in (first, second)]
     pairs = Pairs(critical[0], critical[1], ~first.ok, ~second.ok)
     low, high = pairs.difference()
     shares = [Proportion(len(h), int(c.sum()), int((~h.ok).sum())) for h, c in zip((first, second), critical, strict=True)]
@@ -133,5 +137,5 @@ def _result(first: History, second: History, requirement: Any) -> dict[str, Any]
 
 
 def _listed(history: History, mask: Mask) -> list[dict[str, Any]]:
-    found = [history.records[k] for k in np.flatnonzero(mask)]
+    found = [history.record(int(k)) for k in np.flatnonzero(mask)]
     return [{"run": r.index, "inputs": dict(r.inputs), "seed": r.seed} for r in found]

@@ -1,4 +1,4 @@
-"""What the metamodel of a finished or running campaign believes about concrete scenarios that nobody ran.
+"""What the metamodel of a finished or running campaign predicts about concrete scenarios that nobody ran.
 
 The fitted metamodel is kept beside the store, under a key of the runs that it learned from, so that
 asking again does not fit again.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -27,9 +27,9 @@ from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import Store
 from sbt.store.history import History
-from sbt.workflows.running import assembly_of, loaded_from, settings_of
+from sbt.workflows.study import Study
 
-__all__ = ["MODEL", "Table", "predict_rows", "read_inputs"]
+__all__ = ["MODEL", "Table", "inputs_from", "predict_inputs", "predict_rows", "read_inputs"]
 
 MODEL = "metamodel.sbtmodel"
 """In the folder of a store: the metamodel that was fitted last by `predict`."""
@@ -39,7 +39,7 @@ _TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Table:
-    """Beliefs about rows of inputs.
+    """Predictions for rows of inputs.
 
     Attributes:
         inputs: names of the inputs.
@@ -62,36 +62,50 @@ class Table:
     ignored: tuple[str, ...]
 
     def rows(self) -> list[dict[str, float]]:
-        """Return one mapping a row: inputs, then beliefs."""
+        """Return one mapping a row: inputs, then predictions."""
         names = (*self.inputs, *self.columns)
         values = np.column_stack([self.x, *self.columns.values()])
         return [dict(zip(names, map(float, row), strict=True)) for row in values]
 
 
 def predict_rows(folder: Path, inputs: Path, device: str | None = None) -> Table:
-    """Return what a campaign's metamodel believes about the rows of a CSV file.
+    """Return what a campaign's metamodel predicts for the rows of a CSV file; see `predict_inputs`.
+
+    Args:
+        folder: of a store.
+        inputs: CSV with a column for each input, named as the input or as in exports (`x.<input>`).
+        device: auto, cpu or cuda, where a metamodel that was kept predicts; None: where it was fitted.
+    """
+    return predict_inputs(folder, lambda space: read_inputs(inputs, space), device=device)
+
+
+def predict_inputs(
+    folder: Path, read: Callable[[ParameterSpace], tuple[Points, tuple[str, ...]]], *, device: str | None = None,
+    objects: Mapping[tuple[str, str], Any] | None = None,
+) -> Table:  # fmt: skip
+    """Return what a campaign's metamodel predicts about concrete scenarios.
 
     It learns from all runs that finished well. The campaign's validation scores are those of the same
     metamodel without the held-out runs, and so rather too low.
 
     Args:
         folder: of a store.
-        inputs: CSV with a column for each input, named as the input or as in exports (`x.<input>`).
+        read: the parameter space to x (n, d), checked, and the names of what was ignored.
         device: auto, cpu or cuda, where a metamodel that was kept predicts; None: where it was fitted.
+        objects: what was given in Python when the store was made.
 
     Raises:
-        InputError: the campaign has no metamodel or fewer than two runs to learn from, or the file is
+        InputError: the campaign has no metamodel or fewer than two runs to learn from, or the inputs are
             no such table: columns missing, values that are no numbers or outside of the range.
         StoreError: the folder holds no campaign.
     """
     with Store.read(folder) as store:
-        loaded, history = loaded_from(store), store.history()
-    settings = settings_of(loaded, assembly_of(loaded))
-    learner, choice = settings.learner, loaded.config.metamodel
+        study, history = Study.from_store(store, objects=objects), store.history()
+    learner, choice = study.learner, study.config.metamodel
     if learner is None or choice is None:
         raise InputError(f"predict needs a campaign with a metamodel, but {folder} has none (add metamodel: {{kind: auto}})")
-    space, requirement = settings.scenario.space, settings.scenario.requirement
-    x, ignored = read_inputs(inputs, space)
+    space, requirement = study.scenario.space, study.scenario.requirement
+    x, ignored = read(space)
     training = history.finished
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
@@ -99,11 +113,63 @@ def predict_rows(folder: Path, inputs: Path, device: str | None = None) -> Table
     u = space.metamodel_inputs(space.to_unit(x))
     parts = []
     for k in range(0, len(u), _CHUNK):
-        belief = predictor(u[k : k + _CHUNK])
-        parts.append([belief.mu, belief.sigma, belief.epistemic, belief.noise, belief.probability(requirement.critical)])
+        p = predictor(u[k : k + _CHUNK])
+        parts.append([p.mu, p.sigma, p.epistemic, p.noise, p.probability(requirement.critical)])
     names = ("mu", "sigma", "epistemic", "noise", "p_critical")
     columns = dict(zip(names, np.concatenate(parts, axis=1), strict=True)) if parts else {n: np.empty(0) for n in names}
     return Table(space.names, x, columns, requirement.metric, choice.kind, len(training), source, ignored)
+
+
+def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, ...]]:
+    """Return x (n, d) of a table in memory, and the names of its other columns.
+
+    Args:
+        given: a DataFrame or a mapping with a column (or one number) for each input, named as the input or `x.<input>`;
+            or an array (n, d) in the order of the inputs.
+        space: the inputs.
+
+    Raises:
+        InputError: columns missing, values that are no numbers or outside of the range; the message names row and column.
+    """
+    if not hasattr(given, "keys"):
+        x = np.atleast_2d(np.asarray(given, dtype=np.float64))
+        if x.ndim != 2 or x.shape[1] != space.dimension:
+            raise InputError(f"an array of inputs must be (n, {space.dimension}), for {', '.join(space.names)}, but got {x.shape}")
+        return _within(x, space), ()
+    head = [str(name) for name in given]
+    where = [_column(name, head) for name in space.names]
+    columns = []
+    for name, key in zip(space.names, where, strict=True):
+        try:
+            columns.append(np.atleast_1d(np.asarray(given[key], dtype=np.float64)))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"column {key} must hold numbers, for input {name}, but {error}") from None
+    sizes = {len(column) for column in columns}
+    if len(sizes) > 1:
+        raise InputError(f"columns of inputs must have one length, but got {', '.join(map(str, sorted(sizes)))}")
+    return _within(np.column_stack(columns), space), tuple(name for name in head if name not in where)
+
+
+def _column(name: str, head: list[str]) -> str:
+    """Return the column of an input."""
+    found = [key for key in (name, f"x.{name}") if key in head]
+    if not found:
+        short = [key.removeprefix("x.") for key in head]
+        raise InputError(f"every input must be a column, but {name} is missing{did_you_mean(name, short)}; got {', '.join(head)}")
+    return found[0]
+
+
+def _within(x: Points, space: ParameterSpace) -> Points:
+    """Return x with rounding at the ends of the ranges mended; refuse what lies outside."""
+    low, high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
+    with np.errstate(invalid="ignore"):
+        size = np.where(np.isfinite(low) & np.isfinite(high), _TOLERANCE * np.maximum(np.abs(low), np.abs(high)), 0.0)
+    wrong = ~((x >= low - size) & (x <= high + size))
+    if wrong.any():
+        row, k = (int(i) for i in np.argwhere(wrong)[0])
+        p = space.parameters[k]
+        raise InputError(f"row {row}: {p.name} must be in [{p.low:g}, {p.high:g}] {p.unit}, but got {x[row, k]:g}")
+    return np.clip(x, low, high)
 
 
 def _predictor(folder: Path, learner: Learner, training: History, settings: str, device: str | None) -> tuple[Predictor, str]:
@@ -132,8 +198,8 @@ def _key(learner: Learner, training: History, settings: str) -> str:
     """Return a key of all that decides a fit: the rows, the settings, the seed, the space, the version."""
     space, critical = learner.scenario.space, learner.scenario.requirement.critical
     features = [name for name, _ in space.features]
-    told = (settings, learner.seed, repr(critical), repr(space.parameters), features, version("sumo-sbt"))
-    digest = hashlib.blake2b(json.dumps([str(part) for part in told]).encode(), digest_size=16)
+    decisive = (settings, learner.seed, repr(critical), repr(space.parameters), features, version("sumo-sbt"))
+    digest = hashlib.blake2b(json.dumps([str(part) for part in decisive]).encode(), digest_size=16)
     digest.update(np.ascontiguousarray(training.x).tobytes())
     digest.update(training.y(learner.scenario.requirement.metric).tobytes())
     return digest.hexdigest()

@@ -1,0 +1,220 @@
+"""What a falsification found: failure modes, what was not found, and the sentences that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of
+from sbt.campaigns.parts import share_among_held_out
+from sbt.campaigns.settings import Settings
+from sbt.campaigns.wording import plural
+from sbt.errors import InputError
+from sbt.estimators.binomial import upper
+from sbt.loop.stages import Facts
+from sbt.problem.arrays import Mask, Vector
+from sbt.samplers.search import Search, fit_warped
+from sbt.seeds import stream
+from sbt.store.history import VALIDATION, History
+from sbt.store.records import Validation, to_json
+
+__all__ = ["CONFIRM", "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs"]
+
+CONFIRM = "confirm"
+"""Stage of the runs that repeat a failure mode's representative with fresh seeds; they come beside the budget."""
+FILLING = ("initial", "even", VALIDATION)
+"""Stages of runs that fill the space, whatever the results."""
+
+
+@dataclass(frozen=True)
+class SearchBound:
+    """What the space-filling runs bound where nothing critical was found; the guided ones were chosen by results.
+
+    Attributes:
+        box_fraction: at most this share of the box is critical.
+        confidence: of the bounds.
+        space_filling_runs: Sobol points and random ones.
+        random_runs: those among them that are independent draws.
+        box_fraction_random_runs: the bound by the random ones alone; None: there are none.
+        failed_runs: among the space-filling ones; each may hide a critical run.
+        box_fraction_failed_as_critical: the bound that counts them as critical.
+    """
+
+    box_fraction: float
+    confidence: float
+    space_filling_runs: int
+    random_runs: int
+    box_fraction_random_runs: float | None
+    failed_runs: int
+    box_fraction_failed_as_critical: float
+
+    @classmethod
+    def of(cls, runs: History) -> SearchBound:
+        """Return the bound by the space-filling ones of these runs."""
+        filling = runs.where(np.isin(runs.stage, FILLING))
+        n, failed = len(filling), int((~filling.ok).sum())
+        drawn = int((filling.stage == VALIDATION).sum())
+        high, with_failed = (float(upper(k, n, 0.95)) for k in (0, failed))
+        return cls(high, 0.95, n, drawn, float(upper(0, drawn, 0.95)) if drawn else None, failed, with_failed)
+
+
+@dataclass(frozen=True)
+class ClosestRun:
+    """The uncritical run nearest to the critical interval, by the metric."""
+
+    run: int
+    inputs: Mapping[str, float]
+    metric: float
+    margin: float
+
+
+@dataclass(frozen=True)
+class FalsificationConclusion:
+    """What a falsification found.
+
+    Attributes:
+        first_critical_run: index of the first critical run of the search, from 0; None: there is none.
+        runs_to_first: how many runs of the search it took, from 1.
+        critical_runs: of the search; confirmations are not counted.
+        failure_modes: the deepest first.
+        bound: where nothing critical was found, what the space-filling runs say about the critical share of the box.
+        closest: where nothing critical was found, the run nearest to the critical interval.
+        statement: what follows from the runs, and no more.
+        validation: scores of the metamodel on held-out runs; None without such runs.
+    """
+
+    first_critical_run: int | None
+    runs_to_first: int | None
+    critical_runs: int
+    failure_modes: tuple[FailureMode, ...]
+    bound: SearchBound | None
+    closest: ClosestRun | None
+    statement: str
+    validation: Validation | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON of the command line."""
+        found: dict[str, Any] = to_json(self)
+        return found
+
+    def sentences(self, facts: Facts) -> list[str]:
+        """Return whether the requirement is falsified, and what follows from the runs."""
+        said = [self.statement] if self.statement else []
+        if self.first_critical_run is None:
+            said.insert(0, "The requirement was not falsified: no critical run was found.")
+        else:
+            modes = plural(len(self.failure_modes), "distinct failure mode")
+            said.insert(0, (
+                f"The requirement is falsified: the first critical run is run {self.first_critical_run},"
+                f" after {plural(self.runs_to_first or 0, 'run')} of the search; {modes}."
+            ))  # fmt: skip
+        return [*said, *share_among_held_out(facts).sentence()]
+
+
+@dataclass(frozen=True)
+class FailureSearch:
+    """A search for failures as functions of its runs, shared by both stages and the conclusion.
+
+    Args:
+        settings: of the campaign.
+        found: failure modes by the indices of the runs they were found in; stages ask again and again, and rows
+            that are finished never change.
+    """
+
+    settings: Settings
+    found: dict[tuple[int, ...], list[Mode]] = field(default_factory=dict, repr=False, compare=False)
+
+    @cached_property
+    def search(self) -> Search:
+        """What is searched, with the campaign's metamodel."""
+        scenario, learner = self.settings.scenario, self.settings.learner
+        if learner is None:
+            raise InputError("campaign falsification needs a metamodel, but got none")
+        space = scenario.space
+        return Search(
+            scenario.requirement.critical, learner.metamodel, space.metamodel_inputs, lambda u: space.feasible(space.from_unit(u))
+        )
+
+    def margin(self, history: History) -> Vector:
+        """Return (n,) distance to M_c in the metric's unit, NaN where a run failed."""
+        return self.settings.scenario.requirement.margins(history)
+
+    def modes(self, history: History) -> list[Mode]:
+        """Return the failure modes among these runs."""
+        runs = tuple(history.index.tolist())
+        if runs not in self.found:
+            self.found.clear()  # only the last answer is asked for again
+            self.found[runs] = self._modes(history)
+        return self.found[runs]
+
+    def _modes(self, history: History) -> list[Mode]:
+        scenario = self.settings.scenario
+        ok = np.flatnonzero(history.ok)
+        if not (self.margin(history) <= 0).any():
+            return []
+        if len(ok) < 2:
+            only = int(ok[0])
+            return [Mode((only,), only, only, None)]
+        u, y = scenario.space.to_unit(history.x[ok]), history.y(scenario.requirement.metric)[ok]
+        fitted = fit_warped(self.search, u, y, stream(self.settings.seed, "modes", len(history)))
+        return modes_of(fitted, history, scenario)
+
+    def conclusion(self, history: History, validation: Validation | None) -> FalsificationConclusion:
+        """Return what was found."""
+        searched, scenario = search_runs(history), self.settings.scenario
+        margin = self.margin(searched)
+        hits = np.flatnonzero(margin <= 0)
+        modes = []
+        for mode in self.modes(searched):
+            again = history.where(confirmations(history, searched.x[mode.representative]))
+            modes.append(describe(mode, searched, scenario, again.y(scenario.requirement.metric)))
+        first = int(hits[0]) if len(hits) else None
+        bound = None if len(hits) else SearchBound.of(searched)
+        return FalsificationConclusion(
+            None if first is None else int(searched.index[first]), None if first is None else first + 1, len(hits), tuple(modes),
+            bound, None if len(hits) else _closest(searched, margin, scenario.requirement.metric),
+            _statement(searched, len(hits), modes, bound), validation,
+        )  # fmt: skip
+
+
+def search_runs(history: History) -> History:
+    """Return the runs of the search, without the confirmations."""
+    return history.where(history.stage != CONFIRM)
+
+
+def confirmations(history: History, x: Vector) -> Mask:
+    """Return (n,) booleans: the run repeated the inputs x (d,) to confirm a failure mode."""
+    return (history.stage == CONFIRM) & (history.x == x).all(axis=1)
+
+
+def _closest(runs: History, margin: Vector, metric: str) -> ClosestRun | None:
+    """Return the run that came nearest to M_c."""
+    if not np.isfinite(margin).any():
+        return None
+    k = int(np.nanargmin(margin))
+    return ClosestRun(int(runs.index[k]), runs.inputs(k), float(runs.y(metric)[k]), float(margin[k]))
+
+
+def _statement(runs: History, hits: int, modes: list[FailureMode], bound: SearchBound | None) -> str:
+    """Return what follows from the runs, and no more."""
+    n, failed = len(runs), int((~runs.ok).sum())
+    hidden = f" {failed} runs failed and say nothing about safety." if failed else ""
+    if failed == n:
+        return f"All {n} runs failed: nothing was tested."
+    if bound is not None:
+        sobol = bound.space_filling_runs - bound.random_runs
+        how = f" ({sobol} of them scrambled Sobol points, for which this bound of random ones is approximate)" if sobol else ""
+        share = bound.box_fraction_failed_as_critical
+        return (
+            f"No critical run in {n}. The guided runs bound nothing; from the {bound.space_filling_runs} space-filling ones"
+            f" alone{how}, at most {100 * share:.3g} % of the box is critical (95 %).{hidden}"
+        )
+    if hits == n - failed:
+        return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
+    unsure = [m for m in modes if m.confirmed is not None and m.confirmed < 1.0]
+    doubt = f" {len(unsure)} of them did not fail again with every fresh seed." if unsure else ""
+    return f"{hits} of {n} runs of the search were critical, in {plural(len(modes), 'failure mode')}.{doubt}{hidden}"

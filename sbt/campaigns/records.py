@@ -1,0 +1,120 @@
+"""What the log keeps of how a batch was chosen: one record for each kind of stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from sbt.store.records import optional
+
+__all__ = [
+    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "PoolSummary", "SearchProposal",
+]  # fmt: skip
+
+EXPLORE, LEARN, COUNT = "explore", "learn", "count"
+"""Phases of an estimation: a search for modes, draws that only teach, draws that count."""
+
+
+@dataclass(frozen=True)
+class BatchProposal:
+    """How a batch of a boundary or coverage campaign was chosen.
+
+    Attributes:
+        method: rejection, smc, pool, greedy or mix.
+        next_position: in the campaign's Sobol sequence.
+        candidates: points that were scored.
+        acceptance: share of them that rejection accepted; None where nothing was rejected.
+        held_out: random runs that only score the metamodel.
+        random: of a mix, how its random points were drawn.
+        explored: of a mix, runs that searched for unknown critical regions: the first ones of the batch.
+        filling, representative, greedy: of a mix, runs that fill the space, represent a_BI, or were chosen one by one.
+        even: of a greedy batch, runs that fill the space because nothing else was left.
+    """
+
+    method: str
+    next_position: int
+    candidates: int = 0
+    acceptance: float | None = None
+    held_out: int = 0
+    random: str | None = optional()
+    explored: int | None = optional()
+    filling: int | None = optional()
+    representative: int | None = optional()
+    greedy: int | None = optional()
+    even: int | None = optional()
+
+
+@dataclass(frozen=True)
+class SearchProposal:
+    """How a batch of a falsification was chosen.
+
+    Attributes:
+        method: portfolio, another criterion, an acquisition, even (the first batch) or repeat (confirmations).
+        next_position: in the campaign's Sobol sequence.
+        criteria: how many runs each criterion of the method chose.
+        even: runs that fill the space.
+        held_out: random runs that only score the metamodel.
+    """
+
+    method: str
+    next_position: int
+    criteria: Mapping[str, int] = field(default_factory=dict)
+    even: int = 0
+    held_out: int = 0
+
+
+@dataclass(frozen=True)
+class PoolSummary:
+    """The pool that a batch of an estimation was drawn from.
+
+    Attributes:
+        size: points.
+        probability: mean P(critical) of the metamodel over the pool, under the inputs' distribution.
+        anticipated: variance of one draw that the metamodel anticipates.
+        components: of the mixture that the pool was sampled from.
+        fallback: an earlier metamodel was used, because the newest one had lost its precision.
+    """
+
+    size: int
+    probability: float
+    anticipated: float
+    components: int
+    fallback: bool = False
+
+
+@dataclass(frozen=True)
+class CountedDraws:
+    """Draws with known density, which the estimate counts.
+
+    Attributes:
+        pool_variance: variance of the pool's mean.
+        nominal: share of the draws in proportion to the inputs' distribution.
+        coefficient: of each draw in the estimate: density ratio over the number of draws.
+        control_variate: of each draw, P(critical) that the pool's mean accounts for.
+        pi: of each draw, the metamodel's P(critical).
+    """
+
+    pool_variance: float
+    nominal: float
+    coefficient: tuple[float, ...]
+    control_variate: tuple[float, ...]
+    pi: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class EstimationProposal:
+    """How a batch of an estimation was chosen.
+
+    Attributes:
+        phase: initial, explore (search for modes), learn (draws that only teach), count or subset.
+        method: sobol, explore, uncertainty, difference, meta_is, monte_carlo or subset.
+        modes: failure modes that were known, in the phase of exploration.
+        pool: what the draws came from.
+        counted: the draws that count.
+    """
+
+    phase: str
+    method: str
+    modes: int | None = optional()
+    pool: PoolSummary | None = optional()
+    counted: CountedDraws | None = optional()

@@ -1,0 +1,81 @@
+"""Standard streams that nobody can close on a campaign."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from typing import Any, TextIO
+
+__all__ = ["SteadyStream", "open_missing"]
+
+_GONE = (errno.EPIPE, errno.EBADF, errno.EIO, errno.ENXIO)
+"""Errors of a stream whose reader has left: a closed pipe, descriptor or terminal."""
+
+
+class SteadyStream:
+    """A text stream that goes on without its reader: what can no longer be written is dropped.
+
+    Args:
+        stream: what is written to.
+        any_error: drop the text also where the disk is full, which the result of a command must not do.
+    """
+
+    def __init__(self, stream: TextIO, *, any_error: bool = False):
+        self._stream, self._any = stream, any_error
+        self.gone = False
+
+    def write(self, text: str) -> int:
+        """Write a text, or drop it."""
+        try:
+            return self._stream.write(text)
+        except (OSError, ValueError) as error:
+            self._drop(error)
+            return len(text)
+
+    def flush(self) -> None:
+        """Write what is buffered, or drop it."""
+        try:
+            self._stream.flush()
+        except (OSError, ValueError) as error:
+            self._drop(error)
+
+    def close(self) -> None:
+        """Stay open: the stream belongs to the process."""
+        self.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the stream has of this name."""
+        return getattr(self._stream, name)
+
+    def _drop(self, error: OSError | ValueError) -> None:
+        """From now on write to nowhere, also what is not Python's (SUMO, child processes)."""
+        closed = self._stream.closed
+        if isinstance(error, OSError) and not (self._any or error.errno in _GONE):
+            raise error
+        if isinstance(error, ValueError) and not closed:
+            raise error
+        self.gone = True
+        if closed:
+            self._stream = open(os.devnull, "w")  # noqa: PTH123, SIM115  (lives as long as the process)
+            return
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self._stream.fileno())
+        os.close(nowhere)
+
+
+def open_missing() -> None:
+    """Open those of descriptors 0, 1 and 2 that are closed (`2>&-`), so that no file takes their numbers."""
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            os.set_inheritable(number, True)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115

@@ -1,0 +1,149 @@
+"""Typed records of what is in the log: frozen dataclasses to plain JSON and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, TypeVar
+
+from sbt.errors import StoreError
+
+__all__ = ["FitRecord", "Iteration", "Validation", "from_json", "optional", "to_json"]
+
+T = TypeVar("T")
+
+
+def optional(default: Any = None) -> Any:
+    """Return a dataclass field that is left out of the JSON while it is None."""
+    return field(default=default, metadata={"optional": True})
+
+
+def to_json(record: Any) -> Any:
+    """Return a dataclass as plain JSON data; NaN and infinity become null, as they are in no JSON."""
+    if dataclasses.is_dataclass(record) and not isinstance(record, type):
+        pairs = ((f, getattr(record, f.name)) for f in dataclasses.fields(record))
+        return {f.name: to_json(v) for f, v in pairs if not (v is None and f.metadata.get("optional"))}
+    if isinstance(record, Mapping):
+        return {str(key): to_json(value) for key, value in record.items()}
+    if isinstance(record, list | tuple):
+        return [to_json(value) for value in record]
+    if hasattr(record, "tolist"):  # an array or a scalar of NumPy
+        return to_json(record.tolist())
+    return None if isinstance(record, float) and not math.isfinite(record) else record
+
+
+def from_json(kind: type[T], data: Any) -> T:
+    """Return a dataclass from its JSON data; keys that it does not know are passed over.
+
+    Raises:
+        StoreError: the data are those of something else.
+    """
+    try:
+        found: T = _adapter(kind).validate_python(data)  # type: ignore[arg-type]
+    except ValueError as error:
+        first = str(error).splitlines()[1:3]
+        raise StoreError(f"a record of the log must be a {kind.__name__}, but is not: {' '.join(first)}") from error
+    return found
+
+
+@cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Scores of a metamodel on runs that it had not seen; None where the runs do not tell.
+
+    Attributes:
+        log_likelihood, likelihood: of the moment-matched Gaussian, mean over runs (the paper's yardstick).
+        log_likelihood_mixture: of the whole mixture.
+        rmse, crps: in the metric's unit.
+        log_likelihood_critical, rmse_critical: on the critical runs alone.
+        average_precision, precision_at_recall_90, f1: of finding critical runs by P(critical).
+        calibration_error: mean |P(critical) - frequency| over ten bins.
+        coverage_95: share of the runs in their 95 % interval.
+        base_rate: share of critical runs.
+        error_rate: share on the wrong side of P = 0.5.
+        n, n_critical: runs, and critical ones among them.
+    """
+
+    log_likelihood: float | None = None
+    likelihood: float | None = None
+    log_likelihood_mixture: float | None = None
+    rmse: float | None = None
+    crps: float | None = None
+    log_likelihood_critical: float | None = None
+    rmse_critical: float | None = None
+    average_precision: float | None = None
+    precision_at_recall_90: float | None = None
+    f1: float | None = None
+    calibration_error: float | None = None
+    coverage_95: float | None = None
+    base_rate: float | None = None
+    error_rate: float | None = None
+    n: int = 0
+    n_critical: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the scores by name."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class FitRecord:
+    """What the log keeps of a fitted metamodel.
+
+    Attributes:
+        learned: runs that it learned from.
+        critical_fraction: mean P(critical) over 4,096 fixed Sobol points of the space.
+        expected_misclassified: mean of min(P, 1 - P) there.
+        ambiguous_volume: share of them with P between 0.05 and 0.95.
+        sides: their classification, as hexadecimal bits.
+        validation: scores on runs it had not seen; None without such runs.
+        weights: of a metamodel that mixes others, the share of each.
+        chosen_because: and why.
+        fit_seconds, scoring_seconds: in benchmarks only.
+        runs, iteration: of the campaign when it was fitted.
+    """
+
+    learned: int
+    critical_fraction: float
+    expected_misclassified: float
+    ambiguous_volume: float
+    sides: str
+    validation: Validation | None = None
+    weights: Mapping[str, float] | None = optional()
+    chosen_because: str | None = optional()
+    fit_seconds: float | None = optional()
+    scoring_seconds: float | None = optional()
+    runs: int = 0
+    iteration: int = 0
+
+    def score(self, name: str) -> float | int | None:
+        """Return one of the scores of `Validation`; None where it is not known."""
+        return getattr(self.validation, name, None)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """A batch in the log.
+
+    Attributes:
+        number: from 0.
+        stage: what asked for it.
+        proposal: how it was chosen: the JSON of the stage's own record.
+    """
+
+    number: int
+    stage: str
+    proposal: Mapping[str, Any]
+
+    def read(self, kind: type[T]) -> T:
+        """Return how it was chosen as the stage's own record."""
+        return from_json(kind, self.proposal)

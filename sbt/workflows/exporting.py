@@ -1,0 +1,71 @@
+"""Writes the runs of a store as a table."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from sbt.errors import InputError, did_you_mean
+from sbt.files import write_atomically
+from sbt.store.database import Store
+from sbt.workflows.study import Study
+
+__all__ = ["FORMS", "export_store"]
+
+
+def export_store(folder: Path, form: str = "csv", *, objects: Mapping[tuple[str, str], Any] | None = None) -> Path:
+    """Write the runs of a store as a table into its folder `exports`.
+
+    Args:
+        folder: of the store.
+        form: of `FORMS`: csv and parquet, a row a run with its verdict; dsiod, the layout of the public data set; boundary,
+            points where the metamodel's P(critical) is 0.5.
+        objects: what was given in Python when the store was made.
+
+    Raises:
+        InputError: an unknown form, a library that is not installed, or (boundary) no metamodel.
+        StoreError: the folder holds no campaign.
+    """
+    if form not in FORMS:
+        raise InputError(f"--format must be {', '.join(FORMS)}, but got '{form}'{did_you_mean(form, FORMS)}")
+    if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise InputError("--format parquet needs pyarrow: pip install 'sumo-sbt[parquet]', or choose csv")
+    with Store.read(folder) as store:
+        return FORMS[form](store, Study.from_store(store, objects=objects))
+
+
+def _as_csv(store: Store, study: Study) -> Path:
+    """Write one row a run."""
+    frame = store.history().to_frame(study.scenario.requirement)
+    return write_atomically(store.folder / "exports" / "runs.csv", lambda part: frame.to_csv(part, index=False))
+
+
+def _as_parquet(store: Store, study: Study) -> Path:
+    """Write one row a run."""
+    frame = store.history().to_frame(study.scenario.requirement)
+    return write_atomically(store.folder / "exports" / "runs.parquet", lambda part: frame.to_parquet(part, index=False))
+
+
+def _as_boundary(store: Store, study: Study) -> Path:
+    """Write points of the inputs' space where the metamodel says P(critical) = 0.5."""
+    import pandas as pd
+
+    from sbt.campaigns.boundary import boundary_points
+
+    points = pd.DataFrame(boundary_points(study.settings, store.history()), columns=list(study.scenario.space.names))
+    return write_atomically(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
+
+
+def _as_data_set(store: Store, study: Study) -> Path:
+    """Write the runs in the layout of the public data set, which `table:FOLDER` reads."""
+    from sbt.store.tables import to_folder
+
+    return to_folder(store.history(), study.scenario, store.folder / "exports" / "dsiod")
+
+
+FORMS: Mapping[str, Callable[[Store, Study], Path]] = {
+    "csv": _as_csv, "parquet": _as_parquet, "dsiod": _as_data_set, "boundary": _as_boundary,
+}  # fmt: skip
+"""What `export` can write."""

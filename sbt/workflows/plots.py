@@ -1,0 +1,207 @@
+"""Figures of a result: every function takes `ax=None` and returns the Axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sbt.errors import InputError, did_you_mean
+from sbt.loop.learner import FittedMetamodel
+from sbt.problem.arrays import Mask, Vector
+from sbt.store.history import VALIDATION
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from sbt.workflows.result import Result
+
+__all__ = ["Plots"]
+
+_SLICE_POINTS = 201
+"""Points along a slice: below a pixel of the default figure."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Plots:
+    """Figures of a campaign.
+
+    Args:
+        result: the campaign.
+    """
+
+    result: Result[Any]
+
+    def runs(self, ax: Axes | None = None, *, x: str | None = None, y: str | None = None) -> Axes:
+        """Scatter the runs over two inputs; with one input, the safety metric over it.
+
+        Args:
+            ax: where; None: a new figure.
+            x, y: names of the inputs; None: the most influential ones.
+        """
+        from sbt.report import figures
+
+        r, space = self.result, self.result.scenario.space
+        if space.dimension == 1:
+            return figures.plot_metric(r.history, r.scenario.requirement, space, _axes(ax), unit=r.scenario.unit)
+        return figures.plot_runs(r.history, r.scenario.requirement, space, _axes(ax), pair=self._pair(x, y))
+
+    def boundary(self, ax: Axes | None = None, *, x: str | None = None, y: str | None = None) -> Axes:
+        """Draw P(critical) over two inputs, averaged over the others, with the runs that the metamodel learned from.
+
+        Args:
+            ax: where; None: a new figure.
+            x, y: names of the inputs; None: the most influential ones.
+        """
+        from sbt.report import figures
+        from sbt.report.projection import probability_plane
+
+        r, space = self.result, self.result.scenario.space
+        pair = (0,) if space.dimension == 1 else self._pair(x, y)
+        plane = probability_plane(self._fitted.predict, r.scenario.requirement.critical, space, pair)
+        drawn = figures.plot_probability(plane, space, _axes(ax))
+        learned = r.history.where(r.history.stage != VALIDATION)
+        if space.dimension == 2:
+            figures.plot_runs(learned, r.scenario.requirement, space, drawn, pair=self._pair(x, y), size=10.0)
+        return drawn
+
+    def slices(self, ax: Axes | None = None, *, x: str | None = None, at: int | dict[str, float] | None = None) -> Axes:
+        """Draw the metamodel's mean and its 5 % to 95 % band along one input through a point.
+
+        Args:
+            ax: where; None: a new figure.
+            x: name of the input; None: the most influential one.
+            at: index of a run, or values of inputs (the others at their centre); None: the centre.
+        """
+        from sbt.report import figures
+        from sbt.report.axes import padded, reach, shade
+        from sbt.report.style import label
+
+        r, space = self.result, self.result.scenario.space
+        k = int(np.argmax(self._influence)) if x is None else self._column(x)
+        point = np.tile(self._point(at), (_SLICE_POINTS, 1))
+        low, high = space.parameters[k].bounds
+        point[:, k] = np.linspace(low, high, _SLICE_POINTS)
+        drawn, critical = _axes(ax), r.scenario.requirement.critical
+        prediction = self._fitted.predict(np.clip(space.to_unit(point), 0.0, 1.0))
+        ends = reach(np.concatenate([prediction.quantile(0.05), prediction.quantile(0.95)]), critical)
+        shade(critical, ends, drawn, along="y")
+        figures.plot_prediction(point[:, k], prediction, drawn)
+        parameter = space.parameters[k]
+        drawn.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(r.scenario.requirement.metric, r.scenario.unit))
+        drawn.set(ylim=padded(*ends))
+        return drawn
+
+    def convergence(self, ax: Axes | None = None) -> Axes:
+        """Draw how the answer settled: an estimation's probability, or the critical runs found so far."""
+        from sbt.campaigns.estimation import EstimationConclusion
+        from sbt.report.convergence import plot_convergence
+        from sbt.report.curves import plot_progress
+
+        r = self.result
+        conclusion = r.conclusion if r.finished else None
+        if isinstance(conclusion, EstimationConclusion) and conclusion.convergence:
+            return plot_convergence(conclusion, _axes(ax))
+        self._need(len(r.history) > 0, "runs")
+        return plot_progress(r.history, r.scenario.requirement, _axes(ax))
+
+    def precision_recall(self, ax: Axes | None = None) -> Axes:
+        """Draw precision over recall of finding critical runs by P(critical), on the held-out runs."""
+        from sbt.report.curves import plot_precision_recall
+
+        log_p, log_not, truth = self._held_out()
+        self._need(bool(truth.any()), "critical runs among the held-out ones")
+        return plot_precision_recall(log_p - log_not, truth, _axes(ax))
+
+    def reliability(self, ax: Axes | None = None) -> Axes:
+        """Draw how often held-out runs with a given P(critical) were critical."""
+        from sbt.report.curves import plot_reliability
+
+        log_p, _, truth = self._held_out()
+        return plot_reliability(np.exp(log_p), truth, _axes(ax))
+
+    def influence(self, ax: Axes | None = None) -> Axes:
+        """Draw how much each input influences P(critical), or the metric where there is no metamodel, relative to the largest."""
+        from sbt.report.style import MODEL
+
+        names, weights, drawn = self.result.scenario.space.names, self._influence, _axes(ax)
+        order = np.argsort(weights, kind="stable")
+        drawn.barh([names[k] for k in order], weights[order], color=MODEL)
+        drawn.set(xlabel="influence on P(critical), relative to the largest", xlim=(0.0, 1.05))
+        return drawn
+
+    @cached_property
+    def _influence(self) -> Vector:
+        """(d,) influence of each input: of the metamodel, or of the runs alone."""
+        from sbt.report.projection import influence_from_runs, influence_on_probability
+
+        r = self.result
+        if r.fitted is not None:
+            weights = influence_on_probability(r.fitted.predict, r.scenario.requirement.critical, r.scenario.space.dimension)
+            if weights.any():
+                return weights
+        return influence_from_runs(r.history, r.scenario.requirement)
+
+    @property
+    def _fitted(self) -> FittedMetamodel:
+        """The metamodel."""
+        fitted = self.result.fitted
+        if fitted is None:
+            self._need(self.result.study.learner is not None, "metamodel (run with metamodel=...)")
+            raise InputError(f"this figure needs two runs to learn from, but {self.result.store} has fewer")
+        return fitted
+
+    def _held_out(self) -> tuple[Vector, Vector, Mask]:
+        """Return log P(critical), log P(uncritical) and the verdicts of the held-out runs."""
+        from sbt.report.projection import log_probability
+
+        r = self.result
+        held = r.history.held_out
+        self._need(len(held) > 0, "held-out runs (validation: {share: 0.1})")
+        space, need = r.scenario.space, r.scenario.requirement
+        log_p, log_not = log_probability(self._fitted.predict, need.critical, space.to_unit(held.x))
+        return log_p, log_not, need.critical_runs(held)
+
+    def _need(self, there: bool, what: str) -> None:  # noqa: FBT001
+        if not there:
+            raise InputError(f"this figure needs {what}, but {self.result.store} has none")
+
+    def _pair(self, x: str | None, y: str | None) -> tuple[int, int]:
+        """Return the columns of two inputs: those named, the most influential ones for the rest."""
+        named = [None if name is None else self._column(name) for name in (x, y)]
+        rest = (int(k) for k in np.argsort(-self._influence, kind="stable") if int(k) not in named)
+        if named == [None, None]:
+            first, second = sorted((next(rest), next(rest)))
+            return first, second
+        first, second = (next(rest) if k is None else k for k in named)
+        return first, second
+
+    def _column(self, name: str) -> int:
+        names = self.result.scenario.space.names
+        if name not in names:
+            raise InputError(f"an input must be one of {', '.join(names)}, but got '{name}'{did_you_mean(name, names)}")
+        return names.index(name)
+
+    def _point(self, at: int | dict[str, float] | None) -> Vector:
+        """Return the (d,) point that slices go through."""
+        space, history = self.result.scenario.space, self.result.history
+        if at is None or isinstance(at, dict):
+            values = space.values(at or {})
+            return np.array([values[name] for name in space.names])
+        rows = np.flatnonzero(history.index == at)
+        if len(rows) == 0:
+            raise InputError(f"a run must be a finished one (0 to {len(history) - 1}), but got {at}")
+        found: Vector = history.x[rows[0]]
+        return found
+
+
+def _axes(ax: Axes | None) -> Axes:
+    """Return the axes, or those of a new figure that a notebook shows."""
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    _, made = plt.subplots(figsize=(5.4, 4.0), layout="constrained")
+    return made

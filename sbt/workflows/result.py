@@ -1,0 +1,239 @@
+"""What a campaign gave: its rows, its conclusion, its metamodel, its figures and films."""
+
+from __future__ import annotations
+
+import base64
+import html
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from sbt.errors import InputError, StoreError
+from sbt.loop.learner import FittedMetamodel
+from sbt.loop.stages import Conclusion, Facts
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.trace import Trace
+from sbt.store.database import Store
+from sbt.store.history import History
+from sbt.store.records import FitRecord
+from sbt.workflows.exporting import export_store
+from sbt.workflows.plots import Plots
+from sbt.workflows.prediction import inputs_from, predict_inputs
+from sbt.workflows.running import Replay, rebuild_report, replay_run
+from sbt.workflows.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Film", "Result"]
+
+C = TypeVar("C", bound=Conclusion, covariant=True)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Generic[C]):
+    """A campaign's store, read: as it was when the result was first asked; open it again to see more of a running one.
+
+    Args:
+        store: the folder.
+        objects: what was given in Python when it was made, by kind and name.
+    """
+
+    store: Path
+    objects: Mapping[tuple[str, str], Any] = field(default_factory=dict)
+
+    @cached_property
+    def _read(self) -> tuple[Study, History, dict[str, Any], list[FitRecord]]:
+        with Store.read(self.store) as store:
+            return Study.from_store(store, objects=self.objects), store.history(), store.conclusion or {}, store.fits()
+
+    @property
+    def study(self) -> Study:
+        """The campaign as it is configured."""
+        return self._read[0]
+
+    @property
+    def scenario(self) -> LogicalScenario:
+        """The scenario with the campaign's inputs and requirement; it runs only where its code is at hand."""
+        return self.study.scenario
+
+    @property
+    def history(self) -> History:
+        """All finished runs as columns."""
+        return self._read[1]
+
+    @property
+    def fits(self) -> list[FitRecord]:
+        """Scores of every metamodel that was fitted."""
+        return self._read[3]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the campaign has concluded."""
+        return bool(self._read[2])
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `run --json` prints; empty while the campaign goes on."""
+        return dict(self._read[2])
+
+    @cached_property
+    def conclusion(self) -> C:
+        """What the campaign found, with typed attributes.
+
+        Raises:
+            StoreError: it has not concluded.
+        """
+        if not self.finished:
+            raise StoreError(f"the campaign in {self.store} has not concluded: {len(self.history)} runs are done")
+        found: Any = self.study.conclusion(self.summary["conclusion"])
+        return found
+
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """A row a run: x.<input>, y.<metric>, critical, margin, status, stage, iteration, seed, log_q, reason, ..."""
+        return self.history.to_frame(self.scenario.requirement)
+
+    @cached_property
+    def fitted(self) -> FittedMetamodel | None:
+        """The metamodel that learned from all runs but the held-out ones, with its scores on those; None without one."""
+        return self.study.fit(self.history)
+
+    @property
+    def plot(self) -> Plots:
+        """Figures; each takes `ax=None` and returns the Axes."""
+        return Plots(self)
+
+    def predict(self, inputs: Any, *, device: str | None = None) -> pd.DataFrame:
+        """Return what the metamodel, learned from all runs, predicts about concrete scenarios.
+
+        Args:
+            inputs: a DataFrame or a mapping with a column (or one number) for each input, named as the input or
+                `x.<input>`; or an array (n, d).
+            device: auto, cpu or cuda; None: where the metamodel was fitted.
+
+        Returns:
+            Columns mean, std, epistemic, noise (unit of the metric) and p_critical, with the rows' index.
+
+        Raises:
+            InputError: a column is missing, a value is outside of its range, or there is no metamodel.
+        """
+        import pandas as pd
+
+        table = predict_inputs(
+            self.store, lambda space: inputs_from(inputs, space), device=device, objects=self.objects
+        )
+        columns = {{"mu": "mean", "sigma": "std"}.get(name, name): values for name, values in table.columns.items()}
+        return pd.DataFrame(columns, index=inputs.index if isinstance(inputs, pd.DataFrame) else None)
+
+    def replay(self, run: int) -> Replay:
+        """Execute a stored run again, and make sure that it is the same to the last bit.
+
+        Args:
+            run: its index, from 0.
+
+        Raises:
+            InputError: there is no such run, or the scenario's code is not at hand.
+            StoreError: it is not the same.
+        """
+        again = replay_run(self.store, run, objects=self.objects)
+        if not again.identical:
+            now, stored = f"{again.outcome.status} {dict(again.outcome.metrics)}", dict(again.record.metrics)
+            raise StoreError(f"a replay must equal the stored run {run}, but got {now}, not {again.record.status} {stored}")
+        return again
+
+    def trace(self, run: int) -> pd.DataFrame:
+        """Return the states of every road user over time in a run, by executing it again, verified.
+
+        Args:
+            run: its index, from 0.
+
+        Returns:
+            Columns time (s), actor, x, y (m), heading (rad), speed (m/s), acceleration (m/s^2), length, width (m).
+        """
+        import pandas as pd
+
+        return pd.DataFrame(self._trace(self.replay(run)).rows())
+
+    def film(self, run: int) -> Film:
+        """Return a run as a film from above, with its metric over time; by executing it again, verified."""
+        again = self.replay(run)
+        return Film(self._trace(again), again.scenario, f"{again.scenario.name}, run {run}")
+
+    def _trace(self, again: Replay) -> Trace:
+        if again.trace is None:
+            reason = again.outcome.reason or f"scenario {again.scenario.name} gives its metrics directly"
+            raise InputError(f"only a run with a trace can be shown, but run {again.record.index} has none: {reason}")
+        return again.trace
+
+    def report(self) -> Path:
+        """Write `report.html` in the store's folder, and return its path."""
+        return rebuild_report(self.store, objects=self.objects)
+
+    def export(self, form: str = "csv") -> Path:
+        """Write the runs as csv, parquet, dsiod or boundary points into the store's folder, and return the path."""
+        return export_store(self.store, form, objects=self.objects)
+
+    def sentences(self) -> list[str]:
+        """Return what the campaign found in plain words."""
+        if not self.finished:
+            return [f"The campaign has not concluded: {len(self.history):,} runs are done."]
+        return self.conclusion.sentences(Facts(self.history, self.scenario.requirement, self.scenario.unit))
+
+    def __repr__(self) -> str:
+        """Return campaign, scenario and counts."""
+        config, critical = self.study.config, int(self.scenario.requirement.critical_runs(self.history).sum())
+        return f"<Result: {config.campaign} of {config.scenario}, {len(self.history)} runs, {critical} critical, in {self.store}>"
+
+    def _repr_html_(self) -> str:
+        """Return the summary that a notebook shows."""
+        config, ok = self.study.config, int(self.history.ok.sum())
+        critical = int(self.scenario.requirement.critical_runs(self.history).sum())
+        facts = {
+            "campaign": config.campaign, "scenario": config.scenario, "runs": f"{len(self.history):,}",
+            "critical": f"{critical:,}", "failed": f"{len(self.history) - ok:,}", "store": str(self.store),
+        }  # fmt: skip
+        rows = "".join(f"<tr><th style='text-align:left'>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())
+        said = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in self.sentences())
+        return f"<div>{said}<table>{rows}</table></div>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Film:
+    """A run from above, with its metric over time.
+
+    Args:
+        states: the run.
+        scenario: names metric, requirement and network.
+        title: above the scene.
+    """
+
+    states: Trace
+    scenario: LogicalScenario
+    title: str = ""
+
+    def save(self, path: str | Path) -> Path:
+        """Write the film as an animated GIF in real time, and return its path.
+
+        Raises:
+            InputError: the name does not end in .gif.
+        """
+        from sbt.report.film import write_film
+        from sbt.sumo.nets import lanes
+
+        file = Path(path)
+        if file.suffix.lower() != ".gif":
+            raise InputError(f"a film must be saved as .gif, but got '{path}'")
+        need, net = self.scenario.requirement, getattr(self.scenario.simulate, "net", None)
+        metric = next(m for m in self.scenario.metrics if m.name == need.metric)
+        write_film(file, self.states, metric, need, lanes=() if net is None else lanes(net), title=self.title)
+        return file
+
+    def _repr_html_(self) -> str:
+        """Return the film inline."""
+        with tempfile.TemporaryDirectory() as folder:
+            data = self.save(Path(folder) / "film.gif").read_bytes()
+        return f'<img alt="{html.escape(self.title)}" src="data:image/gif;base64,{base64.b64encode(data).decode()}">'

@@ -1,0 +1,214 @@
+"""A study: a campaign as it is configured, and everything that is built from its configuration, once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from sbt.campaigns.settings import CampaignKind, Gate, PlainConclusion, Settings
+from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of
+from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, resumed
+from sbt.config.model import Configuration
+from sbt.errors import InputError, PluginError
+from sbt.execution.dask import DaskExecutor
+from sbt.execution.local import LocalExecutor
+from sbt.execution.protocol import Executor, SerialExecutor
+from sbt.execution.spec import ScenarioSpec
+from sbt.loop.learner import FittedMetamodel, Learner
+from sbt.loop.stages import Campaign, Conclusion, Shard
+from sbt.plugins import Scope
+from sbt.problem.description import describe_scenario, is_complete, rebuild_scenario
+from sbt.problem.scenario import LogicalScenario
+from sbt.store.database import Store
+from sbt.store.history import History
+
+__all__ = ["RESOLVED", "Study"]
+
+RESOLVED = "config.resolved.yaml"
+"""The configuration with its defaults, in a store's folder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A campaign as it is configured.
+
+    Args:
+        loaded: the checked configuration.
+        kept: what the store remembers of it; empty where there is no store yet.
+        live: the scenario's code is loaded, so that it can be run; False: its description in the store is enough, where that
+            is complete.
+    """
+
+    loaded: Loaded
+    kept: Mapping[str, Any] = field(default_factory=dict)
+    live: bool = True
+
+    @classmethod
+    def from_file(cls, path: str | Path, overrides: Sequence[str] = (), **more: Any) -> Study:
+        """Return the study of a configuration file; as `sbt.config.load.load`."""
+        return cls(load(path, overrides, **more))
+
+    @classmethod
+    def from_mapping(cls, data: Mapping[str, Any], *, name: str, scope: Scope) -> Study:
+        """Return the study of a configuration given as plain data."""
+        return cls(from_mapping(data, name=name, scope=scope))
+
+    @classmethod
+    def from_store(
+        cls, store: Store, *, objects: Mapping[tuple[str, str], Any] | None = None, live: bool = False
+    ) -> Study:
+        """Return the study that a store was made with.
+
+        Args:
+            store: open for reading or writing.
+            objects: what was given in Python when it was made, where that is needed.
+            live: load the scenario's code, to run it.
+        """
+        kept = store.configuration
+        loaded = parse(kept["yaml"], name=str(store.folder / RESOLVED), folder=Path(kept["folder"]), objects=objects)
+        return cls(loaded, kept, live)
+
+    def stored_in(self, store: Store) -> Study:
+        """Return the study with the defaults that its store was begun with."""
+        kept = store.configuration
+        if not kept:
+            return self
+        return replace(self, loaded=replace(self.loaded, config=resumed(self.config, kept)), kept=kept)
+
+    def with_store(self, folder: Path) -> Study:
+        """Return the study with another store."""
+        return replace(self, loaded=replace(self.loaded, config=self.config.model_copy(update={"store": str(folder)})))
+
+    @property
+    def config(self) -> Configuration:
+        """The checked configuration."""
+        return self.loaded.config
+
+    @cached_property
+    def kind(self) -> CampaignKind:
+        """The kind of campaign."""
+        return self.loaded.kind
+
+    @cached_property
+    def _assembly(self) -> Assembly:
+        return assemble(self.loaded)
+
+    @cached_property
+    def scenario(self) -> LogicalScenario:
+        """The scenario with the configured inputs, requirement, ego, step and isolation.
+
+        Raises:
+            ConfigError: all problems of the configuration at once.
+        """
+        described = self.kept.get("described")
+        if not self.live and described is not None and is_complete(described):
+            return rebuild_scenario(described)
+        return self._assembly.scenario if self.live else scenario_of(self.loaded)
+
+    @property
+    def spec(self) -> ScenarioSpec:
+        """The scenario for other processes."""
+        return self._assembly.spec
+
+    @cached_property
+    def learner(self) -> Learner | None:
+        """Fits and scores the metamodel; None where the campaign learns nothing."""
+        config = self.config
+        metamodel = self._assembly.metamodel if self.live else metamodel_of(self.loaded)
+        if metamodel is None or config.acquisition.kind in self.kind.metamodel_free:
+            return None
+        return Learner(self.scenario, metamodel, config.seed, self.kind.target_aware)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """What the campaign is built from."""
+        config, recorded = self.config, self.scenario.pool is not None
+        return Settings(
+            scenario=self.scenario, seed=config.seed, budget=config.budget, initial=config.initial, batch=config.batch,
+            holdout_fraction=config.validation.share if self.learner is not None and not recorded else 0.0,
+            reference=0 if recorded else config.validation.reference, learner=self.learner,
+            acquisition=self._assembly.acquisition if self.live else None, method=config.acquisition.kind,
+            stop=config.stop.model_dump(), gate=None if config.gate is None else Gate(**config.gate.model_dump()),
+            prior_runs=self._prior_runs(),
+        )  # fmt: skip
+
+    @cached_property
+    def campaign(self) -> Campaign:
+        """The campaign itself: its stages, and what it concludes."""
+        return self.kind.recipe(self.settings)
+
+    @property
+    def budget(self) -> int:
+        """Number of runs, those included that only score."""
+        return self.config.budget + self.config.validation.reference
+
+    def executor(self) -> Executor:
+        """Return what executes the runs, as configured."""
+        choice = self.config.executor
+        limit = None if choice.timeout == float("inf") else choice.timeout
+        if choice.kind == "serial":
+            return SerialExecutor(self.spec, limit)
+        if choice.kind == "dask":
+            return DaskExecutor(self.spec, choice.address, choice.workers, limit)
+        return LocalExecutor(self.spec, choice.workers, limit)
+
+    def snapshot(self, shard: Shard | None = None) -> dict[str, Any]:
+        """Return what the store remembers of the configuration: plain JSON, and the YAML to read back."""
+        config = self.config
+        return {
+            **fingerprint(config), "budget": config.budget, "names": list(self.scenario.space.names),
+            "described": describe_scenario(self.scenario), "folder": str(Path(self.loaded.folder).resolve()), "yaml": dump(config),
+            **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
+        }  # fmt: skip
+
+    def conclusion(self, data: Mapping[str, Any]) -> Conclusion:
+        """Return a conclusion from the JSON in the store; values by name where the campaign's own type is not at hand."""
+        try:
+            return self.kind.read(data)
+        except PluginError:
+            return PlainConclusion(dict(data))
+
+    def fit(self, history: History) -> FittedMetamodel | None:
+        """Return the metamodel fitted to the runs that teach it, and scored; None where there is none."""
+        return None if self.learner is None else self.learner.fit(history)
+
+    def _prior_runs(self) -> History | None:
+        """Return the runs of the campaign that `warm_start` names, to learn from; None where it names none.
+
+        Raises:
+            InputError: there is no finished campaign, or it ran another scenario, ego, step or other inputs, or
+                did not measure the metric.
+        """
+        if self.config.warm_start is None:
+            return None
+        folder = self.loaded.folder / Path(self.config.warm_start.store).expanduser()
+        with Store.read(folder) as store:
+            before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
+        if not finished:
+            raise InputError(f"warm_start.store must be a finished campaign, but the one in {folder} has not concluded")
+        if before._simulator != self._simulator:
+            names = f"{before.config.scenario} there, {self.config.scenario} here"
+            raise InputError(f"warm_start.store must have the same scenario, ego and step, but {folder} has another ({names})")
+        here, there = self.scenario.space.names, tuple(before.kept["names"])
+        if there != here:
+            raise InputError(
+                f"warm_start.store must have the same inputs, but {folder} has others ({', '.join(there)} there, "
+                f"{', '.join(here)} here)"
+            )
+        runs = history.where(self.scenario.space.feasible(history.x)) if len(history) else history
+        metric = self.scenario.requirement.metric
+        if len(runs) and metric not in runs.metrics and runs.ok.any():
+            raise InputError(f"warm_start.store must have measured {metric}, but {folder} did not")
+        return runs
+
+    @property
+    def _simulator(self) -> tuple[Any, ...]:
+        """What decides the outcome of a concrete scenario: its code, the ego and the step."""
+        config = self.config
+        own = ".py:" in config.scenario or Path(config.scenario).suffix == ".yaml"
+        name = str((self.loaded.folder / config.scenario).resolve()) if own else config.scenario
+        ego = None if config.ego is None else config.ego.model_dump()
+        return name, ego, config.simulation.step_length
