@@ -193,7 +193,7 @@ def test_exit_codes_of_run(
     [
         (InputError("budget must fit"), 2, "budget must fit\n"),
         (StoreError("the disk is full"), 1, "the disk is full\n"),
-        (KeyboardInterrupt(), 130, "interrupted, run again to resume\n"),
+        (KeyboardInterrupt(), 130, "interrupted, nothing was run yet\n"),
         (ZeroDivisionError("oh"), 1, "internal error: ZeroDivisionError: oh (SBT_DEBUG=1 shows where)\n"),
     ],
 )
@@ -234,10 +234,12 @@ def test_simulate_prints_one_json_object_and_nothing_else(folder: Path):
     ("name", "status", "reason"),
     [
         ("REFUSED", "invalid", "the start is not the one asked for"),
-        ("BROKEN", "failed", "ZeroDivisionError: division by zero"),
+        ("BROKEN", "failed", "ZeroDivisionError: division by zero (plane.py:{line})"),
     ],
 )
 def test_a_failed_run_is_told_and_ends_with_4(folder: Path, name: str, status: str, reason: str):
+    line = 1 + (folder / "plane.py").read_text().splitlines().index('    return {"margin": 1 / 0}')
+    reason = reason.replace("plane.py:{line}", f"{folder}/plane.py:{line}")
     done = call("simulate", f"plane.py:{name}", "--json")
     found = json.loads(done.stdout)
     assert done.exit_code == 4
