@@ -16,7 +16,7 @@ __all__ = ["doctor", "list_", "schema"]
 
 _KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 _WRITTEN = {"table": "table:FOLDER", "testbed": "testbed:NAME", "yaml": "FOLDER/scenario.yaml"}
-"""How the sources of this package are asked for a scenario; others as PREFIX:REST."""
+"""How a scenario of each source of this package is named; those of others are PREFIX:REST."""
 
 
 def list_(
@@ -39,7 +39,7 @@ def list_(
 
 
 def _entries(kind: str) -> list[dict[str, str]]:
-    """Return name and summary of everything of one kind; what cannot be loaded says so."""
+    """Return name and summary of everything of one kind; where it cannot be loaded, the error is the summary."""
     from sbt.plugins import load, names
 
     if kind == "campaigns":
@@ -59,7 +59,7 @@ def _entries(kind: str) -> list[dict[str, str]]:
 
 
 def _sources() -> list[dict[str, str]]:
-    """Return how scenarios are named that come from somewhere else, and the testbeds there are."""
+    """Return how the scenarios of each source are named, and the testbeds."""
     from sbt import testbeds
     from sbt.plugins import load, names
 
@@ -95,7 +95,7 @@ def doctor(
     *,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Look at the environment: versions, SUMO, disk; say what to do where something is amiss."""
+    """Check the environment: versions, SUMO, disk; print advice where something is wrong."""
     with clean_stdout():
         from sbt.cli.doctor import examine
 
