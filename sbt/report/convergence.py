@@ -45,7 +45,7 @@ def drawing_of_convergence(found: Findings) -> Iterator[tuple[str, str]]:
     confidence = percent(conclusion.confidence)
     caption = (
         f"The estimate after each batch that counts, with its {confidence} interval. Runs before the first point were for"
-        " search and training. The interval should narrow and the estimate stay within the earlier intervals; a jump indicates a critical"
-        " region that was found late."
+        " search and training. The interval should narrow and the estimate stay within the earlier intervals; a jump"
+        " indicates a critical region that was found late."
     )
     yield caption, to_svg(figure, "convergence")
