@@ -10,14 +10,13 @@ signature. How a campaign uses the scores is up to the function:
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.errors import InputError
+from sbt.errors import InputError, place_of
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
@@ -71,8 +70,7 @@ def log_scores(acquisition: Acquisition, prediction: Prediction, critical: Criti
     try:
         found = np.asarray(acquisition(prediction, critical, log_density), dtype=np.float64)
     except Exception as error:
-        frame = traceback.extract_tb(error.__traceback__)[-1]
-        raised = f"{type(error).__name__}: {error} ({frame.filename}:{frame.lineno})"
+        raised = f"{type(error).__name__}: {error} ({place_of(error)})"
         raise InputError(f"acquisition {name} must score {n} points, but raised {raised}") from error
     if found.shape != (n,):
         raise InputError(f"acquisition {name} must return shape ({n},), but returned {found.shape}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "did_you_mean"]
+__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "did_you_mean", "place_of"]
 
 
 class SbtError(Exception):
@@ -52,3 +52,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     by_lower = {each.lower(): each for each in known}
     close = get_close_matches(name.lower(), by_lower, 1)
     return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""
+
+
+def place_of(error: BaseException) -> str:
+    """Return file:line where the error was raised."""
+    frame = error.__traceback__
+    if frame is None:
+        return "no place"
+    while frame.tb_next is not None:
+        frame = frame.tb_next
+    return f"{frame.tb_frame.f_code.co_filename}:{frame.tb_lineno}"

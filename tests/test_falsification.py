@@ -23,7 +23,7 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers import portfolio
 from sbt.samplers.criteria import log_expected_improvement
-from sbt.samplers.search import DEFLATION, Search, deflated, fit_warped
+from sbt.samplers.search import DEFLATION, Search, deflate, fit_warped
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION
@@ -305,10 +305,10 @@ def test_the_picks_depend_on_the_runs_alone_and_avoid_deflated_basins():
 def test_deflation_shrinks_rather_than_take_everything():
     search = Search(CriticalInterval(high=0.0), GaussianProcess())
     hits = stream(1, "hits").random((200, 2))
-    free = deflated(search, hits, stream(1, "probe"), 2)
+    free = deflate(search, hits, stream(1, "probe"), 2)
     assert free.radius < DEFLATION
     assert free(stream(2, "probe").random((4000, 2))).mean() > 0.02
-    assert deflated(search, hits[:1], stream(1, "probe"), 2).radius == DEFLATION
+    assert deflate(search, hits[:1], stream(1, "probe"), 2).radius == DEFLATION
 
 
 def test_a_trust_region_lasts_while_it_improves_and_is_halved_where_it_does_not():
@@ -329,7 +329,7 @@ def test_the_warp_keeps_what_is_critical_and_the_order(critical: CriticalInterva
     y = np.sort(10.0 ** stream(3, "y").uniform(-3, 6, 300)) - 1.0
     y = np.concatenate([y, [critical.low, critical.high]])
     y = y[np.isfinite(y)]
-    warp = Warp.about(y, critical)
+    warp = Warp.around_edge(y, critical)
     w = warp.values(y)
     np.testing.assert_array_equal(np.argsort(w, kind="stable"), np.argsort(y, kind="stable"))
     np.testing.assert_array_equal(warp.interval(critical).contains(w), critical.contains(y))

@@ -232,7 +232,7 @@ def test_the_type_of_an_automated_ego_is_the_models() -> None:
 
 
 def test_a_column_has_its_flow_and_its_shortest_headway() -> None:
-    column, speed, flow = TrafficStream("co", ("r",), 0, 20.0, spread=0.1).driven(tau=0.7), 15.0, 900.0
+    column, speed, flow = TrafficStream("co", ("r",), 0, 20.0, spread=0.1).with_driver(tau=0.7), 15.0, 900.0
     cars = [column.draw(np.random.Generator(np.random.PCG64(k)), flow, speed, 900.0, 0.0) for k in range(200)]
     gaps = np.concatenate([-np.diff([c.position for c in row]) for row in cars])
     assert gaps.min() >= MIN_HEADWAY * speed + 5.0 - 1e-9

@@ -22,7 +22,7 @@ from sbt.samplers import evolution, portfolio
 from sbt.samplers.criteria import CRITERIA, propose_by
 from sbt.samplers.greedy import influence_on_mean, propose_greedily
 from sbt.samplers.roi import rejection
-from sbt.samplers.search import Picks, fill
+from sbt.samplers.search import Picks, fill_uniformly
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
@@ -171,7 +171,7 @@ class SearchStage:
             return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
 
         u, _ = propose_greedily(score, existing, n, scale, rng, snap=snap, admissible=feasible)
-        return np.concatenate([u, fill(feasible, n - len(u), space.dimension, rng)])
+        return np.concatenate([u, fill_uniformly(feasible, n - len(u), space.dimension, rng)])
 
     def _snapped(self, parts: list[tuple[str, Points]], runs: History) -> list[PlannedRun]:
         """Return the runs of each part by its stage; where rows are recorded, the nearest one not taken yet."""

@@ -153,10 +153,10 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
     kind = problems.attempt(("metamodel", "kind"), lambda: loaded.scope.load("metamodels", choice.kind))
     if kind is None:
         return None
-    if not isinstance(kind, type) or not callable(getattr(kind, "fit", None)):
+    if not callable(getattr(kind, "fit", None)):
         problems.add(
             ("metamodel", "kind"),
-            f"a metamodel must be a class with fit(u, y, rng), but '{choice.kind}' is not",
+            f"a metamodel must be a class (or an object) with fit(u, y, rng), but '{choice.kind}' is not",
         )
         return None
     settings = choice.settings

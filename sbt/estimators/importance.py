@@ -1,10 +1,10 @@
-"""Draws for a probability from a pool: how many, where, with which weight, and what they are worth.
+"""Importance sampling from a pool: with which probability a point is drawn, and the coefficient of each draw.
 
     P_t = (1/N) sum_i w_i pi_i + (1/n) sum_j w_j (1_j - pi_j) / (N r_j)
 
-over a fresh pool of N points with weights w = p/h and beliefs pi, and n draws from the pool with
-probabilities r. Unbiased for any belief that knows only earlier runs: the first sum is what the
-metamodel thinks, the second corrects it by true runs. With pi = 0 there it is Meta-IS.
+over a fresh pool of N points from the proposal h with weights w = p/h and predicted probabilities pi, and n draws from
+the pool with probabilities r. Unbiased for any metamodel that was fitted to earlier runs only: the first sum is the
+prediction, the second corrects it by true runs (pi is a control variate). With pi = 0 in both it is Meta-IS.
 
 Source:
     Dubourg, Sudret, Deheeger (2013), Meta-IS, Probabilistic Engineering Mechanics 33; the difference
@@ -22,24 +22,25 @@ from sbt.problem.arrays import Points, Vector
 __all__ = ["SHARES", "Draws", "Plan", "draw_systematic", "plan_batch"]
 
 SHARES = (0.78, 0.05, 0.05, 0.12)
-"""Of the draws: in proportion to doubt, to the nominal law, to the pool, to the wide law."""
+"""Shares of the draws in proportion to the metamodel's uncertainty, to the nominal distribution, to the pool and to the
+wide distribution. The last three (22 %) do not depend on the metamodel: they bound what it misses."""
 BLIND = (0.0, 0.5, 0.1, 0.4)
-"""The same while the metamodel knows only one side: nothing to doubt, everything to be found."""
+"""The same while all runs are on one side of the boundary: the metamodel knows nothing of the other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How a batch will draw from its pool.
+    """The sampling plan of a batch.
 
     Attributes:
         form: "difference" or "meta" (Meta-IS).
         probability: (N,) r, the probability of each pool point, sum 1.
-        control_variate: (N,) pi as the correction uses it: 0 for Meta-IS.
+        control_variate: (N,) pi as the correction subtracts it: 0 for Meta-IS.
         weight: (N,) w / N.
-        prior: the first sum: what the metamodel thinks; 0 for Meta-IS.
+        prior: the first sum, the metamodel's prediction of the probability; 0 for Meta-IS.
         anticipated: variance of one draw if the metamodel is right.
         pool_variance: of P_t through the pool, in total.
-        nominal: share of the draws in proportion to the nominal law.
+        nominal: share of the draws in proportion to the nominal distribution.
     """
 
     form: str
@@ -54,7 +55,13 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """n draws: (n,) rows of the pool, (n,) coefficients w / (N r), (n,) beliefs that the correction subtracts."""
+    """n draws from a pool.
+
+    Attributes:
+        rows: (n,) rows of the pool.
+        coefficient: (n,) w / (N r).
+        control_variate: (n,) pi, as the correction subtracts it.
+    """
 
     rows: Vector
     coefficient: Vector
@@ -69,19 +76,19 @@ def plan_batch(
     Args:
         log_pi: (N,) log P(critical) of the metamodel.
         log_not: (N,) log P(uncritical) of the metamodel.
-        log_w: (N,) log p/h; -inf where the nominal law has no mass.
-        log_wide: (N,) log of the wide law over h.
-        stratum: (N,) component of h that gave each point: their counts are fixed.
+        log_w: (N,) log p/h; -inf where the nominal distribution has no mass.
+        log_wide: (N,) log of the wide density over h.
+        stratum: (N,) component of h that each point was drawn from: their counts are fixed.
         shares: of the draws, as `SHARES`.
     """
     n = len(log_w)
     w, pi = np.exp(log_w) / n, np.exp(log_pi)
     alive = np.isfinite(log_w)
-    doubt = {"difference": 0.5 * (log_pi + log_not), "meta": 0.5 * log_pi}
+    log_uncertainty = {"difference": 0.5 * (log_pi + log_not), "meta": 0.5 * log_pi}  # standard deviation of the term
     plans = []
-    for form, log_doubt in doubt.items():
+    for form, log_spread in log_uncertainty.items():
         r = shares[1] * w / w.sum() + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
-        r += shares[0] * _normalised(log_doubt + log_w, alive)
+        r += shares[0] * _normalised(log_spread + log_w, alive)
         r /= r.sum()
         mean = float((w * pi).sum())
         second = float((w**2 * pi / np.where(alive, r, 1.0)).sum())
@@ -89,10 +96,10 @@ def plan_batch(
             variance = float((w**2 * pi * np.exp(log_not) / np.where(alive, r, 1.0)).sum())
         else:
             variance = second - mean**2
-        spread = _stratified_variance(n * w * pi, stratum)
+        pool_variance = _stratified_variance(n * w * pi, stratum)
         plans.append(Plan(
             form, r, pi if form == "difference" else np.zeros(n), w, mean if form == "difference" else 0.0,
-            max(variance, 0.0), spread, shares[1],
+            max(variance, 0.0), pool_variance, shares[1],
         ))  # fmt: skip
     return min(plans, key=lambda plan: plan.anticipated)
 
@@ -124,7 +131,7 @@ def draw_systematic(plan: Plan, n: int, order: Points, rng: np.random.Generator)
     often than needed, so that the variance is at most about that of independent draws.
 
     Args:
-        plan: probabilities and beliefs.
+        plan: probabilities and control variates.
         n: number of draws.
         order: (N,) a number by which the pool is ordered.
         rng: the only source of randomness.

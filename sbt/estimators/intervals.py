@@ -1,4 +1,4 @@
-"""What the batches of an estimation say together: value, interval, and the bounds beside it.
+"""The estimate from all batches of an estimation: value, interval, and the bounds beside it.
 
 Weights of the batches are fixed before their results are known: weights by inverse variance would
 prefer batches that met no surprise, and are biased for it.
@@ -19,15 +19,16 @@ from sbt.problem.arrays import Vector
 __all__ = ["CombinedEstimate", "CountedBatch", "combine_estimates", "few_hits_bound", "undetected_mass"]
 
 FEWEST_HITS = 10
-"""Critical runs below which there is a one-sided bound instead of an interval."""
+"""Critical runs below which there is a one-sided bound instead of an interval: the variance of fewer says little."""
+_BISECTIONS = 60  # of [0, 1]: to the last bit
 
 
 @dataclass(frozen=True, eq=False)
 class CountedBatch:
-    """A batch that counts, with its outcomes.
+    """A batch that enters the estimate, with its outcomes.
 
     Args:
-        prior: what the metamodel thought: mean of w pi over the pool.
+        prior: the metamodel's prediction of the probability: mean of w pi over the pool.
         anticipated: variance of one draw if the metamodel is right.
         pool_variance: of the batch through its pool.
         coefficient: (n,) w / (N r) of the draws.
@@ -64,7 +65,7 @@ class CombinedEstimate:
         std_error: from the larger of the batches' own and the between-batch variance.
         freedom: degrees of freedom of its t quantile.
         effective_sample_size: of the weights of the draws.
-        largest_share: of the sum of weights, by one draw.
+        largest_share: share of the sum of weights that the largest one has.
     """
 
     value: float
@@ -109,7 +110,7 @@ def few_hits_bound(hits: int, nominal: Vector, confidence: float) -> float:
     """Return the exact upper limit of a probability after few hits, from the defensive share of the draws.
 
     Every draw meets a region of probability P with probability at least s P, s the share that is drawn
-    in proportion to the nominal law, whatever the metamodel thinks. The limit is the P at which `hits`
+    in proportion to the nominal distribution, whatever the metamodel predicts. The limit is the P at which `hits`
     or fewer are only just credible.
 
     Args:
@@ -120,7 +121,7 @@ def few_hits_bound(hits: int, nominal: Vector, confidence: float) -> float:
     if len(nominal) == 0 or hits >= len(nominal):
         return 1.0
     low, high = 0.0, 1.0
-    for _ in range(60):
+    for _ in range(_BISECTIONS):
         p = 0.5 * (low + high)
         low, high = (p, high) if _at_most(hits, nominal * p) > 1.0 - confidence else (low, p)
     return high
@@ -137,14 +138,14 @@ def _at_most(hits: int, chances: Vector) -> float:
 
 
 def undetected_mass(nominal: Vector, surprises: int, confidence: float = 0.95) -> float:
-    """Return the most that a region which the metamodel denies may hold.
+    """Return the largest probability that a region may hold which the metamodel takes for uncritical.
 
-    3 / n_p at 95 %, n_p the number of draws in proportion to the nominal law, while none of them was a
-    surprise (a critical run that the metamodel thought impossible).
+    3 / n_p at 95 %, n_p the number of draws in proportion to the nominal distribution, while none of them was a
+    surprise (a critical run to which the metamodel gave next to no probability).
 
     Args:
-        nominal: (n,) share of each draw that is in proportion to the nominal law.
-        surprises: critical runs that the metamodel had denied.
+        nominal: (n,) share of each draw that is in proportion to the nominal distribution.
+        surprises: critical runs to which the metamodel gave next to no probability.
         confidence: of the bound.
     """
     return few_hits_bound(surprises, nominal, confidence)

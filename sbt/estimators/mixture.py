@@ -1,6 +1,6 @@
 """Gaussian mixtures in the standard-normal space: proposals with an exact density.
 
-A mixture is fitted to particles from the regions that matter; the nominal law and a wide one are
+A mixture is fitted to particles from the regions that matter; the nominal and a wide distribution are
 always components of it, so that no point of the space has a density of (nearly) zero.
 """
 
@@ -19,9 +19,16 @@ from sbt.problem.arrays import Points, Vector
 __all__ = ["Mixture", "Normals", "fit_mixture", "log_normal", "particles", "wide_scales"]
 
 LogTarget = Callable[[Points], Vector]
-_TAIL = 1e-4
-_COMPONENTS = (1, 2, 4, 7)
-_STEPS = 25
+_TAIL = 1e-4  # probability of chi^2 beyond the wide component's radius
+_COMPONENTS = (1, 2, 4, 7)  # numbers of normals that are compared: few, as particles are few
+_ROWS = 10  # particles a dimension that each of several normals needs
+_FEWEST = 8  # particles a dimension that a covariance needs
+_LABELLED, _ELSEWHERE = 0.9, 0.1  # of a particle belongs to its nearest centre at first, and to all alike
+_PRIOR_SHAPE = 0.05  # of the covariance of all particles: the prior of each normal's
+_STEPS = 25  # most of the expectation maximisation, which ends earlier where the likelihood stands still
+_NEAR, _NEAR_SHARE = 0.3, 0.25  # standard deviation of candidates around known critical points, and their share
+_MOVES = 8  # Metropolis steps of a particle: resampled duplicates have moved apart
+_STEP, _LONGER, _SHORTER, _ACCEPTANCE = 0.6, 1.3, 0.7, 0.3  # of a Metropolis step: first length, factors, acceptance to reach
 
 
 def log_normal(z: Points, scale: Vector | float = 1.0) -> Vector:
@@ -36,7 +43,7 @@ def wide_scales(bounded: Vector) -> Vector:
     """Return (d,) standard deviations of the wide component: s on normal scores with a tail, 1 on bounded inputs.
 
     s^2 d' is the 1 - 1e-4 quantile of chi^2 with d' degrees of freedom, d' the number of inputs with a
-    tail. The normal score of a uniform input is left alone: its nominal law covers the range evenly.
+    tail. The normal score of a uniform input keeps 1: its nominal distribution covers the range evenly.
 
     Args:
         bounded: (d,) 1 where the input is uniform on its range, else 0.
@@ -44,10 +51,6 @@ def wide_scales(bounded: Vector) -> Vector:
     free = int((bounded == 0).sum())
     s = math.sqrt(2.0 * float(gammainccinv(0.5 * free, _TAIL)) / free) if free else 1.0
     return np.where(bounded == 0, s, 1.0)
-
-
-_NEAR, _NEAR_SHARE = 0.3, 0.25
-"""Spread of candidates about known critical points, and their share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +73,13 @@ class Normals:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """The proposal h: the nominal law, the wide law and fitted normals, with exact density.
+    """The proposal h: the nominal and the wide distribution and fitted normals, with exact density.
 
     Args:
         wide: (d,) standard deviations of the wide component.
         normals: fitted components; None: there was nothing to fit.
-        defence: shares of the nominal and of the wide component where there are fitted ones.
+        defence: shares of the nominal and of the wide component where there are fitted ones (defensive mixture:
+            Hesterberg 1995); they bound the weights p/h by 10.
     """
 
     wide: Vector
@@ -124,8 +128,8 @@ class Mixture:
         return z, np.logaddexp(self.log_density(z) + math.log(1.0 - _NEAR_SHARE), log_near + math.log(_NEAR_SHARE))
 
 
-def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: np.random.Generator, moves: int = 8) -> Points:
-    """Return (n, d) particles that follow exp(target) about: resampled, then moved by Metropolis steps.
+def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: np.random.Generator) -> Points:
+    """Return (n, d) particles that approximately follow exp(target): resampled, then moved by Metropolis steps.
 
     Args:
         target: (m, d) points to (m,) log density, not normalised; -inf is allowed.
@@ -133,7 +137,6 @@ def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: 
         log_start: (m,) log density of the candidates.
         n: particles.
         rng: the only source of randomness.
-        moves: Metropolis steps of each particle.
     """
     value = target(start)
     log_w = np.where(np.isfinite(value), value - log_start, -np.inf)
@@ -148,8 +151,8 @@ def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: 
     edges = np.cumsum(weight)
     rows = np.minimum(np.searchsorted(edges, (np.arange(n) + rng.random()) / n * edges[-1]), len(start) - 1)
     z, log_z = start[rows].copy(), value[rows].copy()
-    step = 0.6
-    for _ in range(moves):
+    step = _STEP
+    for _ in range(_MOVES):
         spread = z.std(axis=0) + 0.1
         a, b = rng.permutation(n), rng.permutation(n)
         jump = np.where(rng.random((n, 1)) < 0.5, 0.5 * (z[a] - z[b]), spread * rng.standard_normal(z.shape))
@@ -157,7 +160,7 @@ def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: 
         log_new = target(new)
         accept = np.log(rng.random(n)) < log_new - log_z
         z[accept], log_z[accept] = new[accept], log_new[accept]
-        step *= 1.3 if accept.mean() > 0.3 else 0.7
+        step *= _LONGER if accept.mean() > _ACCEPTANCE else _SHORTER
     return z
 
 
@@ -170,7 +173,7 @@ def fit_mixture(clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generat
         rng: the only source of randomness.
         inflate: factor on the covariances: the tails of h must not be thinner than the target's.
     """
-    parts = [_em(cloud, rng) for cloud in clouds if len(cloud) >= 8 * cloud.shape[1]]
+    parts = [_em(cloud, rng) for cloud in clouds if len(cloud) >= _FEWEST * cloud.shape[1]]
     if not parts:
         return Mixture(wide)
     return Mixture(wide, Normals(
@@ -182,16 +185,13 @@ def fit_mixture(clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generat
 def _em(z: Points, rng: np.random.Generator) -> Normals:
     """Return the normals of best BIC among a few numbers of components."""
     n, d = z.shape
-    best, best_value = None, math.inf
-    for k in _COMPONENTS:
-        if k > 1 and n < 10 * k * d:
-            break
-        found, log_likelihood = _em_of(z, k, rng)
-        value = -2.0 * log_likelihood + len(found.weight) * (1 + d + d * (d + 1) / 2) * math.log(n)
-        if value < best_value:
-            best, best_value = found, value
-    assert best is not None  # noqa: S101
-    return best
+    found = [_em_of(z, k, rng) for k in _COMPONENTS if k == 1 or n >= _ROWS * k * d]
+
+    def bic(fit: tuple[Normals, float]) -> float:
+        normals, log_likelihood = fit
+        return -2.0 * log_likelihood + len(normals.weight) * (1 + d + d * (d + 1) / 2) * math.log(n)
+
+    return min(found, key=bic)[0]
 
 
 def _em_of(z: Points, k: int, rng: np.random.Generator) -> tuple[Normals, float]:
@@ -205,32 +205,32 @@ def _em_of(z: Points, k: int, rng: np.random.Generator) -> tuple[Normals, float]
         nearest = np.minimum(nearest, ((white - white[centres[-1]]) ** 2).sum(axis=1))
         centres.append(int(rng.choice(n, p=nearest / nearest.sum())) if nearest.sum() > 0 else int(rng.integers(n)))
     label = np.argmin(((white[:, None] - white[centres]) ** 2).sum(axis=2), axis=1)
-    share = np.eye(k)[label].T * 0.9 + 0.1 / k  # (k, n)
+    belonging = np.eye(k)[label].T * _LABELLED + _ELSEWHERE / k  # (k, n)
     value = -math.inf
     for _ in range(_STEPS):
-        model = _maximised(z, share, total)
+        model = _maximise(z, belonging, total)
         terms = model.log_terms(z)
-        together = logsumexp(terms, axis=0)
-        share = np.exp(terms - together)
-        if float(together.sum()) < value + 1e-3 * n:
-            value = max(value, float(together.sum()))
+        log_total = logsumexp(terms, axis=0)
+        belonging = np.exp(terms - log_total)
+        if float(log_total.sum()) < value + 1e-3 * n:
+            value = max(value, float(log_total.sum()))
             break
-        value = float(together.sum())
+        value = float(log_total.sum())
     return model, value
 
 
-def _maximised(z: Points, share: Points, total: Points) -> Normals:
-    """Return the normals of largest likelihood given how much of each particle belongs to them."""
+def _maximise(z: Points, belonging: Points, total: Points) -> Normals:
+    """Return the normals of largest likelihood, given the probability (k, n) with which each particle belongs to them."""
     d = z.shape[1]
-    mass = share.sum(axis=1)
+    mass = belonging.sum(axis=1)
     keep = mass > 1.0
-    share, mass = share[keep], mass[keep]
-    mean = share @ z / mass[:, None]
+    belonging, mass = belonging[keep], mass[keep]
+    mean = belonging @ z / mass[:, None]
     factors = []
-    for weights, centre, m in zip(share, mean, mass, strict=True):
+    for weights, centre, m in zip(belonging, mean, mass, strict=True):
         off = z - centre
         covariance = (weights * off.T) @ off / m
         prior = d + 2.0
-        covariance = (m * covariance + prior * 0.05 * total) / (m + prior) + 1e-4 * np.eye(d)
+        covariance = (m * covariance + prior * _PRIOR_SHAPE * total) / (m + prior) + 1e-4 * np.eye(d)
         factors.append(np.linalg.cholesky(covariance))
     return Normals(mass / mass.sum(), mean, np.array(factors).reshape(len(mass), d, d))

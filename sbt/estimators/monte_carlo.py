@@ -1,4 +1,4 @@
-"""Crude Monte Carlo: draws from the law itself, an exact binomial interval, nothing to be believed."""
+"""Crude Monte Carlo: draws from the inputs' distribution itself, an exact binomial interval, no metamodel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Proportion"]
 
 @dataclass(frozen=True)
 class Proportion:
-    """Hits of n independent draws, with failed runs that may be either.
+    """Share of hits among n independent draws, where failed runs may be hits or not.
 
     Args:
         n: draws, the failed ones included.

@@ -23,12 +23,13 @@ __all__ = ["LEVEL_SHARE", "RepeatedEstimate", "SubsetRun", "combine_repeats"]
 
 LEVEL_SHARE = 0.1
 """Share of a level's points that seeds the next one."""
-_AIM = 0.44
+_ACCEPTANCE = 0.44  # of the chains, near which their correlation is smallest (Papaioannou et al. 2015)
+_SPREADS = 0.05, 1.0  # of a step of the chains; 1: independent of where the chain stands
 
 
 @dataclass(frozen=True, eq=False)
 class SubsetRun:
-    """One subset simulation, at whatever point: a value; `ask` and `tell` take it one step further.
+    """The state of one subset simulation: a value that `ask` and `tell` take one step further.
 
     Args:
         n: points a level; a multiple of 10.
@@ -63,21 +64,21 @@ class SubsetRun:
         return keep * self.front + self.spread * rng.standard_normal(self.front.shape)
 
     def tell(self, z: Points, margin: Vector) -> SubsetRun:
-        """Return the repeat after the runs it asked for; NaN margins (failed runs) are never accepted."""
+        """Return the state after the runs at z (n, d) of `ask`, with their margins (n,); NaN (failed runs) is never accepted."""
         if self.levels == 0:
             return replace(self, z=z, margin=np.where(np.isnan(margin), np.inf, margin))._next()
         accept = margin <= self.level
         front = np.where(accept[:, None], z, self.front)
         front_margin = np.where(accept, margin, self.front_margin)
-        step = math.exp(math.log(self.spread) + (float(accept.mean()) - _AIM))
+        step = math.exp(math.log(self.spread) + (float(accept.mean()) - _ACCEPTANCE))
         grown = replace(
             self, z=np.concatenate([self.z, front]), margin=np.concatenate([self.margin, front_margin]), front=front,
-            front_margin=front_margin, spread=min(max(step, 0.05), 1.0),
+            front_margin=front_margin, spread=min(max(step, _SPREADS[0]), _SPREADS[1]),
         )  # fmt: skip
         return grown._next() if len(grown.z) >= self.n else grown
 
     def _next(self) -> SubsetRun:
-        """Return the repeat at the start of the next level, or finished."""
+        """Return the state at the start of the next level, or finished."""
         hits = int((self.margin <= 0).sum())
         seeds = max(round(LEVEL_SHARE * self.n), 1)
         order = np.argsort(self.margin, kind="stable")
@@ -95,7 +96,7 @@ class SubsetRun:
 
 @dataclass(frozen=True)
 class RepeatedEstimate:
-    """Mean of independent repeats with the t interval of their spread."""
+    """Mean of independent repeats with the t interval of their standard error."""
 
     value: float
     std_error: float

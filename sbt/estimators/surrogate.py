@@ -1,8 +1,8 @@
 """The metamodel as the estimator uses it: P(critical) at points of the standard-normal space.
 
-The metric is warped by asinh about the critical edge, so that precision goes where critical meets
-uncritical and a far tail does not decide the length scales. A ridge trend carries many inputs; a twin
-without trend keeps it from being sure where it only extrapolates.
+The metric is warped by asinh around the critical edge, so that precision goes where critical meets
+uncritical and a far tail does not decide the length scales. A ridge trend carries many inputs; a second fit
+without trend limits its confidence where it only extrapolates.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.metamodels.base import Metamodel, with_target
+from sbt.metamodels.base import Metamodel, Predictor, checked, named_errors, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
@@ -25,15 +25,17 @@ __all__ = ["Coordinates", "LogProbability", "fit_log_probability"]
 LogProbability = Callable[[Points], tuple[Vector, Vector]]
 """(n, d) normal scores to (n,) log P(critical) and (n,) log P(uncritical)."""
 
-_REACH = 5.0
-_TREND_KEPT = 0.5
+_REACH = 5.0  # normal scores from -5 to 5 are the unit interval: 6e-7 of the distribution lies beyond
+_QUANTILE = 0.5  # of the distances to the edge: the scale of the warp; a smaller one becomes a step as runs gather there
+_LEAST_R2 = 0.5  # leave-one-out R2 from which on a trend is taken: it explains more than it leaves
+_RIDGES = (1e-6, 1e-4, 1e-2, 1.0)  # penalties relative to the number of rows
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """What the metamodel sees of a point of the standard-normal space.
+    """From points of the standard-normal space to the inputs of the metamodel.
 
-    A uniform input is seen in its range, every other one as its normal score with -5 to 5 as the unit
+    A uniform input is taken on its range, every other one as its normal score with -5 to 5 as the unit
     interval; derived features of the space follow.
     """
 
@@ -58,37 +60,47 @@ class Coordinates:
 def fit_log_probability(
     metamodel: Metamodel, coordinates: Coordinates, critical: CriticalInterval, z: Points, y: Vector, rng: np.random.Generator
 ) -> LogProbability:
-    """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,)."""
-    u, warp = coordinates(z), Warp.about(y, critical, quantile=0.5)
+    """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,).
+
+    Where a trend was found, the larger P of two fits: to the metric, and to what the trend leaves of it.
+    """
+    u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
     t, inside = warp.values(y), warp.interval(critical)
-    plain = with_target(metamodel, inside).fit(u, t, rng)
+
+    def fit(model: Metamodel, values: Vector) -> Predictor:
+        with named_errors(metamodel, len(y)):
+            predictor = model.fit(u, values, rng)
+
+        def predict(inputs: Points) -> Prediction:
+            with named_errors(metamodel, len(y)):
+                return checked(predictor(inputs), len(inputs))
+
+        return predict
+
+    plain = fit(with_target(metamodel, inside), t)
     trend = _trend(u, t)
     if trend is None:
         return lambda points: plain(coordinates(points)).log_probability(inside)
-    rest = metamodel.fit(u, t - trend(u), rng)
+    residual = fit(metamodel, t - trend(u))
 
-    def both(points: Points) -> tuple[Vector, Vector]:
-        features = coordinates(points)
-        first = plain(features).log_probability(inside)
-        second = _shifted(rest(features).mu, rest(features).sigma, trend(features), inside)
+    def larger_of_both(points: Points) -> tuple[Vector, Vector]:
+        inputs = coordinates(points)
+        first, rest = plain(inputs).log_probability(inside), residual(inputs)
+        second = Prediction.gaussian(rest.mu + trend(inputs), rest.sigma).log_probability(inside)
         larger = second[0] > first[0]
         return np.where(larger, second[0], first[0]), np.where(larger, second[1], first[1])
 
-    return both
-
-
-def _shifted(mu: Vector, sigma: Vector, trend: Vector, inside: CriticalInterval) -> tuple[Vector, Vector]:
-    return Prediction.gaussian(mu + trend, sigma).log_probability(inside)
+    return larger_of_both
 
 
 def _trend(u: Points, t: Vector) -> Callable[[Points], Vector] | None:
     """Return the quadratic or linear ridge trend of larger leave-one-out R2; None where neither exceeds 0.5."""
-    best, best_score = None, _TREND_KEPT
+    best, best_score = None, _LEAST_R2
     for basis in (_linear, _quadratic):
         b = basis(u)
         if len(t) < 4 or b.shape[1] > 4 * len(t):
             continue
-        for ridge in (1e-6, 1e-4, 1e-2, 1.0):
+        for ridge in _RIDGES:
             penalty = np.eye(b.shape[1]) * ridge * len(t)
             penalty[0, 0] = 1e-9
             solved = np.linalg.solve(b.T @ b + penalty, b.T)  # (p, n)

@@ -9,6 +9,8 @@ are tried alone where they seem to have caused several deaths.
 from __future__ import annotations
 
 import multiprocessing
+import platform
+import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
@@ -16,10 +18,13 @@ from typing import Any, Self
 
 from sbt.errors import InputError, SbtError
 from sbt.execution.local import LocalExecutor
+from sbt.execution.pool import start_apart
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.streams import open_missing
 from sbt.execution.worker import versions
 from sbt.problem.outcome import Job, Outcome, Status
+from sbt.processes import SCRATCH, scratch
 
 __all__ = ["DaskExecutor"]
 
@@ -29,6 +34,8 @@ _GRACE = 5
 """So many seconds the client may take to say goodbye."""
 _PATIENCE = 60
 """So many seconds a scheduler may take to answer and to have its first worker."""
+_LARGE = 100_000
+"""A carried scenario of more bytes goes to each worker once, instead of with every chunk."""
 
 
 class DaskExecutor:
@@ -52,21 +59,24 @@ class DaskExecutor:
         self._spec, self._address, self._count, self._timeout = spec, address, workers, timeout
         self._cluster: Any = None
         self._client: Any = None
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._sent: Any = spec
         self._seconds = _TARGET
 
     def __enter__(self) -> Self:
         """Connect, check the workers, and let them load the scenario."""
-        from distributed import Client, LocalCluster
+        from distributed import Client
 
-        if self._address is None:
-            self._cluster = LocalCluster(
-                n_workers=self._count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None,
-                silence_logs="ERROR",
-            )  # fmt: skip
+        open_missing()
         try:
+            if self._address is None:
+                self._scratch = scratch("dask")
+                self._cluster = start_apart(self._own_cluster, abandon=lambda cluster: cluster.close())
             self._client = Client(self._address or self._cluster, timeout=_PATIENCE, set_as_default=False)
             self._client.wait_for_workers(1, timeout=_PATIENCE)
             self._prepare()
+            if len(self._spec.carried) > _LARGE:
+                self._sent = self._client.submit(_same, self._spec, pure=False)
         except (OSError, TimeoutError) as error:
             self.__exit__()
             raise InputError(f"a dask scheduler with workers must answer at {self._address} in {_PATIENCE} s: {error}") from None
@@ -74,6 +84,18 @@ class DaskExecutor:
             self.__exit__()
             raise
         return self
+
+    def _own_cluster(self) -> Any:
+        """Start workers on this machine, whose temporary folders lie in ours."""
+        import dask
+        from distributed import LocalCluster
+
+        folder = self._scratch.name if self._scratch is not None else None
+        with dask.config.set({"temporary-directory": folder}):
+            return LocalCluster(
+                n_workers=self._count, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None,
+                silence_logs="CRITICAL", env={SCRATCH: folder, "PYTHONWARNINGS": "ignore:resource_tracker"},
+            )  # fmt: skip
 
     def __exit__(self, *_: object) -> None:
         """Free the workers, and stop those that were started here."""
@@ -84,6 +106,8 @@ class DaskExecutor:
         if self._cluster is not None:
             self._cluster.close()
         self._client = self._cluster = None
+        if self._scratch is not None:
+            self._scratch.cleanup()
 
     def _free(self) -> None:
         """Let every worker end its process, after what it is at."""
@@ -94,15 +118,15 @@ class DaskExecutor:
 
     def _prepare(self) -> None:
         """Start each worker's process, all at once."""
-        here = versions()
+        own = _versions(self._spec)
         found = {w: self._client.submit(_begin, self._spec, self._timeout, workers=[w], pure=False) for w in self._workers()}
         for worker, future in found.items():
-            there = future.result()
-            if there != here:
-                raise InputError(f"every worker must have the versions of this process ({here}), but {worker} has {there}")
+            of_worker = future.result()
+            if of_worker != own:
+                raise InputError(f"every worker must have the versions of this process ({own}), but {worker} has {of_worker}")
 
     def _workers(self) -> list[str]:
-        """Return the addresses of the workers there are now."""
+        """Return the addresses of the present workers."""
         try:
             threads: dict[str, int] = self._client.nthreads()
         except OSError as error:  # the client has tried to connect again by now
@@ -131,7 +155,7 @@ class DaskExecutor:
             workers = max(len(self._workers()), 1)
             while queue and len(flying) < 2 * workers:
                 chunk = chunk_of(queue, _TARGET / self._seconds, workers)
-                future = self._client.submit(_run, self._spec, chunk, self._timeout, pure=False)
+                future = self._client.submit(_run, self._sent, chunk, self._timeout, pure=False)
                 flying[future] = chunk
                 finished.add(future)
             future = next(finished)
@@ -180,9 +204,20 @@ def _drop() -> None:
 
 
 def _begin(spec: ScenarioSpec, timeout: float | None) -> str:
-    """Start a worker's process, and return the versions there."""
+    """Start a worker's process, and return the versions that it has."""
     _executor_of(spec, timeout)
-    return versions()
+    return _versions(spec)
+
+
+def _versions(spec: ScenarioSpec) -> str:
+    """Return what must be the same in all processes; code that is carried depends on Python's version too."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    return f"{versions()}, Python {python}" if spec.carried else versions()
+
+
+def _same(spec: ScenarioSpec) -> ScenarioSpec:
+    """Be the task whose result is the scenario: dask makes it again where a worker with it is lost."""
+    return spec
 
 
 def _run(spec: ScenarioSpec, jobs: list[Job], timeout: float | None) -> list[Outcome]:

@@ -26,6 +26,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from functools import cache
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from sbt.execution.streams import SteadyStream, open_missing
@@ -79,7 +80,7 @@ def start_apart(function: Callable[[], T], abandon: Callable[[T], None] = lambda
 
     Args:
         function: to call.
-        abandon: is called with its result where the caller is interrupted and does not get it.
+        abandon: is called with its result where the caller is interrupted meanwhile and does not get it.
     """
     starter = _starter(os.getpid())
     if threading.current_thread() is starter.thread:
@@ -87,8 +88,9 @@ def start_apart(function: Callable[[], T], abandon: Callable[[T], None] = lambda
     future = starter.submit(function)
     try:
         return future.result()
-    except BaseException:
-        future.add_done_callback(lambda late: None if late.exception() else abandon(late.result()))
+    except KeyboardInterrupt:
+        if future.exception() is None:
+            abandon(future.result())
         raise
 
 
@@ -106,6 +108,7 @@ class _Starter:
         return future
 
     def _work(self) -> None:
+        resource_tracker.ensure_running()  # to start it later would let the signals through again
         signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL)
         while True:
             function, future = self._tasks.get()

@@ -13,12 +13,12 @@ from importlib.metadata import version
 import numpy as np
 
 from sbt import interruption
-from sbt.errors import InputError, RunError
+from sbt.errors import InputError, RunError, place_of
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["described", "place_of", "run_job", "run_jobs", "run_traced", "versions"]
+__all__ = ["described", "run_job", "run_jobs", "run_traced", "versions"]
 
 _Measured = tuple[dict[str, float], str]
 """Metrics, and SUMO's own collision list."""
@@ -167,16 +167,6 @@ def described(error: BaseException) -> str:
     except BaseException:  # an exception of a user's own
         message = "(its message cannot be read)"
     return f"{type(error).__name__}{': ' if message else ''}{message} ({place_of(error)})"
-
-
-def place_of(error: BaseException) -> str:
-    """Return file:line where the error was raised."""
-    frame = error.__traceback__
-    if frame is None:
-        return "no place"
-    while frame.tb_next is not None:
-        frame = frame.tb_next
-    return f"{frame.tb_frame.f_code.co_filename}:{frame.tb_lineno}"
 
 
 def versions() -> str:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sbt.errors import SbtError
-from sbt.execution.worker import place_of
-from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound, with_target
+from sbt.metamodels.base import Metamodel, Predictor, Screened, checked, log_ambiguity_bound, named_errors, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.arrays import Mask, Points, Vector
@@ -85,8 +82,8 @@ class Learner:
 
         def predict(points: Points) -> Prediction:
             inputs = space.metamodel_inputs(points)
-            with self._named(learned):
-                return predictor(inputs)
+            with named_errors(self.metamodel, learned):
+                return checked(predictor(inputs), len(inputs))
 
         return predict
 
@@ -96,7 +93,7 @@ class Learner:
         y = training.y(requirement.metric)
         u = space.metamodel_inputs(space.to_unit(training.x))
         metamodel = with_target(self.metamodel, requirement.critical) if self.target_aware else self.metamodel
-        with self._named(len(training)):
+        with named_errors(self.metamodel, len(training)):
             return metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
 
     def unseen(self, history: History) -> tuple[Points, Vector]:
@@ -106,17 +103,6 @@ class Learner:
             return history.held_out.x, history.held_out.y(metric)
         left = ~pool.taken(history.x)
         return pool.x[left], pool.metrics[metric][left]
-
-    @contextmanager
-    def _named(self, n: int) -> Iterator[None]:
-        """Say which metamodel raised, and where: it may be the user's own."""
-        try:
-            yield
-        except SbtError:
-            raise
-        except Exception as error:
-            name, raised = type(self.metamodel).__name__, f"{type(error).__name__}: {error} ({place_of(error)})"
-            raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {raised}") from error
 
     def _record(self, predict: Predictor, predictor: Predictor, history: History, learned: int) -> FitRecord:
         """Return the scores of a fitted metamodel, and its classification of fixed points."""

@@ -99,7 +99,7 @@ class Auto:
 
     def _fit(self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None) -> MixturePredictor:
         u, y = check_rows(u, y)
-        n, bins, target_aware = len(y), None if critical is None else Bins.about(y, critical), critical is not None
+        n, bins, target_aware = len(y), None if critical is None else Bins.around_edge(y, critical), critical is not None
         models, compared = self._models(n, n, target_aware=target_aware), min(n, self.compare_rows)
         if n < _FEWEST:
             weights, scores = np.full(len(models), 1.0 / len(models)), None

@@ -1,64 +1,55 @@
-"""What a metamodel is: settings with a `fit` that returns a function from points to beliefs.
+"""What a metamodel is: an object with a `fit` that returns a function from points to predictions.
 
 There is no unfitted state. Points are coordinates in the unit cube (derived features, where a
 scenario declares them, are further columns, scaled to about [0, 1]); y is the safety metric itself.
+
+A metamodel of one's own is any class with `fit(u, y, rng)`; its settings are the keyword arguments of its constructor.
+
+>>> class Nearest:
+...     def __init__(self, sigma=0.1):
+...         self.sigma = sigma
+...
+...     def fit(self, u, y, rng):
+...         def predict(points):
+...             distance = np.linalg.norm(points[:, None] - u, axis=2)
+...             return Prediction.gaussian(y[distance.argmin(axis=1)], self.sigma + distance.min(axis=1))
+...
+...         return predict
+>>> predict = build(Nearest, settings={"sigma": 0.2}).fit(np.array([[0.1], [0.9]]), np.array([1.0, 2.0]), None)
+>>> predict(np.array([[0.2], [0.9]])).mu.tolist()
+[1.0, 2.0]
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol, TypeVar, runtime_checkable
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError, did_you_mean
+from sbt.errors import InputError, SbtError, did_you_mean, place_of
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "log_ambiguity_bound", "sample_paths", "simplest",
-    "split_validation", "standardise", "with_target",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "checked", "log_ambiguity_bound", "named_errors",
+    "sample_paths", "simplest", "split_validation", "standardise", "with_target",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
-"""A fitted metamodel: (n, d) points -> belief at them. Picklable."""
+"""A fitted metamodel: (n, d) points -> prediction at them."""
 
-
-@runtime_checkable
-class Screened(Protocol):
-    """A predictor that can say quickly what P(y in M_c) at most and at least is."""
-
-    def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
-        """Return (n,) lower and (n,) upper bounds of P(y in M_c) at u (n, d)."""
-        ...
-
-
-def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterval) -> Vector:
-    """Return (n,) upper bounds of log a_BI = log(1 - 2 |P(y in M_c) - 0.5|), at least -700."""
-    low, high = predictor.probability_bounds(u, critical)
-    return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), 1e-304))
-
-
-def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
-    """Return (n, m) draws of y as a function, at u (m, d).
-
-    A predictor with `sample_paths` (a process) draws functions; of a mixture one component stands for a function; a single
-    Gaussian a point is drawn point by point.
-    """
-    joint: Any = getattr(predictor, "sample_paths", None)
-    if joint is not None:
-        return joint(u, n, rng)
-    p = predictor(u)
-    component = rng.choice(len(p.weight), n, p=p.weight)
-    if len(p.weight) >= 5:
-        return p.mean[component]
-    return p.mean[component] + p.std[component] * rng.standard_normal((n, len(u)))
+_SMALLEST = 1e-304  # of an upper bound of a_BI, before the logarithm: about the smallest normal number
+_MIXED = 5  # components from which on one of them stands for a function (an ensemble, a forest)
+_CONSTANT = 1e-12  # standard deviation relative to |y|: below it, y is constant but for rounding
+_CONSTANT_SCALE = 1e-3  # scale of a constant y, relative to max(1, |y|)
 
 
 class Metamodel(Protocol):
-    """Settings of a metamodel; a frozen dataclass, optionally with `PRESETS`."""
+    """A metamodel, not fitted; the built-in ones are frozen dataclasses, with `PRESETS` by name."""
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> Predictor:
         """Return the predictor learned from n rows.
@@ -68,6 +59,10 @@ class Metamodel(Protocol):
             y: (n,) finite values of the safety metric, in the order in which they were run.
             rng: the only source of randomness; the same state gives the same predictor, bit by bit.
 
+        Returns:
+            A function from (m, d) points to their `Prediction`, such as `Prediction.gaussian(mu, sigma)`. It may have
+            the methods of `Screened`, and `sample_paths(u, n, rng)`: (n, m) draws of y as a function at u (m, d).
+
         Raises:
             InputError: n < 2, or values that are not finite.
         """
@@ -76,15 +71,24 @@ class Metamodel(Protocol):
 
 @runtime_checkable
 class TargetAware(Protocol):
-    """Settings of a metamodel that learns otherwise where it knows what is critical."""
+    """A metamodel that learns otherwise where it knows the critical interval."""
 
     def with_target(self, critical: CriticalInterval) -> Metamodel:
-        """Return the same settings, told M_c in the unit of the y that it will learn (warped, where y is)."""
+        """Return the same settings for a known M_c, in the unit of the y that will be learned (warped, where y is)."""
+        ...
+
+
+@runtime_checkable
+class Screened(Protocol):
+    """A predictor with quick bounds of P(y in M_c)."""
+
+    def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
+        """Return (n,) lower and (n,) upper bounds of P(y in M_c) at u (n, d)."""
         ...
 
 
 def with_target(metamodel: Metamodel, critical: CriticalInterval) -> Metamodel:
-    """Return the metamodel told of M_c where it wants to know, else itself."""
+    """Return the metamodel for a known M_c where it is `TargetAware`, else itself."""
     return metamodel.with_target(critical) if isinstance(metamodel, TargetAware) else metamodel
 
 
@@ -94,33 +98,122 @@ def simplest(metamodel: Metamodel) -> Metamodel:
     return found
 
 
+def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterval) -> Vector:
+    """Return (n,) upper bounds of log a_BI = log(1 - 2 |P(y in M_c) - 0.5|), at least -700."""
+    low, high = predictor.probability_bounds(u, critical)
+    return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), _SMALLEST))
+
+
+def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
+    """Return (n, m) draws of y as a function, at u (m, d).
+
+    By the predictor's own `sample_paths` where it has one (a process, a mixture of processes). Otherwise a component of
+    its mixture stands for a function; of a mixture of few components the noise is added point by point.
+    """
+    own: Any = getattr(predictor, "sample_paths", None)
+    if own is not None:
+        return own(u, n, rng)
+    p = predictor(u)
+    component = rng.choice(len(p.weight), n, p=p.weight)
+    if len(p.weight) >= _MIXED:
+        return p.mean[component]
+    return p.mean[component] + p.std[component] * rng.standard_normal((n, len(u)))
+
+
 M = TypeVar("M")
 
 
-def build(kind: type[M], preset: str | None = None, settings: Mapping[str, Any] | None = None) -> M:
+@overload
+def build(kind: type[M], preset: str | None = None, settings: Mapping[str, Any] | None = None) -> M: ...
+@overload
+def build(kind: Metamodel, preset: str | None = None, settings: Mapping[str, Any] | None = None) -> Metamodel: ...
+def build(kind: Any, preset: str | None = None, settings: Mapping[str, Any] | None = None) -> Any:
     """Return a metamodel with the values of a preset, then of `settings`, over its defaults.
 
     Args:
-        kind: a frozen dataclass of settings; its class variable `PRESETS`, where there is one, maps the
-            name of a preset to settings.
+        kind: a class with `fit(u, y, rng)`, whose settings are the keyword arguments of its constructor; its class
+            variable `PRESETS`, where there is one, maps the name of a preset to settings. Or an object with `fit`, which
+            is returned as it is and has no settings.
         preset: name of a preset, or None for the defaults.
-        settings: values by name of the field; they win over the preset.
+        settings: values by name; they win over the preset.
 
     Raises:
-        InputError: an unknown preset or setting (with the valid ones), or a value the metamodel refuses.
+        InputError: an unknown preset or setting (with the valid ones), a required one that is missing, a value that the
+            metamodel refuses, or no `fit(u, y, rng)`.
     """
-    presets: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
+    name = kind.__name__ if isinstance(kind, type) else type(kind).__name__
+    presets: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {}) if isinstance(kind, type) else {}
     if preset is not None and preset not in presets:
-        raise InputError(_unknown(kind.__name__, "preset", preset, presets))
-    fields = [f.name for f in dataclasses.fields(kind) if f.init]  # type: ignore[arg-type]
+        raise InputError(_unknown(name, "preset", preset, presets))
     values = {**presets.get(preset or "", {}), **(settings or {})}
-    for name in values:
-        if name not in fields:
-            raise InputError(_unknown(kind.__name__, "setting", name, fields))
+    if isinstance(kind, type):
+        _check_settings(name, kind, values)
+        try:
+            made = kind(**values)
+        except SbtError:
+            raise
+        except Exception as error:  # e.g. a comparison of text with a number
+            raise InputError(f"{name} does not take the settings {values}: {type(error).__name__}: {error}") from error
+    elif values:
+        raise InputError(f"{name} is an object, which takes no settings, but got {', '.join(values)}; name its class instead")
+    else:
+        made = kind
     try:
-        return kind(**values)
-    except TypeError as error:  # e.g. a comparison of text with a number
-        raise InputError(f"{kind.__name__} does not take the settings {values}: {error}") from error
+        inspect.signature(made.fit).bind(None, None, None)
+    except (AttributeError, TypeError) as error:
+        raise InputError(f"a metamodel must have a method fit(u, y, rng), but {name} has not: {error}") from error
+    return made
+
+
+def _check_settings(name: str, kind: type, values: Mapping[str, Any]) -> None:
+    """Raise InputError where the constructor of a class does not take these settings by keyword."""
+    try:
+        parameters = inspect.signature(kind).parameters.values()
+    except ValueError:  # a class written in C; its constructor checks
+        return
+    required = [p for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    by_position = [p.name for p in required if p.kind is p.POSITIONAL_ONLY]
+    if by_position:
+        raise InputError(f"settings are given by name, but the constructor of {name} takes {by_position[0]} by position only")
+    known = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+        for each in values:
+            if each not in known:
+                raise InputError(_unknown(name, "setting", each, known))
+    missing = [p.name for p in required if p.name not in values]
+    if missing:
+        raise InputError(f"{name} needs the setting{'s' * (len(missing) > 1)} {', '.join(missing)}, but got {_listed(values)}")
+
+
+@contextmanager
+def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
+    """Return a context in which an error of a metamodel's own code names the metamodel, its n rows and the line.
+
+    Raises:
+        SbtError: in place of an error that is not one of this package's.
+    """
+    try:
+        yield
+    except SbtError:
+        raise
+    except Exception as error:
+        name, raised = type(metamodel).__name__, f"{type(error).__name__}: {error} ({place_of(error)})"
+        raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {raised}") from error
+
+
+def checked(prediction: Prediction, n: int) -> Prediction:
+    """Return what a predictor returned for n points.
+
+    Raises:
+        TypeError: it is no `Prediction`.
+        ValueError: it is one of another number of points.
+    """
+    if not isinstance(prediction, Prediction):
+        kind = type(prediction).__name__
+        raise TypeError(f"a predictor must return a Prediction, such as Prediction.gaussian(mu, sigma), but returned a {kind}")
+    if len(prediction) != n:
+        raise ValueError(f"a predictor must return a prediction of {n} points, but returned one of {len(prediction)}")
+    return prediction
 
 
 def split_validation(n: int) -> tuple[slice, slice]:
@@ -160,17 +253,21 @@ def standardise(y: Vector) -> tuple[Vector, float, float]:
     """Return z (n,) with mean 0 and variance 1, and the shift and scale > 0 with y = shift + scale z.
 
     A constant y has no scale of its own: z is 0 and the scale is a thousandth of max(1, |y|), so that
-    a belief keeps a small sigma > 0.
+    a prediction keeps a small sigma > 0.
     """
     shift = float(y.mean())
     scale = float(y.std())
     size = float(np.abs(y).max())
-    if scale <= 1e-12 * size or scale == 0.0:
-        return np.zeros_like(y), shift, 1e-3 * max(1.0, size)
+    if scale <= _CONSTANT * size or scale == 0.0:
+        return np.zeros_like(y), shift, _CONSTANT_SCALE * max(1.0, size)
     return (y - shift) / scale, shift, scale
 
 
 def _unknown(kind: str, what: str, name: str, valid: Iterable[str]) -> str:
     """Return the message about a name that is not among the valid ones."""
     names = sorted(valid)
-    return f"{kind} takes a {what} of {', '.join(names) or '(none)'}, but got {name!r}{did_you_mean(name, names)}"
+    return f"{kind} takes a {what} of {_listed(names)}, but got {name!r}{did_you_mean(name, names)}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names) or "(none)"

@@ -38,9 +38,9 @@ class Bins:
     near: float
 
     @classmethod
-    def about(cls, y: Vector, critical: CriticalInterval) -> Bins:
+    def around_edge(cls, y: Vector, critical: CriticalInterval) -> Bins:
         """Return the ranges for runs y (n,): the quarter of them that is nearest to the edge is near."""
-        return cls(critical, Warp.about(y, critical).scale)
+        return cls(critical, Warp.around_edge(y, critical).scale)
 
     @property
     def cuts(self) -> Vector:

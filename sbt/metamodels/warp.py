@@ -26,7 +26,7 @@ class Warp:
         edge: end of the critical interval, in the unit of y.
         scale: > 0; within it the warp is nearly straight.
 
-    >>> warp = Warp.about(np.array([1.0, 5.0, 1e6]), CriticalInterval(high=0.0))
+    >>> warp = Warp.around_edge(np.array([1.0, 5.0, 1e6]), CriticalInterval(high=0.0))
     >>> warp.interval(CriticalInterval(high=0.0)).high, bool(warp.values(np.array([1e6]))[0] < 14)
     (0.0, True)
     """
@@ -35,7 +35,7 @@ class Warp:
     scale: float
 
     @classmethod
-    def about(cls, y: Vector, critical: CriticalInterval, quantile: float = 0.25) -> Warp:
+    def around_edge(cls, y: Vector, critical: CriticalInterval, quantile: float = 0.25) -> Warp:
         """Return the warp for values y (n,), about the end of the interval that is nearer to their median.
 
         The scale is a quantile of the distances to the edge. A small one shrinks as runs gather at the edge, and

@@ -1,4 +1,4 @@
-"""Batches by one criterion alone: parts of the portfolio, and what others use, to compare with."""
+"""Batches by one criterion alone: parts of the portfolio, and the usual criteria to compare it with."""
 
 from __future__ import annotations
 
@@ -8,50 +8,51 @@ import numpy as np
 from scipy.special import erfcx, log_ndtr
 
 from sbt.problem.arrays import Points, Vector
-from sbt.samplers.search import Picks, Search, WarpedModel, fill, fit_warped, known, refine_best, repelled
+from sbt.samplers.search import Picks, Search, WarpedModel, fill_uniformly, fit_warped, log_repulsion, refine_best, search_data
 
 __all__ = [
     "CRITERIA", "Criterion", "log_expected_improvement", "lower_confidence_bound", "probability_of_violation", "propose_by",
 ]  # fmt: skip
 
 Criterion = Callable[[WarpedModel, Points, float], Vector]
-"""(belief, points (n, d), margin of the best run in warped units) -> (n,) scores, larger is better."""
+"""(model, points (n, d), margin of the best run in warped units) -> (n,) scores, larger is better."""
 
-_KAPPA = 2.0  # standard deviations below the mean
-_CLEAR = 0.05  # as in the portfolio
-_DRAWN = 600  # candidates at which functions are drawn
+_KAPPA = 2.0  # standard deviations below the mean, the usual choice
+_CLEAR, _CLEAR_OF_RUNS = 0.05, 0.2 * 0.05  # repulsion among picks and from runs, as in the portfolio
+_DRAWN = 600  # candidates at which sample paths are drawn: their cost is cubic
+_STARTS = 30  # best runs that are candidates again, as many as are refined
 _SQRT_HALF_PI, _LOG_SQRT_2PI = np.sqrt(0.5 * np.pi), 0.5 * np.log(2.0 * np.pi)
 
 
-def probability_of_violation(belief: WarpedModel, u: Points, best: float) -> Vector:
+def probability_of_violation(model: WarpedModel, u: Points, best: float) -> Vector:
     """Return (n,) log P(critical).
 
     Source:
         Kushner (1964), probability of improvement, with the edge of the critical interval as the level.
     """
     del best
-    return belief.log_probability(u)
+    return model.log_probability(u)
 
 
-def lower_confidence_bound(belief: WarpedModel, u: Points, best: float) -> Vector:
+def lower_confidence_bound(model: WarpedModel, u: Points, best: float) -> Vector:
     """Return (n,) minus the margin two standard deviations towards the critical interval.
 
     Source:
         Cox and John (1992); kappa = 2.
     """
     del best
-    p = belief(u)
-    return _KAPPA * p.sigma - belief.critical.margin(p.mu)
+    p = model(u)
+    return _KAPPA * p.sigma - model.critical.margin(p.mu)
 
 
-def log_expected_improvement(belief: WarpedModel, u: Points, best: float) -> Vector:
+def log_expected_improvement(model: WarpedModel, u: Points, best: float) -> Vector:
     """Return (n,) log E[max(best - margin, 0)], the margin measured from the end on which the mean lies.
 
     Source:
         Ament et al. (2023), arXiv 2310.20708, eq. (9): stable far below the incumbent.
     """
-    p = belief(u)
-    return np.asarray(np.log(p.sigma) + _log_h((best - belief.critical.margin(p.mu)) / p.sigma))
+    p = model(u)
+    return np.asarray(np.log(p.sigma) + _log_h((best - model.critical.margin(p.mu)) / p.sigma))
 
 
 def _log_h(z: Vector) -> Vector:
@@ -73,7 +74,7 @@ CRITERIA: Mapping[str, Criterion | None] = {
     "lower_confidence_bound": lower_confidence_bound,
     "thompson": None,
 }
-"""By name, as in `acquisition.kind`; Thompson sampling draws functions and has no score."""
+"""By name, as in `acquisition.kind`; Thompson sampling draws sample paths and has no score."""
 
 
 def propose_by(
@@ -81,37 +82,37 @@ def propose_by(
 ) -> Picks:
     """Return n points by the criterion `name` alone; deflation and arguments as in `portfolio.propose`.
 
-    The points of one batch repel each other, or are each the best of a function drawn (`thompson`).
+    The points of one batch repel each other, or are each the best of a sample path (`thompson`).
 
     Raises:
         KeyError: there is no such criterion.
     """
     criterion = CRITERIA[name]
-    seen, d = known(search, u, y, batch, rng), u.shape[1]
+    seen, d = search_data(search, u, y, batch, rng), u.shape[1]
     if len(seen.u) < 2:
-        return Picks(fill(seen.admissible, n, d, rng), (name,) * n)
-    belief = fit_warped(search, seen.u, seen.y, rng)
-    margin = belief.critical.margin(belief.warp.values(seen.y))
-    start = seen.u[np.argsort(margin, kind="stable")[:30]]
+        return Picks(fill_uniformly(seen.admissible, n, d, rng), (name,) * n)
+    model = fit_warped(search, seen.u, seen.y, rng)
+    margin = model.critical.margin(model.warp.values(seen.y))
+    start = seen.u[np.argsort(margin, kind="stable")[:_STARTS]]
     best = float(margin.min())
     score = probability_of_violation if criterion is None else criterion
-    candidates, values = refine_best(lambda v: score(belief, v, best), start, seen.admissible, rng)
+    candidates, values = refine_best(lambda v: score(model, v, best), start, seen.admissible, rng)
     if criterion is None:
-        return Picks(_thompson(belief, candidates[np.argsort(-values, kind="stable")[:_DRAWN]], n, rng), (name,) * n)
-    values = values + repelled(candidates, u, 0.2 * _CLEAR * np.sqrt(d))
+        return Picks(_thompson(model, candidates[np.argsort(-values, kind="stable")[:_DRAWN]], n, rng), (name,) * n)
+    values = values + log_repulsion(candidates, u, _CLEAR_OF_RUNS * np.sqrt(d))
     picks = np.empty((n, d))
     for k in range(n):
         picks[k] = candidates[int(np.argmax(values))]
-        values += repelled(candidates, picks[k][None], _CLEAR * np.sqrt(d))
+        values += log_repulsion(candidates, picks[k][None], _CLEAR * np.sqrt(d))
     return Picks(picks, (name,) * n)
 
 
-def _thompson(belief: WarpedModel, candidates: Points, n: int, rng: np.random.Generator) -> Points:
-    """Return n points, each the best of a function drawn over the candidates; no point twice."""
-    drawn = belief.critical.margin(belief.sample_paths(candidates, n, rng))
-    chosen = np.empty((n, candidates.shape[1]))
+def _thompson(model: WarpedModel, candidates: Points, n: int, rng: np.random.Generator) -> Points:
+    """Return n points, each the best of a sample path over the candidates; no point twice."""
+    margin = model.critical.margin(model.sample_paths(candidates, n, rng))
+    picks = np.empty((n, candidates.shape[1]))
     for k in range(n):
-        at = int(np.argmin(drawn[k]))
-        chosen[k] = candidates[at]
-        drawn[:, at] = np.inf
-    return chosen
+        at = int(np.argmin(margin[k]))
+        picks[k] = candidates[at]
+        margin[:, at] = np.inf
+    return picks

@@ -1,4 +1,4 @@
-"""CMA-ES as a proposer: replayed from the runs so far, so that nothing is remembered between batches."""
+"""CMA-ES: replayed from the runs so far, so that no state is kept between batches."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from sbt.seeds import stream
 
 __all__ = ["propose", "require"]
 
-_SIGMA = 0.3  # of the unit cube, at each start
+_SIGMA = 0.3  # of the unit cube, at each start: the range is about 3 sigma wide, as Hansen (2016) recommends
 _FAILED = 1e9  # stands for the margin of a failed run: worse than all others
 
 
 def require() -> None:
-    """Check that the library is there.
+    """Check that the library is installed.
 
     Raises:
-        InputError: it is not installed.
+        InputError: it is not.
     """
     if importlib.util.find_spec("cma") is None:
         raise InputError("acquisition cma_es needs the library cma, but it is not installed: pip install 'sumo-sbt[compare]'")
@@ -33,8 +33,8 @@ def require() -> None:
 def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int) -> Picks:
     """Return the next n points of a covariance matrix adaptation evolution strategy.
 
-    The same seed and margins give the same points: earlier generations are drawn again and told their
-    margins. A strategy that has converged is started anew at a random point.
+    The same seed and margins give the same points: earlier generations are drawn again and given their
+    margins. A strategy that has converged is restarted at a random point.
 
     Args:
         start: (d,) where the first one starts, in the unit cube.
@@ -49,24 +49,23 @@ def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int) -> Pick
         Hansen (2016), The CMA evolution strategy: a tutorial, arXiv 1604.00772; library pycma.
     """
     require()
-    d, begun = len(start), 0
-    strategy, shared = _started(start, n, seed, begun), start
+    d, restarts = len(start), 0
+    strategy = _started(start, n, seed, restarts)
     for values in margins:
-        asked = strategy.ask(len(values))
-        strategy.tell(asked, np.where(np.isfinite(values), values, _FAILED).tolist())
+        generation = strategy.ask(len(values))
+        strategy.tell(generation, np.where(np.isfinite(values), values, _FAILED).tolist())
         if strategy.stop():
-            begun += 1
-            shared = stream(seed, "cma", "restart", begun).random(d)
-            strategy = _started(shared, n, seed, begun)
+            restarts += 1
+            strategy = _started(stream(seed, "cma", "restart", restarts).random(d), n, seed, restarts)
     points: Points = np.clip(np.array(strategy.ask(n)), 0.0, 1.0).reshape(n, -1)[:, :d]
     return Picks(points, ("cma_es",) * n)
 
 
-def _started(start: Vector, n: int, seed: int, begun: int) -> Any:
+def _started(start: Vector, n: int, seed: int, restarts: int) -> Any:
     """Return a strategy that draws from our streams alone."""
     import cma
 
-    rng = stream(seed, "cma", begun)
+    rng = stream(seed, "cma", restarts)
     options = {
         "bounds": [0.0, 1.0], "popsize": max(n, 2), "verbose": -9, "seed": math.nan,
         "randn": lambda *shape: rng.standard_normal(shape), "CMA_elitist": False,

@@ -18,10 +18,10 @@ from sbt.problem.arrays import Mask, Points, Vector
 
 __all__ = ["influence_on_mean", "propose_greedily", "refine_diverse", "select_diverse", "select_representative"]
 
-_CANDIDATES = 4096  # uniform ones: the acquisition of 2,000 to 10,000 candidates is scored in tens of milliseconds
+_CANDIDATES = 4096  # uniform ones; the refinement adds up to 2,880
 _KEEP, _CHILDREN, _ROUNDS = 60, 16, 3  # best candidates of a round, steps from each, rounds
 _STEP, _NARROWER = 0.1, 2.5  # first step in the unit cube, by how much it shrinks from round to round
-_PROBES = 128  # pairs of points that the influence of an input is estimated from: its error is about a tenth
+_PROBES = 128  # pairs of points that an influence is estimated from: its relative error is about 1 / sqrt(2 x 128)
 _LEAST = 0.05  # of the largest influence: an input the metamodel calls irrelevant may not be
 
 

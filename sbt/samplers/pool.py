@@ -19,7 +19,7 @@ class PoolSequence:
     """The rows of a pool that are left, addressed by position like a `SobolSequence`.
 
     The order is one permutation of the whole pool, so that a batch of even candidates continues where
-    the one before ended, whatever was chosen in between.
+    the previous one ended, whatever was chosen in between.
 
     Args:
         u: (n, d) unit-cube points of all rows.

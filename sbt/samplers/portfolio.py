@@ -12,19 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.samplers.search import Picks, Search, WarpedModel, fill, fit_warped, known, refine_best, repelled
+from sbt.samplers.search import Picks, Search, WarpedModel, fill_uniformly, fit_warped, log_repulsion, refine_best, search_data
 
 __all__ = ["Region", "propose", "regions"]
 
-_APART = 0.25  # of the best runs of two trust regions, Chebyshev distance
-_MOST_REGIONS = 3
-_LONGEST, _SHORTEST = 0.8, 2.0**-6  # side of a trust region
-_PATIENCE = 3  # batches without an improvement before a trust region is halved
-_HOPELESS = 1e-4  # largest inflated P(critical) in a region that is given up
-_INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a belief from few runs is too sure
-_THOMPSON = 0.6  # share of the picks
-_LOCAL = 350  # candidates of a trust region
+_APART = 0.25  # of the best runs of two trust regions, Chebyshev distance: a little more than DEFLATION
+_MOST_REGIONS = 3  # a batch of ten has two Thompson draws for each
+_LONGEST, _SHORTEST = 0.8, 2.0**-6  # side of a trust region: TuRBO's first one; it is retired after six halvings
+_PATIENCE = 3  # batches without an improvement before a trust region is halved; two were measured to be worse
+_HOPELESS = 1e-4  # largest inflated P(critical) in a region that is given up, and below which all candidates are alike
+_INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a fit to few runs is too sure; measured
+_THOMPSON = 0.6  # share of the picks; 75 % and 30 % were measured, see docs/falsification.md
+_LOCAL = 350  # candidates of a trust region: the cost of sample paths is cubic in them
 _CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
+_CLEAR_OF_RUNS = 0.2 * _CLEAR  # the metamodel knows what a finished run says of its neighbourhood
 
 
 def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None) -> Picks:
@@ -49,23 +50,23 @@ def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generat
         Trust regions and Thompson draws: Eriksson et al. (2019), TuRBO, arXiv 1910.01739; the mixture
         and the deflation were measured, see docs/falsification.md.
     """
-    seen, d = known(search, u, y, batch, rng), u.shape[1]
+    seen, d = search_data(search, u, y, batch, rng), u.shape[1]
     if len(seen.u) < 2:
-        return Picks(fill(seen.admissible, n, d, rng), ("global",) * n)
-    belief = fit_warped(search, seen.u, seen.y, rng)
+        return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n)
+    model = fit_warped(search, seen.u, seen.y, rng)
     fresh = ~seen.flank
     found = regions(seen.u[fresh], search.critical.margin(seen.y[fresh]), seen.batch[fresh])
-    niches = _hopeful(belief, found, seen.admissible, rng)
-    drawn = _thompson(belief, niches, round(_THOMPSON * n), d, rng)
-    picks = _globally(belief, drawn, n, u, niches, seen.admissible, rng)
+    niches = _hopeful(model, found, seen.admissible, rng)
+    drawn = _thompson(model, niches, round(_THOMPSON * n), d, rng)
+    picks = _globally(model, drawn, n, u, niches, seen.admissible, rng)
     why = ("thompson",) * len(drawn) + ("global",) * (n - len(drawn))
-    order = np.argsort(-belief.log_probability(picks), kind="stable")
+    order = np.argsort(-model.log_probability(picks), kind="stable")
     return Picks(picks[order], tuple(why[k] for k in order))
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A trust region: a box about the best run of its neighbourhood.
+    """A trust region: a box around the best run of its neighbourhood.
 
     Args:
         centre: (d,) the run.
@@ -88,7 +89,7 @@ class Region:
 
 
 def regions(u: Points, margin: Vector, batch: Vector) -> list[Region]:
-    """Return the trust regions about the best runs, at least 0.25 apart, the best first.
+    """Return the trust regions around the best runs, at least 0.25 apart, the best first.
 
     The side is replayed from the runs near the centre: halved after three batches without an
     improvement, doubled after two with one; a side below 2^-6 retires the region.
@@ -129,29 +130,29 @@ def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
 
 
 def _hopeful(
-    belief: WarpedModel, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator
+    model: WarpedModel, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator
 ) -> list[tuple[Region, Points]]:
     """Return the regions in which a critical run may be, each with its candidates."""
-    kept = []
+    hopeful = []
     for region in found:
         points = region.candidates(_LOCAL, rng)
         points = points[admissible(points)]
         if len(points) == 0:
             continue
         tried = region.failures >= _PATIENCE
-        if not tried or belief.log_probability(points, _INFLATION).max() >= np.log(_HOPELESS):
-            kept.append((region, points))
-    return kept
+        if not tried or model.log_probability(points, _INFLATION).max() >= np.log(_HOPELESS):
+            hopeful.append((region, points))
+    return hopeful
 
 
-def _thompson(belief: WarpedModel, niches: list[tuple[Region, Points]], n: int, d: int, rng: np.random.Generator) -> Points:
-    """Return n points, each the best of a function drawn over the candidates of a region; none without regions.
+def _thompson(model: WarpedModel, niches: list[tuple[Region, Points]], n: int, d: int, rng: np.random.Generator) -> Points:
+    """Return n points, each the best of a sample path over the candidates of a region; none without regions.
 
-    Every second one is from the region whose draw is best, the others from each region in turn.
+    Every second one is from the region whose path is best, the others from each region in turn.
     """
     if not niches:
         return np.empty((0, d))
-    drawn = [belief.critical.margin(belief.sample_paths(points, n, rng)) for _, points in niches]
+    drawn = [model.critical.margin(model.sample_paths(points, n, rng)) for _, points in niches]
     picks = np.empty((n, d))
     for k in range(n):
         which = (k // 2) % len(niches) if k % 2 else int(np.argmin([values[k].min() for values in drawn]))
@@ -162,7 +163,7 @@ def _thompson(belief: WarpedModel, niches: list[tuple[Region, Points]], n: int, 
 
 
 def _globally(
-    belief: WarpedModel, picks: Points, n: int, u: Points, niches: list[tuple[Region, Points]],
+    model: WarpedModel, picks: Points, n: int, u: Points, niches: list[tuple[Region, Points]],
     admissible: Callable[[Points], Mask], rng: np.random.Generator,
 ) -> Points:  # fmt: skip
     """Return the picks and further ones, n in all: the largest P(critical), every second time inflated.
@@ -171,13 +172,13 @@ def _globally(
     """
     d = u.shape[1]
     start = np.vstack([np.empty((0, d)), *(points for _, points in niches)])
-    candidates, wide = refine_best(lambda v: belief.log_probability(v, _INFLATION), start, admissible, rng)
-    scores = [np.maximum(values, np.log(_HOPELESS)) for values in (belief.log_probability(candidates), wide)]
-    away = repelled(candidates, u, 0.2 * _CLEAR * np.sqrt(d))
+    candidates, wide = refine_best(lambda v: model.log_probability(v, _INFLATION), start, admissible, rng)
+    scores = [np.maximum(values, np.log(_HOPELESS)) for values in (model.log_probability(candidates), wide)]
+    away = log_repulsion(candidates, u, _CLEAR_OF_RUNS * np.sqrt(d))
     for point in picks:
-        away += repelled(candidates, point[None], _CLEAR * np.sqrt(d))
+        away += log_repulsion(candidates, point[None], _CLEAR * np.sqrt(d))
     for k in range(n - len(picks)):
         at = int(np.argmax(scores[k % 2] + away))
         picks = np.vstack([picks, candidates[at]])
-        away += repelled(candidates, candidates[at][None], _CLEAR * np.sqrt(d))
+        away += log_repulsion(candidates, candidates[at][None], _CLEAR * np.sqrt(d))
     return picks

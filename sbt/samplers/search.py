@@ -1,6 +1,6 @@
-"""What every search for failures stands on: its belief, deflation, candidates.
+"""What every search for failures is built on: a metamodel of the warped metric, deflation, candidates.
 
-The belief is about the warped metric, not about the distance to the critical interval, which has a
+The metamodel learns the warped metric, not the distance to the critical interval, which has a
 kink. After a hit its basin is deflated: left out of the runs to learn from and of the candidates, so
 that the next failure is a different one, and so that runs piled up in one basin do not decide which
 inputs seem to matter elsewhere.
@@ -15,27 +15,32 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.metamodels.base import Metamodel, Predictor, sample_paths, with_target
+from sbt.metamodels.base import Metamodel, Predictor, checked, named_errors, sample_paths, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "DEFLATION", "Free", "Known", "Picks", "Search", "WarpedModel", "deflated", "fill", "fit_warped", "known", "refine_best",
-    "repelled",
+    "DEFLATION", "FreeRegion", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fill_uniformly", "fit_warped",
+    "log_repulsion", "refine_best", "search_data",
 ]  # fmt: skip
 
 DEFLATION = 0.22
-"""Half the side of the box about a critical run that the search leaves alone (unit cube)."""
-_FEWEST_FREE = 0.05  # of the space that deflation must leave
-_FLANK = 0.15  # beyond a deflated box
-_CANDIDATES = 1500
+"""Half the side of the box around a critical run that the search leaves alone (unit cube); see docs/falsification.md."""
+_LEAST_FREE = 0.05  # of the space that deflation must leave: below, too few of the uniform candidates are admissible
+_FLANK = 0.15  # beyond a deflated box: runs there are near-critical for what is known already
+_PROBES = 512  # points that the free share is estimated from, to a hundredth
+_CANDIDATES = 1500  # uniform ones; with them a proposal of ten takes 0.06 s at 50 runs, 0.5 s at 500 (docs/falsification.md)
+_STEPS = (0.1, 0.03)  # standard deviations of the steps from the best candidates, in the unit cube, round by round
+_BEST, _CHILDREN = 30, 10  # candidates that are refined in a round, steps from each
+_MOVED = 0.3  # share of the coordinates that a step changes: others stay, which pays where few inputs matter
+_FILL_ROUNDS = 100  # of at least 100 uniform points each
 
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched, and with what belief.
+    """What is searched, and with which metamodel.
 
     Args:
         critical: M_c, in the unit of y.
@@ -58,7 +63,7 @@ class Picks:
 
     Args:
         u: (n, d) in the unit cube, the one of largest P(critical) first.
-        why: (n,) `thompson` or `global`.
+        why: (n,) by which criterion, such as `thompson` or `global`.
     """
 
     u: Points
@@ -67,16 +72,29 @@ class Picks:
 
 @dataclass(frozen=True, eq=False)
 class WarpedModel:
-    """A metamodel of the warped metric."""
+    """A metamodel fitted to the warped metric.
+
+    Args:
+        predictor: of the warped metric, at the metamodel's inputs.
+        columns: (n, d) unit-cube points to the metamodel's inputs.
+        warp: from the metric to the warped metric.
+        critical: M_c, warped.
+        metamodel: what was fitted; errors name it.
+        n: rows it learned from.
+    """
 
     predictor: Predictor
     columns: Callable[[Points], Points]
     warp: Warp
-    critical: CriticalInterval  # warped
+    critical: CriticalInterval
+    metamodel: Metamodel
+    n: int
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief about the warped metric at u (n, d)."""
-        return self.predictor(self.columns(u))
+        """Return the prediction of the warped metric at u (n, d)."""
+        inputs = self.columns(u)
+        with named_errors(self.metamodel, self.n):
+            return checked(self.predictor(inputs), len(u))
 
     def log_probability(self, u: Points, inflation: float = 1.0) -> Vector:
         """Return (n,) log P(critical) at u, sigma multiplied by `inflation`."""
@@ -90,23 +108,27 @@ class WarpedModel:
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of the warped metric as a function, at u (m, d)."""
-        return sample_paths(self.predictor, self.columns(u), n, rng)
+        inputs = self.columns(u)
+        with named_errors(self.metamodel, self.n):
+            return sample_paths(self.predictor, inputs, n, rng)
 
 
 def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator) -> WarpedModel:
-    """Return the belief learned from u (n, d) and finite y (n,), n >= 2."""
-    warp = Warp.about(y, search.critical)
+    """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2."""
+    warp = Warp.around_edge(y, search.critical)
     critical = warp.interval(search.critical)
-    predictor = with_target(search.metamodel, critical).fit(search.columns(u), warp.values(y), rng)
-    return WarpedModel(predictor, search.columns, warp, critical)
+    inputs, warped = search.columns(u), warp.values(y)
+    with named_errors(search.metamodel, len(y)):
+        predictor = with_target(search.metamodel, critical).fit(inputs, warped, rng)
+    return WarpedModel(predictor, search.columns, warp, critical, search.metamodel, len(y))
 
 
 @dataclass(frozen=True, eq=False)
-class Free:
-    """The part of the cube that is not deflated.
+class FreeRegion:
+    """The part of the cube that is not deflated: all but k boxes.
 
     Args:
-        low, high: (k, d) ends of the boxes that are.
+        low, high: (k, d) ends of the boxes.
         radius: by which each box reaches beyond its critical runs.
     """
 
@@ -115,8 +137,8 @@ class Free:
     radius: float
 
     @classmethod
-    def about(cls, hits: Points, radius: float) -> Free:
-        """Return what boxes about critical runs (n, d) leave; runs whose boxes touch share one box, their hull."""
+    def without(cls, hits: Points, radius: float) -> FreeRegion:
+        """Return what boxes around critical runs (n, d) leave; runs whose boxes touch share one box, their hull."""
         if len(hits) == 0:
             return cls(hits, hits, radius)
         count, group = connected_components(cdist(hits, hits, "chebyshev") <= 2.0 * radius, directed=False)
@@ -133,18 +155,18 @@ class Free:
         return ~inside
 
 
-def deflated(search: Search, hits: Points, rng: np.random.Generator, dimension: int) -> Free:
+def deflate(search: Search, hits: Points, rng: np.random.Generator, dimension: int) -> FreeRegion:
     """Return what deflation leaves; the radius is halved until that is at least 5 % of the space."""
-    probe = rng.random((512, dimension))
+    probe = rng.random((_PROBES, dimension))
     probe = probe[search.feasible(probe)] if search.feasible(probe).any() else probe
     radius = search.deflation
-    while radius > 1e-6 and Free.about(hits, radius)(probe).mean() < _FEWEST_FREE:
+    while radius > 1e-6 and FreeRegion.without(hits, radius)(probe).mean() < _LEAST_FREE:
         radius /= 2
-    return Free.about(hits, radius)
+    return FreeRegion.without(hits, radius)
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class SearchData:
     """What is left to learn from, and where to look.
 
     Args:
@@ -160,7 +182,7 @@ class Known:
     admissible: Callable[[Points], Mask]
 
 
-def known(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.random.Generator) -> Known:
+def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.random.Generator) -> SearchData:
     """Return the runs and the space that deflation leaves.
 
     Args:
@@ -173,35 +195,38 @@ def known(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.ra
     number = np.arange(len(u), dtype=np.float64) if batch is None else np.asarray(batch, dtype=np.float64)
     ok = np.isfinite(y)
     hit = ok & search.critical.contains(y)
-    free = deflated(search, u[hit], rng, u.shape[1])
+    free = deflate(search, u[hit], rng, u.shape[1])
     left = ok & ~hit & free(u)
     flank = ~free(u[left], _FLANK)
-    return Known(u[left], y[left], number[left], flank, lambda points: search.feasible(points) & free(points))
+    return SearchData(u[left], y[left], number[left], flank, lambda points: search.feasible(points) & free(points))
 
 
-def fill(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:
+def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:
     """Return (n, d) uniform admissible points; what 10,000 tries do not find is uniform in the cube."""
-    kept = np.empty((0, d))
-    for _ in range(100):
+    found = np.empty((0, d))
+    for _ in range(_FILL_ROUNDS):
         u = rng.random((max(100, n), d))
-        kept = np.vstack([kept, u[admissible(u)]])
-        if len(kept) >= n:
+        found = np.vstack([found, u[admissible(u)]])
+        if len(found) >= n:
             break
-    missing = n - len(kept)
-    return np.vstack([kept, rng.random((missing, d))]) if missing > 0 else kept[:n]
+    missing = n - len(found)
+    return np.vstack([found, rng.random((missing, d))]) if missing > 0 else found[:n]
 
 
 def refine_best(
     score: Callable[[Points], Vector], start: Points, admissible: Callable[[Points], Mask], rng: np.random.Generator
 ) -> tuple[Points, Vector]:
-    """Return (m, d) candidates and (m,) scores: uniform ones, those of `start` (k, d), and steps from the best of them."""
+    """Return (m, d) candidates and (m,) scores: uniform ones, those of `start` (k, d), and steps from the best of them.
+
+    The best are refined wherever they lie; `greedy.refine_diverse` spreads them.
+    """
     d = start.shape[1]
-    candidates = np.vstack([fill(admissible, _CANDIDATES, d, rng), start])
+    candidates = np.vstack([fill_uniformly(admissible, _CANDIDATES, d, rng), start])
     values = score(candidates)
-    for scale in (0.1, 0.03):
-        best = candidates[np.argsort(-values, kind="stable")[:30]]
-        around = np.repeat(best, 10, axis=0)
-        moved = rng.random(around.shape) < max(0.3, 1.0 / d)
+    for scale in _STEPS:
+        best = candidates[np.argsort(-values, kind="stable")[:_BEST]]
+        around = np.repeat(best, _CHILDREN, axis=0)
+        moved = rng.random(around.shape) < max(_MOVED, 1.0 / d)
         around = np.clip(around + scale * rng.standard_normal(around.shape) * moved, 0.0, 1.0)
         around = around[admissible(around)]
         if len(around):
@@ -209,7 +234,7 @@ def refine_best(
     return candidates, values
 
 
-def repelled(u: Points, others: Points, radius: float) -> Vector:
+def log_repulsion(u: Points, others: Points, radius: float) -> Vector:
     """Return (n,) log factors: -inf on one of the others, 0 from three radii on, or all that is left would be corners."""
     square = cdist(u, others, "sqeuclidean").min(axis=1) / radius**2
     with np.errstate(divide="ignore"):

@@ -18,10 +18,12 @@ from sbt.problem.arrays import Points, Vector
 
 __all__ = ["SmcDraw", "smc"]
 
-_MOVES = 4
-_TARGET_ESS = 0.5
-_TARGET_ACCEPTANCE = 0.3
-_MAX_LEVELS = 40
+_MOVES = 4  # Metropolis steps a level: resampled duplicates have moved apart
+_TARGET_ESS = 0.5  # share of the effective sample size that a tempering step leaves, the usual choice
+_TARGET_ACCEPTANCE = 0.3  # of the Metropolis steps: near the optimal 0.234 to 0.44 (Roberts and Rosenthal 2001)
+_MAX_LEVELS = 40  # each halves the region: 2^-40 of the space
+_FIRST_SCALE, _SCALES = 0.3, (0.01, 1.5)  # of a step relative to the difference of two particles: at first, and its range
+_OWN_SCALE = 0.02  # of a step that particles do not share: it keeps duplicates from staying duplicates
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,7 @@ def smc(
     log_score = _checked(score, u)
     if np.isneginf(log_score).all():
         return None
-    temper, log_mean, scale, levels = 0.0, 0.0, 0.3, 0
+    temper, log_mean, scale, levels = 0.0, 0.0, _FIRST_SCALE, 0
     while temper < 1.0 and levels < _MAX_LEVELS:
         step = _next(log_score, temper)
         log_weight = step * log_score if levels else np.where(np.isneginf(log_score), -np.inf, step * log_score)
@@ -125,7 +127,7 @@ def _move(
     n, d = u.shape
     for _ in range(_MOVES):
         a, b = rng.permutation(n), rng.permutation(n)
-        jump = scale * (u[a] - u[b]) + 0.02 * scale * rng.standard_normal((n, d))
+        jump = scale * (u[a] - u[b]) + _OWN_SCALE * scale * rng.standard_normal((n, d))
         proposed = _reflected(u + jump)
         least = np.log(rng.random(n)) / temper + np.where(np.isneginf(log_score), -1e300, log_score)  # to be accepted
         hopeful = np.ones(n, dtype=bool) if bound is None else bound(proposed) > least
@@ -135,7 +137,7 @@ def _move(
         accepted = new > least
         u = np.where(accepted[:, None], proposed, u)
         log_score = np.where(accepted, new, log_score)
-        scale = float(np.clip(scale * np.exp(accepted.mean() - _TARGET_ACCEPTANCE), 0.01, 1.5))
+        scale = float(np.clip(scale * np.exp(accepted.mean() - _TARGET_ACCEPTANCE), *_SCALES))
     return u, log_score, scale
 
 

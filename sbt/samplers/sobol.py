@@ -84,5 +84,5 @@ class SobolSequence:
 
 @lru_cache(maxsize=8)
 def _engine(dimension: int, seed: int) -> qmc.Sobol:
-    """Return the engine, wherever it is: the next points mostly follow those it gave last."""
+    """Return the engine at any position: the next points mostly follow those it gave last."""
     return qmc.Sobol(dimension, scramble=True, bits=_BITS, rng=stream(seed, "sobol", dimension))

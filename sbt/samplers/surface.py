@@ -1,4 +1,4 @@
-"""Points on the boundary that a metamodel sees: where P(y in M_c) crosses 0.5."""
+"""Points on the predicted boundary: where P(y in M_c) crosses 0.5."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sbt.problem.arrays import Points, Vector
 
 __all__ = ["crossings"]
 
-_HALVINGS = 30
+_HALVINGS = 30  # of a segment: to 1e-9 of its length
 
 
 def crossings(probability: Callable[[Points], Vector], u: Points, most: int) -> Points:
@@ -23,7 +23,7 @@ def crossings(probability: Callable[[Points], Vector], u: Points, most: int) -> 
     Args:
         probability: (n, d) points -> (n,) P(critical).
         u: (n, d) points of the unit cube to look from.
-        most: how many pairs are bisected; the closest ones, which know the boundary best.
+        most: how many pairs are bisected: the closest ones, between which the boundary is known best.
 
     Returns:
         (m, d) points, empty where all of `u` lies on one side.

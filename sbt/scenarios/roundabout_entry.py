@@ -48,7 +48,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     """Return ego on the southern arm and cars from the western one, which pass ego's entry or leave before it."""
     speed = values["v_ego"] / 3.6
     driver = ego.driver(rng, speed)
-    cars = PASSING.driven(tau=values["tau_co"]).draw(
+    cars = PASSING.with_driver(tau=values["tau_co"]).draw(
         rng, values["flow_co"], values["v_co"] / 3.6, NEAREST, FARTHEST, start=values["v_co"] / 3.6 * LIMIT / RING_LIMIT
     )
     leaves = rng.random(len(cars)) < values["p_leave"]

@@ -1,4 +1,4 @@
-"""Controllers that the built-in scenarios use: an ego of ACC and AEB, and scripted others."""
+"""Controllers of the built-in scenarios: an ego with ACC and AEB, and scripted road users."""
 
 from __future__ import annotations
 
@@ -15,39 +15,44 @@ from sbt.sumo.sensors import PERIOD, RangeSensor, Target
 __all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stationary", "Walk"]
 
 _as_action = partial(tuple.__new__, Action)
-"""An `Action` of its four parts, without the default values that take most of the time to make one."""
+"""Makes an `Action` from a tuple of its four fields; faster than the constructor, which handles defaults."""
 
 
 class AccAeb:
-    """Adaptive cruise control with automatic emergency braking on a noisy radar.
+    """Adaptive cruise control (ACC) and automatic emergency braking (AEB) with a noisy radar.
 
-    ACC holds the set speed, or follows with a constant time gap (gap and closing-speed feedback, the
-    form of Milanes and Shladover (2014), doi 10.1016/j.trc.2014.09.001), within comfort limits. AEB
-    brakes fully once the target is closer than a driver could still stop from: when the time to
-    collision falls below closing / (2 aeb_braking) + aeb_reserve; it holds until nothing closes in. Its first demand
-    counts for the share of the radar's period, half of it before the measurement and half after, in which it is due:
-    the clock of the radar does not show in how the vehicle brakes. The demand passes a dead time and a first-order
-    lag before it becomes acceleration.
+    ACC keeps the set speed, or follows at a constant time gap by feedback of gap and closing speed within
+    comfort limits. AEB demands full braking when the time to collision falls below
+    closing / (2 aeb_braking) + aeb_reserve, until the gap no longer shrinks. When AEB triggers within a period
+    of the radar, its first demand is weighted by the fraction of the period in which it is due (half a period
+    before and half a period after the measurement), so that the sampling of the radar causes no jumps in the
+    braking. The demanded acceleration passes a dead time and first-order lags.
 
     Args:
         rng: source of the sensor noise.
         set_speed: cruising speed (m/s).
         reaction_time: dead time from measurement to actuation (s).
-        lag, lag_2: time constants of the actuation, one after the other (s).
-        time_gap: wanted headway (s).
-        distance_min: wanted gap at standstill (m).
-        acc_accel, acc_braking: comfort limits of ACC (m/s^2), both positive.
+        lag: time constant of the actuation (s).
+        lag_2: time constant of a second lag after it (s).
+        time_gap: desired time gap (s).
+        distance_min: desired gap at standstill (m).
+        acc_accel: largest acceleration of ACC (m/s^2).
+        acc_braking: largest deceleration of ACC (m/s^2), positive.
         aeb_braking: deceleration that AEB demands and the vehicle can reach (m/s^2), positive.
-        aeb_reserve: time that AEB keeps in hand beyond the last moment to brake (s); None: AEB knows
-            `aeb_distance` only.
-        aeb_distance: gap below which AEB brakes whenever the target closes in (m).
-        gap_noise, speed_noise: standard deviations of the sensor (m, m/s).
-        sensor_range: of the radar (m).
+        aeb_reserve: time between the trigger of AEB and the last moment at which full braking avoids the collision
+            (s); None: only `aeb_distance` triggers AEB.
+        aeb_distance: gap below which AEB triggers whenever the gap shrinks (m).
+        gap_noise: standard deviation of the measured gap (m).
+        speed_noise: standard deviation of the measured closing speed (m/s).
+        sensor_range: range of the radar (m).
         path_margin: lateral clearance up to which a road user counts as in the path (m).
-        smoothing: time constant of the radar's track of the target (s); 0: raw measurements.
+        smoothing: time constant of the radar's tracking filter (s); 0: unfiltered measurements.
 
     Raises:
-        InputError: a negative time, distance or limit.
+        InputError: a setting is not a number >= 0.
+
+    Source:
+        ACC: Milanes and Shladover (2014), doi 10.1016/j.trc.2014.09.001.
     """
 
     def __init__(
@@ -69,7 +74,7 @@ class AccAeb:
         sensor = RangeSensor(
             rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise, smoothing=smoothing
         )
-        self._sensor = sensor.__call__  # a bound method is called faster than an object
+        self._sensor = sensor.__call__  # calling a bound method is faster than calling an object
         self._delay = DeadTime(reaction_time).__call__
         self._lag = FirstOrderLag(lag).__call__
         self._lag_2 = FirstOrderLag(lag_2).__call__ if lag_2 > 0 else None
@@ -78,7 +83,7 @@ class AccAeb:
         self._target: Target | None = None
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the acceleration over the next step: the mean of the lag's output at its ends."""
+        """Return the acceleration over the next step: the mean of the actuated values at its ends."""
         demand = self._delay(t, self._demand(own, self._sensor(t, own, others)))
         before, dt = self._reached, t - self._last
         after = self._lag(demand, dt)
@@ -88,7 +93,7 @@ class AccAeb:
         return _as_action((0.5 * (before + after), None, None, None))
 
     def _demand(self, own: State, target: Target | None) -> float:
-        """Return the acceleration that ACC and AEB ask for."""
+        """Return the acceleration that ACC and AEB demand."""
         demand, due = 0.4 * (self._set_speed - own.speed), 0.0
         if target is not None:
             gap, closing = target
@@ -105,27 +110,31 @@ class AccAeb:
         return demand - due * (demand + self._aeb_braking) if due else demand
 
     def _emergency(self, gap: float, closing: float, new: bool, step: float) -> float:
-        """Return AEB's share of the demand: from its second measurement on 1, until nothing closes in."""
+        """Return the weight of AEB in the demand: a fraction at the first measurement, then 1 until the gap no longer shrinks."""
         if self._due:
             return 1.0 if new else self._due
         limit = self._aeb_distance
-        if self._aeb_reserve is not None:  # the gap from which it can only just stop, and the reserve
+        if self._aeb_reserve is not None:  # braking distance at the closing speed, and the reserve
             limit = max(limit, closing * (closing / (2 * self._aeb_braking) + self._aeb_reserve))
         period = max(step, PERIOD)
-        window = 0.0 if self._target is None else 0.5 * period  # nothing can be due of a target before it is seen
+        window = 0.0 if self._target is None else 0.5 * period  # AEB cannot be due before the first measurement
         since = (limit - gap) / closing + window
         return min(since / period, 1.0) if since > 0.0 else 0.0
 
 
 class LaneChange:
-    """Holds its speed and changes to another lane at once, continuously in SUMO."""
+    """Keeps its speed and starts a lane change at once.
+
+    Args:
+        lane: index of the target lane.
+    """
 
     def __init__(self, lane: int):
         self._lane = lane
         self._started = False
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the lane change at first, then nothing new."""
+        """Return the lane change in the first step, and no change afterwards."""
         if self._started:
             return KEEP
         self._started = True
@@ -133,7 +142,7 @@ class LaneChange:
 
 
 class Braking:
-    """Brakes at once with a constant deceleration down to a final speed and holds it.
+    """Brakes with a constant deceleration from the start down to a final speed, and keeps it.
 
     Args:
         deceleration: m/s^2, positive.
@@ -144,25 +153,25 @@ class Braking:
         self._action = Action(acceleration=-deceleration, speed=final_speed)
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the braking, which ends at the final speed."""
+        """Return the deceleration with the final speed as its limit."""
         return self._action
 
 
 class SpeedProfile:
-    """Accelerates from a speed to another, holds it, brakes to a stop: exact at every step, however long.
+    """Accelerates from standstill to a speed, keeps it, and brakes to a standstill; in closed form, exact for any step.
 
     Args:
-        acceleration: of the first part (m/s^2), positive.
-        speed: that is held (m/s).
-        hold: time for which it is held (s).
-        deceleration: of the last part (m/s^2), positive.
+        acceleration: of the first phase (m/s^2), positive.
+        speed: of the second phase (m/s).
+        hold: duration of the second phase (s).
+        deceleration: of the last phase (m/s^2), positive.
     """
 
     def __init__(self, acceleration: float, speed: float, hold: float, deceleration: float):
         self._acceleration, self._speed, self._deceleration = acceleration, speed, deceleration
         self._brakes = speed / acceleration + hold
         self.end = self._brakes + speed / deceleration
-        """When it stands still again (s)."""
+        """Time at which it stands still again (s)."""
 
     def at(self, t: float) -> float:
         """Return the speed at time t (m/s)."""
@@ -181,12 +190,13 @@ class SpeedProfile:
 
 
 class Walk:
-    """Walks straight on at a constant speed, pushed by gusts of wind along and across.
+    """Walks straight ahead at a constant speed, plus the displacement by gusts of wind.
 
     Args:
-        start: where it starts and which way it walks.
-        speed: m/s.
-        along, across: what the wind adds forwards and to the left.
+        start: initial pose.
+        speed: without wind (m/s).
+        along: gusts in the walking direction.
+        across: gusts to the left.
     """
 
     def __init__(self, start: Pose, speed: float, along: Gust, across: Gust):
@@ -204,27 +214,30 @@ class Walk:
 
 
 class Stationary:
-    """Stands where it is."""
+    """Stays where it is."""
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the pose it has."""
+        """Return the current pose."""
         return Action(speed=0.0, pose=(own.x, own.y, own.heading))
 
 
 class ArcExit:
-    """Drives out on an arc to the left: accelerates from standstill, holds its speed, brakes to a stop.
+    """Leaves a parking space on an arc to the left, with a `SpeedProfile`.
 
     Args:
-        start: where it stands.
-        radius: of the arc of its middle (m).
-        acceleration, speed, hold, deceleration: as of a `SpeedProfile`.
+        start: initial pose.
+        radius: of the arc on which the centre moves (m).
+        acceleration: of the first phase (m/s^2), positive.
+        speed: of the second phase (m/s).
+        hold: duration of the second phase (s).
+        deceleration: of the last phase (m/s^2), positive.
     """
 
     def __init__(self, start: Pose, radius: float, acceleration: float, speed: float, hold: float, deceleration: float):
         self._start, self._radius = start, radius
         self._profile = SpeedProfile(acceleration, speed, hold, deceleration)
         self.end = self._profile.end
-        """When it stands again (s)."""
+        """Time at which it stands still again (s)."""
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the pose and the speed at the end of the step."""

@@ -1,4 +1,4 @@
-"""The AV under test, chosen by name: a controller of ours or the user's, or one of SUMO's models."""
+"""The AV under test, configured by name: a built-in or user-defined controller, or one of SUMO's models."""
 
 from __future__ import annotations
 
@@ -20,24 +20,21 @@ from sbt.sumo.models import unit_of, vtype_attributes
 __all__ = ["SUMO", "Ego"]
 
 SUMO = "sumo"
-"""The kind of ego that one of SUMO's own models drives."""
+"""The kind of an ego that one of SUMO's models drives."""
 _DEFAULTS = {"decel": "4.5", "emergencyDecel": "9", "accel": "2.6", "minGap": "2.5"}
-_RANGE = ({"min", "max"}, {"min", "max", "unit"})
+_RANGE_KEYS = ({"min", "max"}, {"min", "max", "unit"})
 
 
 @dataclass(frozen=True)
 class Ego:
     """Kind and settings of the AV under test.
 
-    A setting that is a range, `{min: 0.5, max: 2.0}`, is an input of the scenario: `ego_` and its name.
+    A setting given as a range, such as `{min: 0.5, max: 2.0}`, is an input of the scenario with the prefix `ego_`.
 
     Args:
-        kind: a controller by name or `file.py:NAME`, called as `NAME(rng, set_speed, **settings)`
-            once a run; or `sumo`, driven by the car-following model `model` with vType attributes.
-        settings: (name, value) pairs; a `Parameter` as value is such an input.
-
-    Raises:
-        InputError: unknown kind or settings (`Ego.of`).
+        kind: a controller by name or `file.py:NAME`, constructed as `NAME(rng, set_speed, **settings)` once
+            per run; or `sumo`, with the car-following model `model` and vType attributes as settings.
+        settings: (name, value) pairs; inputs of the scenario have a `Parameter` as value.
     """
 
     kind: str = "acc_aeb"
@@ -45,9 +42,13 @@ class Ego:
 
     @classmethod
     def of(cls, kind: str = "acc_aeb", **settings: Any) -> Ego:
-        """Return the ego of this kind, its settings tried out once, ranges at their centre."""
+        """Return an ego of this kind; tries the settings once, with ranges at their centre.
+
+        Raises:
+            InputError: the kind is unknown, or its settings are.
+        """
         ego = cls(kind, tuple((name, _setting(name, value)) for name, value in sorted(settings.items())))
-        trial = ego.bound({p.name: p.centre for p in ego.inputs})
+        trial = ego.bind({p.name: p.centre for p in ego.inputs})
         if kind == SUMO:
             vtype_attributes(dict(trial.settings))
         elif not callable(getattr(trial.driver(stream(0, "ego"), 1.0), "act", None)):
@@ -56,12 +57,12 @@ class Ego:
 
     @property
     def deterministic(self) -> bool:
-        """Whether SUMO draws no random numbers for this ego."""
+        """Whether SUMO draws no random numbers to drive this ego."""
         return self.kind != SUMO
 
     @property
     def lane_change(self) -> str:
-        """SUMO's lane-change model that the settings choose, "" for a controller."""
+        """The lane-change model of SUMO that the settings select; "" for a controller."""
         settings = dict(self.settings)
         return str(settings.get("lane_change", settings.get("laneChangeModel", "LC2013"))) if self.kind == SUMO else ""
 
@@ -70,20 +71,23 @@ class Ego:
         """The settings that are inputs of the scenario."""
         return tuple(value for _, value in self.settings if isinstance(value, Parameter))
 
-    def bound(self, values: Mapping[str, float]) -> Ego:
-        """Return the ego of one run: every setting that is an input has its value."""
+    def bind(self, values: Mapping[str, float]) -> Ego:
+        """Return the ego of one run, with the values of the settings that are inputs."""
         if not self.inputs:
             return self
-        bound = ((name, values[value.name] if isinstance(value, Parameter) else value) for name, value in self.settings)
-        return replace(self, settings=tuple(bound))
+        settings = ((name, values[value.name] if isinstance(value, Parameter) else value) for name, value in self.settings)
+        return replace(self, settings=tuple(settings))
 
     def driver(self, rng: np.random.Generator, set_speed: float, **overrides: Any) -> Controller | None:
-        """Return the controller of one run, None where SUMO drives.
+        """Return the controller of one run; None where SUMO drives.
 
         Args:
-            rng: of the run.
-            set_speed: the speed it starts with and would keep (m/s).
-            overrides: settings that the scenario's inputs decide; they win.
+            rng: random generator of the run.
+            set_speed: initial and desired speed (m/s).
+            overrides: settings that the scenario determines; they take precedence.
+
+        Raises:
+            InputError: the controller does not take the settings.
         """
         if self.kind == SUMO:
             return None
@@ -96,7 +100,7 @@ class Ego:
         return built
 
     def vehicle_type(self, base: VehicleType, set_speed: float) -> VehicleType:
-        """Return the SUMO type of the ego: `base`, with SUMO's models where they drive."""
+        """Return the vehicle type of the ego: `base`, extended by the models where SUMO drives."""
         if self.kind != SUMO:
             return base
         given = vtype_attributes(dict(self.settings))
@@ -106,11 +110,11 @@ class Ego:
 
 
 def _setting(name: str, value: Any) -> Any:
-    """Return a setting with its number plain, or the scenario input that a range such as `{min: 0.5, max: 2.0}` declares."""
+    """Return a setting: a plain number, or the scenario input that a range such as `{min: 0.5, max: 2.0}` declares."""
     if not isinstance(value, Mapping):
         return plain(value)
     numbers = all(isinstance(value.get(key), Real) and not isinstance(value.get(key), bool) for key in ("min", "max"))
-    if set(value) not in _RANGE or not numbers:
+    if set(value) not in _RANGE_KEYS or not numbers:
         raise InputError(f"ego.{name} must be a value or a range such as {{min: 0.5, max: 2.0}}, but got {dict(value)}")
     unit = str(value.get("unit", unit_of(name)))
     return Parameter(f"ego_{name}", float(value["min"]), float(value["max"]), unit, description=f"setting {name} of the ego")

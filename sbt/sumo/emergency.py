@@ -1,4 +1,4 @@
-"""Controllers that brake in an emergency for what they see: a person who steps out, a car that leaves its bay."""
+"""Controllers for emergency braking: for a pedestrian who steps onto the road, and for a car that leaves its parking space."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ __all__ = ["EmergencyStop", "PedestrianBraking"]
 _TICK = 0.05
 """Period of the sensors (s)."""
 GRAVITY = 9.81
+"""Gravitational acceleration (m/s^2)."""
 
 
-class Noise:
-    """Standard Gaussian numbers by tick of a sensor: the same whatever the step and whatever was seen before."""
+class TickNoise:
+    """Standard Gaussian numbers by the tick of a sensor, independent of the step and of what was seen before."""
 
     def __init__(self, rng: np.random.Generator, columns: int):
         self._rng, self._columns = rng, columns
@@ -32,32 +33,33 @@ class Noise:
 
 
 class PedestrianBraking:
-    """Holds its speed, and brakes for a person on a course that meets its own.
+    """Keeps its speed, and brakes for a pedestrian on a collision course.
 
-    A camera behind the windscreen sees the person within `sight` and past the obstacles, once the
-    middle of the body is visible, and measures position and velocity with noise. A conflict is predicted
-    where the person, walking on, would be in ego's corridor in the time in which ego passes there, give or
-    take a margin as long as ego could still stop. After `confirmations` conflicts in a row ego brakes as
-    soon as `firmness` times the constant deceleration that would stop it `clearance` before the person
-    reaches `braking_min`, and on until the person has left the corridor on the far side. Tyres transmit no
-    more than friction allows.
+    A camera behind the windscreen detects the pedestrian within `sight` once the centre of the body is not
+    occluded, and measures position and velocity with noise. A conflict is predicted if the pedestrian, walking
+    on, would be in the corridor of the ego while the ego passes, with a time margin as long as the ego can still
+    stop. After `confirmations` consecutive conflicts the ego brakes as soon as `firmness` times the constant
+    deceleration that would stop it `clearance` ahead of the pedestrian reaches `braking_min`, and until the
+    pedestrian has left the corridor on the far side. The friction of the tyres limits the deceleration.
 
     Args:
         rng: source of the sensor noise.
-        set_speed: the speed it holds (m/s).
+        set_speed: the speed it keeps (m/s).
         friction: coefficient between tyre and road.
         sight: range of the camera (m).
-        obstacles: what hides the person.
+        obstacles: rectangles that may occlude the pedestrian.
         camera: distance of the camera behind the front bumper (m).
-        confirmations: ticks of 0.05 s in a row with a conflict before it brakes.
+        confirmations: consecutive frames (0.05 s) with a conflict before it brakes.
         reaction_time: dead time from decision to actuation (s).
         lag: time constant of the brakes (s).
-        braking_min, braking_max: range of the demanded deceleration (m/s^2).
-        firmness: factor on the deceleration that is needed.
-        clearance: wanted distance to the person (m).
-        side: lateral clearance that the corridor has beyond ego's side (m).
-        time_margin: how much earlier or later than ego the person counts as a conflict (s).
-        position_noise, speed_noise: standard deviations (m, m/s).
+        braking_min: smallest demanded deceleration (m/s^2).
+        braking_max: largest demanded deceleration (m/s^2).
+        firmness: factor on the required deceleration.
+        clearance: desired distance to the pedestrian at standstill (m).
+        side: lateral clearance between the sides of the ego and of its corridor (m).
+        time_margin: how much earlier or later than the ego the pedestrian may pass to count as a conflict (s).
+        position_noise: standard deviation of a measured coordinate (m).
+        speed_noise: standard deviation of a measured velocity component (m/s).
     """
 
     def __init__(
@@ -66,11 +68,11 @@ class PedestrianBraking:
         lag: float = 0.1, braking_min: float = 3.0, braking_max: float = 9.0, firmness: float = 1.2, clearance: float = 1.5,
         side: float = 0.4, time_margin: float = 0.6, position_noise: float = 0.1, speed_noise: float = 0.1,
     ):  # fmt: skip
-        self._noise = Noise(rng, 4)
+        self._noise = TickNoise(rng, 4)
         self._set_speed = set_speed
         self._limit = friction * GRAVITY
         self._sight, self._camera = sight, camera
-        self._boxes = Occluders((*o.pose, o.length, o.width) for o in obstacles)
+        self._occluders = Occluders((*o.pose, o.length, o.width) for o in obstacles)
         self._confirmations = confirmations
         self._delay, self._lag = DeadTime(reaction_time), FirstOrderLag(lag)
         self._range = (braking_min, braking_max)
@@ -81,7 +83,7 @@ class PedestrianBraking:
         self._demand = self._reached = self._last = 0.0
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the acceleration over the next step: the mean of the lag's output at its ends."""
+        """Return the acceleration over the next step: the mean of the actuated values at its ends."""
         tick = int(t / _TICK + 1e-6)
         if tick >= self._next:
             self._next = tick + 1
@@ -112,7 +114,7 @@ class PedestrianBraking:
         return -min(max(needed, least), most) if self._braking else 0.0
 
     def _conflict(self, gap: float, offset: float, towards: float, corridor: float, margin: float, own: State) -> bool:
-        """Return whether the person is in the corridor while ego passes; `towards` is the speed to the left."""
+        """Return whether the pedestrian is in the corridor while the ego passes; `towards` is the speed to the left."""
         if abs(offset) < corridor:
             return True
         if towards <= 0.05 or offset < 0.0:
@@ -123,11 +125,11 @@ class PedestrianBraking:
         return enters < passed + margin and leaves > arrives - margin
 
     def _measure(self, tick: int, own: State, person: State) -> tuple[float, float, float] | None:
-        """Return gap ahead, offset to the right and speed to the left of the person, as measured; None: not seen."""
+        """Return the measured gap ahead, offset to the right and speed to the left of the pedestrian; None: not visible."""
         ahead = 0.5 * own.length - self._camera
         eye = np.array([own.x + ahead * own.cos, own.y + ahead * own.sin])
         middle = np.array([[person.x, person.y]])
-        if math.hypot(person.x - eye[0], person.y - eye[1]) > self._sight or self._boxes.occlude(eye, middle)[0]:
+        if math.hypot(person.x - eye[0], person.y - eye[1]) > self._sight or self._occluders.occlude(eye, middle)[0]:
             return None
         n = [a * b for a, b in zip(self._noise(tick), self._deviation, strict=True)]
         dx, dy = person.x - own.x + n[0], person.y - own.y + n[1]
@@ -137,29 +139,29 @@ class PedestrianBraking:
 
 
 class EmergencyStop:
-    """Drives straight on, and stops for a car that moves out of a bay, as far as it sees that.
+    """Drives straight ahead, and stops for a car that it sees leaving a parking space.
 
-    A sensor at the front sees the points of the car's outline ahead of it that no other car hides. Once
-    the uppermost of them (the furthest to the north) has moved by `threshold` since it was first seen, ego
-    brakes `delay` later, its deceleration growing with `jerk` up to `braking`, until it stands. The moment
-    of the movement is interpolated between the frames of the sensor, 0.05 s apart.
+    A sensor at the front sees those points of the car's outline that are ahead and not occluded by other cars.
+    When the northernmost visible point has moved by `threshold` since it was first seen, the ego brakes after
+    `delay` to a standstill; its deceleration grows with `jerk` up to `braking`. The time of the movement is
+    interpolated between the frames of the sensor, which are 0.05 s apart.
 
     Args:
         rng: source of the sensor noise.
-        set_speed: the speed it holds (m/s).
-        threshold: movement that it takes for a departure (m).
+        set_speed: the speed it keeps (m/s).
+        threshold: movement that counts as leaving (m).
         delay: dead time (s).
         braking: deceleration (m/s^2), positive.
-        jerk: rate at which it grows (m/s^3), positive.
-        target: name of the car that it watches; the others hide it.
-        position_noise: standard deviation of the uppermost point (m).
+        jerk: rate at which the deceleration grows (m/s^3), positive.
+        target: name of the observed car; the others may occlude it.
+        position_noise: standard deviation of the position of the northernmost point (m).
     """
 
     def __init__(
         self, rng: np.random.Generator, set_speed: float, *, threshold: float = 0.3, delay: float = 0.3,
         braking: float = 6.0, jerk: float = 12.0, target: str = "co_1", position_noise: float = 0.015,
     ):  # fmt: skip
-        self._noise = Noise(rng, 1)
+        self._noise = TickNoise(rng, 1)
         self._speed, self._threshold, self._target, self._deviation = set_speed, threshold, target, position_noise
         self._delay, self._jerk, self._braking = delay, jerk, braking
         self._next = 0
@@ -183,7 +185,7 @@ class EmergencyStop:
         return Action(speed=speed, pose=(own.x + distance * own.cos, own.y + distance * own.sin, own.heading))
 
     def _departure(self, tick: int, own: State, others: tuple[State, ...]) -> float | None:
-        """Return when what is visible of the watched car had moved by the threshold (s), None as long as it has not."""
+        """Return when the visible part of the observed car had moved by the threshold (s); None as long as it has not."""
         watched = next((o for o in others if o.name == self._target), None)
         if watched is None:
             return None

@@ -1,8 +1,8 @@
-"""What SUMO is started with: the options of a `.sumocfg`, a command line or a scenario file, and the files they name.
+"""The options of a user's simulation, from a `.sumocfg`, a command line or a scenario file, and the files they name.
 
-All options go to SUMO's command line, so that placeholders may stand in every value. Files are found
-relative to where they are named. A few options are this package's own (`OWN`): the run's seed, and what
-makes a run repeatable and its collisions visible. What a configuration would write is left out.
+All options are passed on SUMO's command line, so that every value may contain placeholders. File names are
+relative to the file that contains them. Some options are fixed (`FIXED_OPTIONS`), and so is the seed of the run;
+output options are dropped.
 """
 
 from __future__ import annotations
@@ -18,29 +18,30 @@ from sbt.errors import InputError
 from sbt.sumo.formatting import format_number
 from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template
 
-__all__ = ["OWN", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
+__all__ = ["FIXED_OPTIONS", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
 
-OWN = {
+FIXED_OPTIONS = {
     "random": "false", "collision.action": "warn", "collision.mingap-factor": "0", "collision.check-junctions": "true",
     "no-step-log": "true", "duration-log.disable": "true", "xml-validation": "never",
 }  # fmt: skip
-"""Options that are the same for every run, whatever a configuration says; `seed` is the run's."""
+"""Set for every run, whatever a configuration says: they make runs repeatable and collisions visible."""
 _DEFAULTS = {"step-length": "0.1", "time-to-teleport": "-1", "xml-validation.net": "never", "xml-validation.routes": "never"}
-"""Where nothing else is said. SUMO's own would be a step of 1 s, and to move who waits for 300 s."""
-_NAMES = {
+"""Where the user sets nothing else. SUMO's defaults are a step of 1 s, and teleporting after 300 s of waiting."""
+_ALIASES = {
     "n": "net-file", "net": "net-file", "r": "route-files", "a": "additional-files", "additional": "additional-files",
     "w": "weight-files", "b": "begin", "e": "end", "c": "configuration-file",
 }  # fmt: skip
+"""Short names of options, as SUMO has them."""
 _FILES = ("net-file", "route-files", "additional-files")
-_WRITTEN = re.compile(r".*(-output|output-prefix|-log)$|save-state.*|save-configuration|save-template|log|l")
+_OUTPUT = re.compile(r".*(-output|output-prefix|-log)$|save-state.*|save-configuration|save-template|log|l")
 _GUI = ("gui-settings-file", "start", "quit-on-end", "delay", "window-size", "window-pos", "tracker-interval", "S", "Q", "d", "g")
-_NEWEST_NET = (1, 20)
-"""Version of the networks that this SUMO writes."""
+_NEWEST_NET_VERSION = (1, 20)
+"""Version of the network files that SUMO 1.28 writes."""
 
 
 @dataclass(frozen=True)
 class Launch:
-    """A finished command line but for the seed, as `Session.run` takes it."""
+    """A complete command line except for the seed; a `Loadable` of `Session.run`."""
 
     arguments: tuple[str, ...]
 
@@ -51,13 +52,14 @@ class Launch:
 
 @dataclass(frozen=True)
 class SumoFiles:
-    """The options of a simulation and its files.
+    """The options and files of a simulation.
 
     Args:
-        options: SUMO option to value, without the files.
-        net: the network.
-        routes, additional: the further files, in order.
-        places: option to where it stands, for messages.
+        options: values by SUMO's option names, without the files below.
+        net: network file.
+        routes: route files, in order.
+        additional: additional files, in order.
+        places: where each option was given, for messages.
     """
 
     options: Mapping[str, str]
@@ -68,17 +70,17 @@ class SumoFiles:
 
     @classmethod
     def of(cls, options: Mapping[str, str], folder: Path, place: str) -> SumoFiles:
-        """Return the files that options name.
+        """Return the files that are named in options.
 
         Args:
-            options: by SUMO's names; files relative to `folder`, several of them joined by commas.
-            folder: of what names them.
-            place: what names them, for messages.
+            options: values by SUMO's option names; several files are separated by commas.
+            folder: that file names are relative to.
+            place: where the options were given, for messages.
 
         Raises:
-            InputError: no network, or a file that is not there.
+            InputError: not exactly one network is named, or a file does not exist.
         """
-        named = {k: [_found(k, name, folder, place) for name in _split(options.get(k, ""))] for k in _FILES}
+        named = {k: [_existing(k, name, folder, place) for name in _split(options.get(k, ""))] for k in _FILES}
         if len(named["net-file"]) != 1:
             raise InputError(f"{place}: a simulation needs one network (net-file), but got {len(named['net-file'])}")
         others = {k: _absolute(k, v, folder) for k, v in options.items() if k not in _FILES}
@@ -87,28 +89,28 @@ class SumoFiles:
 
     @cached_property
     def templates(self) -> tuple[Template, ...]:
-        """Every file with those it includes, checked.
+        """All files, with the files that they include, checked.
 
         Raises:
-            InputError: one of them is not what it should be.
+            InputError: a file is not as required.
         """
         found = tuple(t for path in (self.net, *self.routes, *self.additional) for t in template(path).tree())
         for name, value in self.options.items():
-            for path in map(Path, _split(value) if _of_files(name) else ()):
+            for path in map(Path, _split(value) if _names_files(name) else ()):
                 if path.name.endswith((".xml", ".xml.gz")) and path.is_file():
                     template(path)
         _check_net(template(self.net))
         return found
 
     def placeholders(self) -> Iterator[Placeholder]:
-        """Yield every placeholder, in the files and in the options."""
+        """Yield all placeholders in files and options."""
         for one in self.templates:
             yield from (p.placeholder for p in one.parts if p.placeholder is not None)
         for name, value in self.options.items():
             yield from placeholders(value, f"{self.places.get(name, '')}: {name}")
 
     def vehicle(self, name: str) -> tuple[Vehicle, Template] | None:
-        """Return a vehicle, or the flow that makes it, and its file; None where there is none."""
+        """Return a vehicle, or the flow that generates it, and its file; None if there is none."""
         for wanted in (name, name.rpartition(".")[0]):
             for one in self.templates:
                 if wanted in one.vehicles:
@@ -120,25 +122,25 @@ class SumoFiles:
         return [name for one in self.templates for name in one.vehicles]
 
     def launch(self, values: Mapping[str, float], folder: Path, step_length: float | None = None) -> Launch:
-        """Return the command line for these values; filled copies go to `folder`.
+        """Return the command line for these values, writing copies of files with placeholders to `folder`.
 
         Raises:
             RunError: a placeholder's value is not finite.
         """
-        self.templates  # noqa: B018  (checked before SUMO sees them)
+        self.templates  # noqa: B018  (checks them before SUMO reads them)
         written = {
             name: ",".join(str(template(path).write(values, folder)) for path in paths)
             for name, paths in zip(_FILES, ((self.net,), self.routes, self.additional), strict=True)
             if paths
         }
         given = {k: fill(v, values, self.places.get(k, "")) for k, v in self.options.items()}
-        chosen = {} if step_length is None else {"step-length": format_number(step_length)}
-        options = {**_DEFAULTS, **given, **chosen, **OWN, **written}
+        step = {} if step_length is None else {"step-length": format_number(step_length)}
+        options = {**_DEFAULTS, **given, **step, **FIXED_OPTIONS, **written}
         options.pop("seed", None)
         return Launch(tuple(part for name, value in options.items() for part in (f"--{name}", value)))
 
     def step_length(self) -> float | None:
-        """Return the step that the options ask for (s), None where they do not, or by an input."""
+        """Return the step that the options set (s); None where they do not, or set it by a placeholder."""
         try:
             return float(self.options["step-length"])
         except (KeyError, ValueError):
@@ -146,10 +148,10 @@ class SumoFiles:
 
 
 def options_of_config(path: Path) -> dict[str, str]:
-    """Return the options of a `.sumocfg`: names as SUMO's, files absolute, without what it would write.
+    """Return the options of a `.sumocfg` by SUMO's names, with absolute file names and without outputs.
 
     Raises:
-        InputError: it cannot be read, or is no configuration of SUMO.
+        InputError: it cannot be read, or is not a SUMO configuration.
     """
     root = template(path.resolve())
     if not re.fullmatch("(sumo-?)?configuration", root.root[0], re.IGNORECASE):
@@ -157,17 +159,17 @@ def options_of_config(path: Path) -> dict[str, str]:
     options: dict[str, str] = {}
     for section in ET.parse(path).getroot().iter():
         value = section.get("value", section.get("v"))
-        name = _NAMES.get(section.tag, section.tag)
-        if value is not None and not _left_out(name):
+        name = _ALIASES.get(section.tag, section.tag)
+        if value is not None and not _dropped(name):
             options[name] = _absolute(name, value, path.resolve().parent)
     return options
 
 
 def options_of_command(command: Sequence[str], folder: Path) -> dict[str, str]:
-    """Return the options of a command line such as `traci.start` takes, without the program's name.
+    """Return the options of a SUMO command line without the program's name, as passed to `traci.start`.
 
     Raises:
-        InputError: it is no such command line.
+        InputError: an argument is not an option.
     """
     options: dict[str, str] = {}
     rest = [str(part) for part in command]
@@ -178,23 +180,23 @@ def options_of_command(command: Sequence[str], folder: Path) -> dict[str, str]:
         name, equals, value = word.lstrip("-").partition("=")
         if not equals:
             value = rest.pop(0) if rest and not re.match(r"--?[A-Za-z]", rest[0]) else "true"
-        name = _NAMES.get(name, name)
+        name = _ALIASES.get(name, name)
         if name == "configuration-file":
             options = {**options_of_config((folder / value).resolve()), **options}
-        elif not _left_out(name):
+        elif not _dropped(name):
             options[name] = value if name in _FILES else _absolute(name, value, folder)
     return options
 
 
-def _left_out(name: str) -> bool:
-    return _WRITTEN.fullmatch(name) is not None or name in _GUI
+def _dropped(name: str) -> bool:
+    return _OUTPUT.fullmatch(name) is not None or name in _GUI
 
 
 def _split(value: str) -> list[str]:
     return [name.strip() for name in value.split(",") if name.strip()]
 
 
-def _found(option: str, name: str, folder: Path, place: str) -> Path:
+def _existing(option: str, name: str, folder: Path, place: str) -> Path:
     path = (folder / Path(name).expanduser()).resolve()
     if "${" in name:
         raise InputError(f"{place}: {option} must not hold a placeholder (their values may), but got '{name}'")
@@ -203,13 +205,13 @@ def _found(option: str, name: str, folder: Path, place: str) -> Path:
     return path
 
 
-def _of_files(option: str) -> bool:
+def _names_files(option: str) -> bool:
     return option.endswith(("-file", "-files", "load-state"))
 
 
 def _absolute(option: str, value: str, folder: Path) -> str:
-    """Return the value with names of existing files absolute, where the option is about files."""
-    if not _of_files(option):
+    """Return the value of an option, with absolute names of existing files where it names files."""
+    if not _names_files(option):
         return value
     return ",".join(
         str((folder / name).resolve()) if (folder / name).exists() or option in _FILES else name for name in _split(value)
@@ -217,10 +219,10 @@ def _absolute(option: str, value: str, folder: Path) -> str:
 
 
 def _check_net(net: Template) -> None:
-    """Refuse what is no network, or one of a SUMO that this one does not know.
+    """Check that a file is a network of a supported version.
 
     Raises:
-        InputError: it is another kind of file, or of another version.
+        InputError: it is not.
     """
     tag, attributes = net.root
     if tag != "net":
@@ -228,8 +230,8 @@ def _check_net(net: Template) -> None:
     version = attributes.get("version", "")
     match = re.fullmatch(r"(\d+)\.(\d+)", version)
     numbers = (int(match.group(1)), int(match.group(2))) if match is not None else (0, 0)
-    if not (1, 0) <= numbers <= _NEWEST_NET:
-        newest = ".".join(map(str, _NEWEST_NET))
+    if not (1, 0) <= numbers <= _NEWEST_NET_VERSION:
+        newest = ".".join(map(str, _NEWEST_NET_VERSION))
         raise InputError(
             f"{net.path}: a network must be of a version from 1.0 to {newest}, but is of '{version}', made by another SUMO; "
             f"convert it: netconvert -s {net.path.name} -o new.net.xml"

@@ -1,7 +1,7 @@
-"""SUMO's car-following and lane-change models and the vType attributes each takes: what an ego may be made of.
+"""SUMO's car-following and lane-change models and their vType attributes: the settings of an ego of kind `sumo`.
 
-SUMO ignores an attribute that a model does not have, silently; this table is what misspelt or misplaced ones
-are told by. Source: SUMO's documentation, "Definition of Vehicles, Vehicle Types, and Routes" and "Car-Following Models".
+SUMO silently ignores attributes that a model does not have; with these tables, misspelt and misplaced ones are
+refused. Source: SUMO's documentation, "Definition of Vehicles, Vehicle Types, and Routes" and "Car-Following Models".
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sbt.sumo.formatting import format_number
 __all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "known_attributes", "unit_of", "vtype_attributes"]
 
 SUBLANE = "SL2015"
-"""The lane-change model that needs SUMO's option --lateral-resolution; without it, it never changes lanes."""
+"""The sublane model; it changes lanes only with SUMO's option --lateral-resolution."""
 _COMMON = {
     "minGap": "m", "accel": "m/s^2", "decel": "m/s^2", "emergencyDecel": "m/s^2", "apparentDecel": "m/s^2", "tau": "s",
     "maxSpeed": "m/s", "speedFactor": "", "speedDev": "", "actionStepLength": "s", "impatience": "", "startupDelay": "s",
@@ -48,8 +48,8 @@ CAR_FOLLOWING: Mapping[str, Mapping[str, str]] = {
         "speedControlGainCACC", "gapClosingControlGainGap", "gapClosingControlGainGapDot", "gapControlGainGap",
         "gapControlGainGapDot", "collisionAvoidanceGainGap", "collisionAvoidanceGainGapDot"), ""),
 }  # fmt: skip
-"""Car-following model to its own attributes and their units; all take the common ones beside. KraussAB and Rail, which
-the documentation names too, are left out: SUMO 1.28 does not know the one, and the other takes no ballistic steps."""
+"""Car-following models: their specific attributes and units, besides the common ones. Two documented models are missing:
+SUMO 1.28 does not know KraussAB, and Rail does not support ballistic integration."""
 _LC_COMMON = dict.fromkeys((
     "lcStrategic", "lcCooperative", "lcSpeedGain", "lcKeepRight", "lcOvertakeRight", "lcLookaheadLeft", "lcSpeedGainRight",
     "lcSpeedGainLookahead", "lcCooperativeRoundabout", "lcCooperativeSpeed", "lcAssertive", "lcSigma",
@@ -62,31 +62,31 @@ LANE_CHANGE: Mapping[str, Mapping[str, str]] = {
     },
     "DK2008": {},
 }  # fmt: skip
-"""Lane-change model to its attributes and their units. SL2015 needs SUMO's option --lateral-resolution."""
+"""Lane-change models: their attributes and units."""
 
 
 def known_attributes(model: str, lane_change: str) -> dict[str, str]:
-    """Return the attributes that a vehicle of these two models takes, with their units.
+    """Return the attributes of a vehicle with these two models, with their units.
 
     Raises:
         InputError: there is no such model.
     """
-    return {**_COMMON, **_of("model", CAR_FOLLOWING, model), **_of("lane_change", LANE_CHANGE, lane_change)}
+    return {**_COMMON, **_entry("model", CAR_FOLLOWING, model), **_entry("lane_change", LANE_CHANGE, lane_change)}
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of an attribute, "" for a pure number or where it is unknown."""
+    """Return the unit of an attribute; "" if it is dimensionless or unknown."""
     tables = (_COMMON, *CAR_FOLLOWING.values(), *LANE_CHANGE.values())
     return next((table[name] for table in tables if name in table), "")
 
 
 def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the vType attributes that settings of an ego of kind `sumo` mean, after a check of names and numbers.
+    """Return the vType attributes for the settings of an ego of kind `sumo`.
 
-    `model` and `lane_change` choose the models (SUMO's `carFollowModel` and `laneChangeModel`; Krauss and LC2013).
+    `model` and `lane_change` (SUMO's `carFollowModel` and `laneChangeModel`) select the models, by default Krauss and LC2013.
 
     Raises:
-        InputError: an unknown model, an attribute that these models do not have, or one that is no finite number.
+        InputError: a model is unknown, the models do not have an attribute, or its value is not a finite number.
 
     >>> vtype_attributes({"model": "IDM", "tau": 1.2})
     {'carFollowModel': 'IDM', 'laneChangeModel': 'LC2013', 'tau': '1.2'}
@@ -109,7 +109,7 @@ def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _of(key: str, table: Mapping[str, Mapping[str, str]], name: str) -> Mapping[str, str]:
+def _entry(key: str, table: Mapping[str, Mapping[str, str]], name: str) -> Mapping[str, str]:
     if name not in table:
         raise InputError(f"ego.{key} must be one of SUMO's {', '.join(table)}, but got '{name}'{did_you_mean(name, table)}")
     return table[name]

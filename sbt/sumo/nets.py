@@ -1,4 +1,4 @@
-"""Where the built-in networks are: beside the checkout, or inside the installed wheel."""
+"""Network files: the built-in ones, in the source tree or in the installed package, and those of the user."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Lane", "lanes", "net_file", "nets_folder"]
 
 
 class Lane(NamedTuple):
-    """A lane as it lies in the plane: its middle line (n, 2) and its width (m)."""
+    """The geometry of a lane: its centre line, (n, 2) points, and its width (m)."""
 
     shape: tuple[tuple[float, float], ...]
     width: float
@@ -23,10 +23,10 @@ class Lane(NamedTuple):
 
 @cache
 def nets_folder() -> Path:
-    """Return the folder with the built-in networks.
+    """Return the folder of the built-in networks.
 
     Raises:
-        InputError: the installation has none.
+        InputError: the installation is incomplete.
     """
     package = Path(__file__).resolve().parent.parent
     for folder in (package / "_nets", package.parent / "sumo_nets"):
@@ -37,10 +37,10 @@ def nets_folder() -> Path:
 
 @cache
 def net_file(net: str) -> Path:
-    """Return the file of a network: a built-in name, or a path to a `.net.xml`.
+    """Return the file of a network, given by a built-in name or the path of a `.net.xml`.
 
     Raises:
-        InputError: there is no such file.
+        InputError: there is no such file, or it is not a network.
     """
     path = nets_folder() / net / f"{net}.net.xml" if "." not in net else Path(net)
     if not path.is_file():
@@ -51,7 +51,7 @@ def net_file(net: str) -> Path:
 
 
 def lanes(net: str) -> tuple[Lane, ...]:
-    """Return the lanes of a network, those inside junctions too.
+    """Return all lanes of a network, including internal lanes of junctions.
 
     Raises:
         InputError: there is no such network.
@@ -67,7 +67,7 @@ def lanes(net: str) -> tuple[Lane, ...]:
 
 
 def _check_well_formed(path: Path) -> None:
-    """Refuse a file that is no network: libsumo does not raise on one, it ends the process."""
+    """Refuse a file that is not a network: libsumo would not raise an error, but end the process."""
     roots: list[tuple[str, dict[str, str]]] = []
 
     def start(tag: str, attributes: dict[str, str]) -> None:

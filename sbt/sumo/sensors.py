@@ -1,4 +1,4 @@
-"""What the AV under test perceives: noisy, sampled, limited in range and to its own path."""
+"""The radar of the AV under test: noisy, sampled, limited in range and to its own path."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ __all__ = ["PERIOD", "RangeSensor", "Target", "Track"]
 
 
 Target = tuple[float, float]
-"""The nearest road user ahead in the path, as measured: gap from bumper to bumper (m), rate at which it shrinks (m/s)."""
+"""The measured nearest road user ahead in the path: bumper-to-bumper gap (m) and closing speed (m/s)."""
 
 PERIOD = 0.05
 """Of the radar's measurements (s)."""
 _BLOCK = 128
+"""Measurements for which noise is drawn at once."""
 
 
 class Track:
-    """What a radar keeps of one road user: gap, speed and acceleration, smoothed over the measurements.
+    """Tracking filter for one road user: gap, speed and acceleration.
 
-    The speed passes an alpha-beta filter, critically damped, which follows a constant acceleration without a
-    lag; the gap is carried on with the closing speed in between, and so has none either.
+    The speed passes a critically damped g-h filter, which follows a constant acceleration without lag; the gap is
+    predicted with the closing speed and therefore has no lag either.
 
     Args:
         smoothing: time constant (s), > 0.
@@ -40,7 +41,7 @@ class Track:
         self._state = (0.0, 0.0, 0.0, 0.0)
 
     def __call__(self, t: float, name: str, own_speed: float, gap: float, speed: float) -> Target:
-        """Put in what was measured of `name` at time t (m, m/s); another road user begins a new track."""
+        """Add a measurement of `name` at time t (s): gap (m) and speed (m/s). A new name restarts the filter."""
         dt = t - self._last
         self._last = t
         if name != self._name:
@@ -61,15 +62,15 @@ class Track:
         return gap if gap > 0.0 else 0.0, own_speed - speed
 
     def lose(self) -> None:
-        """Forget the road user: it is out of the path."""
+        """Stop tracking: there is no road user in the path."""
         self._name = ""
 
 
 class RangeSensor:
-    """A forward-looking radar that measures the nearest road user in the own path.
+    """A forward-looking radar that measures the nearest road user in the ego's path.
 
-    Measurements come every `period` with Gaussian noise and hold until the next one. A road user is
-    in the path when the lateral clearance between the two rectangles is below `margin`.
+    A measurement is taken every `period`, with Gaussian noise, and is held until the next one. A road user is
+    in the path if the lateral clearance between the two rectangles is below `margin`.
 
     Args:
         rng: source of the noise.
@@ -78,7 +79,7 @@ class RangeSensor:
         margin: lateral clearance up to which a road user counts as in the path (m).
         gap_noise: standard deviation of the gap (m).
         speed_noise: standard deviation of the closing speed (m/s).
-        smoothing: time constant of the `Track` that it keeps (s); 0: the measurements as they are.
+        smoothing: time constant of the `Track` (s); 0: unfiltered measurements.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class RangeSensor:
         self._held: Target | None = None
 
     def __call__(self, t: float, own: State, others: tuple[State, ...]) -> Target | None:
-        """Return the latest measurement at time t; None where nothing is in the path."""
+        """Return the latest measurement at time t (s); None if nothing is in the path."""
         tick = int(t / self._period + 1e-6)
         if tick < self._next:
             return self._held
@@ -122,7 +123,7 @@ class RangeSensor:
         return held
 
     def _draw(self, tick: int) -> list[float]:
-        """Return the noise of one tick: the same whatever was in the path before."""
+        """Return the noise of one measurement, which does not depend on what was in the path before."""
         while tick >= len(self._buffer):
             self._buffer += (self._rng.standard_normal((_BLOCK, 2)) * self._noise).tolist()
         return self._buffer[tick]

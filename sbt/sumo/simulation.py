@@ -171,7 +171,7 @@ class SumoSimulation:
     def build_scene(self, values: Mapping[str, float], seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
         values = plain_values(values)
-        return self.scene(values, self.ego.bound(values), stream(seed, "scene"))
+        return self.scene(values, self.ego.bind(values), stream(seed, "scene"))
 
     def setup(self, scene: Scene, replicas: int = 1) -> Setup:
         """Return what SUMO is loaded from for a scene."""

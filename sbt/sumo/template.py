@@ -1,9 +1,9 @@
-"""The user's own SUMO files with `${...}` in their attributes, filled with numbers and nothing else.
+"""SUMO files with placeholders `${...}` in attribute values, which are replaced by numbers.
 
-What stands between the braces is a formula over inputs (`${gap}`, `${100 + gap}`, `${v / 3.6}`). Every
-other byte stays as it is. A file without placeholders, also in what it includes, is used where it lies;
-of the others a filled copy is written. Document types and entities are refused: a file must not make
-SUMO read another one behind the user's back.
+A placeholder is a formula over the inputs (`${gap}`, `${100 + gap}`, `${v / 3.6}`); all other bytes of a file
+are copied unchanged. Files without placeholders, also in the files they include, are used in place; of the
+others, filled copies are written. Document types and entities are refused, as they could make SUMO read
+files that the user does not know of.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from sbt.problem.outcome import Status
 __all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
 
 _PLACEHOLDER = re.compile(r"\$\{([^{}]*)\}")
-_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
+_START_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
 _REFERRING = ("include", "variableSpeedSign", "rerouter")
-"""Elements whose `href` or `file` SUMO reads, relative to the file they stand in."""
+"""Elements whose `href` or `file` names another file, relative to the file that contains the element."""
 _VEHICLES = ("vehicle", "trip", "flow")
 
 
 @dataclass(frozen=True)
 class Placeholder:
-    """One placeholder: its formula, and where it stands (`file:line:column`)."""
+    """A placeholder: its formula, and its place as `file:line:column`."""
 
     formula: Expression
     place: str
@@ -42,7 +42,7 @@ class Placeholder:
 
 @dataclass(frozen=True)
 class _Part:
-    """A stretch of a file that is not copied as it is: a placeholder, or the name of another file."""
+    """Bytes of a file that are replaced in a copy: a placeholder, or the name of another file."""
 
     start: int
     end: int
@@ -51,9 +51,9 @@ class _Part:
 
 
 class Vehicle(NamedTuple):
-    """What a file says of the start of a vehicle, trip or flow, as it is written; None where it says nothing.
+    """Departure attributes of a vehicle, trip or flow as text; None for those that are not given.
 
-    `place` is its line and column, `varies` whether any of its attributes has a placeholder.
+    `place` is its line and column, `varies` whether any of its attributes contains a placeholder.
     """
 
     tag: str
@@ -67,14 +67,14 @@ class Vehicle(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """One XML file of the user.
+    """One XML file.
 
     Attributes:
         path: absolute.
-        root: name and attributes of its outermost element.
+        root: name and attributes of the root element.
         parts: what is replaced in a copy, in order.
-        vehicles: its vehicles, trips and flows by id.
-        data: its bytes, kept only where there are parts to replace.
+        vehicles: vehicles, trips and flows by id.
+        data: the bytes of the file; empty if there is nothing to replace.
     """
 
     path: Path
@@ -85,50 +85,50 @@ class Template:
 
     @cached_property
     def varying(self) -> tuple[str, ...]:
-        """Ids of the vehicles with a placeholder."""
+        """Ids of the vehicles with placeholders."""
         return tuple(name for name, vehicle in self.vehicles.items() if vehicle.varies)
 
     @cached_property
     def includes(self) -> tuple[Template, ...]:
-        """The files it includes, as templates."""
+        """The included files."""
         return tuple(template(p.target) for p in self.parts if p.target is not None)
 
-    def tree(self, above: tuple[Path, ...] = ()) -> Iterator[Template]:
-        """Yield the file and all that it includes.
+    def tree(self, ancestors: tuple[Path, ...] = ()) -> Iterator[Template]:
+        """Yield this file and all files that it includes, directly or not.
 
         Raises:
-            InputError: a file includes itself, or one of them is no proper file.
+            InputError: a file includes itself, or a file is not as required.
         """
-        if self.path in above:
+        if self.path in ancestors:
             raise InputError(f"a SUMO file must not include itself, but {self.path} does")
         yield self
         for inner in self.includes:
-            yield from inner.tree((*above, self.path))
+            yield from inner.tree((*ancestors, self.path))
 
     @cached_property
     def placeholders(self) -> tuple[Placeholder, ...]:
-        """All placeholders, those of included files too."""
+        """All placeholders, including those of included files."""
         return tuple(p.placeholder for t in self.tree() for p in t.parts if p.placeholder is not None)
 
     def write(self, values: Mapping[str, float], folder: Path) -> Path:
-        """Return the file with the placeholders filled: a copy in `folder`, or the file itself where it has none.
+        """Return the file with its placeholders filled: a copy in `folder`, or the file itself if it has none.
 
         Raises:
             RunError: a formula is not finite for these values.
         """
         if not self.placeholders:
             return self.path
-        copied, at = [], 0
+        pieces, at = [], 0
         for part in self.parts:
-            copied += [self.data[at : part.start], self._replaced(part, values, folder)]
+            pieces += [self.data[at : part.start], self._replacement(part, values, folder)]
             at = part.end
         name = self.path.name.removesuffix(".gz")
         target = folder / f"{abs(hash(self.path)):x}-{name}"
-        target.unlink(missing_ok=True)  # a simulation that ends may still hold the old one open
-        target.write_bytes(b"".join([*copied, self.data[at:]]))
+        target.unlink(missing_ok=True)  # the previous simulation may still have the old copy open
+        target.write_bytes(b"".join([*pieces, self.data[at:]]))
         return target
 
-    def _replaced(self, part: _Part, values: Mapping[str, float], folder: Path) -> bytes:
+    def _replacement(self, part: _Part, values: Mapping[str, float], folder: Path) -> bytes:
         if part.placeholder is not None:
             return number(part.placeholder, values).encode()
         if part.target is None:
@@ -138,21 +138,21 @@ class Template:
 
 
 def placeholders(text: str, place: str) -> tuple[Placeholder, ...]:
-    """Return the placeholders of one value.
+    """Return the placeholders in a text.
 
     Raises:
-        InputError: one is no formula; the message begins with the place.
+        InputError: one of them is not a formula; the message begins with the place.
     """
     return tuple(_placeholder(match.group(1), place) for match in _PLACEHOLDER.finditer(text))
 
 
 def fill(text: str, values: Mapping[str, float], place: str = "") -> str:
-    """Return a value with its placeholders filled."""
+    """Return a text with its placeholders filled."""
     return _PLACEHOLDER.sub(lambda match: number(_placeholder(match.group(1), place), values), text)
 
 
 def number(placeholder: Placeholder, values: Mapping[str, float]) -> str:
-    """Return the value of a placeholder as SUMO reads it; whole numbers without a point, for lanes and counts.
+    """Return the value of a placeholder as text; whole numbers have no decimal point, so that they can be lanes and counts.
 
     Raises:
         RunError: it is not finite.
@@ -174,7 +174,7 @@ def _placeholder(text: str, place: str) -> Placeholder:
 
 
 def _read(path: Path) -> bytes:
-    """Return the bytes of a file, unpacked."""
+    """Return the bytes of a file, decompressed if it is gzipped."""
     try:
         data = path.read_bytes()
         return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
@@ -184,11 +184,11 @@ def _read(path: Path) -> bytes:
 
 @cache
 def template(path: Path) -> Template:
-    """Return one file of the user; read once a process.
+    """Parse an XML file; each file is read once per process.
 
     Raises:
-        InputError: it cannot be read, is no well-formed XML, declares a document type or entities, or has a
-            placeholder that is no formula; the message begins with file, line and column.
+        InputError: it cannot be read, is not well-formed XML, declares a document type or entities, or has a
+            placeholder that is not a formula; the message begins with file, line and column.
     """
     data = _read(path)
     if b"\0" in data[:64]:
@@ -197,7 +197,7 @@ def template(path: Path) -> Template:
     roots: list[tuple[str, Mapping[str, str]]] = []
     parts: list[_Part] = []
     vehicles: dict[str, Vehicle] = {}
-    every = b"${" in data or any(b"<" + tag.encode() in data for tag in _REFERRING)
+    has_parts = b"${" in data or any(b"<" + tag.encode() in data for tag in _REFERRING)
 
     def place() -> str:
         return f"{path}:{parser.CurrentLineNumber}:{parser.CurrentColumnNumber + 1}"
@@ -208,14 +208,14 @@ def template(path: Path) -> Template:
     def start(tag: str, attributes: dict[str, str]) -> None:
         if not roots:
             roots.append((tag, attributes))
-            if tag == "net" and not every:  # large, and only its root matters
+            if tag == "net" and not has_parts:  # networks are large, and only the root is needed
                 parser.StartElementHandler = None
         if tag in _VEHICLES and "id" in attributes:
             at = (parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
-            varies = every and any("${" in value for value in attributes.values())
-            asked = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane"))
-            vehicles[attributes["id"]] = Vehicle(tag, at, varies, *asked)
-        if every and (tag in _REFERRING or any("${" in value for value in attributes.values())):
+            varies = has_parts and any("${" in value for value in attributes.values())
+            departure = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane"))
+            vehicles[attributes["id"]] = Vehicle(tag, at, varies, *departure)
+        if has_parts and (tag in _REFERRING or any("${" in value for value in attributes.values())):
             parts.extend(_parts(path, data, parser.CurrentByteIndex, tag, place()))
 
     parser.StartDoctypeDeclHandler = refuse
@@ -229,12 +229,12 @@ def template(path: Path) -> Template:
 
 
 def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_Part]:
-    """Yield the placeholders and file names of the tag that begins at a byte."""
-    found = _TAG.match(data, at)
-    if found is None:
+    """Yield the placeholders and file names of the start tag at a byte offset."""
+    start_tag = _START_TAG.match(data, at)
+    if start_tag is None:
         return
-    text = found.group()
-    taken: list[_Part] = []
+    text = start_tag.group()
+    parts: list[_Part] = []
     if tag in _REFERRING:
         for match in _REFERENCE.finditer(text):
             name = match.group(2)[1:-1].decode()
@@ -242,7 +242,7 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_
             if tag == "include" and not target.is_file():
                 raise InputError(f"{place}: an included file must exist, but got '{name}'")
             if target.is_file():
-                taken.append(_Part(at + match.start(2), at + match.end(2), target=target))
+                parts.append(_Part(at + match.start(2), at + match.end(2), target=target))
     for match in re.finditer(_PLACEHOLDER.pattern.encode(), text):
-        taken.append(_Part(at + match.start(), at + match.end(), placeholder=_placeholder(match.group(1).decode(), place)))
-    yield from sorted(taken, key=lambda part: part.start)
+        parts.append(_Part(at + match.start(), at + match.end(), placeholder=_placeholder(match.group(1).decode(), place)))
+    yield from sorted(parts, key=lambda part: part.start)

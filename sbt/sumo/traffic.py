@@ -1,8 +1,8 @@
-"""Background traffic: columns of cars that SUMO's own models drive, drawn from the run's generator.
+"""Background traffic: random streams of cars that SUMO's models drive.
 
-A column is there from the first step, spread over the road that leads to where it matters, so that a run
-needs no warm-up and every car's start can be verified. What SUMO draws while they drive (the
-imperfection `sigma` of its drivers) follows from the run's seed.
+All cars of a stream are inserted in the first step, along the road that leads to the place of interest, so that
+a run needs no warm-up and every initial state can be verified. Random numbers that SUMO draws on the way (the
+imperfection `sigma` of its drivers) are determined by the seed of the run.
 """
 
 from __future__ import annotations
@@ -16,23 +16,28 @@ from sbt.sumo.actors import Actor, VehicleType
 from sbt.sumo.ego import SUMO, Ego
 from sbt.sumo.formatting import format_number
 
-__all__ = ["DRIVER", "TrafficStream", "ego_type"]
+__all__ = ["DEFAULT_DRIVER", "MIN_HEADWAY", "TrafficStream", "ego_type"]
 
-DRIVER = (("carFollowModel", "Krauss"), ("accel", "2.6"), ("decel", "4.5"), ("emergencyDecel", "9"), ("minGap", "2"),
-          ("tau", "1"), ("sigma", "0.5"), ("sigmaStep", "1"), ("speedDev", "0"))  # fmt: skip
-"""SUMO's default passenger car, every number given: SUMO would draw what is left out. The imperfection is drawn once a
-second, which makes it independent of the step."""
+DEFAULT_DRIVER = (("carFollowModel", "Krauss"), ("accel", "2.6"), ("decel", "4.5"), ("emergencyDecel", "9"), ("minGap", "2"),
+                  ("tau", "1"), ("sigma", "0.5"), ("sigmaStep", "1"), ("speedDev", "0"))  # fmt: skip
+"""SUMO's default passenger car, with all values given because SUMO draws missing ones at random. The imperfection is drawn
+once per second, so that it does not depend on the step."""
 MIN_HEADWAY = 1.0
-"""Smallest headway from front to front in a column (s) beyond the time a car needs to cover its own length."""
+"""Smallest time headway in a stream (s), from the rear of a car to the front of the next one."""
 
 
 def ego_type(ego: Ego, speed: float, limit: float) -> VehicleType:
-    """Return the type of an ego of 5.0 m x 1.8 m that wants to drive at a speed (m/s) where this limit (m/s) holds.
+    """Return the vehicle type of an ego in traffic, 5.0 m x 1.8 m large.
 
-    Its driver is perfect (`sigma` 0) unless the ego's settings say otherwise.
+    Its driver has no imperfection (`sigma` 0) unless the settings of the ego give one.
+
+    Args:
+        ego: the AV under test.
+        speed: desired speed (m/s).
+        limit: speed limit of the road (m/s), to which SUMO's speed factor refers.
     """
-    margin = 1.0 + 1e-9  # SUMO refuses a start above the desired speed, which it computes as factor times limit
-    attributes = dict(DRIVER) | {"sigma": "0", "speedFactor": format_number(speed / limit * margin)}
+    margin = 1.0 + 1e-9  # SUMO refuses an initial speed above the desired one, which it computes as factor times limit
+    attributes = dict(DEFAULT_DRIVER) | {"sigma": "0", "speedFactor": format_number(speed / limit * margin)}
     if ego.kind != SUMO:
         return VehicleType(attributes=(("speedFactor", format_number(max(speed / limit, 1.0) * margin)),))
     del attributes["carFollowModel"]
@@ -41,15 +46,15 @@ def ego_type(ego: Ego, speed: float, limit: float) -> VehicleType:
 
 @dataclass(frozen=True)
 class TrafficStream:
-    """Cars one behind the other in a lane, at random headways of a shifted exponential law.
+    """A stream of cars in one lane, with time headways from a shifted exponential distribution.
 
     Args:
-        name: cars are called `name_0`, `name_1`, ... from the front.
-        route: edges; long enough that no car arrives before the run is over.
+        name: prefix of the cars' names `name_0`, `name_1`, ..., numbered from the front.
+        route: edges; so long that no car arrives before the run is over.
         lane: index on the first edge.
         limit: speed limit of the road (m/s), to which SUMO's speed factors refer.
-        spread: standard deviation of the cars' speed factors (normal, at most two deviations off).
-        type: rectangle and further vType attributes.
+        spread: standard deviation of the cars' speed factors (normal, truncated at two standard deviations).
+        type: vehicle type of the cars.
     """
 
     name: str
@@ -57,28 +62,28 @@ class TrafficStream:
     lane: int
     limit: float
     spread: float = 0.1
-    type: VehicleType = field(default_factory=lambda: VehicleType(attributes=DRIVER))
+    type: VehicleType = field(default_factory=lambda: VehicleType(attributes=DEFAULT_DRIVER))
 
-    def driven(self, **attributes: float) -> TrafficStream:
-        """Return the column with other vType attributes of its drivers, such as `tau`."""
+    def with_driver(self, **attributes: float) -> TrafficStream:
+        """Return the stream with other vType attributes of its drivers, such as `tau`."""
         changed = dict(self.type.attributes) | {name: format_number(value) for name, value in attributes.items()}
         return replace(self, type=replace(self.type, attributes=tuple(changed.items())))
 
     def draw(
         self, rng: np.random.Generator, flow: float, speed: float, first: float, last: float, *, start: float | None = None
     ) -> tuple[Actor, ...]:
-        """Return the cars between two positions, from the front one backwards.
+        """Draw the cars between two positions, from the foremost one backwards.
 
         Args:
-            rng: of the run.
-            flow: cars an hour; the mean distance of two fronts is 3600 speed / flow.
-            speed: mean desired speed (m/s); a car starts with its own.
-            first: foremost position of a front on the first edge (m).
-            last: hindmost position (m).
-            start: mean speed at the start, where another limit holds than where the cars matter (m/s); None: `speed`.
+            rng: random generator of the run.
+            flow: cars per hour; the mean distance of two fronts is 3600 speed / flow.
+            speed: mean desired speed (m/s); each car starts at its own.
+            first: foremost position of a front bumper on the first edge (m).
+            last: rearmost position (m).
+            start: mean initial speed, where another limit holds than at the place of interest (m/s); None: `speed`.
 
         Raises:
-            InputError: more cars than fit.
+            InputError: the flow exceeds the capacity of the lane.
         """
         pace = speed if start is None else start
         shortest = MIN_HEADWAY + self.type.length / pace

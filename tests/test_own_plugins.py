@@ -1,0 +1,284 @@
+"""Metamodels and acquisitions of one's own: any class with fit, any function of a prediction, in real campaigns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sbt.acquisitions import boundary, greedy, is_greedy, log_scores
+from sbt.cli import app
+from sbt.config.load import parse
+from sbt.errors import InputError
+from sbt.metamodels.base import build
+from sbt.metamodels.prediction import Prediction
+from sbt.plugins import load
+from sbt.problem.requirement import CriticalInterval
+from sbt.store.database import Store
+from sbt.testing import ContractError, check_acquisition, check_metamodel
+from sbt.workflows.running import run_campaign
+
+PLUGINS = '''
+import numpy as np
+
+from sbt.acquisitions import greedy
+from sbt.metamodels.prediction import Prediction
+from sbt.testbeds import analytic
+
+
+class Quadratic:
+    def __init__(self, ridge=1e-6, *, least=0.05):
+        self.ridge, self.least = ridge, least
+
+    def fit(self, u, y, rng):
+        basis = lambda v: np.column_stack([np.ones(len(v)), v, v**2, v**3])
+        b, (shift, scale) = basis(u), (y.mean(), y.std() or 1e-3)
+        w = np.linalg.solve(b.T @ b + self.ridge * np.eye(b.shape[1]), b.T @ ((y - shift) / scale))
+        sigma = max(np.std(y - shift - scale * (b @ w)), self.least * scale)
+        return lambda v: Prediction.gaussian(shift + scale * (basis(v) @ w), np.full(len(v), sigma))
+
+
+QUADRATIC = Quadratic(ridge=1e-4)
+
+
+class Nearest:
+    """Doubts what is far from a run."""
+
+    def fit(self, u, y, rng):
+        def predict(v):
+            distance = np.linalg.norm(v[:, None, :] - u[None], axis=2)
+            near = distance.argmin(axis=1)
+            return Prediction.gaussian(y[near], 0.02 + 3 * distance[np.arange(len(v)), near])
+
+        return predict
+
+
+class Tuple:
+    def fit(self, u, y, rng):
+        return lambda v: (np.zeros(len(v)), np.ones(len(v)))
+
+
+class Needy:
+    def __init__(self, degree, /, order):
+        pass
+
+    def fit(self, u, y, rng):
+        return None
+
+
+def score(prediction, critical, log_density):
+    return np.log(prediction.sigma)
+
+
+@greedy
+def farthest(prediction, critical, log_density):
+    return np.log(prediction.sigma)
+
+
+class Wide:
+    """An object that is declared greedy by its attribute."""
+
+    selection = "greedy"
+
+    def __call__(self, prediction, critical, log_density):
+        return prediction.sigma
+
+
+WIDE = Wide()
+
+
+def broken(prediction, critical, log_density):
+    return prediction.sgima  # marked
+
+
+PLANE = analytic(
+    lambda x: 3 * (x[:, 0] - 0.5) + x[:, 1] ** 2, inputs={"a": (0.0, 0.5), "b": (0.0, 0.5)}, critical=(-np.inf, 0.0), name="plane"
+)
+'''
+Run = Callable[..., tuple[dict[str, Any], np.ndarray]]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "own.py").write_text(PLUGINS)
+    return tmp_path
+
+
+@pytest.fixture
+def run(folder: Path) -> Run:
+    """Run a campaign; return its result and x of the runs (n, d)."""
+
+    def runner(store: str = "s", **keys: Any) -> tuple[dict[str, Any], np.ndarray]:
+        settings = {"campaign": "boundary", "scenario": "own.py:PLANE", "budget": 60, "initial": 20, "batch": 20, "seed": 1,
+                    "executor": {"kind": "serial"}, "store": str(folder / store), **keys}  # fmt: skip
+        text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in settings.items())
+        result = run_campaign(parse(text, folder=folder), report=False)
+        with Store.read(folder / store) as written:
+            return result, written.history().x
+
+    return runner
+
+
+def plain(name: str, folder: Path) -> Any:
+    return load("metamodels", f"own.py:{name}", folder)
+
+
+def test_a_plain_class_obeys_the_contract(folder):
+    check_metamodel(build(plain("Quadratic", folder)), dimensions=(1, 2))
+
+
+def test_settings_are_the_keyword_arguments_of_the_constructor(folder):
+    kind = plain("Quadratic", folder)
+    made = build(kind, settings={"ridge": 0.5, "least": 0.1})
+    assert (made.ridge, made.least) == (0.5, 0.1)
+    assert build(plain("QUADRATIC", folder)).ridge == 1e-4
+    assert isinstance(build(plain("Nearest", folder)), plain("Nearest", folder))
+
+
+class Missing:
+    def __init__(self, degree, order, seed=0):
+        self.fit = None
+
+
+class Refuses:
+    def __init__(self, degree=1):
+        assert degree < 5, "too wiggly"  # noqa: PT018
+
+    def fit(self, u, y, rng):
+        return None
+
+
+class TwoArguments:
+    def fit(self, u, y):
+        return None
+
+
+class Anything:
+    def __init__(self, **settings):
+        self.settings = settings
+
+    def fit(self, u, y, rng):
+        return None
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (Refuses, {"degre": 2}, r"Refuses takes a setting of degree, but got 'degre' \(did you mean 'degree'\?\)"),
+        (Refuses, {"degree": 7}, r"Refuses does not take the settings \{'degree': 7\}: AssertionError: too wiggly"),
+        (Missing, {"seed": 1}, "Missing needs the settings degree, order, but got seed"),
+        (Missing, {"order": 1}, "Missing needs the setting degree, but got order"),
+        (Missing, {"degree": 1, "order": 1}, r"must have a method fit\(u, y, rng\), but Missing has not"),
+        (TwoArguments, {}, r"must have a method fit\(u, y, rng\), but TwoArguments has not: too many positional arguments"),
+        (Refuses(), {"degree": 1}, "Refuses is an object, which takes no settings, but got degree"),
+    ],
+)
+def test_what_a_class_cannot_take_is_said(kind, settings, message):
+    with pytest.raises(InputError, match=message):
+        build(kind, settings=settings)
+
+
+def test_positional_only_arguments_and_presets_of_nobody_are_refused(folder):
+    with pytest.raises(InputError, match="the constructor of Needy takes degree by position only"):
+        build(plain("Needy", folder), settings={"order": 2})
+    with pytest.raises(InputError, match=r"Anything takes a preset of \(none\), but got 'paper'"):
+        build(Anything, "paper")
+    with pytest.raises(InputError, match=r"Refuses takes a preset of \(none\)"):
+        build(Refuses(), "paper")
+    assert build(Anything, settings={"whatever": 1}).settings == {"whatever": 1}
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "falsification", "estimation"])
+def test_a_plain_class_runs_a_campaign(run, campaign):
+    metamodel = {"kind": "own.py:Quadratic", "ridge": 1e-4}
+    result, x = run(campaign=campaign, metamodel=metamodel)
+    assert len(x) >= 60  # confirmations come beside the budget
+    again, same = run("again", campaign=campaign, metamodel=metamodel)
+    np.testing.assert_array_equal(x, same)
+    assert again["conclusion"] == result["conclusion"]
+
+
+def test_objects_and_recalibration_work_in_campaigns(run, folder):
+    result, _ = run(metamodel={"kind": "own.py:QUADRATIC", "recalibrate": True})
+    assert result["runs"] == 60
+    points = folder / "points.csv"
+    points.write_text("a,b\n0.1,0.1\n0.4,0.4\n")
+    done = CliRunner().invoke(app, ["predict", str(folder / "s"), "--inputs", str(points), "--json"])
+    assert done.exit_code == 0, done.output
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "falsification", "estimation"])
+def test_what_is_no_prediction_is_said_with_the_metamodels_name(run, campaign):
+    with pytest.raises(Exception, match=r"metamodel Tuple .*must return a Prediction, .* but returned a tuple") as caught:
+        run(campaign=campaign, metamodel={"kind": "own.py:Tuple"})
+    assert type(caught.value).__name__ == "SbtError"
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "falsification"])
+@pytest.mark.parametrize("kind", ["importance", "own.py:score"])
+def test_scores_above_zero_are_drawn_from(run, campaign, kind):
+    """The density on [0, 0.5]^2 is 4, and so is the largest score of `importance`; log sigma has no bound."""
+    _, x = run(campaign=campaign, acquisition={"kind": kind}, metamodel={"kind": "own.py:Nearest"}, validation={"share": 0})
+    assert len(np.unique(x, axis=0)) >= 60
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "falsification"])
+@pytest.mark.parametrize("kind", ["straddle", "expected_feasibility", "u", "own.py:farthest", "own.py:WIDE"])
+def test_greedy_acquisitions_are_chosen_greedily(run, campaign, kind):
+    """Of the same budget: the highest scores, none of them near another."""
+    keys = {"campaign": campaign, "metamodel": {"kind": "own.py:Nearest"}, "validation": {"share": 0}, "stop": None}
+    keys = {k: v for k, v in keys.items() if v is not None}
+    _, x = run(acquisition={"kind": kind}, **keys)
+    u = x[:60] / 0.5
+    gaps = np.linalg.norm(u[:, None] - u[None], axis=2)[np.triu_indices(len(u), 1)]
+    if kind in ("own.py:farthest", "own.py:WIDE"):
+        _, random = run("random", acquisition={"kind": "even"}, **keys)
+        far = np.linalg.norm((random[:60] / 0.5)[:, None] - (random[:60] / 0.5)[None], axis=2)[np.triu_indices(60, 1)]
+        assert gaps.min() > far.min()
+    assert len(np.unique(u, axis=0)) == 60
+
+
+def test_an_error_of_an_acquisition_names_it_and_the_line(run, folder):
+    line = next(i for i, text in enumerate(PLUGINS.splitlines(), 1) if "# marked" in text)
+    with pytest.raises(InputError, match=rf"acquisition broken must score \d+ points, but raised AttributeError: .*own.py:{line}\)"):
+        run(acquisition={"kind": "own.py:broken"})
+
+
+GAUSSIAN = Prediction.gaussian([0.0, 1.0], [1.0, 2.0])
+
+
+def test_selection_is_declared(folder):
+    own = {name: load("acquisitions", f"own.py:{name}", folder) for name in ("score", "farthest", "WIDE")}
+    assert {name: is_greedy(each) for name, each in own.items()} == {"score": False, "farthest": True, "WIDE": True}
+    for each in own.values():
+        check_acquisition(each)
+
+    def other(prediction, critical, log_density):
+        return np.zeros(len(prediction))
+
+    assert greedy(other) is other
+    other.selection = "gredy"
+    with pytest.raises(InputError, match="must be 'draw' or 'greedy', but other has 'gredy'"):
+        is_greedy(other)
+    with pytest.raises(ContractError, match="must be 'draw' or 'greedy', but got 'gredy'"):
+        check_acquisition(other)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda p, c, d: np.zeros(1), r"must return shape \(2,\), but returned \(1,\)"),
+        (lambda p, c, d: p.mu * np.nan, "must return scores < inf, but returned nan"),
+        (lambda p, c, d: p.mu + np.inf, "must return scores < inf, but returned inf"),
+    ],
+)
+def test_scores_are_checked_where_they_are_made(wrong, message):
+    with pytest.raises(InputError, match=message):
+        log_scores(wrong, GAUSSIAN, CriticalInterval(high=0.0), np.zeros(2))
+    scores = log_scores(boundary, GAUSSIAN, CriticalInterval(high=0.0), np.zeros(2))
+    np.testing.assert_array_equal(scores, boundary(GAUSSIAN, CriticalInterval(high=0.0), np.zeros(2)))
