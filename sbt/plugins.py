@@ -24,7 +24,7 @@ __all__ = ["KINDS", "OBJECT", "Scope", "load", "names"]
 OBJECT = "object:"
 """Before the name of an object that was given in Python, where a name is asked for."""
 
-KINDS = ("scenarios", "metamodels", "acquisitions", "metrics", "controllers", "campaigns", "sources")
+KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
 
@@ -47,12 +47,12 @@ class Scope:
         Raises:
             PluginError: nothing has this name, or it was defined in Python and is not given here.
         """
-        if not name.startswith(OBJECT):
-            return load(kind, name, self.folder)
-        if (kind, name) not in self.objects:
+        if (kind, name) in self.objects:
+            return self.objects[kind, name]
+        if name.startswith(OBJECT):
             one, own = kind.removesuffix("s"), name.removeprefix(OBJECT)
             raise PluginError(f"the {one} '{own}' was defined in Python and must be given again: {one}={own}")
-        return self.objects[kind, name]
+        return load(kind, name, self.folder)
 
 
 @cache

@@ -19,14 +19,14 @@ import pytest
 from typer.testing import CliRunner
 
 from sbt.cli import app
-from sbt.config.load import load
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.geometry import part
 from sbt.store.database import Store
 from sbt.sumo.files import options_of_command
 from sbt.sumo.template import template
-from sbt.workflows.running import run_campaign
+from sbt.workflows.running import run_study
+from sbt.workflows.study import Study
 
 pytestmark = pytest.mark.sumo
 
@@ -76,7 +76,7 @@ def rows_of(path: Path) -> list[tuple[str, str]]:
     settings = {"campaign": "coverage", "scenario": str(path), "budget": 3, "initial": 3, "executor": {"kind": "serial"},
                 "store": str(store)}  # fmt: skip
     config.write_text(json.dumps(settings))
-    run_campaign(load(config), report=False)
+    run_study(Study.from_file(config), report=False)
     with Store.read(store) as found:
         return [(record.status, record.reason) for record in found.history().records]
 
@@ -371,13 +371,13 @@ def test_a_formula_is_a_metric_here_and_the_requirement_of_a_campaign(study, tmp
     config = tmp_path / "formula.yaml"
     config.write_text("campaign: coverage\nscenario: cut_in\nbudget: 12\ninitial: 12\nexecutor: {kind: serial}\n"
                       f"store: {tmp_path / 'f'}\nrequirement: {{stl: 'G(gap > 2)'}}\n")  # fmt: skip
-    assert run_campaign(load(config), report=False)["ok"] == 12
+    assert run_study(Study.from_file(config), report=False).ok == 12
     config.write_text(config.read_text().replace("gap > 2", "gab > 2"))
     with pytest.raises(InputError, match=r"formula.yaml:7:20: requirement.stl: stl, column 3: a signal must be one of"):
-        run_campaign(load(config), report=False)
+        run_study(Study.from_file(config), report=False)
     config.write_text(config.read_text().replace("cut_in", "testbed:four_branch_7"))
     with pytest.raises(InputError, match="needs the trace of a run"):
-        run_campaign(load(config), report=False)
+        run_study(Study.from_file(config), report=False)
 
 
 def test_a_stored_run_replays_bit_by_bit(study):

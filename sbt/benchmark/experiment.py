@@ -53,7 +53,7 @@ def run_benchmark(
     references, made = dict(loaded.references()), []
     todo = [cell for cell in all_cells if not is_done(cell)] if cells else []
     listener.message(f"{len(all_cells)} cells, {len(todo)} to do")
-    groups = groupby(todo, lambda cell: (cell.seed, cell.scenario)) if cells else ((("", name), ()) for name in references)
+    groups = groupby(todo, lambda cell: (cell.seed, cell.scenario)) if cells else [(("", name), ()) for name in references]
     for (_, scenario), group in groups:
         if reference and scenario in references:  # made when it is needed: early cells give early results
             listener.message(f"{scenario}: reference runs")

@@ -19,8 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sbt.errors import InputError
-from sbt.execution.worker import described
+from sbt.errors import InputError, described
 from sbt.problem.scenario import LogicalScenario
 
 __all__ = ["carry", "delivered"]
@@ -108,18 +107,17 @@ def _by_value(pickle: Any) -> Iterator[None]:
 
 def _own_modules() -> list[types.ModuleType]:
     """Return the modules that a fresh process could not import."""
-    installed = {Path(sysconfig.get_path(kind)).resolve() for kind in ("stdlib", "platstdlib", "purelib", "platlib")}
     here = {name: module for name, module in sys.modules.items() if getattr(module, "__name__", None) == name}
     candidates = {
         name: module for name, module in here.items()
-        if isinstance(module, types.ModuleType) and _maybe_own(name, module, installed)
+        if isinstance(module, types.ModuleType) and _maybe_own(name, module)
     }  # fmt: skip
     packages = {name.partition(".")[0] for name in candidates if not name.startswith("sbt_user_")}
     found = _importable(packages) if packages else {}
     return [m for name, m in candidates.items() if not _lies_in(m, found.get(name.partition(".")[0], ()))]
 
 
-def _maybe_own(name: str, module: types.ModuleType, installed: set[Path]) -> bool:
+def _maybe_own(name: str, module: types.ModuleType) -> bool:
     """Return whether a module may be a user's own: not of Python, not installed, not of this package."""
     package = name.partition(".")[0]
     if package in sys.stdlib_module_names or package in ("sbt", "__main__", "__mp_main__"):
@@ -127,7 +125,14 @@ def _maybe_own(name: str, module: types.ModuleType, installed: set[Path]) -> boo
     file = getattr(module, "__file__", None)
     if file is None or name.startswith("sbt_user_"):
         return name.startswith("sbt_user_")
-    return not installed & set(Path(file).resolve().parents)
+    return not _is_installed(str(file))
+
+
+@functools.cache
+def _is_installed(file: str) -> bool:
+    """Return whether a file lies where Python and packages are installed; asked of thousands of modules at every carrying."""
+    places = (Path(sysconfig.get_path(kind)).resolve() for kind in ("stdlib", "platstdlib", "purelib", "platlib"))
+    return not set(Path(file).resolve().parents).isdisjoint(places)
 
 
 def _importable(packages: set[str]) -> dict[str, list[str]]:
