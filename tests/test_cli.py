@@ -395,9 +395,13 @@ def test_a_folder_without_a_campaign_is_refused(folder: Path, verb: str):
     assert "must be the folder of a campaign" in done.stderr
 
 
-def test_report_prints_its_path(folder: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sbt_run, "rebuild_report", lambda folder: folder / "report.html")
-    assert call("report", str(store(folder / "s"))).stdout.strip() == str(folder / "s" / "report.html")
+def test_report_writes_the_same_page_again_and_prints_its_path(folder: Path):
+    assert call("run", "c.yaml", "--quiet", "--store", str(folder / "s")).exit_code == 0
+    page = folder / "s" / "report.html"
+    before = page.read_bytes()
+    page.unlink()
+    assert call("report", str(folder / "s")).stdout.strip() == str(page)
+    assert page.read_bytes() == before
 
 
 def test_progress_without_a_terminal_is_a_line_an_iteration(capsys: pytest.CaptureFixture[str]):

@@ -26,7 +26,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.html import write_report
-from sbt.report.projection import influence_from_runs, influence_on_probability, most_telling_pairs, probability_plane
+from sbt.report.projection import influence_from_runs, influence_on_probability, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words, warnings_for
 from sbt.store.database import PlannedRun, Store
@@ -310,11 +310,11 @@ def test_influence_finds_what_matters(tmp_path):
         order = influence_from_runs(store.history(), scenario.requirement)
     assert order.argmax() == 1
     assert order.max() == 1.0
-    pairs = most_telling_pairs(np.array([0.1, 1.0, 0.5, 0.2, 0.0]))
+    pairs = most_influential_pairs(np.array([0.1, 1.0, 0.5, 0.2, 0.0]))
     assert pairs[0] == (1, 2)
     assert len(pairs) == 6
     assert all(4 not in pair for pair in pairs)
-    assert most_telling_pairs(np.zeros(20)) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert most_influential_pairs(np.zeros(20)) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
 def test_plane_is_the_mean_over_the_other_inputs():

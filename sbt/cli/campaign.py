@@ -17,7 +17,7 @@ from sbt.errors import InputError
 __all__ = ["export", "merge", "report", "run", "status"]
 
 _SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
-"""What `status` tells of the last validation."""
+"""Scores of the last validation that `status` prints."""
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign (its store).")]
 FailOnCritical = Annotated[bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")]
@@ -79,7 +79,7 @@ def merge(
 
 
 def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path | None, as_json: bool) -> None:
-    """Print the result of a campaign, and end with the exit code that it deserves."""
+    """Print the result of a campaign; raise the exit of its verdict, where that is not 0."""
     if junit is not None:
         from sbt.report.junit import write_junit
 
@@ -109,7 +109,7 @@ def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
         if key == "convergence":
             continue  # a figure of the report
         if key == "warnings":
-            lines += [f"  warning: {told}" for told in value]
+            lines += [f"  warning: {warning}" for warning in value]
         elif isinstance(value, Mapping):
             lines.append(f"  {key.replace('_', ' ')}")
             lines += [f"    {name.replace('_', ' '):<24}{_number(item)}" for name, item in value.items()]
@@ -142,7 +142,7 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Repeat until the campaign is finished.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Say how far a campaign is, also while it runs."""
+    """Print the progress of a campaign, also while it runs."""
     found = _status(folder)
     try:
         while watch and found["conclusion"] is None and not getattr(sys.stdout, "gone", False):

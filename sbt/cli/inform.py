@@ -54,7 +54,7 @@ def doctor(
     *,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Look at the environment: versions, SUMO, disk; say what to do where something is amiss."""
+    """Check the environment: versions, SUMO, disk; print advice where something is wrong."""
     with clean_stdout():
         from sbt.cli.doctor import examine
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["check", "simulate"]
 
-Isolation = Annotated[str, typer.Option(metavar="auto|fresh|reuse|replicas", help="How SUMO is kept between runs.")]
+Isolation = Annotated[str, typer.Option(metavar="auto|fresh|reuse|replicas", help="When SUMO is loaded.")]
 
 
 def simulate(
@@ -91,7 +91,7 @@ def check(
     isolation: Isolation = "auto",
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as one JSON object.")] = False,
 ) -> None:
-    """Try out the contract of a scenario: corners run, same seed same trace, also elsewhere and reused."""
+    """Check a scenario: its corners run, and one seed gives one trace, in every process and at every isolation level."""
     with clean_stdout():
         from sbt.workflows.front import check_target
 

@@ -1,4 +1,4 @@
-"""One self-contained page a campaign: what was asked, what was found, how far to trust it."""
+"""The report of a campaign as one self-contained page: the question, the result, and how reliable it is."""
 
 from __future__ import annotations
 
@@ -161,5 +161,5 @@ def _objects(configuration: Mapping[str, Any]) -> str:
 
 
 def _configuration(found: Findings) -> str:
-    """Return the configuration as the user would write it, or all that the store keeps of it."""
+    """Return the configuration as the user would write it, or the whole snapshot in the store."""
     return str(found.configuration.get("yaml") or json.dumps(found.configuration, indent=2, ensure_ascii=False))

@@ -1,4 +1,4 @@
-"""The tables of a report: cells with what is read, what is sorted by, and no markup."""
+"""The tables of a report: cells with a text and a key to sort by, without markup."""
 
 from __future__ import annotations
 
