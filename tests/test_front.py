@@ -180,7 +180,7 @@ def guarded() -> Any:
 STRETCHED = [sbt.Parameter("a", -1, 2, "m"), INPUTS[1]]
 MISSPELT = pd.DataFrame({"x.aa": [0.1], "b": [0.2]})
 WRONG = {
-    "keyword": (lambda s: sbt.run(campaign="boundary", scenario=scenario_of(), bugdet=3), r"'bugdet' \(did you mean 'budget'\?\)"),
+    "keyword": (lambda s: sbt.run(campaign="boundary", scenario=scenario_of(), bugdet=3), r"'bugdet' \(did you mean 'budget'"),
     "campaign": (lambda s: sbt.run(campaign="boundry", scenario=scenario_of()), r"did you mean 'boundary'"),
     "lock": (lambda s: unable(scenario_of(guarded()), s.parent / "lock"), r"variable 'lock' of guarded"),
     "other scenario": (lambda s: sbt.open(s, scenario=scenario_of(name="disk")), r"with scenario disc, but got disk"),
