@@ -214,7 +214,7 @@ def entry_points() -> list[tuple[str, str, str]]:
 def test_entry_points_exist(group, name, target):
     module, _, attribute = target.partition(":")
     found = getattr(importlib.import_module(module), attribute)
-    assert callable(found) or group in ("sbt.scenarios", "sbt.metrics")
+    assert callable(found) or group in ("sbt.scenarios", "sbt.metrics", "sbt.campaigns")
     if group in ("sbt.scenarios", "sbt.metrics"):
         assert found.name == name
 
