@@ -152,8 +152,9 @@ class CampaignKind:
             raise InputError(f"campaign '{name}' is known by its description only: its code must be at hand to run it")
 
         known = {f.name for f in fields(cls)}
-        given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in described.items() if k in known}
-        return cls(**{**given, "recipe": recipe})
+        given: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described.items() if key in known}
+        given["recipe"] = recipe
+        return cls(**given)
 
     def read(self, data: Mapping[str, Any]) -> Conclusion:
         """Return a conclusion from its JSON."""

@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,9 @@ from sbt.seeds import stream
 from sbt.store.history import Record
 from sbt.store.records import to_json
 from sbt.workflows.checking import check_scenario
-from sbt.workflows.front import run_campaign
-from sbt.workflows.result import Result
+
+if TYPE_CHECKING:
+    from sbt.workflows.result import Result
 
 __all__ = [
     "ContractError", "check_acquisition", "check_campaign", "check_metamodel", "check_metric", "check_sampler", "check_scenario",
@@ -221,6 +222,7 @@ def _ran(
     stop_after: int | None = None,
 ) -> tuple[Result[Any], list[Record]]:  # fmt: skip
     """Return the result of a small campaign and its runs without what may differ."""
+    from sbt.workflows.front import run_campaign
 
     def evaluate(values: Mapping[str, float], seed: int) -> dict[str, float]:
         del seed

@@ -87,8 +87,12 @@ class Plots:
 
         r, space = self.result, self.result.scenario.space
         if space.dimension == 1:
-            return figures.plot_metric(r.history, r.scenario.requirement, space, _axes(ax), unit=r.scenario.unit)
-        return figures.plot_runs(r.history, r.scenario.requirement, space, _axes(ax), pair=self._pair(x, y))
+            drawn = figures.plot_metric(r.history, r.scenario.requirement, space, _axes(ax), unit=r.scenario.unit)
+        else:
+            drawn = figures.plot_runs(r.history, r.scenario.requirement, space, _axes(ax), pair=self._pair(x, y))
+        if drawn.get_legend_handles_labels()[0]:
+            drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize="small", frameon=False)
+        return drawn
 
     def boundary(self, ax: Axes | None = None, *, x: str | None = None, y: str | None = None) -> Axes:
         """Draw P(critical) over two inputs, averaged over the others, with the runs that the metamodel learned from.
