@@ -102,7 +102,7 @@ class CampaignKind:
         target_aware: the metamodel may be told where the critical edge is; otherwise all of y counts.
         most_initial: the most runs that the default of `initial` takes.
         batch: default runs per iteration; None: as many as initial.
-        takes_gate: it takes the keys `gate` and `from`.
+        takes_gate: it takes the keys `gate` and `warm_start`.
     """
 
     description: str
