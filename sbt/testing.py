@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from sbt.acquisitions import Acquisition
 from sbt.campaigns.settings import CampaignKind, Settings
-from sbt.errors import RunError, SbtError
-from sbt.execution.worker import described
+from sbt.errors import RunError, SbtError, described
 from sbt.loop.stages import Campaign, Progress
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
