@@ -131,7 +131,7 @@ def test_a_gap_or_a_jump_begins_a_new_interval(tmp_path):
         ("a.xml.gz", as_xml(DRIVE), "must be whole"),
         ("a.csv", as_csv(DRIVE).replace("angle", "bearing"), "angle is missing"),
         ("a.csv", as_csv(DRIVE).replace("40.0", "forty", 1), "must be numbers"),
-        ("a.csv", as_csv([*DRIVE, DRIVE[0]]), "there once at a time"),
+        ("a.csv", as_csv([*DRIVE, DRIVE[0]]), "occur once per time step"),
         ("a.csv", "", "must be a table"),
         ("a.csv", as_csv([r | {"x": 13.4 + r["x"] * 1e-5} for r in DRIVE]), "fcd-output.geo"),
         ("a.txt", "", "must end in"),
