@@ -16,13 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+import sbt
 from sbt import testbeds
-from sbt.config.load import parse
-from sbt.loop.learner import chunked
 from sbt.metamodels.scores import scores
 from sbt.seeds import stream
-from sbt.store.database import Store
-from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 SIZES = (2, 5, 10, 20, 40)
 SEARCHES = ("hartmann6_1e-3", "needle_d4_1e-3")
@@ -30,38 +27,32 @@ BOUNDARY = "cut_in_crash:box"
 SIMULATION = 60.0
 
 
-def campaign(text: str, folder: str) -> dict:
-    loaded = parse(f"{text}\nexecutor: {{kind: serial}}\nstore: {folder}/store\n")
-    return {"loaded": loaded, "result": run_campaign(loaded, report=False)}
-
-
 def search(name: str, size: int, seed: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
-        text = (
-            f"campaign: falsification\nscenario: testbed:{name}\nseed: {seed}\nbudget: 400\ninitial: {max(size, 10)}\n"
-            f"batch: {size}\nstop: {{failures: 1}}"
-        )
-        result = campaign(text, folder)["result"]
-    first, seconds = result["conclusion"]["first_critical_run"], result["seconds"]
-    return {"value": first or 400, "hours": (result["iterations"] * SIMULATION + seconds["fit"] + seconds["propose"]) / 3600}
+        result = sbt.run(
+            campaign="falsification", scenario=f"testbed:{name}", seed=seed, budget=400, initial=max(size, 10), batch=size,
+            stop={"failures": 1}, executor="serial", store=f"{folder}/store", report=False,
+        )  # fmt: skip
+        first = result.conclusion.runs_to_first
+    return {"value": first or 400, "hours": hours(result)}
+
+
+def hours(result: sbt.Result) -> float:
+    seconds = result.summary["seconds"]
+    return (result.summary["iterations"] * SIMULATION + seconds["fit"] + seconds["propose"]) / 3600
 
 
 def boundary(size: int, seed: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
-        text = (
-            f"campaign: boundary\nscenario: 'testbed:{BOUNDARY}'\nseed: {seed}\nbudget: 100\ninitial: 20\nbatch: {size}\n"
-            "metamodel: {kind: gp}"
-        )
-        done = campaign(text, folder)
-        settings = settings_of(done["loaded"], assembly_of(done["loaded"]))
-        with Store.read(Path(folder) / "store") as store:
-            history = store.history()
-    space, seconds = settings.scenario.space, done["result"]["seconds"]
+        result = sbt.run(
+            campaign="boundary", scenario=f"testbed:{BOUNDARY}", seed=seed, budget=100, initial=20, batch=size, metamodel="gp",
+            executor="serial", store=f"{folder}/store", report=False,
+        )  # fmt: skip
+        space, learner, runs = result.scenario.space, result.study.learner, result.history.finished
     u = stream(99, "reference").random((20_000, space.dimension))
-    belief = chunked(settings.learner.train(history.finished), space.metamodel_inputs(u))
+    prediction = learner.on_inputs(learner.train(runs), len(runs))(u)
     y = testbeds.values(BOUNDARY, space.from_unit(u))
-    hours = (done["result"]["iterations"] * SIMULATION + seconds["fit"] + seconds["propose"]) / 3600
-    return {"value": scores(belief, y, settings.scenario.requirement.critical)["f1"], "hours": hours}
+    return {"value": scores(prediction, y, result.scenario.requirement.critical)["f1"], "hours": hours(result)}
 
 
 def main() -> None:

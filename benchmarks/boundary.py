@@ -15,52 +15,47 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sbt.config.load import parse
+import sbt
 from sbt.execution.local import LocalExecutor
-from sbt.loop.learner import Learner
+from sbt.execution.spec import ScenarioSpec
+from sbt.metamodels.scores import scores
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job
+from sbt.problem.scenario import LogicalScenario
 from sbt.seeds import run_seed, stream
-from sbt.store.database import Store
-from sbt.store.history import VALIDATION, History, Record
-from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 METRICS = ("precision_at_recall_90", "average_precision", "f1", "log_likelihood_critical", "calibration_error")
 
 
-def configuration(args: argparse.Namespace, campaign: str, seed: int, folder: str) -> str:
-    kind = args.acquisition if campaign == "boundary" else "even"
-    return (
-        f"campaign: {campaign}\nscenario: {args.scenario}\nseed: {seed}\nbudget: {args.budget}\ninitial: {args.batch}\n"
-        f"batch: {args.batch}\nmetamodel: {{kind: {args.metamodel}}}\nvalidation: {{share: 0}}\nstore: {folder}\n"
-        f"acquisition: {{kind: {kind}}}\n"
-    )
+def run(args: argparse.Namespace, campaign: str, seed: int, folder: str) -> sbt.Result:
+    return sbt.run(
+        campaign=campaign, scenario=args.scenario, seed=seed, budget=args.budget, initial=args.batch, batch=args.batch,
+        metamodel=args.metamodel, validation={"share": 0.0}, acquisition=args.acquisition if campaign == "boundary" else "even",
+        store=f"{folder}/store", report=False,
+    )  # fmt: skip
 
 
-def reference_set(args: argparse.Namespace, learner: Learner) -> History:
-    loaded = parse(configuration(args, "coverage", 0, "unused"))
-    parts, space = assembly_of(loaded), learner.scenario.space
+def reference_set(args: argparse.Namespace, scenario: LogicalScenario) -> tuple[Points, Vector]:
+    """Return x (n, d) and the metric (n,) of the reference runs, without those that failed."""
+    space = scenario.space
     x = space.from_unit(stream(99, "reference").random((args.reference, space.dimension)))
     jobs = [Job(i, dict(zip(space.names, map(float, row), strict=True)), run_seed(99, i)) for i, row in enumerate(x)]
-    records = []
-    with LocalExecutor(parts.spec, os.cpu_count() or 1, 60.0) as executor:
-        for o in executor.run(jobs):
-            job = jobs[o.index]
-            row = (o.index, VALIDATION, 0, job.inputs, job.seed, str(o.status), o.metrics, o.reason, None, 0.0, "", "")
-            records.append(Record(*row))
-    return History(space.names, tuple(sorted(records, key=lambda r: r.index)))
+    y = np.full(len(x), np.nan)
+    with LocalExecutor(ScenarioSpec(args.scenario), os.cpu_count() or 1, 60.0) as executor:
+        for outcome in executor.run(jobs):
+            y[outcome.index] = outcome.metrics.get(scenario.requirement.metric, np.nan)
+    good = np.isfinite(y)
+    return x[good], y[good]
 
 
-def on_boundary(history: History, reference: History, learner: Learner, radius: float) -> float:
-    space, requirement = learner.scenario.space, learner.scenario.requirement
-    tree = cKDTree(space.to_unit(reference.x))
-    critical = requirement.critical.contains(reference.y(requirement.metric))
-    near = tree.query_ball_point(space.to_unit(history.x), radius * np.sqrt(space.dimension))
+def on_boundary(x: Points, reference: tuple[Points, Vector], scenario: LogicalScenario, radius: float) -> float:
+    space, critical = scenario.space, scenario.requirement.critical.contains(reference[1])
+    tree = cKDTree(space.to_unit(reference[0]))
+    near = tree.query_ball_point(space.to_unit(x), radius * np.sqrt(space.dimension))
     return float(np.mean([len(i) > 0 and critical[i].any() and not critical[i].all() for i in near]))
 
 
@@ -78,22 +73,18 @@ def main() -> None:
     for seed in range(args.seeds):
         for campaign in shares:
             with tempfile.TemporaryDirectory() as folder:
-                loaded = parse(configuration(args, campaign, seed, str(Path(folder) / "store")))
-                run_campaign(loaded, report=False)
-                learner = settings_of(loaded, assembly_of(loaded)).learner
-                reference = reference or reference_set(args, learner)
-                with Store.read(Path(folder) / "store") as store:
-                    history = store.history()
+                result = run(args, campaign, seed, folder)
+                learner, scenario, history = result.study.learner, result.scenario, result.history
+                reference = reference or reference_set(args, scenario)
             for n in range(args.batch, args.budget + 1, args.batch):
-                seen = replace(history, records=history.records[:n])
-                belief = learner.fit(History(history.names, seen.records + reference.records))
+                runs = history.where(np.arange(len(history)) < n).finished
+                prediction = learner.on_inputs(learner.train(runs), len(runs))(scenario.space.to_unit(reference[0]))
+                found = scores(prediction, reference[1], scenario.requirement.critical)
                 for metric in METRICS:
-                    rows.setdefault((n, campaign), {}).setdefault(metric, []).append(belief.scores[metric])
-            later = replace(history, records=history.records[args.batch :])
-            shares[campaign].append(on_boundary(later, reference, learner, 0.02))
-    y = reference.y(learner.scenario.requirement.metric)
-    base = learner.scenario.requirement.critical.contains(y).mean()
-    print(f"{args.scenario}, {args.metamodel}, {args.seeds} seeds, {len(reference)} reference runs, base rate {base:.4f}\n")
+                    rows.setdefault((n, campaign), {}).setdefault(metric, []).append(found[metric])
+            shares[campaign].append(on_boundary(history.x[args.batch :], reference, scenario, 0.02))
+    base = scenario.requirement.critical.contains(reference[1]).mean()
+    print(f"{args.scenario}, {args.metamodel}, {args.seeds} seeds, {len(reference[1])} reference runs, base rate {base:.4f}\n")
     print("| runs | campaign | " + " | ".join(METRICS) + " |\n|---|---|" + "---|" * len(METRICS))
     for (n, campaign), found in sorted(rows.items()):
         cells = [f"{np.median(v):.3f} ({np.min(v):.3f} to {np.max(v):.3f})" for v in found.values()]

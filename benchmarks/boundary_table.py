@@ -30,17 +30,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+import sbt
 from sbt import testbeds
-from sbt.campaigns.settings import Settings
-from sbt.config.load import parse
 from sbt.execution.local import LocalExecutor
-from sbt.loop.learner import chunked
+from sbt.execution.spec import ScenarioSpec
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Job
+from sbt.problem.scenario import LogicalScenario
 from sbt.seeds import run_seed, stream
-from sbt.store.database import Store
-from sbt.store.tables import from_folder
-from sbt.workflows.running import assembly_of, run_campaign, settings_of
 
 TABLE = Path(__file__).parents[2] / "shared" / "data" / "dsiod_jaywalking"
 APART = 600  # rows
@@ -49,53 +46,53 @@ BUDGETS = {
     "testbed:cut_in_near_miss:box": 200, "testbed:hartmann6_1e-3:box": 200, "testbed:wavy_level_d3:box": 60,
     "table": 400, "cut_in": 100, "emergency_braking": 200, "jaywalking": 200,
 }  # fmt: skip
-GP = "{kind: gp, nu: 2.5, input_noise: false}"
+GP = {"kind": "gp", "nu": 2.5, "input_noise": False}
 """The process that `auto` falls back on at the critical edge."""
 SHOWN = ("precision_at_recall_90", "f1", "average_precision", "calibration_error")
 Test = tuple[Points, Mask, Vector]
 """x (n, d), whether each point is critical, and its weight."""
 
 
-def configuration(problem: str, method: str, seed: int, folder: Path, metamodel: str = "auto quick") -> str:
-    campaign = "coverage" if method == "even" else "boundary"
-    scenario = f"table:{folder / 'table'}" if problem == "table" else problem
+TABLE_REQUIREMENT = sbt.Requirement("min_dist*", -1e9, 0.0)
+
+
+def run(problem: str, method: str, seed: int, folder: Path, metamodel: str) -> sbt.Result:
     kind, _, preset = metamodel.partition(" ")
-    model = GP if metamodel == "gp" else f"{{kind: {kind}, preset: {preset or 'null'}}}"
-    lines = [
-        f"campaign: {campaign}", f"scenario: '{scenario}'", f"seed: {seed}", f"budget: {BUDGETS[problem]}",
-        f"metamodel: {model}", f"acquisition: {{kind: {method}}}", f"store: {folder / 'store'}", "executor: {kind: serial}",
-    ]  # fmt: skip
-    if problem == "table":
-        lines.append('requirement: {metric: "min_dist*", critical: [-1.0e9, 0.0]}')
-    return "\n".join(lines)
+    keys: dict[str, Any] = {"requirement": TABLE_REQUIREMENT} if problem == "table" else {}
+    return sbt.run(
+        campaign="coverage" if method == "even" else "boundary", seed=seed,
+        scenario=f"table:{folder / 'table'}" if problem == "table" else problem, budget=BUDGETS[problem],
+        metamodel=GP if metamodel == "gp" else {"kind": kind, "preset": preset or None},
+        acquisition=method, store=folder / "store", executor="serial", report=False, **keys,
+    )  # fmt: skip
 
 
 def set_apart(folder: Path, seed: int) -> Test:
     """Write the recorded rows but 600 to folder/table, and return these 600."""
-    recorded, requirement = from_folder(str(TABLE), Path()), parse(configuration("table", "even", 0, folder)).config.requirement
+    recorded, need = ScenarioSpec(f"table:{TABLE}").resolve(), TABLE_REQUIREMENT
     rows = pd.read_parquet(next(TABLE.glob("*.parquet")))
     apart = stream(seed, "apart").permutation(len(rows))[:APART]
     (folder / "table").mkdir()
     rows.drop(index=rows.index[apart]).to_parquet(folder / "table" / "rows.parquet")
     shutil.copy(TABLE / "config.yml", folder / "table")
-    chosen, (low, high) = rows.iloc[apart], requirement.critical
-    critical = chosen[requirement.metric].between(low, high).to_numpy()
+    chosen = rows.iloc[apart]
+    critical = chosen[need.metric].between(need.low, need.high).to_numpy()
     return chosen[list(recorded.space.names)].to_numpy(np.float64), critical, np.ones(APART)
 
 
-def test_points(problem: str, settings: Settings, folder: Path, n: int) -> Test:
+def test_points(problem: str, scenario: LogicalScenario, folder: Path, n: int) -> Test:
     """Return the points of a testbed or of SUMO that score, kept in the folder."""
     kept = folder / f"test_{problem.replace(':', '_')}.npz"
     if not kept.is_file():
-        x, critical, weight = (strata if problem.startswith("testbed:") else simulated)(problem, settings, n)
+        x, critical, weight = (strata if problem.startswith("testbed:") else simulated)(problem, scenario, n)
         np.savez(kept, x=x, critical=critical, weight=weight)
     with np.load(kept) as data:
         return data["x"], data["critical"], data["weight"]
 
 
-def strata(problem: str, settings: Settings, n: int) -> Test:
+def strata(problem: str, scenario: LogicalScenario, n: int) -> Test:
     del n
-    space, interval = settings.scenario.space, settings.scenario.requirement.critical
+    space, interval = scenario.space, scenario.requirement.critical
     rng = stream(99, "strata")
     x = space.from_unit(rng.random((600_000, space.dimension)))
     y = testbeds.values(problem.removeprefix("testbed:"), x, rng)
@@ -110,13 +107,12 @@ def strata(problem: str, settings: Settings, n: int) -> Test:
     return x[chosen], critical[chosen], np.concatenate(weights)
 
 
-def simulated(problem: str, settings: Settings, n: int) -> Test:
-    space, requirement = settings.scenario.space, settings.scenario.requirement
-    parts = assembly_of(parse(configuration(problem, "even", 0, Path("unused"))))
+def simulated(problem: str, scenario: LogicalScenario, n: int) -> Test:
+    space, requirement = scenario.space, scenario.requirement
     x = space.from_unit(stream(99, "reference").random((n, space.dimension)))
     jobs = [Job(i, dict(zip(space.names, map(float, row), strict=True)), run_seed(99, i)) for i, row in enumerate(x)]
     y = np.full(n, np.nan)
-    with LocalExecutor(parts.spec, os.cpu_count() or 1, 60.0) as executor:
+    with LocalExecutor(ScenarioSpec(problem), os.cpu_count() or 1, 60.0) as executor:
         for outcome in executor.run(jobs):
             y[outcome.index] = outcome.metrics.get(requirement.metric, np.nan)
     good = np.isfinite(y)
@@ -145,17 +141,14 @@ def cell(problem: str, method: str, metamodel: str, seed: int, folder: Path, n: 
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         apart = set_apart(place, seed) if problem == "table" else None
-        loaded = parse(configuration(problem, method, seed, place, metamodel))
         start = time.process_time()
-        run_campaign(loaded, report=False)
+        result = run(problem, method, seed, place, metamodel)
         seconds = time.process_time() - start
-        settings = settings_of(loaded, assembly_of(loaded))
-        with Store.read(place / "store") as store:
-            history = store.history()
-    predictor = settings.learner.train(history.finished)
-    space, interval = settings.scenario.space, settings.scenario.requirement.critical
-    x, critical, weight = test_points(problem, settings, folder, n) if apart is None else apart
-    p = chunked(predictor, space.metamodel_inputs(space.to_unit(x))).probability(interval)
+        scenario, learner, runs = result.scenario, result.study.learner, result.history.finished
+        predict = learner.on_inputs(learner.train(runs), len(runs))
+    space, interval = scenario.space, scenario.requirement.critical
+    x, critical, weight = test_points(problem, scenario, folder, n) if apart is None else apart
+    p = predict(space.to_unit(x)).probability(interval)
     return {**weighted_scores(p, critical, weight), "cpu_s": seconds}
 
 

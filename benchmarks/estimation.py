@@ -22,9 +22,8 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.stats import gamma, norm
 
-from sbt.config.load import parse
+import sbt
 from sbt.testbeds import truth
-from sbt.workflows.running import run_campaign
 
 
 def _truncated() -> float:
@@ -38,27 +37,29 @@ BARS = {
     "metaball@200": 0.10, "gayton_hat@200": 0.15, "linear_d10@200": 0.12, "rp110@250": 0.10, "damped_oscillator_15@300": 0.20,
 }  # fmt: skip
 """Problem@runs: the largest relative RMSE of issue 5."""
-_EXPONENTIAL = "{distribution: {kind: exponential, mean: 1}, min: 0, max: .inf}"
+_EXPONENTIAL = {"distribution": {"kind": "exponential", "mean": 1}, "min": 0, "max": math.inf}
 LAWS = {
-    "copula@200": ("testbed:linear_d2", "correlation: [{inputs: [x1, x2], value: 0.7}]", norm.cdf(-3.5 / math.sqrt(1.7))),
-    "counter_copula@200": (
-        "testbed:linear_d2", "correlation: [{inputs: [x1, x2], value: -0.5}]", norm.cdf(-3.5 / math.sqrt(0.5)),
+    "copula@200": (
+        "testbed:linear_d2", {"correlation": [{"inputs": ["x1", "x2"], "value": 0.7}]}, norm.cdf(-3.5 / math.sqrt(1.7)),
     ),
-    "constraint@200": ("testbed:linear_d2", 'constraints: ["x1 < x2"]', norm.cdf(-3.5)),
-    "truncated@200": ("testbed:linear_d2", "inputs: {x1: {min: -1.0, max: 1.0}}", _truncated()),
+    "counter_copula@200": (
+        "testbed:linear_d2", {"correlation": [{"inputs": ["x1", "x2"], "value": -0.5}]}, norm.cdf(-3.5 / math.sqrt(0.5)),
+    ),
+    "constraint@200": ("testbed:linear_d2", {"constraints": ["x1 < x2"]}, norm.cdf(-3.5)),
+    "truncated@200": ("testbed:linear_d2", {"inputs": {"x1": {"min": -1.0, "max": 1.0}}}, _truncated()),
     "exponential@200": (
-        "testbed:linear_d2", f"inputs: {{x1: {_EXPONENTIAL}, x2: {_EXPONENTIAL}}}\nrequirement: {{critical: [-.inf, -4.0]}}",
+        "testbed:linear_d2",
+        {"inputs": {"x1": _EXPONENTIAL, "x2": _EXPONENTIAL}, "requirement": {"critical": [-math.inf, -4.0]}},
         gamma.sf(7.5 * math.sqrt(2.0), 2),
     ),
-    "rare@200": ("testbed:linear_d2", "requirement: {critical: [-.inf, -1.7]}", norm.cdf(-5.2)),
-    "rare_d10@300": ("testbed:linear_d10", "requirement: {critical: [-.inf, -1.7]}", norm.cdf(-5.2)),
+    "rare@200": ("testbed:linear_d2", {"requirement": {"critical": [-math.inf, -1.7]}}, norm.cdf(-5.2)),
+    "rare_d10@300": ("testbed:linear_d10", {"requirement": {"critical": [-math.inf, -1.7]}}, norm.cdf(-5.2)),
     "sumo_cut_in@300": (
         "cut_in",
-        "inputs:\n  d_v: {distribution: {kind: normal, mean: 15, std: 12}}\n"
-        "  d_t: {distribution: {kind: lognormal, mean: 1.8, std: 0.9}}",
+        {"inputs": {"d_v": sbt.Normal(15, 12), "d_t": sbt.LogNormal(1.8, 0.9)}},
         0.00238,  # 400,000 crude runs, seeds 101 and 102: 0.00223 to 0.00254
     ),
-    "noisy@200": ("testbed:four_branch_noisy", "", truth("four_branch_noisy").probability),
+    "noisy@200": ("testbed:four_branch_noisy", {}, truth("four_branch_noisy").probability),
 }  # fmt: skip
 """Name@runs: scenario, what the configuration changes of it, and the probability; the testbeds' own inputs are unbounded."""
 KEPT = ("probability", "low", "high", "cov", "hits", "undetected_mass_bound", "warnings")
@@ -66,16 +67,16 @@ KEPT = ("probability", "low", "high", "cov", "hits", "undetected_mass_bound", "w
 
 def campaign(cell: str, seed: int) -> dict:
     name, _, runs = cell.partition("@")
-    name, changed, _ = LAWS.get(cell, (f"testbed:{name}", "", 0.0))
+    name, changed, _ = LAWS.get(cell, (f"testbed:{name}", {}, 0.0))
     with tempfile.TemporaryDirectory() as folder:
-        text = (
-            f"campaign: estimation\nscenario: {name}\nbudget: {runs}\nseed: {seed}\nstop: {{cov: null}}\n"
-            f"executor: {{kind: serial}}\nstore: {folder}/store\n{changed}\n"
-        )
         start, cpu = time.perf_counter(), time.process_time()
-        result = run_campaign(parse(text), report=False)
+        result = sbt.run(
+            campaign="estimation", scenario=name, budget=int(runs), seed=seed, stop={"cov": None}, executor="serial",
+            store=f"{folder}/store", report=False, **changed,
+        )  # fmt: skip
+        summary = result.summary
     took = {"seconds": round(time.perf_counter() - start, 1), "cpu": round(time.process_time() - cpu, 1)}
-    return {"cell": cell, "seed": seed, "runs": result["runs"], **took, **{k: result["conclusion"][k] for k in KEPT}}
+    return {"cell": cell, "seed": seed, "runs": summary["runs"], **took, **{k: summary["conclusion"][k] for k in KEPT}}
 
 
 def finished(table: Path) -> dict[tuple[str, int], dict]:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
+import sbt
 from sbt.benchmark.compare import compare, table
 from sbt.campaigns.falsification import CONFIRM
 from sbt.config.load import parse
@@ -26,9 +27,7 @@ from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.samplers.portfolio import propose
 from sbt.samplers.search import Search
 from sbt.seeds import stream
-from sbt.store.database import Store
 from sbt.testbeds import find, values
-from sbt.workflows.running import run_campaign
 
 CASES = {
     "hartmann6_1e-3": ("testbed:hartmann6_1e-3", None, (45, 65)),
@@ -43,12 +42,12 @@ CASES = {
 MINIMA = np.array([[0.20169, 0.150011, 0.476874, 0.275332, 0.311652, 0.6573], [0.4047, 0.8824, 0.8436, 0.5740, 0.1389, 0.0385]])
 
 
-def configuration(case: str, budget: int, seed: int = 0, stop: str = "{failures: 1}", store: str = "unused") -> str:
+def configuration(case: str, budget: int) -> str:
     scenario, tighter, _ = CASES[case]
     requirement = "" if tighter is None else f"requirement: {tighter}\n"
     return (
-        f"campaign: falsification\nscenario: {scenario}\n{requirement}budget: {budget}\nseed: {seed}\nstop: {stop}\n"
-        f"executor: {{kind: serial}}\nstore: {store}\n"
+        f"campaign: falsification\nscenario: {scenario}\n{requirement}budget: {budget}\n"
+        "stop: {failures: 1}\nexecutor: {kind: serial}\n"
     )
 
 
@@ -76,17 +75,18 @@ def both_modes(args: argparse.Namespace) -> None:
         if seed in rows:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            store = str(Path(folder) / "s")
-            result = run_campaign(parse(configuration("hartmann6_1e-3", 300, seed, "{}", store)), report=False)
-            with Store.read(Path(store)) as kept:
-                history = kept.history()
+            result = sbt.run(
+                campaign="falsification", scenario=CASES["hartmann6_1e-3"][0], budget=300, seed=seed, executor="serial",
+                store=f"{folder}/store", report=False,
+            )  # fmt: skip
+            history, found = result.history, result.conclusion
         runs = history.where(history.stage != CONFIRM)
         hits = np.flatnonzero(runs.y("y") <= -2.4)
         basin = np.array([_basin(runs.x[k]) for k in hits], dtype=int)
         first = [hits[basin == k][:1] for k in (0, 1)]
         both = int(max(f[0] for f in first)) + 1 if all(len(f) for f in first) else None
-        rows[seed] = {"seed": seed, "both": both, "counted": len(result["conclusion"]["failure_modes"]),
-                      "critical": result["conclusion"]["critical_runs"], "seconds": result["seconds"]}  # fmt: skip
+        rows[seed] = {"seed": seed, "both": both, "counted": len(found.failure_modes),
+                      "critical": found.critical_runs, "seconds": result.summary["seconds"]}  # fmt: skip
         with path.open("a") as file:
             file.write(json.dumps(rows[seed]) + "\n")
     found = [rows[k]["both"] for k in range(args.seeds) if rows[k]["both"] is not None]

@@ -14,13 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+import sbt
 from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.scores import scores
-from sbt.plugins import load, names
 from sbt.problem.requirement import CriticalInterval
 from sbt.seeds import stream
-from sbt.store.database import Store
-from sbt.workflows.running import assembly_of, loaded_from, settings_of
 
 FAST = ("et", "et paper", "gp", "gp paper", "ensemble", "auto")
 SCORES = {
@@ -37,10 +35,11 @@ SCORES = {
 
 def main() -> None:
     """Print the table."""
-    kinds = {name: build(load("metamodels", name)) for name in names("metamodels")}
-    for name in names("metamodels"):
-        for preset in getattr(load("metamodels", name), "PRESETS", {}):
-            kinds[f"{name} {preset}"] = build(load("metamodels", name), preset)
+    classes = {name: getattr(sbt.metamodels, name) for name in sbt.list("metamodels")}
+    kinds = {name: build(kind) for name, kind in classes.items()}
+    for name, kind in classes.items():
+        for preset in getattr(kind, "PRESETS", {}):
+            kinds[f"{name} {preset}"] = build(kind, preset)
     parser = argparse.ArgumentParser(description="Time or score the metamodels.")
     parser.add_argument("--kinds", nargs="+", choices=kinds, default=list(FAST))
     parser.add_argument("--rows", nargs="+", type=int, default=[50, 200, 500], help="numbers of rows n")
@@ -126,8 +125,8 @@ def _read_jaywalking(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_store(folder: Path) -> tuple[np.ndarray, np.ndarray, CriticalInterval]:
     """Return the finished runs of a campaign: inputs in the unit cube, the metric, what is critical."""
-    with Store.read(folder) as store:
-        scenario, runs = settings_of(loaded_from(store), assembly_of(loaded_from(store))).scenario, store.history().finished
+    result = sbt.open(folder)
+    scenario, runs = result.scenario, result.history.finished
     u = scenario.space.metamodel_inputs(scenario.space.to_unit(runs.x))
     return u, runs.y(scenario.requirement.metric), scenario.requirement.critical
 

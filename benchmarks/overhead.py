@@ -20,28 +20,24 @@ from unittest.mock import patch
 import numpy as np
 from scipy.stats import qmc
 
-from sbt.config.load import parse
-from sbt.plugins import load
+import sbt
+from sbt.execution.spec import ScenarioSpec
 from sbt.sumo import simulation
 from sbt.sumo.sumo_run import SumoRun
-from sbt.workflows.running import run_campaign
 
 EMPTY = """
-from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario
-from sbt.problem.space import ParameterSpace
+import sbt
 
-SCENARIO = LogicalScenario(
-    "empty", ParameterSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))), Requirement("y", high=0.5),
-    evaluate=lambda values, seed: {"y": values["a"]}, metric_names=("y",),
+SCENARIO = sbt.Scenario(
+    "empty", [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)], sbt.Requirement("y", high=0.5),
+    evaluate=lambda values, seed: {"y": values["a"]},
 )
 """
 
 
 def worker(runs: int) -> list[float]:
     """Return milliseconds a run outside the loop over the steps, five times."""
-    scenario = load("scenarios", "cut_in")
+    scenario = ScenarioSpec("cut_in").resolve()
     x = scenario.space.from_unit(qmc.Sobol(2, rng=1).random_base2(math.ceil(math.log2(runs)))[:runs])
     values = [dict(zip(scenario.space.names, map(float, row), strict=True)) for row in x]
     inside, found = [0.0], []
@@ -76,12 +72,12 @@ def driver(runs: int) -> list[float]:
     for _ in range(5):
         with tempfile.TemporaryDirectory() as folder:
             (Path(folder) / "empty.py").write_text(textwrap.dedent(EMPTY))
-            text = (
-                f"campaign: coverage\nscenario: {folder}/empty.py:SCENARIO\nbudget: {runs}\nbatch: {runs}\ninitial: {runs}\n"
-                f"executor: {{kind: local, workers: 2}}\nstore: {folder}/store\n"
-            )
-            result = run_campaign(parse(text), report=False)
-            found.append((result["seconds"]["simulate"] + result["seconds"]["propose"]) / runs * 1e3)
+            result = sbt.run(
+                campaign="coverage", scenario=f"{folder}/empty.py:SCENARIO", budget=runs, batch=runs, initial=runs,
+                executor="local", workers=2, store=f"{folder}/store", report=False,
+            )  # fmt: skip
+            seconds = result.summary["seconds"]
+        found.append((seconds["simulate"] + seconds["propose"]) / runs * 1e3)
     return found
 
 

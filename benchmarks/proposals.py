@@ -17,11 +17,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+import sbt
 from sbt.campaigns.falsification import SearchStage
 from sbt.campaigns.parts import BatchStage
 from sbt.campaigns.sequential import SequentialStage
-from sbt.config.load import parse
-from sbt.workflows.running import run_campaign
 
 STAGES = {"boundary": BatchStage, "falsification": SearchStage, "estimation": SequentialStage}
 
@@ -40,13 +39,10 @@ def proposal(campaign: str, testbed: str, runs: int, seed: int) -> float:
     stage.propose = timed
     try:
         with tempfile.TemporaryDirectory() as folder:
-            text = (
-                f"campaign: {campaign}\nscenario: testbed:{testbed}\nbudget: {runs + 10}\ninitial: {runs}\nbatch: 10\n"
-                f"seed: {seed}\nexecutor: {{kind: serial}}\nstore: {folder}/store\n"
-            )
-            if campaign == "falsification":
-                text += "stop: {failures: null}\n"
-            run_campaign(parse(text), report=False)
+            sbt.run(
+                campaign=campaign, scenario=f"testbed:{testbed}", budget=runs + 10, initial=runs, batch=10, seed=seed,
+                stop={"failures": None}, executor="serial", store=f"{folder}/store", report=False,
+            )  # fmt: skip
     finally:
         stage.propose = original
     return spent[1]

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from sbt.acquisitions import boundary
+import sbt
 from sbt.metamodels.automatic import Auto
 from sbt.metamodels.base import build, log_ambiguity_bound, with_target
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -53,7 +53,7 @@ def _line(kind: str, d: int, n: int, samples: int, seed: int) -> None:
     predict = with_target(KINDS[kind], critical).fit(u, _metric(u, rng), stream(seed, "fit", n))
 
     def score(points: np.ndarray) -> np.ndarray:
-        return boundary(predict(points), critical, np.zeros(len(points)))
+        return sbt.acquisitions.boundary(predict(points), critical, np.zeros(len(points)))
 
     def timed(screen: bool) -> tuple[RoiDraw, float]:
         bound = (lambda points: log_ambiguity_bound(predict, points, critical)) if screen else None

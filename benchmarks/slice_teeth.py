@@ -13,7 +13,7 @@ import argparse
 import numpy as np
 from scipy.stats import qmc
 
-from sbt.plugins import load
+from sbt.execution.spec import ScenarioSpec
 from sbt.problem.scenario import LogicalScenario
 
 EGOS = {
@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=8)
     parser.add_argument("--values", type=int, default=31)
     args = parser.parse_args()
-    scenario = load("scenarios", args.scenario)
+    scenario = ScenarioSpec(args.scenario).resolve()
     around = centres(scenario, args.points)
     print(f"{args.scenario}: {len(around)} points, {args.values} values along each input\n")
     print("| ego | median tooth (s) | mean (s) | 90 % | 99 % |\n|---|---|---|---|---|")

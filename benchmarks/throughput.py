@@ -18,16 +18,15 @@ import shutil
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 
 from scipy.stats import qmc
 
-from sbt import plugins
+import sbt
 from sbt.execution.local import settle
 from sbt.execution.protocol import CHUNK
+from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_jobs
-from sbt.plugins import load
 from sbt.problem.outcome import Job, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.sumo import session as sumo_session
@@ -108,17 +107,12 @@ def campaign_rate(name: str, workers: int, n: int, step: float | None = None) ->
     """Runs a second of a whole coverage campaign, the driver and the store included."""
     import tempfile
 
-    from sbt.config.load import parse
-    from sbt.workflows.running import run_campaign
-
     with tempfile.TemporaryDirectory() as folder:
-        text = (
-            f"campaign: coverage\nscenario: {name}\nbudget: {n}\nbatch: {n}\nvalidation: {{share: 0}}\n"
-            f"executor: {{kind: local, workers: {workers}}}\nstore: {Path(folder) / 'store'}\n"
-            + (f"simulation: {{step_length: {step}}}\n" if step else "")
-        )
-        result = run_campaign(parse(text), report=False)
-        return n / result["seconds"]["simulate"]
+        result = sbt.run(
+            campaign="coverage", scenario=name, budget=n, batch=n, validation={"share": 0.0}, executor="local", workers=workers,
+            simulation={"step_length": step}, store=f"{folder}/store", report=False,
+        )  # fmt: skip
+        return n / result.summary["seconds"]["simulate"]
 
 
 def every(names: list[str], repeats: int, seconds: float) -> None:
@@ -128,7 +122,7 @@ def every(names: list[str], repeats: int, seconds: float) -> None:
     cut_in: dict[float, float] = {}
     for name in sorted({"cut_in", *names}, key=lambda n: (n != "cut_in", n)):
         for step in STEPS:
-            scenario = load("scenarios", name).configured(step_length=step)
+            scenario = ScenarioSpec(name, step_length=step).resolve()
             if not scenario.isolations:
                 continue
             few = points(scenario, 8)
@@ -169,13 +163,13 @@ def main() -> None:
     parser.add_argument("--no-campaign", action="store_true", help="leave out the rows of whole campaigns")
     args = parser.parse_args()
     if args.every:
-        names = args.only or sorted(n for n in plugins.names("scenarios") if load("scenarios", n).isolations)
+        names = args.only or [n for n in sbt.list("scenarios") if ScenarioSpec(n).resolve().isolations]
         if not args.only_campaigns:
             every(names, args.repeats, args.seconds)
         if not args.no_campaign:
             campaigns(names, args.repeats, args.seconds)
         return
-    scenario = load("scenarios", args.scenario)
+    scenario = ScenarioSpec(args.scenario).resolve()
     values = points(scenario, args.runs)
     few = values[: max(args.runs // 10, 10)]
     rows: dict[str, tuple[Callable[[], None], int]] = {

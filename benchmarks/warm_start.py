@@ -15,10 +15,9 @@ from unittest.mock import patch
 
 import numpy as np
 
+import sbt
 from sbt.metamodels import gaussian_process as gp
 from sbt.metamodels.scores import scores
-from sbt.store.database import Store
-from sbt.workflows.running import assembly_of, loaded_from, settings_of
 
 KEYS = ("log_likelihood", "average_precision", "log_likelihood_critical")
 _fit_posterior = gp._fit_posterior
@@ -56,8 +55,8 @@ def main() -> None:
     print(f"Seeds 0 to {args.seeds - 1}, refits at {sizes[1]} to {sizes[-1]} runs; warm minus cold ± standard error of seeds.\n")
     print("| store | cold fit [s] | warm fit [s] | ll | AP | ll critical | worst refit's ll |\n|---|---|---|---|---|---|---|")
     for folder in args.stores:
-        with Store.read(folder) as store:
-            scenario, runs = settings_of(loaded_from(store), assembly_of(loaded_from(store))).scenario, store.history().finished
+        result = sbt.open(folder)
+        scenario, runs = result.scenario, result.history.finished
         u, y = scenario.space.metamodel_inputs(scenario.space.to_unit(runs.x)), runs.y(scenario.requirement.metric)
         cold, warm = (
             np.array([replay(u, y, scenario.requirement.critical, sizes, seed, warm=w)[1:] for seed in range(args.seeds)])

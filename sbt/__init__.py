@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from sbt.store.database import PlannedRun
     from sbt.workflows.front import Run
     from sbt.workflows.front import check_target as check
-    from sbt.workflows.front import installed as list  # noqa: A004
-    from sbt.workflows.front import open_result as open  # noqa: A004
+    from sbt.workflows.front import installed as list
+    from sbt.workflows.front import open_result as open
     from sbt.workflows.front import run_campaign as run
     from sbt.workflows.front import simulate_scenario as simulate
     from sbt.workflows.result import Film, Result

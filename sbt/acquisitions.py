@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.errors import InputError, place_of
+from sbt.errors import InputError, described
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
@@ -70,8 +70,7 @@ def log_scores(acquisition: Acquisition, prediction: Prediction, critical: Criti
     try:
         found = np.asarray(acquisition(prediction, critical, log_density), dtype=np.float64)
     except Exception as error:
-        raised = f"{type(error).__name__}: {error} ({place_of(error)})"
-        raise InputError(f"acquisition {name} must score {n} points, but raised {raised}") from error
+        raise InputError(f"acquisition {name} must score {n} points, but raised {described(error)}") from error
     if found.shape != (n,):
         raise InputError(f"acquisition {name} must return shape ({n},), but returned {found.shape}")
     if not (found < np.inf).all():  # also NaN

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "did_you_mean", "place_of"]
+__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "described", "did_you_mean", "place_of"]
 
 
 class SbtError(Exception):
@@ -52,6 +52,15 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     by_lower = {each.lower(): each for each in known}
     close = get_close_matches(name.lower(), by_lower, 1)
     return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""
+
+
+def described(error: BaseException) -> str:
+    """Return type, message and place of an error, on one line where its message has one."""
+    try:
+        message = str(error)
+    except BaseException:  # an exception of a user's own
+        message = "(its message cannot be read)"
+    return f"{type(error).__name__}{': ' if message else ''}{message} ({place_of(error)})"
 
 
 def place_of(error: BaseException) -> str:

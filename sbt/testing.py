@@ -9,30 +9,39 @@ from __future__ import annotations
 import dataclasses
 import math
 import pickle
-from collections.abc import Callable, Iterable
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbt.acquisitions import Acquisition
-from sbt.errors import SbtError
+from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.errors import RunError, SbtError
+from sbt.execution.worker import described
+from sbt.loop.stages import Campaign, Progress
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
-from sbt.problem.requirement import CriticalInterval
-from sbt.problem.scenario import Metric
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
+from sbt.store.history import Record
+from sbt.store.records import to_json
 from sbt.workflows.checking import check_scenario
+from sbt.workflows.front import run_campaign
+from sbt.workflows.result import Result
 
-__all__ = ["ContractError", "check_acquisition", "check_metamodel", "check_metric", "check_sampler", "check_scenario"]
+__all__ = [
+    "ContractError", "check_acquisition", "check_campaign", "check_metamodel", "check_metric", "check_sampler", "check_scenario",
+]  # fmt: skip
 
-_INTERVALS = (
-    CriticalInterval(high=0.0),
-    CriticalInterval(low=1.0),
-    CriticalInterval(-0.5, 0.5),
-    CriticalInterval(high=-1e6),
-)
+_INTERVALS = (CriticalInterval(high=0.0), CriticalInterval(low=1.0), CriticalInterval(-0.5, 0.5), CriticalInterval(high=-1e6))
 _SINGLE = 1e-5  # relative: networks predict in single precision (eps 1.2e-7), and another shape adds in another order
 
 
@@ -165,6 +174,94 @@ def check_metric(metric: Metric, traces: Iterable[Trace]) -> None:
         _close(np.array([later]), np.array([y]), 1e-9, "a metric must not depend on when the run began")
     alone = _measured(metric, _apart())
     _close(np.array([alone]), np.array([metric.without]), 1e-9, "where the two never meet a metric must give its `without`")
+
+
+def check_campaign(kind: CampaignKind | Callable[[Settings], Campaign], *, seed: int = 0) -> None:
+    """Check a campaign by running it, tiny, on a scenario of two inputs, and on one where a quarter of the runs fail.
+
+    It ends; the same seed gives the same runs and the same conclusion, also where it was stopped in the middle and went on;
+    the conclusion goes to JSON and back, and its sentences are text.
+
+    Args:
+        kind: the campaign, or its recipe alone.
+        seed: of the campaigns, >= 0.
+
+    Raises:
+        ContractError: a law is broken.
+    """
+    for share in (0.0, 0.25):
+        with tempfile.TemporaryDirectory() as folder:
+            case = f"{share:.0%} of the runs fail"
+            whole, rows = _ran(kind, share, seed, Path(folder) / "whole", case)
+            again, same = _ran(kind, share, seed, Path(folder) / "again", case)
+            _require(same == rows, "the same seed must give the same runs", f"others ({case})")
+            said, found = again.conclusion.to_dict(), whole.conclusion.to_dict()
+            _require(said == found, "the same runs must give the same conclusion", f"{said} after {found} ({case})")
+            half = len(rows) // 2
+            stopped, part = Path(folder) / "stopped", f"{case}, stopped after {half} runs"
+            with suppress(_StoppedError):
+                _ran(kind, share, seed, stopped, part, stop_after=half)
+            resumed, same = _ran(kind, share, seed, stopped, part)
+            _require(same == rows, "a campaign that was stopped must go on to the same runs: a stage may look at the log alone",
+                     f"others ({part})")  # fmt: skip
+            said = resumed.conclusion.to_dict()
+            _require(said == found, "a campaign that was stopped must conclude the same", f"{said} after {found} ({part})")
+            _check_conclusion(whole, case)
+
+
+_BUDGET = 36
+_ENDLESS = 10  # times the budget: confirmations come beside it
+
+
+class _StoppedError(Exception):
+    """The campaign was stopped on purpose."""
+
+
+def _ran(
+    kind: CampaignKind | Callable[[Settings], Campaign], share: float, seed: int, store: Path, case: str, *,
+    stop_after: int | None = None,
+) -> tuple[Result[Any], list[Record]]:  # fmt: skip
+    """Return the result of a small campaign and its runs without what may differ."""
+
+    def evaluate(values: Mapping[str, float], seed: int) -> dict[str, float]:
+        del seed
+        if values["b"] < share:
+            raise RunError("invalid", "b is too small")
+        return {"y": float(np.hypot(values["a"] - 0.6, values["b"] - 0.5)) - 0.3}
+
+    def listen(progress: Progress) -> None:
+        rule = f"a campaign must end near its budget of {_BUDGET}"
+        _require(progress.done <= _ENDLESS * _BUDGET, rule, f"{progress.done} runs")
+        if stop_after is not None and progress.done >= stop_after:
+            raise _StoppedError
+
+    inputs = [Parameter("a", 0, 1), Parameter("b", 0, 1)]
+    scenario = LogicalScenario("disc", inputs, Requirement("y", high=0.0), evaluate=evaluate)
+    settings: dict[str, Any] = {"budget": _BUDGET, "initial": 12, "batch": 12, "seed": seed, "store": store}
+    if CampaignKind.of(kind, "check_campaign").adaptive:
+        settings["metamodel"] = "et"
+    try:
+        found = run_campaign(
+            campaign=kind, scenario=scenario, executor="serial", report=False, progress=listen, **settings
+        )
+    except (_StoppedError, ContractError):
+        raise
+    except Exception as error:
+        raise ContractError(f"a campaign must run to its end, but raised {described(error)} ({case})") from error
+    return found, [dataclasses.replace(record, seconds=0.0, versions="") for record in found.history.records]
+
+
+def _check_conclusion(result: Result[Any], case: str) -> None:
+    """Check that a conclusion goes to JSON and back, and says what it found."""
+    found = result.summary["conclusion"]
+    try:
+        back, sentences = result.conclusion.to_dict(), result.sentences()
+    except Exception as error:
+        rule = "a conclusion must be read back from its JSON and say what was found"
+        raise ContractError(f"{rule}, but raised {described(error)} ({case})") from error
+    _require(to_json(back) == found, "a conclusion must go to JSON and back", f"{back} after {found} ({case})")
+    texts = isinstance(sentences, list) and all(isinstance(sentence, str) for sentence in sentences)
+    _require(texts, "sentences of a conclusion must be a list of text", f"{sentences!r} ({case})")
 
 
 def _measured(metric: Metric, trace: Trace) -> float:

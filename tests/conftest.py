@@ -205,11 +205,11 @@ def configured(analytic: Path) -> Callable[..., Path]:
 @pytest.fixture
 def campaign(configured: Callable[..., Path]) -> Callable[..., dict[str, Any]]:
     """Run a campaign of an analytic scenario in this process; no report unless it is asked for."""
-    from sbt.config.load import load
-    from sbt.workflows.running import run_campaign
+    from sbt.workflows.running import run_study
+    from sbt.workflows.study import Study
 
     def run(name: str = "c", scenario: str = "SCENARIO", *, report: bool = False, **keys: Any) -> dict[str, Any]:
-        return run_campaign(load(configured(name, scenario, **keys)), report=report)
+        return run_study(Study.from_file(configured(name, scenario, **keys)), report=report).to_dict()
 
     return run
 

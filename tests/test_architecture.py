@@ -45,7 +45,8 @@ LATE = {
 """Imports inside functions that may look up: only when they are needed."""
 BELONGS = {
     "libsumo": {"sumo"}, "traci": {"sumo"}, "torch": {"metamodels"}, "gpytorch": {"metamodels"}, "sklearn": {"metamodels"},
-    "joblib": {"execution"}, "distributed": {"execution"}, "sqlite3": {"store", "cli"}, "typer": {"cli"}, "pydantic": {"config"},
+    "joblib": {"execution"}, "distributed": {"execution"}, "sqlite3": {"store", "cli"}, "typer": {"cli"},
+    "pydantic": {"config", "store"},  # reads configurations, and records of the log
 }  # fmt: skip
 HEAVY = ("torch", "gpytorch", "libsumo", "pandas", "scipy", "sklearn", "matplotlib", "pydantic", "joblib", "numpy")
 
@@ -83,8 +84,10 @@ def imports(path: Path) -> Iterator[tuple[str, int, str]]:
             assert "*" not in {alias.name for alias in node.names}, f"{path}:{node.lineno}: no star imports"
             base = node.module or ""
             for alias in node.names:
-                submodule = (PACKAGE.parent / Path(*base.split("."), f"{alias.name}.py")).is_file() and base.startswith("sbt")
-                yield (f"{base}.{alias.name}" if submodule else base, node.lineno, kind.get(node, "now"))
+                named = ROOT / Path(*base.split("."), alias.name)
+                submodule = named.with_suffix(".py").is_file() or (named / "__init__.py").is_file()
+                target = f"{base}.{alias.name}" if submodule and base.startswith("sbt") else base
+                yield (target, node.lineno, kind.get(node, "now"))
 
 
 def test_imports_go_down():
@@ -101,6 +104,20 @@ def test_imports_go_down():
             if not allowed:
                 wrong.append(f"{path.relative_to(ROOT)}:{line}: {here} imports {target} ({when})")
     assert wrong == []
+
+
+def test_the_root_is_small():
+    assert len(list(PACKAGE.glob("*.py"))) <= 10
+
+
+def test_rooms_know_few_rooms():
+    """Rooms: folders, loose modules at the root, benchmarks/. An edge: a room that one of its files imports, now or late."""
+    files = [*zip(FILES, map(room, MODULES), strict=True), *((path, "benchmarks") for path in (ROOT / "benchmarks").glob("*.py"))]
+    edges = {
+        (here, room(target)) for path, here in files for target, _, when in imports(path)
+        if target.split(".")[0] == "sbt" and when != "types" and room(target) != here
+    }  # fmt: skip
+    assert len(edges) <= 140, "\n".join(f"{here} -> {there}" for here, there in sorted(edges))
 
 
 def test_no_import_goes_round():
@@ -214,6 +231,10 @@ def entry_points() -> list[tuple[str, str, str]]:
 def test_entry_points_exist(group, name, target):
     module, _, attribute = target.partition(":")
     found = getattr(importlib.import_module(module), attribute)
+    if group == "sbt.campaigns":
+        assert found.description
+        assert callable(found.recipe)
+        return
     assert callable(found) or group in ("sbt.scenarios", "sbt.metrics")
     if group in ("sbt.scenarios", "sbt.metrics"):
         assert found.name == name

@@ -104,6 +104,17 @@ def test_the_command_runs_resumes_and_draws(analytic):
     assert {p: p.stat().st_mtime_ns for p in (folder / "b").rglob("*.npz")} == before  # nothing was done again
 
 
+def test_reference_only_makes_the_runs_of_every_scenario(analytic):
+    folder = analytic.parent
+    written(folder, TINY.replace("metamodels:", "  - {scenario: analytic.py:LINE, name: line, batch: 12}\nmetamodels:"))
+    result = invoked(folder, "--store", str(folder / "b"), "--reference-only")
+    assert [Path(p).name for p in result["references"]] == ["disc", "line"]
+    assert (result["cells"], result["done"], result["table"]) == (8, 0, None)
+    for name in ("disc", "line"):
+        with Store.read(folder / "b" / "reference" / name) as store:
+            assert len(store.history()) == 60
+
+
 def test_scores_are_those_of_the_reference_runs_and_no_metamodel_learns_from_them(analytic):
     loaded = written(analytic.parent)
     (_, reference), cell = next(loaded.references()), next(loaded.cells())

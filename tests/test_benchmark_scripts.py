@@ -25,7 +25,7 @@ SMALLEST = {
     "faults.py": "--kills 2",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
-SUMO = {"boundary.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py", "throughput.py"}
+SUMO = {"boundary.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py", "throughput.py"}
 LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
 
 

@@ -32,7 +32,7 @@ from sbt.samplers.surface import crossings
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION, History, Record
-from sbt.workflows.running import assembly_of, run_campaign, settings_of
+from studies import run_loaded, settings_of
 
 
 def test_particles_have_the_density_of_the_score():
@@ -123,7 +123,7 @@ def test_straddle():
 def run(folder: Path, **keys: Any) -> dict[str, Any]:
     lines = [f"{key}: {value}" for key, value in keys.items()]
     base = ["campaign: boundary", "executor: {kind: serial}", f"store: {folder / 'store'}"]
-    return run_campaign(parse("\n".join([*base, *lines])), report=False)
+    return run_loaded(parse("\n".join([*base, *lines])), report=False)
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Asking:
 @pytest.mark.parametrize(("campaign", "times"), [("boundary", 1), ("falsification", 1), ("estimation", 1), ("coverage", 0)])
 def test_campaigns_that_look_for_the_edge_tell_the_metamodel_where_it_is(campaign: str, times: int):
     loaded = parse(f"campaign: {campaign}\nscenario: 'testbed:cut_in_near_miss:box'\nmetamodel: {{kind: et}}\n")
-    settings, asking = settings_of(loaded, assembly_of(loaded)), Asking()
+    settings, asking = settings_of(loaded), Asking()
     names, metric = settings.scenario.space.names, settings.scenario.requirement.metric
     runs = [
         Record(i, "initial", 0, dict(zip(names, x, strict=True)), i, "ok", {metric: float(i)}, "", None, 0.0, "", "")

@@ -268,10 +268,10 @@ def test_runs_concentrate_on_the_boundary(campaign: Run):
 
 def test_progress_counts_what_was_run(configured: Callable[..., Path]):
     from sbt.config.load import load
-    from sbt.workflows.running import run_campaign
+    from studies import run_loaded
 
     seen: list[Any] = []
-    run_campaign(load(configured("c", "SOME_FAIL", budget=40)), progress=seen.append, report=False)
+    run_loaded(load(configured("c", "SOME_FAIL", budget=40)), progress=seen.append, report=False)
     done = [p.done for p in seen]
     assert done == sorted(done)
     assert (done[0], done[-1], seen[-1].budget) == (0, 40, 40)
@@ -279,7 +279,7 @@ def test_progress_counts_what_was_run(configured: Callable[..., Path]):
     assert seen[-1].failed == sum(r.status != "ok" for r in found)
     assert seen[-1].critical == sum(r.metrics["y"] <= 0 for r in found if r.status == "ok")
     resumed: list[Any] = []
-    run_campaign(load(configured("c", "SOME_FAIL", budget=60)), progress=resumed.append, report=False)
+    run_loaded(load(configured("c", "SOME_FAIL", budget=60)), progress=resumed.append, report=False)
     assert resumed[0].done == 40
 
 

@@ -16,12 +16,16 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from sbt.campaigns.settings import PlainConclusion
 from sbt.cli import app, console
 from sbt.errors import InputError, StoreError
 from sbt.loop.stages import Progress
 from sbt.problem.outcome import Outcome, Status
 from sbt.store.database import PlannedRun, Store
+from sbt.store.records import FitRecord, Validation
 from sbt.workflows import running as sbt_run
+from sbt.workflows.running import Summary
+from sbt.workflows.study import Study
 
 SBT = [sys.executable, "-m", "sbt"]
 PLUGIN = """
@@ -87,14 +91,14 @@ def campaign(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Replace the campaign by one that returns RESULT at once, and keep what it was given."""
     given: list[Any] = []
 
-    def run_campaign(loaded: Any, *, progress: Any) -> dict[str, Any]:
-        given.append(loaded)
+    def run_study(study: Study, *, progress: Any, shard: Any) -> Summary:
+        given.append(study)
         print("noise on stdout")
         for done in (5, 10):
             progress(Progress(done, 10, 1, 2, done // 5 - 1, "simulating"))
-        return RESULT
+        return Summary(**{**RESULT, "conclusion": PlainConclusion(RESULT["conclusion"])})
 
-    monkeypatch.setattr(sbt_run, "run_campaign", run_campaign)
+    monkeypatch.setattr(sbt_run, "run_study", run_study)
     return given
 
 
@@ -108,12 +112,13 @@ def process(*args: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 def store(folder: Path, *, concluded: bool = False) -> Path:
     """Write a store of three runs, one of them failed, and one more planned."""
-    with Store.open(folder, {"names": ["speed"]}) as made:
-        made.plan(0, "initial", [PlannedRun("initial", {"speed": k / 3}) for k in range(4)], [1, 2, 3, 4], {"kind": "even"})
+    with Store.open(folder, Study.from_file(folder.parent / "c.yaml").snapshot()) as made:
+        planned = [PlannedRun("initial", {"speed": k / 3, "gap": 2.0}) for k in range(4)]
+        made.plan(0, "initial", planned, [1, 2, 3, 4], {"kind": "even"})
         for k in range(2):
             made.append(Outcome(k, Status.OK, {"margin": 0.1 * k}))
         made.append(Outcome(2, Status.TIMEOUT, reason="too long, 60 s"))
-        made.add_fit(2, 0, {"rmse": 0.5})
+        made.add_fit(FitRecord(2, 0.5, 0.1, 0.2, "", Validation(rmse=0.5), runs=2))
         if concluded:
             made.conclude(RESULT)
     return folder
@@ -155,7 +160,7 @@ def test_run_prints_one_json_object_and_nothing_else(folder: Path, campaign: lis
     assert json.loads(done.stdout) == RESULT
     assert "5/10" not in done.stderr
     config = campaign[0].config
-    assert (config.store, config.seed, config.executor.workers, campaign[0].folder) == ("a b: c", 3, 2, folder)
+    assert (config.store, config.seed, config.executor.workers, campaign[0].loaded.folder) == ("a b: c", 3, 2, folder)
 
 
 def test_run_tells_people_the_conclusion(folder: Path, campaign: list[Any]):
@@ -193,19 +198,29 @@ def test_exit_codes_of_run(
     [
         (InputError("budget must fit"), 2, "budget must fit\n"),
         (StoreError("the disk is full"), 1, "the disk is full\n"),
-        (KeyboardInterrupt(), 130, "interrupted, run again to resume\n"),
+        (KeyboardInterrupt(), 130, "interrupted, nothing was run yet\n"),
         (ZeroDivisionError("oh"), 1, "internal error: ZeroDivisionError: oh (SBT_DEBUG=1 shows where)\n"),
     ],
 )
 def test_errors_become_exit_codes(folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, text: str):
-    def run_campaign(loaded: Any, *, progress: Any) -> dict[str, Any]:
+    def run_study(study: Study, *, progress: Any, shard: Any) -> Summary:
         raise error
 
-    monkeypatch.setattr(sbt_run, "run_campaign", run_campaign)
+    monkeypatch.setattr(sbt_run, "run_study", run_study)
     done = call("run", "c.yaml", "--json")
     assert (done.exit_code, done.stdout, done.stderr) == (code, "", text)
     monkeypatch.setenv("SBT_DEBUG", "1")
     assert ("Traceback" in call("run", "c.yaml").stderr) is isinstance(error, Exception)
+
+
+def test_an_interrupted_campaign_can_be_resumed(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    def run_study(study: Study, *, progress: Any, shard: Any) -> Summary:
+        with Store.open(Path(study.config.store)):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sbt_run, "run_study", run_study)
+    done = call("run", "c.yaml", "--json")
+    assert (done.exit_code, done.stdout, done.stderr) == (130, "", "interrupted, run again to resume\n")
 
 
 def test_sigterm_is_an_interruption(folder: Path):
@@ -234,10 +249,12 @@ def test_simulate_prints_one_json_object_and_nothing_else(folder: Path):
     ("name", "status", "reason"),
     [
         ("REFUSED", "invalid", "the start is not the one asked for"),
-        ("BROKEN", "failed", "ZeroDivisionError: division by zero"),
+        ("BROKEN", "failed", "ZeroDivisionError: division by zero (plane.py:{line})"),
     ],
 )
 def test_a_failed_run_is_told_and_ends_with_4(folder: Path, name: str, status: str, reason: str):
+    line = 1 + (folder / "plane.py").read_text().splitlines().index('    return {"margin": 1 / 0}')
+    reason = reason.replace("plane.py:{line}", f"{folder}/plane.py:{line}")
     done = call("simulate", f"plane.py:{name}", "--json")
     found = json.loads(done.stdout)
     assert done.exit_code == 4
@@ -378,9 +395,13 @@ def test_a_folder_without_a_campaign_is_refused(folder: Path, verb: str):
     assert "must be the folder of a campaign" in done.stderr
 
 
-def test_report_prints_its_path(folder: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sbt_run, "rebuild_report", lambda folder: folder / "report.html")
-    assert call("report", str(store(folder / "s"))).stdout.strip() == str(folder / "s" / "report.html")
+def test_report_writes_the_same_page_again_and_prints_its_path(folder: Path):
+    assert call("run", "c.yaml", "--quiet", "--store", str(folder / "s")).exit_code == 0
+    page = folder / "s" / "report.html"
+    before = page.read_bytes()
+    page.unlink()
+    assert call("report", str(folder / "s")).stdout.strip() == str(page)
+    assert page.read_bytes() == before
 
 
 def test_progress_without_a_terminal_is_a_line_an_iteration(capsys: pytest.CaptureFixture[str]):

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from sbt.config.assemble import acquisition_of, assemble, metamodel_of, scenario_of, spec_of
+from sbt.config.kinds import kinds
 from sbt.config.load import ConfigError, dump, fingerprint, load, parse, resolve, resumed, schema
-from sbt.config.model import CAMPAIGNS, EXECUTORS
+from sbt.config.model import EXECUTORS
 from sbt.metamodels.extra_trees import ExtraTrees
 
 BASE = "campaign: boundary\nscenario: plugin.py:SCENARIO\n"
@@ -194,7 +195,7 @@ def test_a_wrong_line_is_refused(line: str, expected: str):
         ("scenario: x\n", "f.yaml:1:1: campaign: is required"),
         (
             "campaign: coverge\nscenario: x\n",
-            "campaign: must be boundary or falsification or estimation or coverage, but got 'coverge' (did you mean 'coverage'?)",
+            "campaign: campaigns must be one of boundary, coverage, estimation, falsification, or file.py:NAME, but got 'coverge' (did you mean 'coverage'?)",
         ),
         (
             "campaign: coverage\nscenario: x\nacquisition: {kind: boundary}\n",
@@ -261,13 +262,15 @@ def test_errors_survive_pickling():
 def test_schema_describes_every_key():
     found = schema()
     assert found["required"] == ["campaign", "scenario"]
-    assert found["properties"]["campaign"]["enum"] == list(CAMPAIGNS)
+    campaign = found["properties"]["campaign"]
+    assert campaign["examples"] == list(kinds())
+    assert all(f"{name}: {kind.description}" in campaign["description"] for name, kind in kinds().items())
     assert found["$defs"]["ExecutorChoice"]["properties"]["kind"]["enum"] == list(EXECUTORS)
     models = [found, *(d for d in found["$defs"].values() if "properties" in d)]
     assert all("description" in key for model in models for key in model["properties"].values())
 
 
-@pytest.mark.parametrize("campaign", CAMPAIGNS)
+@pytest.mark.parametrize("campaign", kinds())
 @pytest.mark.parametrize("key", ["metamodel", "acquisition"])
 def test_schema_says_the_defaults_of_each_campaign(campaign: str, key: str):
     default = parse(f"campaign: {campaign}\nscenario: cut_in\n").config.model_dump(exclude_none=True).get(key)
@@ -337,7 +340,7 @@ def test_without_changes_the_scenario_is_the_plugins_own(folder: Path):
         ("metamodel: {kind: gq}", "f.yaml:3:19: metamodel.kind: metamodels must be one of"),
         ("metamodel: {kind: et, tres: 3}", "f.yaml:3:12: metamodel: ExtraTrees takes a setting of"),
         ("metamodel: {kind: et, preset: papr}", "f.yaml:3:12: metamodel: ExtraTrees takes a preset of paper, but got 'papr'"),
-        ("metamodel: {kind: 'plugin.py:my_acquisition'}", "metamodel.kind: a metamodel must be a class with fit(u, y, rng)"),
+        ("metamodel: {kind: 'plugin.py:my_acquisition'}", "metamodel.kind: a metamodel must be a class (or an object) with fit(u, y, rng)"),
         ("acquisition: {kind: bondary}", "f.yaml:3:21: acquisition.kind: acquisitions must be one of"),
         ("acquisition: {kind: 'plugin.py:NOT_A_SCENARIO'}", "acquisition.kind: an acquisition must be a function"),
     ],

@@ -89,16 +89,18 @@ def test_commands_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert done.exit_code == 0, f"{args}: {done.output}"
 
 
-LANGUAGES = {"bash", "console", "python", "text", "xml", "yaml"}
+LANGUAGES = {"bash", "console", "python", "text", "toml", "xml", "yaml"}
 RUN = {
-    "README.md": {"bash", "yaml"}, "docs/benchmark.md": {"bash"}, "docs/boundary.md": {"console"},
+    "README.md": {"bash", "yaml"}, "docs/benchmark.md": {"bash"}, "docs/boundary.md": {"console", "python"},
     "docs/clusters.md": {"bash", "yaml"}, "docs/configuration.md": {"yaml"}, "docs/estimation.md": {"yaml"},
-    "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
-    "docs/scenarios.md": {"python"}, "docs/testbeds.md": {"console", "python", "yaml"},
+    "docs/extending.md": {"python", "toml", "yaml"}, "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
+    "docs/python.md": {"python"}, "docs/scenarios.md": {"python"}, "docs/testbeds.md": {"console", "python", "yaml"},
     "docs/tutorials/actors.md": {"bash", "python", "yaml"}, "docs/tutorials/own_files.md": {"bash", "xml", "yaml"},
     "docs/tutorials/traci_loop.md": {"bash", "python", "xml", "yaml"},
 }  # fmt: skip
 """What each page must show; all of it is run or checked, by this file or (a block that names a file) by test_tutorials.py."""
+NOTEBOOKS = ("docs/python.md",)
+"""Pages whose Python blocks go on from each other."""
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 
 
@@ -124,10 +126,57 @@ def test_every_block_says_its_language_and_few_are_not_run():
     assert sum(bool(block.not_run) for block in BLOCKS) <= 2
 
 
-@pytest.mark.parametrize("block", of("python"))
+@pytest.mark.parametrize("block", [each for each in of("python") if each.values[0].page not in NOTEBOOKS])
 def test_python_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(block.text, str(block), "exec"), {"__name__": "documentation"})
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("page", NOTEBOOKS)
+def test_notebook_pages_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One block after the other, in one process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    namespace: dict[str, Any] = {"__name__": "documentation"}
+    for block in blocks_of(ROOT / page, "python"):
+        exec(compile(block.text, str(block), "exec"), namespace)
+
+
+RECIPES = {block.name: block for block in BLOCKS if block.page == "docs/extending.md" and block.name}
+
+
+@pytest.fixture
+def recipes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the files of the page."""
+    monkeypatch.chdir(tmp_path)
+    for name, block in RECIPES.items():
+        (tmp_path / name).write_text(block.text)
+    return tmp_path
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("name", [name for name in RECIPES if name.endswith(".py")])
+def test_recipes_pass_their_own_checks(name: str, recipes: Path):
+    done = subprocess.run([sys.executable, name], cwd=recipes, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    private = re.findall(r"sbt\.(?!campaigns\b|testing\b)[a-z_]+\.[a-z_]+ import|from sbt\.(?!campaigns |testing )", RECIPES[name].text)
+    assert private == []
+
+
+@pytest.mark.parametrize("name", [name for name in RECIPES if name.endswith(".yaml")])
+def test_recipes_run_from_a_configuration(name: str, recipes: Path):
+    done = CliRunner().invoke(app, ["run", name, "--json", "--set", "executor.kind=serial", "--store", str(recipes / "s")])
+    assert done.exit_code in (0, 4), done.output
+
+
+def test_recipes_are_short():
+    def lines(name: str) -> int:
+        text = RECIPES[name].text.partition("if __name__")[0]
+        return len([line for line in text.splitlines() if line.strip()])
+
+    assert lines("quadratic.py") <= 15
+    assert lines("weighted.py") <= 6
 
 
 @pytest.mark.parametrize("block", of("yaml"))

@@ -21,7 +21,7 @@ from sbt.errors import InputError
 from sbt.loop.stages import Log
 from sbt.store.database import Store
 from sbt.testbeds import truth
-from sbt.workflows.running import assembly_of, run_campaign, settings_of
+from studies import run_loaded, settings_of
 
 Run = Callable[..., dict[str, Any]]
 NEAREST = {"kind": "analytic.py:Nearest"}
@@ -31,7 +31,7 @@ DISC = np.pi * 0.09
 
 def on_testbed(name: str, folder: Path, **keys: Any) -> dict[str, Any]:
     given = {"campaign": "estimation", "scenario": f"testbed:{name}", "executor": {"kind": "serial"}, "store": str(folder / "s")}
-    return run_campaign(parse(json.dumps({**given, **keys})), report=False)
+    return run_loaded(parse(json.dumps({**given, **keys})), report=False)
 
 
 def test_a_known_probability(tmp_path):
@@ -66,7 +66,7 @@ def test_interrupted_and_in_two_processes_it_is_the_same(campaign: Run, configur
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_campaign(load(configured("again", **QUICK)), progress=interrupt, report=False)
+        run_loaded(load(configured("again", **QUICK)), progress=interrupt, report=False)
     again = campaign("again", **QUICK)
     two = campaign("two", **QUICK | {"executor": {"kind": "local", "workers": 2}})
     assert whole["conclusion"] == again["conclusion"] == two["conclusion"]
@@ -160,7 +160,7 @@ def test_it_refuses_runs_of_unknown_density(campaign: Run, configured: Callable[
     with Store.read(Path(result["store"])) as store:
         log = Log(store.history(), tuple(store.iterations()), ())
     loaded = load(configured(**QUICK))
-    settings = settings_of(loaded, assembly_of(loaded))
+    settings = settings_of(loaded)
     assert counted_batches(log, settings)
     blank = tuple(replace(r, log_q=None) for r in log.history.records)
     with pytest.raises(InputError, match="known proposal density"):
@@ -173,7 +173,7 @@ def test_incomplete_batches_do_not_count(campaign: Run, configured: Callable[...
     with Store.read(Path(result["store"])) as store:
         log = Log(store.history(), tuple(store.iterations()), ())
     loaded = load(configured(**QUICK))
-    settings = settings_of(loaded, assembly_of(loaded))
+    settings = settings_of(loaded)
     cut = replace(log, history=replace(log.history, records=log.history.records[:-3]))
     assert len(counted_batches(cut, settings)) == len(counted_batches(log, settings)) - 1
 

@@ -1,4 +1,4 @@
-"""Laws of the estimators: unbiased for any belief, weights fixed in advance, bounds that are exact."""
+"""Laws of the estimators: unbiased for any metamodel, weights fixed in advance, bounds that are exact."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ TRUTH = ndtr(-2.0)  # of x1 > 2
 
 
 def wrong(z):
-    """A belief that is wrong everywhere: it takes the failure to lie at x2 > 1.5, and half doubts the rest."""
+    """A metamodel that is wrong everywhere: it takes the failure to lie at x2 > 1.5, and is nearly sure of that."""
     pi = np.clip(0.9 * (z[:, 1] > 1.5) + 0.02, 0.0, 1.0)
     return np.log(pi), np.log1p(-pi)
 
 
 def nothing(z):
-    """A belief that denies every failure."""
+    """A metamodel that gives no failure any probability."""
     return np.full(len(z), -60.0), np.full(len(z), -1e-26)
 
 
 H = Mixture(WIDE, Normals(np.ones(1), np.array([[2.2, 0.5]]), np.eye(2)[None]))
 
 
-def replicate(belief, rng, *, form=None, n=20, shares=SHARES):
+def replicate(predict, rng, *, form=None, n=20, shares=SHARES):
     """Return one batch on the line x1 = 2 with a fresh, rather small pool."""
     z, stratum = H.sample(300, rng)
     log_h = H.log_density(z)
-    log_pi, log_not = belief(z)
+    log_pi, log_not = predict(z)
     plan = plan_batch(log_pi, log_not, log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum, shares)
     if form == "meta":
         plan = replace(plan, form="meta", prior=0.0, control_variate=np.zeros(len(z)))
@@ -50,10 +50,10 @@ def replicate(belief, rng, *, form=None, n=20, shares=SHARES):
 
 
 @pytest.mark.parametrize("form", [None, "meta"])
-@pytest.mark.parametrize("belief", [wrong, nothing])
-def test_unbiased_with_a_wrong_belief(belief, form):
+@pytest.mark.parametrize("predict", [wrong, nothing])
+def test_unbiased_with_a_wrong_metamodel(predict, form):
     rng = stream(1, "unbiased")
-    values = np.array([replicate(belief, rng, form=form).value for _ in range(250)])
+    values = np.array([replicate(predict, rng, form=form).value for _ in range(250)])
     error = values.std(ddof=1) / math.sqrt(len(values))
     assert abs(values.mean() - TRUTH) < 3 * error
     assert error < 0.5 * TRUTH  # the law says something

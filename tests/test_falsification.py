@@ -28,7 +28,7 @@ from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION
 from sbt.testbeds import values
-from sbt.workflows.running import run_campaign
+from studies import run_loaded
 
 CASES = '''
 from dataclasses import replace
@@ -106,7 +106,7 @@ def falsified(tmp_path: Path) -> Run:
         asked = {"campaign": "falsification", "scenario": scenario if ":" in scenario else f"cases.py:{scenario}", "budget": 50,
                  "seed": 2, "initial": 10, "executor": {"kind": "serial"}, "store": str(tmp_path / store), **keys}  # fmt: skip
         text = "".join(f"{k}: {json.dumps(v)}\n" for k, v in asked.items())
-        return run_campaign(parse(text, folder=tmp_path), report=False)
+        return run_loaded(parse(text, folder=tmp_path), report=False)
 
     return run
 

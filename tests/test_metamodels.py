@@ -149,9 +149,9 @@ from {module} import {name}
 from sbt.acquisitions import boundary
 from sbt.problem.requirement import CriticalInterval
 u = np.random.default_rng(0).random((400, 5)); y = np.sin(9 * u[:, 0]) + u[:, 1] * u[:, 2]
-belief = {name}().fit(u[:200], y[:200], np.random.default_rng(1))(u)
-score = boundary(belief, CriticalInterval(high=0.3), np.zeros(400))
-print(hashlib.sha256(score.tobytes() + belief.mu.tobytes() + belief.sigma.tobytes()).hexdigest())
+prediction = {name}().fit(u[:200], y[:200], np.random.default_rng(1))(u)
+score = boundary(prediction, CriticalInterval(high=0.3), np.zeros(400))
+print(hashlib.sha256(score.tobytes() + prediction.mu.tobytes() + prediction.sigma.tobytes()).hexdigest())
 """
     digests = set()
     for threads in ("1", "2"):
@@ -236,18 +236,18 @@ def test_likelihood_is_gpytorchs():
 def test_process_interpolates_a_smooth_function():
     u, y = rows(120)
     asked, truth = rows(200, seed=5)
-    belief = GaussianProcess().fit(u, y, np.random.default_rng(0))(asked)
-    assert np.sqrt(np.mean((belief.mu - truth) ** 2)) < 0.05
-    assert np.mean(np.abs(truth - belief.mu) < 1.96 * belief.sigma) > 0.9
+    prediction = GaussianProcess().fit(u, y, np.random.default_rng(0))(asked)
+    assert np.sqrt(np.mean((prediction.mu - truth) ** 2)) < 0.05
+    assert np.mean(np.abs(truth - prediction.mu) < 1.96 * prediction.sigma) > 0.9
 
 
 def test_noise_is_found_where_it_is():
     rng = np.random.default_rng(2)
     u = rng.random((400, 2))
     y = np.sin(4 * u[:, 1]) + np.where(u[:, 0] > 0.5, 0.5, 0.02) * rng.normal(size=400)
-    belief = GaussianProcess().fit(u, y, rng)(np.array([[0.25, 0.5], [0.75, 0.5]]))
-    assert belief.noise[0] < 0.1
-    assert 0.3 < belief.noise[1] < 0.8
+    prediction = GaussianProcess().fit(u, y, rng)(np.array([[0.25, 0.5], [0.75, 0.5]]))
+    assert prediction.noise[0] < 0.1
+    assert 0.3 < prediction.noise[1] < 0.8
 
 
 def test_process_learns_from_more_rows_than_it_is_tuned_on():
@@ -320,7 +320,7 @@ def test_recorded_jaywalking_runs(kind, least):
     for seed in range(4):
         order = np.random.default_rng(seed).permutation(len(y))
         train, test = order[:500], order[500:]
-        belief = kind().fit(u[train], y[train], np.random.default_rng(seed))(u[test])
-        results.append(scores(belief, y[test], CriticalInterval(high=0.0)))
+        prediction = kind().fit(u[train], y[train], np.random.default_rng(seed))(u[test])
+        results.append(scores(prediction, y[test], CriticalInterval(high=0.0)))
     assert np.mean([r["log_likelihood"] for r in results]) >= least
     assert np.mean([r["average_precision"] for r in results]) >= 0.38

@@ -28,7 +28,7 @@ from sbt.metamodels.recalibrated import Recalibrated
 from sbt.metamodels.scores import scores
 from sbt.metamodels.sigma_point import DeepSigmaPointProcess
 from sbt.metamodels.sparse_gp import SparseGaussianProcess
-from sbt.metamodels.stacking import Bins, stacked
+from sbt.metamodels.stacking import Bins, stacking_weights
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import device_of, minibatches
 from sbt.plugins import load, names
@@ -85,8 +85,8 @@ def test_defaults_obey_their_contract(name):
 def test_papers_settings_learn(kind):
     u, y = rows(60, d=2)
     asked, truth = rows(200, d=2, seed=3, noise=0.0)
-    belief = build(kind, "paper").fit(u, y, np.random.default_rng(0))(asked)
-    assert np.sqrt(np.mean((belief.mu - truth) ** 2)) < 0.5 * truth.std()
+    prediction = build(kind, "paper").fit(u, y, np.random.default_rng(0))(asked)
+    assert np.sqrt(np.mean((prediction.mu - truth) ** 2)) < 0.5 * truth.std()
 
 
 def test_all_built_in_metamodels_are_found():
@@ -151,10 +151,10 @@ def test_everything_moves_to_the_device(name, monkeypatch):
     with pretended_cuda(monkeypatch) as marks:
         there = dataclasses.replace(metamodel, device="cuda").fit(u, y, np.random.default_rng(0))
         fitted = marks.marked
-        belief = there(asked)
+        prediction = there(asked)
         assert 0 < fitted < marks.marked  # both the fit and the prediction were there
-        np.testing.assert_allclose(belief.mean, here(asked).mean, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(belief.std, here(asked).std, rtol=1e-6)
+        np.testing.assert_allclose(prediction.mean, here(asked).mean, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(prediction.std, here(asked).std, rtol=1e-6)
         if name.startswith("gp"):
             draws = [p.sample_paths(asked, 3, np.random.default_rng(1)) for p in (here, there)]
             np.testing.assert_allclose(*draws, rtol=1e-6, atol=1e-6)
@@ -217,8 +217,8 @@ from sbt.metamodels.sigma_point import DeepSigmaPointProcess
 from sbt.metamodels.deep_ensemble import Ensemble
 u = np.random.default_rng(0).random((300, 5)); y = np.sin(9 * u[:, 0]) + u[:, 1] * u[:, 2]
 for kind in (Ensemble(steps=20), BayesianNetwork(widths=(256, 256), max_steps=10), DeepSigmaPointProcess(max_epochs=2)):
-    belief = kind.fit(u[:150], y[:150], np.random.default_rng(1))(u)
-    print(hashlib.sha256(belief.mean.tobytes() + belief.std.tobytes()).hexdigest())
+    prediction = kind.fit(u[:150], y[:150], np.random.default_rng(1))(u)
+    print(hashlib.sha256(prediction.mean.tobytes() + prediction.std.tobytes()).hexdigest())
 """
     runs = []
     for threads in ("1", "2"):
@@ -240,10 +240,10 @@ def test_ensemble_learns_function_and_noise():
     rng = np.random.default_rng(2)
     u = rng.random((600, 2))
     y = np.sin(4 * u[:, 1]) + np.where(u[:, 0] > 0.5, 0.5, 0.05) * rng.normal(size=600)
-    belief = Ensemble(members=4, steps=600).fit(u, y, rng)(np.array([[0.2, 0.5], [0.8, 0.5]]))
-    assert np.abs(belief.mu[0] - np.sin(2.0)) < 0.15
-    assert belief.noise[0] < 0.2
-    assert 0.3 < belief.noise[1] < 0.8
+    prediction = Ensemble(members=4, steps=600).fit(u, y, rng)(np.array([[0.2, 0.5], [0.8, 0.5]]))
+    assert np.abs(prediction.mu[0] - np.sin(2.0)) < 0.15
+    assert prediction.noise[0] < 0.2
+    assert 0.3 < prediction.noise[1] < 0.8
 
 
 @pytest.mark.parametrize("name", ["ensemble", "et"])
@@ -268,10 +268,10 @@ def test_masks_drop_the_share_they_learned():
 
 def test_draws_of_the_bnn_are_different_functions():
     u, y = rows(60, d=2)
-    belief = QUICK["bnn"].fit(u, y, np.random.default_rng(0))(u)
-    assert belief.mean.shape == (10, 60)
-    assert (belief.mean.std(axis=0) > 0).all()
-    assert (belief.epistemic > 0).all()
+    prediction = QUICK["bnn"].fit(u, y, np.random.default_rng(0))(u)
+    assert prediction.mean.shape == (10, 60)
+    assert (prediction.mean.std(axis=0) > 0).all()
+    assert (prediction.epistemic > 0).all()
 
 
 @pytest.mark.parametrize("kernel", ["rq", "matern_0.5", "matern_1.5", "matern_2.5"])
@@ -336,13 +336,13 @@ def test_students_widths_follow_the_tails():
 def test_weights_are_those_of_largest_likelihood():
     rng = np.random.default_rng(0)
     log_density = rng.normal(size=(2, 400))
-    weights = stacked(log_density, prior=0.0)
+    weights = stacking_weights(log_density, prior=0.0)
     grid = np.linspace(0.001, 0.999, 999)
     likelihood = [np.logaddexp(log_density[0] + np.log(w), log_density[1] + np.log1p(-w)).sum() for w in grid]
     assert weights[0] == pytest.approx(grid[int(np.argmax(likelihood))], abs=0.01)
-    np.testing.assert_allclose(stacked(log_density, prior=1e9), [0.5, 0.5], atol=1e-3)
+    np.testing.assert_allclose(stacking_weights(log_density, prior=1e9), [0.5, 0.5], atol=1e-3)
     hopeless = np.array([[-1e308, -1e308], [0.0, 0.0]])
-    np.testing.assert_allclose(stacked(hopeless, prior=0.0), [0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(stacking_weights(hopeless, prior=0.0), [0.0, 1.0], atol=1e-6)
 
 
 def test_auto_says_what_it_chose_and_why():
@@ -418,7 +418,7 @@ def test_auto_on_recorded_jaywalking_runs(n, least, precision):
     for seed in range(100, 105):
         order = np.random.default_rng(seed).permutation(len(y))
         train, test = order[:n], order[n:]
-        belief = Auto().fit(u[train], y[train], np.random.default_rng(seed))(u[test])
-        results.append(scores(belief, y[test], CriticalInterval(high=0.0)))
+        prediction = Auto().fit(u[train], y[train], np.random.default_rng(seed))(u[test])
+        results.append(scores(prediction, y[test], CriticalInterval(high=0.0)))
     assert np.mean([r["log_likelihood"] for r in results]) >= least
     assert np.mean([r["average_precision"] for r in results]) >= precision

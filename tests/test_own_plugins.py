@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 from typer.testing import CliRunner
 
 from sbt.acquisitions import boundary, greedy, is_greedy, log_scores
@@ -21,7 +22,8 @@ from sbt.plugins import load
 from sbt.problem.requirement import CriticalInterval
 from sbt.store.database import Store
 from sbt.testing import ContractError, check_acquisition, check_metamodel
-from sbt.workflows.running import run_campaign
+from sbt.workflows.running import Summary, run_study
+from sbt.workflows.study import Study
 
 PLUGINS = '''
 import numpy as np
@@ -100,7 +102,7 @@ PLANE = analytic(
     lambda x: 3 * (x[:, 0] - 0.5) + x[:, 1] ** 2, inputs={"a": (0.0, 0.5), "b": (0.0, 0.5)}, critical=(-np.inf, 0.0), name="plane"
 )
 '''
-Run = Callable[..., tuple[dict[str, Any], np.ndarray]]
+Run = Callable[..., tuple[Summary, np.ndarray]]
 
 
 @pytest.fixture
@@ -113,11 +115,11 @@ def folder(tmp_path: Path) -> Path:
 def run(folder: Path) -> Run:
     """Run a campaign; return its result and x of the runs (n, d)."""
 
-    def runner(store: str = "s", **keys: Any) -> tuple[dict[str, Any], np.ndarray]:
+    def runner(store: str = "s", **keys: Any) -> tuple[Summary, np.ndarray]:
         settings = {"campaign": "boundary", "scenario": "own.py:PLANE", "budget": 60, "initial": 20, "batch": 20, "seed": 1,
                     "executor": {"kind": "serial"}, "store": str(folder / store), **keys}  # fmt: skip
         text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in settings.items())
-        result = run_campaign(parse(text, folder=folder), report=False)
+        result = run_study(Study(parse(text, folder=folder)), report=False)
         with Store.read(folder / store) as written:
             return result, written.history().x
 
@@ -147,7 +149,7 @@ class Missing:
 
 class Refuses:
     def __init__(self, degree=1):
-        assert degree < 5, "too wiggly"  # noqa: PT018
+        assert degree < 5, "too wiggly"
 
     def fit(self, u, y, rng):
         return None
@@ -200,12 +202,12 @@ def test_a_plain_class_runs_a_campaign(run, campaign):
     assert len(x) >= 60  # confirmations come beside the budget
     again, same = run("again", campaign=campaign, metamodel=metamodel)
     np.testing.assert_array_equal(x, same)
-    assert again["conclusion"] == result["conclusion"]
+    assert again.conclusion == result.conclusion
 
 
 def test_objects_and_recalibration_work_in_campaigns(run, folder):
     result, _ = run(metamodel={"kind": "own.py:QUADRATIC", "recalibrate": True})
-    assert result["runs"] == 60
+    assert result.runs == 60
     points = folder / "points.csv"
     points.write_text("a,b\n0.1,0.1\n0.4,0.4\n")
     done = CliRunner().invoke(app, ["predict", str(folder / "s"), "--inputs", str(points), "--json"])
@@ -230,22 +232,19 @@ def test_scores_above_zero_are_drawn_from(run, campaign, kind):
 @pytest.mark.parametrize("campaign", ["boundary", "falsification"])
 @pytest.mark.parametrize("kind", ["straddle", "expected_feasibility", "u", "own.py:farthest", "own.py:WIDE"])
 def test_greedy_acquisitions_are_chosen_greedily(run, campaign, kind):
-    """Of the same budget: the highest scores, none of them near another."""
-    keys = {"campaign": campaign, "metamodel": {"kind": "own.py:Nearest"}, "validation": {"share": 0}, "stop": None}
-    keys = {k: v for k, v in keys.items() if v is not None}
+    """No point twice; where the score is the distance to the runs, points lie farther apart than even ones."""
+    keys = {"campaign": campaign, "metamodel": {"kind": "own.py:Nearest"}, "validation": {"share": 0}}
     _, x = run(acquisition={"kind": kind}, **keys)
-    u = x[:60] / 0.5
-    gaps = np.linalg.norm(u[:, None] - u[None], axis=2)[np.triu_indices(len(u), 1)]
-    if kind in ("own.py:farthest", "own.py:WIDE"):
-        _, random = run("random", acquisition={"kind": "even"}, **keys)
-        far = np.linalg.norm((random[:60] / 0.5)[:, None] - (random[:60] / 0.5)[None], axis=2)[np.triu_indices(60, 1)]
-        assert gaps.min() > far.min()
-    assert len(np.unique(u, axis=0)) == 60
+    assert len(np.unique(x[:60], axis=0)) == 60
+    if kind.startswith("own.py"):
+        _, even = run("even", acquisition={"kind": "even"}, **keys)
+        assert pdist(x[:60]).min() > pdist(even[:60]).min()
 
 
 def test_an_error_of_an_acquisition_names_it_and_the_line(run, folder):
     line = next(i for i, text in enumerate(PLUGINS.splitlines(), 1) if "# marked" in text)
-    with pytest.raises(InputError, match=rf"acquisition broken must score \d+ points, but raised AttributeError: .*own.py:{line}\)"):
+    message = rf"acquisition broken must score \d+ points, but raised AttributeError: .*own.py:{line}\)"
+    with pytest.raises(InputError, match=message):
         run(acquisition={"kind": "own.py:broken"})
 
 

@@ -18,7 +18,7 @@ from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import Store
 from sbt.workflows.prediction import MODEL, read_inputs
-from sbt.workflows.running import assembly_of, loaded_from, settings_of
+from sbt.workflows.study import Study
 
 ROWS = "b,note,x.a\n0.5,middle,0.5\n0.1,corner,0.9\n"
 
@@ -43,8 +43,7 @@ def predicted(store) -> dict:
 def test_it_is_the_belief_of_the_campaign(store):
     found = predicted(store)
     with Store.read(store) as opened:
-        loaded, history = loaded_from(opened), opened.history()
-    settings = settings_of(loaded, assembly_of(loaded))
+        settings, history = Study.from_store(opened).settings, opened.history()
     belief = settings.learner.train(history.finished)(np.array([[0.5, 0.5], [0.9, 0.1]]))  # held-out runs, too
     assert [(row["a"], row["b"]) for row in found["rows"]] == [(0.5, 0.5), (0.9, 0.1)]
     for name, values in {

@@ -1,4 +1,4 @@
-"""Laws of the belief: densities, probabilities and quantiles against SciPy, far into the tails."""
+"""Laws of the prediction: densities, probabilities and quantiles against SciPy, far into the tails."""
 
 from __future__ import annotations
 
@@ -48,21 +48,21 @@ def test_density_integrates_to_one_and_matches_scipy():
     np.testing.assert_allclose(GAUSSIAN.log_density_gaussian(y), expected)
 
 
-@pytest.mark.parametrize("belief", [GAUSSIAN, MIXTURE], ids=["gaussian", "mixture"])
+@pytest.mark.parametrize("prediction", [GAUSSIAN, MIXTURE], ids=["gaussian", "mixture"])
 @pytest.mark.parametrize("critical", INTERVALS, ids=str)
-def test_inside_and_outside_sum_to_one(belief, critical):
-    inside, outside = belief.log_probability(critical)
+def test_inside_and_outside_sum_to_one(prediction, critical):
+    inside, outside = prediction.log_probability(critical)
     np.testing.assert_allclose(np.exp(inside) + np.exp(outside), 1.0, atol=1e-14)
     assert (inside <= 0).all()
     assert (outside <= 0).all()
-    p = belief.probability(critical)
+    p = prediction.probability(critical)
     assert ((p >= 0) & (p <= 1)).all()
 
 
-@pytest.mark.parametrize("belief", [GAUSSIAN, MIXTURE], ids=["gaussian", "mixture"])
-def test_probability_is_the_difference_of_the_cdf(belief):
-    expected = belief.cdf(np.full(40, 0.5)) - belief.cdf(np.full(40, -0.7))
-    np.testing.assert_allclose(belief.probability(CriticalInterval(-0.7, 0.5)), expected, atol=1e-14)
+@pytest.mark.parametrize("prediction", [GAUSSIAN, MIXTURE], ids=["gaussian", "mixture"])
+def test_probability_is_the_difference_of_the_cdf(prediction):
+    expected = prediction.cdf(np.full(40, 0.5)) - prediction.cdf(np.full(40, -0.7))
+    np.testing.assert_allclose(prediction.probability(CriticalInterval(-0.7, 0.5)), expected, atol=1e-14)
 
 
 def test_probability_grows_with_the_interval():
@@ -76,12 +76,12 @@ def test_probability_grows_with_the_interval():
 @pytest.mark.parametrize("z", [1.0, 5.0, 8.0, 37.0, 100.0, 1e3])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_far_tails_agree_with_scipy(z, side):
-    belief = Prediction.gaussian([side * z], [1.0])
+    prediction = Prediction.gaussian([side * z], [1.0])
     tail = CriticalInterval(high=0.0) if side > 0 else CriticalInterval(low=0.0)
-    inside, outside = belief.log_probability(tail)
+    inside, outside = prediction.log_probability(tail)
     assert inside[0] == pytest.approx(stats.norm.logsf(z), rel=1e-12)
     assert outside[0] == pytest.approx(stats.norm.logcdf(z), rel=1e-9, abs=1e-300)
-    inside, outside = belief.log_probability(CriticalInterval(-0.01, 0.01))
+    inside, outside = prediction.log_probability(CriticalInterval(-0.01, 0.01))
     near, far = stats.norm.logsf(z - 0.01), stats.norm.logsf(z + 0.01)
     assert inside[0] == pytest.approx(near + np.log(-np.expm1(far - near)), rel=1e-9)
     assert np.isfinite(outside[0])
@@ -89,29 +89,29 @@ def test_far_tails_agree_with_scipy(z, side):
 
 def test_narrow_interval_is_density_times_width():
     for centre in (0.0, 3.0, 50.0, -400.0):
-        belief, width = Prediction.gaussian([0.0], [1.0]), max(abs(centre), 1.0) * 1e-9
+        prediction, width = Prediction.gaussian([0.0], [1.0]), max(abs(centre), 1.0) * 1e-9
         critical = CriticalInterval(centre - width / 2, centre + width / 2)
         real = critical.high - critical.low  # as rounded
         expected = stats.norm.logpdf(centre) + np.log(real)
-        assert belief.log_probability(critical)[0][0] == pytest.approx(expected, rel=1e-6)
+        assert prediction.log_probability(critical)[0][0] == pytest.approx(expected, rel=1e-6)
     point = Prediction.gaussian([0.0], [1.0]).log_probability(CriticalInterval(1.0, 1.0))
     assert point[0][0] == -np.inf
     assert point[1][0] == 0.0
 
 
 def test_mixture_of_far_components_stays_finite():
-    belief = Prediction(np.array([[1e3], [2e3]]), np.ones((2, 1)), np.array([0.5, 0.5]), np.zeros(1))
+    prediction = Prediction(np.array([[1e3], [2e3]]), np.ones((2, 1)), np.array([0.5, 0.5]), np.zeros(1))
     for critical in (CriticalInterval(high=0.0), CriticalInterval(-1.0, 0.0)):
-        log_p, log_not = belief.log_probability(critical)
+        log_p, log_not = prediction.log_probability(critical)
         assert np.isfinite(log_p[0])
         assert log_not[0] == 0.0
-    assert np.isfinite(belief.log_density(np.array([-1e6]))[0])
+    assert np.isfinite(prediction.log_density(np.array([-1e6]))[0])
 
 
 def test_a_zero_weight_and_a_tiny_sigma_do_no_harm():
-    belief = Prediction(np.array([[0.0], [5.0]]), np.array([[1e-12], [1.0]]), np.array([0.0, 1.0]), np.zeros(1))
-    assert belief.mu[0] == 5.0
-    log_p, log_not = belief.log_probability(CriticalInterval(high=0.0))
+    prediction = Prediction(np.array([[0.0], [5.0]]), np.array([[1e-12], [1.0]]), np.array([0.0, 1.0]), np.zeros(1))
+    assert prediction.mu[0] == 5.0
+    log_p, log_not = prediction.log_probability(CriticalInterval(high=0.0))
     assert log_p[0] == pytest.approx(stats.norm.logcdf(-5.0))
     assert np.isfinite(log_not[0])
 
@@ -119,9 +119,9 @@ def test_a_zero_weight_and_a_tiny_sigma_do_no_harm():
 @pytest.mark.parametrize("q", [1e-12, 1e-3, 0.025, 0.5, 0.9, 0.975, 1 - 1e-9])
 def test_quantile_inverts_the_cdf(q):
     wide = Prediction(MIXTURE.mean * 50.0, MIXTURE.std, MIXTURE.weight, MIXTURE.noise)
-    for belief in (GAUSSIAN, MIXTURE, wide):
-        y = belief.quantile(q)
-        np.testing.assert_allclose(belief.cdf(y), q, rtol=1e-8 if q > 1e-6 else 1e-6)
+    for prediction in (GAUSSIAN, MIXTURE, wide):
+        y = prediction.quantile(q)
+        np.testing.assert_allclose(prediction.cdf(y), q, rtol=1e-8 if q > 1e-6 else 1e-6)
 
 
 def test_mixture_of_predictions_is_the_weighted_law():

@@ -267,7 +267,7 @@ WRONG = {
     "surplus": (lambda: Distribution.of("uniform", low=0), "takes no parameters, but got low"),
     "negative": (lambda: Distribution.of("normal", mean=0, std=-1), "cannot have the parameters"),
     "zero": (lambda: Distribution.of("lognormal", mean=0, std=1), "cannot have the parameters"),
-    "scipy": (lambda: Distribution.of("scipy", name="poisson", mu=3), "continuous law of scipy.stats, but got poisson"),
+    "scipy": (lambda: Distribution.of("scipy", name="poisson", mu=3), "continuous distribution of scipy.stats, but got poisson"),
     "no inputs": (lambda: ParameterSpace(()), "at least one input"),
     "doubled": (lambda: ParameterSpace((Parameter("a", 0, 1),) * 2), "different names, but got a, a"),
     "shape": (lambda: ParameterSpace(SQUARE.parameters, ((1.0,),)), "symmetric \\(2, 2\\) matrix"),

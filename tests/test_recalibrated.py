@@ -32,9 +32,9 @@ class Wrong:
 def test_sigma_comes_out_right_and_noise_with_it(sigma):
     y = np.random.default_rng(0).normal(size=1500)
     u = np.random.default_rng(1).random((1500, 2))
-    belief = Recalibrated(Wrong(sigma)).fit(u, y, stream(0, "fit"))(u[:5])
-    np.testing.assert_allclose(belief.sigma, 1.0, atol=0.12)
-    np.testing.assert_allclose(belief.noise / belief.sigma, 0.5)
+    prediction = Recalibrated(Wrong(sigma)).fit(u, y, stream(0, "fit"))(u[:5])
+    np.testing.assert_allclose(prediction.sigma, 1.0, atol=0.12)
+    np.testing.assert_allclose(prediction.noise / prediction.sigma, 0.5)
     few = Recalibrated(Wrong(sigma)).fit(u[:40], y[:40], stream(0, "fit"))(u[:5])
     np.testing.assert_array_equal(few.sigma, sigma)
 

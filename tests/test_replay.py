@@ -22,11 +22,16 @@ from sbt.report.film import metric_so_far
 from sbt.sumo import gui
 from sbt.sumo.nets import lanes
 from sbt.sumo.session import libsumo, session
-from sbt.workflows.running import replay, run_campaign
+from sbt.workflows.running import replay_run, run_study
+from sbt.workflows.study import Study
 
 pytestmark = pytest.mark.sumo
 
 Run = tuple[Path, Trace, LogicalScenario]
+
+
+def study(text: str) -> Study:
+    return Study(parse(text))
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +44,10 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
             f"campaign: coverage\nscenario: {name}\nbudget: 4\nbatch: 4\nvalidation: {{share: 0}}\n"
             f"executor: {{kind: serial}}\nstore: {folder}\n"
         )
-        run_campaign(parse(text), report=False)
-        _, _, trace, scenario = replay(folder, 1)
-        assert trace is not None
-        found[name] = (folder, trace, scenario)
+        run_study(study(text), report=False)
+        again = replay_run(folder, 1)
+        assert again.trace is not None
+        found[name] = (folder, again.trace, again.scenario)
     return found
 
 
@@ -138,7 +143,7 @@ def test_a_replay_that_cannot_be_shown_says_so(stored: dict[str, Run], tmp_path:
     with pytest.raises(InputError, match="needs a display, but neither DISPLAY"):
         gui.gui_program()
     text = f"campaign: coverage\nscenario: testbed:four_branch_7\nbudget: 4\nexecutor: {{kind: serial}}\nstore: {tmp_path}/s\n"
-    run_campaign(parse(text), report=False)
+    run_study(study(text), report=False)
     done = CliRunner().invoke(app, ["replay", str(tmp_path / "s"), "1", "--gif", str(tmp_path / "x.gif")])
     assert done.exit_code == 2
     assert "only a run with a trace can be shown" in done.output
@@ -148,7 +153,7 @@ def test_a_replay_that_cannot_be_shown_says_so(stored: dict[str, Run], tmp_path:
 @pytest.mark.parametrize("name", ["cut_in", "jaywalking"])
 def test_another_sumo_program_shows_the_same_run(name: str, stored: dict[str, Run]):
     folder, trace, scenario = stored[name]
-    record = replay(folder, 1)[0]
+    record = replay_run(folder, 1).record
     program = shutil.which("sumo")
     assert program is not None
     assert gui.run_in_gui(scenario.simulate, record.inputs, record.seed, program).identical(trace)

@@ -12,6 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sbt.campaigns.boundary import BoundaryConclusion
+from sbt.campaigns.coverage import CoverageConclusion
+from sbt.campaigns.estimation import EstimationConclusion
+from sbt.campaigns.failures import FalsificationConclusion
+from sbt.campaigns.parts import CriticalShare
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.distribution import Distribution
 from sbt.problem.outcome import Outcome, Status
@@ -21,18 +26,24 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.html import write_report
-from sbt.report.projection import influence_from_runs, influence_on_probability, most_telling_pairs, probability_plane
+from sbt.report.projection import influence_from_runs, influence_on_probability, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words, warnings_for
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import VALIDATION
+from sbt.store.records import FitRecord, Validation
 
 CRITICAL = CriticalInterval(-5.0, 0.5)
 SECTIONS = ("conclusion", "figures", "inputs", "iterations", "critical", "failed", "reproduce", "references")
-SCORES = {
-    "log_likelihood": -0.4, "log_likelihood_critical": None, "rmse": 0.3, "average_precision": 0.9,
-    "precision_at_recall_90": 0.8, "calibration_error": 0.03, "n": 50, "n_critical": 17,
-}  # fmt: skip
+SCORES = Validation(
+    log_likelihood=-0.4, rmse=0.3, average_precision=0.9, precision_at_recall_90=0.8, calibration_error=0.03, n=50, n_critical=17
+)
+
+
+def fit_record(runs, iteration, **scores):
+    """Return what the log keeps of a fit."""
+    return FitRecord(runs, 0.16, 0.02, 0.1, "", dataclasses.replace(SCORES, **scores), runs=runs, iteration=iteration)
+
 
 
 def metric(u):
@@ -46,8 +57,8 @@ def predict(u):
 
 
 def scenario_of(d, description="Wedge.\nAn analytic stand-in.", **changes):
-    law = Distribution.of(kind="normal", mean=0, std=8)
-    first = (Parameter("d_t", 0.2, 4.0, "s", description="time gap"), Parameter("d_v", -10.0, 30.0, "m/s", law))
+    distribution = Distribution.of(kind="normal", mean=0, std=8)
+    first = (Parameter("d_t", 0.2, 4.0, "s", description="time gap"), Parameter("d_v", -10.0, 30.0, "m/s", distribution))
     rest = tuple(Parameter(f"x{k}", 0, 5, "", kind="integer") for k in range(2, d))
     return LogicalScenario(
         "wedge", ParameterSpace((first + rest)[:d]), Requirement("ttc_min", CRITICAL.low, CRITICAL.high), description=description,
@@ -74,8 +85,8 @@ def fill(folder, scenario, runs=60, held_out=50, *, fail=False, fits=True, reaso
             outcome = Outcome(start + k, Status.FAILED if lost else Status.OK, metrics, reason if lost else "", 0.01)
             store.append(outcome, "sbt 0, libsumo 1.28")
     if fits:
-        store.add_fit(60, 1, SCORES)
-        store.add_fit(110, 2, {**SCORES, "log_likelihood": -0.2})
+        store.add_fit(fit_record(60, 1))
+        store.add_fit(fit_record(110, 2, log_likelihood=-0.2))
     return store
 
 
@@ -95,8 +106,8 @@ class Page(HTMLParser):
             self.loads += [value for key, value in attrs if key in ("src", "href", "xlink:href", "data") and value]
 
 
-def page_of(store, scenario, predictor=predict):
-    return Page(write_report(store, scenario, predictor).read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " "))
+def page_of(store, scenario, predictor=predict, conclusion=None):
+    return Page(write_report(store, scenario, predictor, conclusion).read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " "))
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +214,7 @@ def test_thousands_of_runs_stay_a_small_file(tmp_path):
     scenario = scenario_of(5)
     with fill(tmp_path, scenario, 4500, 500) as store:
         start = time.perf_counter()
-        path = write_report(store, scenario, predict)
+        path = write_report(store, scenario, predict, None)
         assert time.perf_counter() - start < 20
     assert path.stat().st_size < 3_000_000
     assert "more critical runs are in the store" in path.read_text(encoding="utf-8")
@@ -212,7 +223,7 @@ def test_thousands_of_runs_stay_a_small_file(tmp_path):
 def test_writes_elsewhere_and_leaves_no_temporary_file(tmp_path):
     scenario = scenario_of(2)
     with fill(tmp_path / "store", scenario) as store:
-        assert write_report(store, scenario, None, folder=tmp_path / "out") == tmp_path / "out" / "report.html"
+        assert write_report(store, scenario, None, None, folder=tmp_path / "out") == tmp_path / "out" / "report.html"
     assert not (tmp_path / "store" / "report.html").exists()
     assert not [path for path in Path(tmp_path / "out").rglob(".*")]
 
@@ -221,20 +232,20 @@ def warned(tmp_path, conclusion=None, fit=None, runs=60, **settings):
     scenario = scenario_of(2)
     with fill(tmp_path, scenario, runs, fits=False, **settings) as store:
         if fit is not None:
-            store.add_fit(110, 2, {**SCORES, **fit})
+            store.add_fit(fit_record(110, 2, **fit))
         if conclusion is not None:
-            store.conclude(conclusion)
-        return " ".join(warnings_for(Findings.of(store, scenario)))
+            store.conclude({"stopped": "budget"})
+        return " ".join(warnings_for(Findings.of(store, scenario, conclusion)))
 
 
 def test_says_what_limits_the_conclusion(tmp_path):
-    done = {"conclusion": {"warnings": ["own warning"]}, "stopped": "budget"}
+    done = EstimationConclusion(0.1, 0.0, 0.2, warnings=("own warning",))
     assert "not concluded: 110 of 110" in warned(tmp_path / "a")
     text = warned(tmp_path / "b", done, {"n_critical": 3, "calibration_error": 0.3})
     for part in ("Only 3 critical runs", "Poor calibration", "own warning", "3 of 110 runs failed"):
         assert part in text
     assert "not concluded" not in text
-    fine = warned(tmp_path / "c", {"stopped": "budget"}, {})
+    fine = warned(tmp_path / "c", EstimationConclusion(0.1, 0.0, 0.2), {})
     assert "Only" not in fine
     assert "calibration" not in fine
     assert "never tested" in warned(tmp_path / "d", done, {"n": 0, "n_critical": 0})
@@ -245,31 +256,35 @@ def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
     with fill(tmp_path, scenario) as store:
         narrow = dataclasses.replace(scenario, requirement=Requirement("ttc_min", 0.0, 0.5))
         n = int((store.history().y("ttc_min") < 0).sum())
-        assert f"{n} runs have ttc_min below 0, beyond" in " ".join(warnings_for(Findings.of(store, narrow)))
-        assert "beyond" not in " ".join(warnings_for(Findings.of(store, scenario)))
+        assert f"{n} runs have ttc_min below 0, beyond" in " ".join(warnings_for(Findings.of(store, narrow, None)))
+        assert "beyond" not in " ".join(warnings_for(Findings.of(store, scenario, None)))
 
 
 @pytest.mark.parametrize(
     ("result", "expected"),
     [
-        ({"critical_fraction": 0.163, "low": 0.12, "high": 0.21}, "16.3 % (95 % interval 12 % to 21 %)"),
-        ({"critical_fraction": 0.163}, "takes 16.3 % of the parameter space"),
+        (CoverageConclusion(0.163, 0.12, 0.21), "16.3 % (95 % interval 12 % to 21 %)"),
+        (BoundaryConclusion(0.163, 0.01, 0.1, None), "takes 16.3 % of the parameter space"),
         (
-            {"held_out_fraction": {"critical_fraction": 0.2, "low": 0.1, "high": 0.3, "counted": 50}},
+            BoundaryConclusion(0.163, 0.01, 0.1, None, held_out_fraction=CriticalShare(0.2, 0.1, 0.3, 0.95, 50)),
             "10 % to 30 %), from 50 runs",
         ),
-        ({"first_critical_run": 12, "failure_modes": 3}, "falsified: the first critical run is number 12; 3 distinct"),
-        ({"first_critical_run": None}, "not falsified"),
-        ({"probability": 1.2e-5, "low": 8e-6, "high": 2e-5, "confidence": 0.95, "hits": 0}, "1.2e-05 (95 % interval 8e-06"),
-        ({"probability": 0.0, "exact_bound": 0.003}, "at most 0.003"),
-        ({}, "from 50 runs spread over it"),
+        (
+            FalsificationConclusion(11, 12, 5, (), None, None, "What follows."),
+            "falsified: the first critical run is run 11, after 12 runs of the search; 0 distinct failure modes",
+        ),
+        (FalsificationConclusion(None, None, 0, (), None, None, ""), "not falsified"),
+        (EstimationConclusion(1.2e-5, 8e-6, 2e-5), "1.2e-05 (95 % interval 8e-06"),
+        (EstimationConclusion(0.0, 0.0, 0.003, exact_bound=0.003), "at most 0.003"),
+        (BoundaryConclusion(None, None, None, None), "from 50 runs spread over it"),
+        (None, "from 50 runs spread over it"),
     ],
 )
 def test_conclusion_in_words(tmp_path, result, expected):
     scenario = scenario_of(2)
     with fill(tmp_path, scenario) as store:
-        store.conclude({"conclusion": result, "stopped": "budget", "seconds": {"fit": 2.0}})
-        assert expected in page_of(store, scenario, None).text
+        store.conclude({"stopped": "budget", "seconds": {"fit": 2.0}})
+        assert expected in page_of(store, scenario, None, result).text
 
 
 def test_ego_of_the_campaign_is_not_forgotten(tmp_path):
@@ -295,11 +310,11 @@ def test_influence_finds_what_matters(tmp_path):
         order = influence_from_runs(store.history(), scenario.requirement)
     assert order.argmax() == 1
     assert order.max() == 1.0
-    pairs = most_telling_pairs(np.array([0.1, 1.0, 0.5, 0.2, 0.0]))
+    pairs = most_influential_pairs(np.array([0.1, 1.0, 0.5, 0.2, 0.0]))
     assert pairs[0] == (1, 2)
     assert len(pairs) == 6
     assert all(4 not in pair for pair in pairs)
-    assert most_telling_pairs(np.zeros(20)) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert most_influential_pairs(np.zeros(20)) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
 def test_plane_is_the_mean_over_the_other_inputs():

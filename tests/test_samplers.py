@@ -71,9 +71,9 @@ def test_dimension_zero_is_refused():
 
 
 def test_even_is_the_sequence_itself():
-    belief = CriticalInterval(high=0.0)
+    critical = CriticalInterval(high=0.0)
     draw = rejection(
-        lambda u: even(Prediction.gaussian(np.zeros(len(u)), np.ones(len(u))), belief, np.zeros(len(u))),
+        lambda u: even(Prediction.gaussian(np.zeros(len(u)), np.ones(len(u))), critical, np.zeros(len(u))),
         SOBOL, 700, start=40, seed=0, label=1,
     )  # fmt: skip
     np.testing.assert_array_equal(draw.u, SOBOL.points(40, 740))

@@ -18,8 +18,8 @@ CRITICAL = CriticalInterval(high=0.0)
 rng = np.random.default_rng(0)
 MU, SIGMA = rng.normal(1.0, 1.5, 500), rng.uniform(0.3, 1.5, 500)
 Y = rng.normal(MU, SIGMA)
-BELIEF = Prediction.gaussian(MU, SIGMA)
-RESULT = scores(BELIEF, Y, CRITICAL)
+PREDICTION = Prediction.gaussian(MU, SIGMA)
+RESULT = scores(PREDICTION, Y, CRITICAL)
 
 
 def test_likelihood_and_rmse_are_the_papers():
@@ -33,7 +33,7 @@ def test_likelihood_and_rmse_are_the_papers():
 
 
 def test_ranking_and_classification_agree_with_scikit_learn():
-    p, mask = BELIEF.probability(CRITICAL), Y <= 0
+    p, mask = PREDICTION.probability(CRITICAL), Y <= 0
     assert RESULT["average_precision"] == pytest.approx(metrics.average_precision_score(mask, p))
     assert RESULT["f1"] == pytest.approx(metrics.f1_score(mask, p >= 0.5))
     precision, recall, _ = metrics.precision_recall_curve(mask, p)
@@ -41,7 +41,7 @@ def test_ranking_and_classification_agree_with_scikit_learn():
 
 
 def test_ties_are_one_threshold():
-    p = np.round(BELIEF.probability(CRITICAL), 1)
+    p = np.round(PREDICTION.probability(CRITICAL), 1)
     mask = Y <= 0
     precision, recall, threshold = precision_recall(p, mask)
     assert (np.diff(threshold) < 0).all()
@@ -71,7 +71,7 @@ def test_an_honest_belief_is_calibrated():
     assert bold["log_likelihood"] < RESULT["log_likelihood"]
 
 
-def test_reliability_of_a_certain_belief():
+def test_reliability_of_a_certain_prediction():
     mean_p, frequency, count = reliability(np.array([0.0, 1.0, 1.0]), np.array([False, True, False]), 15)
     assert count.tolist() == [1, *[0] * 13, 2]
     assert (mean_p[-1], frequency[-1]) == (1.0, 0.5)
@@ -79,7 +79,7 @@ def test_reliability_of_a_certain_belief():
 
 
 def test_without_a_critical_run_its_scores_are_none():
-    result = scores(BELIEF, np.abs(Y) + 1.0, CRITICAL)
+    result = scores(PREDICTION, np.abs(Y) + 1.0, CRITICAL)
     keys = ("average_precision", "precision_at_recall_90", "f1", "rmse_critical", "log_likelihood_critical")
     assert all(result[key] is None for key in keys)
     assert (result["n_critical"], result["base_rate"]) == (0, 0.0)
@@ -87,8 +87,8 @@ def test_without_a_critical_run_its_scores_are_none():
 
 
 def test_one_run_and_no_run_are_answered():
-    one = scores(BELIEF.take(slice(0, 1)), Y[:1], CRITICAL)
-    none = scores(BELIEF.take(slice(0, 0)), Y[:0], CRITICAL)
+    one = scores(PREDICTION.take(slice(0, 1)), Y[:1], CRITICAL)
+    none = scores(PREDICTION.take(slice(0, 0)), Y[:0], CRITICAL)
     assert one["n"] == 1
     assert none["n"] == 0
     assert all(value is None for key, value in none.items() if not key.startswith("n"))
@@ -102,9 +102,9 @@ def test_every_value_is_json_even_far_off():
 
 def test_wrong_input_is_refused():
     with pytest.raises(InputError, match="finite"):
-        scores(BELIEF, np.full(500, np.nan), CRITICAL)
+        scores(PREDICTION, np.full(500, np.nan), CRITICAL)
     with pytest.raises(InputError, match="one value a point"):
-        scores(BELIEF, Y[:3], CRITICAL)
+        scores(PREDICTION, Y[:3], CRITICAL)
     with pytest.raises(InputError, match="bins"):
         reliability(Y, Y > 0, 0)
     with pytest.raises(InputError, match=r"\(n,\)"):

@@ -33,14 +33,14 @@ def fitted(kind: str, n: int = 90, d: int = 3):
 def test_bounds_hold(kind):
     predict, rows = fitted(kind)
     u = np.vstack([rows, rows + 1e-9, np.random.default_rng(5).random((3000, 3))])
-    belief = predict(u)
+    prediction = predict(u)
     for critical in INTERVALS:
-        p = belief.probability(critical)
+        p = prediction.probability(critical)
         low, high = predict.probability_bounds(u, critical)
         assert (low <= p).all()
         assert (p <= high).all()
         bound = log_ambiguity_bound(predict, u, critical)
-        assert (np.maximum(boundary(belief, critical, np.zeros(len(u))), -699.0) <= bound).all()
+        assert (np.maximum(boundary(prediction, critical, np.zeros(len(u))), -699.0) <= bound).all()
 
 
 @pytest.mark.parametrize("kind", ["nu 1.5", "auto"])

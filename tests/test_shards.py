@@ -21,8 +21,9 @@ from sbt.config.load import load
 from sbt.errors import InputError
 from sbt.loop.stages import Shard
 from sbt.store.database import Store
-from sbt.workflows.merging import merge
-from sbt.workflows.running import replay, run_campaign
+from sbt.workflows.merging import merge_shards
+from sbt.workflows.running import replay_run
+from studies import run_loaded
 
 Run = Callable[..., dict[str, Any]]
 Rows = Callable[[Path | str], dict[str, list[Any]]]
@@ -39,7 +40,7 @@ def sharded(configured: Configured, n: int, scenario: str = "SCENARIO", **keys: 
     folders = []
     for k in range(n, 0, -1):
         loaded = load(configured(f"shard{k}", scenario, **keys))
-        result = run_campaign(loaded, shard=Shard(k, n))
+        result = run_loaded(loaded, shard=Shard(k, n))
         assert result["conclusion"]["shard"] == f"{k}/{n}"
         folders.append(Path(result["store"]))
     return folders
@@ -57,7 +58,7 @@ def test_merged_shards_are_the_campaign_row_for_row(
     keys: dict[str, Any], n: int, configured: Configured, campaign: Run, rows: Rows, tmp_path: Path
 ):
     whole = campaign("whole", "SOME_FAIL", **keys)
-    merged = merge(sharded(configured, n, "SOME_FAIL", **keys), tmp_path / "merged", report=False)
+    merged = merge_shards(sharded(configured, n, "SOME_FAIL", **keys), tmp_path / "merged", report=False)
     assert rows(merged["store"]) == rows(whole["store"])
     assert timeless(merged) == timeless(whole)
     assert 0 < merged["failed"] < merged["runs"]
@@ -75,18 +76,19 @@ def test_every_run_is_in_one_shard_with_its_own_index(configured: Configured, ro
 def test_a_merged_store_is_a_store(configured: Configured, rows: Rows, tmp_path: Path):
     folders = sharded(configured, 2, **LEARNED)
     into = tmp_path / "deep" / "merged"
-    merge(folders, into)
+    merge_shards(folders, into)
     assert (into / "report.html").is_file()
     assert sorted(p.name for p in into.iterdir() if p.name.startswith(".")) == []
     before = rows(into)
-    record, outcome, _, _ = replay(into, 17)
+    again = replay_run(into, 17)
+    record, outcome = again.record, again.outcome
     assert dict(record.metrics) == dict(outcome.metrics)
     told = CliRunner().invoke(app, ["status", str(into), "--json"])
     assert json.loads(told.stdout)["runs"] == {"ok": 60}
     assert CliRunner().invoke(app, ["export", str(into)]).exit_code == 0
     (tmp_path / "asked.csv").write_text("a,b\n0.5,0.5\n")
     assert CliRunner().invoke(app, ["predict", str(into), "--inputs", str(tmp_path / "asked.csv")]).exit_code == 0
-    again = run_campaign(load(configured("again", **LEARNED | {"store": str(into)})), report=False)
+    again = run_loaded(load(configured("again", **LEARNED | {"store": str(into)})), report=False)
     assert (again["runs"], rows(into)) == (60, before)
 
 
@@ -103,7 +105,7 @@ def test_a_merged_store_is_a_store(configured: Configured, rows: Rows, tmp_path:
 )
 def test_what_cannot_be_shared_out_is_refused(keys: dict[str, Any], told: str, configured: Configured):
     with pytest.raises(InputError, match=told.replace(".", r"\.").replace("(", r"\(").replace(")", r"\)")):
-        run_campaign(load(configured("c", **keys)), shard=Shard(2, 30))
+        run_loaded(load(configured("c", **keys)), shard=Shard(2, 30))
 
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "3", "a/b", "-1/3", "1/0", "1/2/3"])
@@ -113,21 +115,21 @@ def test_a_shard_is_one_of_n(text: str):
 
 
 def test_a_shard_belongs_to_one_number_and_budget(configured: Configured, rows: Rows):
-    run_campaign(load(configured("c", **COVERAGE)), shard=Shard(1, 3))
+    run_loaded(load(configured("c", **COVERAGE)), shard=Shard(1, 3))
     before = rows(configured().parent / "c")
     for shard, budget in ((None, 53), (Shard(2, 3), 53), (Shard(1, 4), 53), (Shard(1, 3), 90)):
         with pytest.raises(InputError, match="a store belongs to one configuration"):
-            run_campaign(load(configured("c", **COVERAGE | {"budget": budget})), shard=shard)
-    again = run_campaign(load(configured("c", **COVERAGE)), shard=Shard(1, 3))
+            run_loaded(load(configured("c", **COVERAGE | {"budget": budget})), shard=shard)
+    again = run_loaded(load(configured("c", **COVERAGE)), shard=Shard(1, 3))
     assert (again["runs"], rows(configured().parent / "c")) == (18, before)
 
 
 def test_what_is_not_whole_is_not_merged(configured: Configured, campaign: Run, tmp_path: Path):
     three, two, one = sharded(configured, 3, **COVERAGE)
     other = tmp_path / "other"
-    run_campaign(load(configured("other", **COVERAGE | {"seed": 9})), shard=Shard(2, 3))
+    run_loaded(load(configured("other", **COVERAGE | {"seed": 9})), shard=Shard(2, 3))
     finer = tmp_path / "finer"
-    run_campaign(load(configured("finer", **COVERAGE)), shard=Shard(2, 4))
+    run_loaded(load(configured("finer", **COVERAGE)), shard=Shard(2, 4))
     whole = Path(campaign("whole", **COVERAGE)["store"])
     cases = [
         ([one, three], r"all 53 runs must be there, but 1, 4, 7, .* \(18 in all\) are missing: shards 2 of 3 were not given"),
@@ -138,10 +140,10 @@ def test_what_is_not_whole_is_not_merged(configured: Configured, campaign: Run, 
     ]
     for folders, told in cases:
         with pytest.raises(InputError, match=told):
-            merge(folders, tmp_path / "merged")
+            merge_shards(folders, tmp_path / "merged")
         assert not (tmp_path / "merged").exists()
     with pytest.raises(InputError, match="a folder without a campaign, but there is one in"):
-        merge([one, two, three], whole)
+        merge_shards([one, two, three], whole)
 
 
 def test_a_merge_that_fails_leaves_nothing(configured: Configured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -151,9 +153,9 @@ def test_a_merge_that_fails_leaves_nothing(configured: Configured, tmp_path: Pat
     def stop(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sbt.workflows.merging.result_of", stop)
+    monkeypatch.setattr("sbt.workflows.merging.summarise", stop)
     with pytest.raises(KeyboardInterrupt):
-        merge(folders, into)
+        merge_shards(folders, into)
     assert list(into.iterdir()) == []
 
 
@@ -169,7 +171,7 @@ def moved(*paths):
     left -= 1
     move(*paths)
 sbt.workflows.merging.move_atomically = moved
-sbt.workflows.merging.merge([Path(p) for p in sys.argv[3:]], Path(sys.argv[2]))
+sbt.workflows.merging.merge_shards([Path(p) for p in sys.argv[3:]], Path(sys.argv[2]))
 """
 
 
@@ -182,7 +184,7 @@ def test_a_killed_merge_leaves_no_store_and_can_be_repeated(
     assert killed.returncode == -signal.SIGKILL
     assert list(into.iterdir()) != []
     assert not Store.begun(into)
-    merged, whole = merge(folders, into, report=False), campaign("whole", **COVERAGE)
+    merged, whole = merge_shards(folders, into, report=False), campaign("whole", **COVERAGE)
     assert rows(into) == rows(whole["store"])
     assert timeless(merged) == timeless(whole)
 
@@ -199,10 +201,10 @@ def test_a_killed_shard_goes_on_and_is_not_merged_before(configured: Configured,
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
     with pytest.raises(InputError, match=r"shards must be finished, but 1/2 in .*shard-1-of-2 is not: runs .* are missing"):
-        merge([shard], into)
+        merge_shards([shard], into)
     for k in (1, 2):
-        run_campaign(load(config, [f"store={into}/shard-{k}-of-2"]), shard=Shard(k, 2))
-    merged = merge(sorted(into.glob("shard-*-of-2")), into, report=False)  # where one run would have put it
+        run_loaded(load(config, [f"store={into}/shard-{k}-of-2"]), shard=Shard(k, 2))
+    merged = merge_shards(sorted(into.glob("shard-*-of-2")), into, report=False)  # where one run would have put it
     assert rows(merged["store"]) == rows(campaign("whole", "SLOW", **keys)["store"])
 
 
@@ -229,5 +231,5 @@ def test_dask_that_is_not_installed_is_told_before_anything_is_written(configure
     monkeypatch.setattr("sbt.execution.dask.find_spec", lambda _: None)
     config = configured("c", executor={"kind": "dask"})
     with pytest.raises(InputError, match=r"needs dask\.distributed: pip install 'sumo-sbt\[dask\]', or choose local"):
-        run_campaign(load(config))
+        run_loaded(load(config))
     assert not (config.parent / "c").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import sqlite3
@@ -17,11 +18,16 @@ import pytest
 
 from sbt.errors import StoreError
 from sbt.problem.outcome import Outcome, Status
+from sbt.problem.requirement import Requirement
 from sbt.store.database import DATABASE, PlannedRun, Store
 from sbt.store.history import VALIDATION, History
+from sbt.store.records import FitRecord, Iteration, Validation
 
 CONFIGURATION = {"names": ["a", "b"], "seed": 3}
 BATCH = [PlannedRun("initial", {"a": 0.1 * k, "b": 1 / 3}, -0.5 if k % 2 else None) for k in range(5)]
+
+
+FIT = FitRecord(3, 0.25, 0.01, 0.1, "ff", Validation(rmse=0.1, n=2), runs=3, iteration=1)
 
 
 def planned(folder: Path) -> Store:
@@ -42,15 +48,15 @@ def test_rows_come_back_to_the_last_bit(tmp_path: Path):
         for k in (3, 0):
             store.append(outcome(k), "sbt 1")
         store.append(Outcome(1, Status.TIMEOUT, {}, "too long: 60 s ünd 'quotes'"))
-        store.add_fit(3, 1, {"rmse": 0.1, "sides": "ff"})
+        store.add_fit(FIT)
         assert [j.index for j in store.unfinished()] == [2, 4]
         assert store.counts == {"ok": 2, "timeout": 1, "planned": 2}
     with Store.read(tmp_path / "s") as store:
         history = store.history()
         assert (store.planned, len(history)) == (5, 3)
         assert store.configuration == CONFIGURATION
-        assert store.iterations() == [{"iteration": 0, "stage": "initial", "method": "rejection"}]
-        assert store.fits() == [{"runs": 3, "iteration": 1, "rmse": 0.1, "sides": "ff"}]
+        assert store.iterations() == [Iteration(0, "initial", {"method": "rejection"})]
+        assert store.fits() == [FIT]
     np.testing.assert_array_equal(history.index, [0, 1, 3])
     np.testing.assert_array_equal(history.x, [[0.0, 1 / 3], [0.1, 1 / 3], [0.1 * 3, 1 / 3]])
     np.testing.assert_array_equal(history.y("y"), [0.1, np.nan, 3.1])
@@ -64,16 +70,20 @@ def test_a_frame_has_one_column_an_input_and_a_metric(tmp_path: Path):
     with planned(tmp_path) as store:
         store.append(outcome(0))
         store.append(Outcome(1, Status.FAILED, {}, "why"))
-        frame = store.history().to_frame()
+        frame = store.history().to_frame(Requirement("y", high=0.5))
     assert list(frame.columns) == [
-        "index", "stage", "iteration", "x.a", "x.b", "y.y", "y.z", "log_q", "status", "reason", "seed", "collisions", "seconds",
-        "versions",
+        "index", "stage", "iteration", "x.a", "x.b", "y.y", "y.z", "critical", "margin", "log_q", "status", "reason", "seed",
+        "collisions", "seconds", "versions", "seed_chosen", "level", "warm_up", "unconfirmed",
     ]  # fmt: skip
+    assert frame["critical"].isna().tolist() == [False, True]
+    assert bool(frame["critical"][0]) is True
+    assert frame["margin"][0] == pytest.approx(-0.4)
+    assert np.isnan(frame["margin"][1])
     assert frame["status"].tolist() == ["ok", "failed"]
     assert np.isnan(frame["y.y"][1])
     assert np.isnan(frame["log_q"][0])
     assert frame["log_q"][1] == -0.5
-    empty = History(("a",)).to_frame()
+    empty = History.of(("a",)).to_frame()
     assert (len(empty), "x.a" in empty.columns) == (0, True)
 
 
@@ -86,14 +96,14 @@ def test_a_history_keeps_held_out_runs_apart(tmp_path: Path):
         history = store.history()
     assert [r.index for r in history.training.records] == [0, 2]
     assert [r.index for r in history.held_out.records] == [3]
-    assert History(("a", "b")).x.shape == (0, 2)
-    assert History(("a", "b")).metrics == ()
+    assert History.of(("a", "b")).x.shape == (0, 2)
+    assert History.of(("a", "b")).metrics == ()
 
 
 def test_a_plan_is_all_or_nothing(tmp_path: Path):
     with Store.open(tmp_path, CONFIGURATION) as store:
         with pytest.raises(ValueError, match="Out of range"):
-            store.plan(0, "s", [*BATCH[:2], PlannedRun("s", {"a": float("nan")})], [1, 2, 3], {})
+            store.plan(0, "s", [*BATCH[:2], PlannedRun("s", {"a": float("nan"), "b": 0.0})], [1, 2, 3], {})
         with pytest.raises(IndexError):
             store.plan(0, "s", BATCH, [1, 2], {})
         with pytest.raises(ValueError, match="Out of range"):
@@ -110,6 +120,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from sbt.problem.outcome import Outcome, Status
+from sbt.problem.requirement import Requirement
 from sbt.store.database import PlannedRun, Store
 
 store = Store.open(Path(sys.argv[1]), {"names": ["a"]})
@@ -161,7 +172,7 @@ def test_runs_wait_for_the_disk_together_and_plans_always(tmp_path: Path, monkey
         assert level() == 2
         store.append(outcome(4))
         assert level() == 1
-        store.add_fit(5, 1, {})
+        store.add_fit(dataclasses.replace(FIT, runs=5))
         assert level() == 2
 
 

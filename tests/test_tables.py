@@ -15,7 +15,7 @@ from sbt.plugins import load
 from sbt.samplers.pool import PoolSequence
 from sbt.seeds import stream
 from sbt.store.database import Store
-from sbt.workflows.running import run_campaign
+from studies import run_loaded
 
 CONFIG = """
 title: "Disc"
@@ -61,7 +61,7 @@ def test_table_is_a_scenario(folder: Path) -> None:
 
 @pytest.mark.parametrize("campaign", ["boundary", "coverage"])
 def test_every_row_is_chosen_at_most_once_and_the_rest_is_the_validation(folder: Path, campaign: str) -> None:
-    result = run_campaign(parse(configuration(folder, campaign, "s")), report=False)
+    result = run_loaded(parse(configuration(folder, campaign, "s")), report=False)
     with Store.read(folder.parent / "s") as store:
         x = store.history().x
     pool = load("scenarios", f"table:{folder}").pool
@@ -72,7 +72,7 @@ def test_every_row_is_chosen_at_most_once_and_the_rest_is_the_validation(folder:
 
 
 def test_a_campaign_ends_with_the_table(folder: Path) -> None:
-    result = run_campaign(parse(configuration(folder, "coverage", "all", budget=500)), report=False)
+    result = run_loaded(parse(configuration(folder, "coverage", "all", budget=500)), report=False)
     assert result["runs"] == 200
     assert result["stopped"] == "no rows left"
 
@@ -113,7 +113,7 @@ def test_the_public_data_set_loads() -> None:
 
 
 def test_export_in_the_data_set_layout_reads_back_the_same_rows(folder: Path) -> None:
-    run_campaign(parse(configuration(folder, "coverage", "out")), report=False)
+    run_loaded(parse(configuration(folder, "coverage", "out")), report=False)
     done = CliRunner().invoke(app, ["export", str(folder.parent / "out"), "--format", "dsiod"])
     assert done.exit_code == 0, done.output
     with Store.read(folder.parent / "out") as store:

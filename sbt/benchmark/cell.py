@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from sbt.acquisitions import Acquisition, boundary
-from sbt.benchmark.keeping import opened
 from sbt.benchmark.reference import reference_rows
+from sbt.benchmark.stores import open_store
 from sbt.campaigns.settings import PlainConclusion
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
@@ -71,10 +71,10 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
         fitted = learner.fit(log.history)
         if fitted is None:
             raise SbtError(f"{cell.name}: a metamodel needs two runs that went well, but got fewer")
-        _keep_predictions(cell.folder, learner, fitted, log.history)
+        _write_predictions(cell.folder, learner, fitted, log.history)
         return PlainConclusion({}), fitted
 
-    with opened(cell.folder, cell.loaded, scenario, reference=n, max_candidates=cell.max_candidates) as store:
+    with open_store(cell.folder, cell.loaded, scenario, reference=n, max_candidates=cell.max_candidates) as store:
         limit = None if config.executor.timeout == float("inf") else config.executor.timeout
         with _Recalling(SerialExecutor(parts.spec, limit), _known_runs(cell)) as executor:
             finished = run_stages(
@@ -86,7 +86,8 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
         store.conclude({
             "campaign": config.campaign, "scenario": config.scenario, "store": str(cell.folder), "runs": len(history),
             "ok": int(history.ok.sum()), "failed": int((~history.ok).sum()), "critical": int(critical.sum()),
-            "iterations": len(store.iterations()), "stopped": finished.stopped, "seconds": dict(finished.seconds), "conclusion": {},
+            "iterations": len(store.iterations()), "stopped": finished.stopped, "seconds": dict(finished.seconds),
+            "conclusion": {},
         })  # fmt: skip
 
 
@@ -111,7 +112,7 @@ class CellProposal:
 
 @dataclass(frozen=True)
 class _ReferenceLearner(Learner):
-    """Scores on the reference runs, on the rows that were not chosen for a recorded table."""
+    """Scores on the reference runs; for a recorded table, on the rows that were not chosen."""
 
     rows: tuple[Points, Vector] | None = None
 
@@ -120,7 +121,7 @@ class _ReferenceLearner(Learner):
         return super().unseen(history) if self.rows is None else self.rows
 
     def fit(self, history: History) -> FittedMetamodel | None:
-        """Return the fitted, the seconds of fit and of scoring among its scores."""
+        """Return the fitted metamodel, with the seconds of fit and scoring in its record."""
         start = time.perf_counter()
         fitted = super().fit(history)
         if fitted is None:
@@ -131,7 +132,7 @@ class _ReferenceLearner(Learner):
 
 @dataclass(frozen=True)
 class _BenchmarkStage:
-    """Batches of equal size, the first one even; then from the acquisition, or even on and on.
+    """Batches of equal size: the first one even, the others from the acquisition, or even as well.
 
     Source:
         Winkelmann et al. (2022), sections IV-B and V-A.
@@ -195,7 +196,7 @@ class _BenchmarkStage:
 
 
 class _Recalling:
-    """An executor that recalls runs which another cell has made: same scenario, inputs and seed, same outcome."""
+    """An executor that takes the outcomes of runs with the same inputs and seed from other cells of the scenario."""
 
     def __init__(self, executor: SerialExecutor, known: Mapping[tuple[int, tuple[float, ...]], Outcome]):
         self._executor, self._known = executor, known
@@ -233,8 +234,8 @@ def _known_runs(cell: Cell) -> dict[tuple[int, tuple[float, ...]], Outcome]:
     return known
 
 
-def _keep_predictions(folder: Path, learner: _ReferenceLearner, fitted: FittedMetamodel, history: History) -> None:
-    """Write what the last metamodel believes about the reference runs, for the figures."""
+def _write_predictions(folder: Path, learner: _ReferenceLearner, fitted: FittedMetamodel, history: History) -> None:
+    """Write the predictions of the last metamodel for the reference runs, for the figures."""
     x, y = learner.unseen(history)
     u, critical = learner.scenario.space.to_unit(x), learner.scenario.requirement.critical
     columns = []

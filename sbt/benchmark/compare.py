@@ -58,7 +58,7 @@ class Cell:
 
 
 def compare(
-    loaded: Loaded, samplers: Sequence[str], seeds: int, folder: Path, told: Callable[[Cell], None] = lambda _: None
+    loaded: Loaded, samplers: Sequence[str], seeds: int, folder: Path, listener: Callable[[Cell], None] = lambda _: None
 ) -> list[Cell]:
     """Return one cell a sampler and seed; cells that the folder already holds are not run again.
 
@@ -67,7 +67,7 @@ def compare(
         samplers: of `SAMPLERS`.
         seeds: the configuration's seed and the ones after it.
         folder: keeps `compare.jsonl`, a line a finished cell.
-        told: called after every cell.
+        listener: called after every cell.
 
     Raises:
         InputError: not a falsification, an unknown sampler, recorded rows, or a library that is not installed.
@@ -82,8 +82,8 @@ def compare(
         raise InputError("compare needs a scenario that can be simulated, but got recorded rows")
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "compare.jsonl"
-    asked = _asked(loaded)
-    finished = dict(_finished(path, asked))
+    settings = _settings(loaded)
+    finished = dict(_finished(path, settings))
     cells = []
     for seed in range(config.seed, config.seed + seeds):
         for name in samplers:
@@ -91,26 +91,26 @@ def compare(
             if cell is None:
                 cell = _run(loaded, name, seed)
                 with path.open("a") as file:
-                    file.write(json.dumps({**vars(cell), "asked": asked}) + "\n")
-                told(cell)
+                    file.write(json.dumps({**vars(cell), "asked": settings}) + "\n")
+                listener(cell)
             cells.append(cell)
     return cells
 
 
-def _asked(loaded: Loaded) -> dict[str, Any]:
-    """Return what a cell depends on beside sampler and seed."""
-    kept = loaded.config.model_dump(mode="json", exclude={"seed", "store", "executor", "acquisition"})
-    return json.loads(json.dumps(kept))
+def _settings(loaded: Loaded) -> dict[str, Any]:
+    """Return the settings that a cell depends on, beside sampler and seed."""
+    settings = loaded.config.model_dump(mode="json", exclude={"seed", "store", "executor", "acquisition"})
+    return json.loads(json.dumps(settings))
 
 
-def _finished(path: Path, asked: Mapping[str, Any]) -> Iterator[tuple[tuple[str, int], Cell]]:
-    """Yield the finished cells of the same question; a line cut short by a kill is none."""
+def _finished(path: Path, settings: Mapping[str, Any]) -> Iterator[tuple[tuple[str, int], Cell]]:
+    """Yield the finished cells with the same settings; an incomplete line, of a process that was killed, is skipped."""
     for line in path.read_text().splitlines() if path.is_file() else []:
         try:
             row = json.loads(line)
         except ValueError:
             continue
-        if row.pop("asked") == asked:
+        if row.pop("asked") == settings:
             yield (row["sampler"], row["seed"]), Cell(**row)
 
 
@@ -132,8 +132,8 @@ def _own(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
         acquisition = loaded.config.acquisition.model_copy(update={"kind": name})
         config = loaded.config.model_copy(update={"seed": seed, "store": store, "acquisition": acquisition})
         run_study(Study(replace(loaded, config=config)), report=False)
-        with Store.read(Path(store)) as kept:
-            history = kept.history()
+        with Store.read(Path(store)) as opened:
+            history = opened.history()
     runs = history.where(history.stage != CONFIRM)
     scenario = scenario_of(loaded)
     return scenario.space.to_unit(runs.x), scenario.requirement.margins(runs)
@@ -166,15 +166,15 @@ def _outside(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
 
 def _distinct(u: Points) -> int:
     """Return how many critical runs are farther apart than the deflation radius, counted in order."""
-    kept = np.empty((0, u.shape[1]))
+    distinct = np.empty((0, u.shape[1]))
     for point in u:
-        if len(kept) == 0 or cdist(point[None], kept, "chebyshev").min() > DEFLATION:
-            kept = np.vstack([kept, point])
-    return len(kept)
+        if len(distinct) == 0 or cdist(point[None], distinct, "chebyshev").min() > DEFLATION:
+            distinct = np.vstack([distinct, point])
+    return len(distinct)
 
 
 def table(cells: Sequence[Cell]) -> str:
-    """Return the cells as a Markdown table: a row a sampler; a run that never came counts as infinite."""
+    """Return the cells as a Markdown table: a row a sampler; a seed without a critical run counts as infinite."""
     lines = [
         "| sampler | seeds | found | median runs to the first | 90th percentile | distinct failures | seconds |",
         "|" + "---|" * 7,

@@ -22,25 +22,25 @@ TABLE = "results.csv"
 
 @dataclass(frozen=True)
 class Listener:
-    """Hears how far a benchmark is.
+    """Callbacks for the progress of a benchmark.
 
     Args:
-        say: takes one line for people.
+        message: called with one line of text.
         progress: called after every reference run.
     """
 
-    say: Callable[[str], None]
+    message: Callable[[str], None]
     progress: Callable[[Progress], None]
 
 
 def run_benchmark(
     loaded: LoadedBenchmark, listener: Listener, *, reference: bool = True, cells: bool = True, figures: bool = True
 ) -> dict[str, Any]:
-    """Run a benchmark, or go on where it was stopped; what is done is not done again.
+    """Run a benchmark, or resume it; finished cells are not run again.
 
     Args:
         loaded: a checked configuration.
-        listener: hears how far it is.
+        listener: callbacks for its progress.
         reference: make the reference runs that are missing.
         cells: run the cells that are not done.
         figures: write the table and the figures of what is done.
@@ -52,14 +52,14 @@ def run_benchmark(
     store, failed = Path(config.store), {}
     references, made = dict(loaded.references()), []
     todo = [cell for cell in all_cells if not is_done(cell)] if cells else []
-    listener.say(f"{len(all_cells)} cells, {len(todo)} to do")
-    groups = groupby(todo, lambda cell: (cell.seed, cell.scenario)) if cells else ((("", name), ()) for name in references)
+    listener.message(f"{len(all_cells)} cells, {len(todo)} to do")
+    groups = groupby(todo, lambda cell: (cell.seed, cell.scenario)) if cells else [(("", name), ()) for name in references]
     for (_, scenario), group in groups:
         if reference and scenario in references:  # made when it is needed: early cells give early results
-            listener.say(f"{scenario}: reference runs")
+            listener.message(f"{scenario}: reference runs")
             made.append(make_reference(references.pop(scenario), config.workers, listener.progress))
         for cell, reason in each(run_cell, list(group), config.workers):
-            listener.say(f"{cell.name}: {reason or 'done'}")
+            listener.message(f"{cell.name}: {reason or 'done'}")
             if reason is not None:
                 failed[cell.name] = reason
     result: dict[str, Any] = {

@@ -33,7 +33,7 @@ _DPI = 110
 
 @dataclass(frozen=True)
 class Results:
-    """What a benchmark found so far.
+    """The results of a benchmark so far.
 
     Attributes:
         rows: of the table.
@@ -50,10 +50,11 @@ class Results:
     def of(cls, loaded: LoadedBenchmark, table: Path) -> Results:
         """Return the results in a table."""
         rows, cells = tuple(read_table(table)), tuple(loaded.cells())
-        there = {key: {row[key] for row in rows} for key in ("scenario", "metamodel")}
-        named = [dict.fromkeys(getattr(cell, key) for cell in cells) for key in there]
-        kept = [tuple(n for n in names if n in found) for names, found in zip(named, there.values(), strict=True)]
-        return cls(rows, cells, kept[0], kept[1])
+        scenarios, metamodels = (
+            tuple(name for name in dict.fromkeys(getattr(cell, key) for cell in cells) if name in {row[key] for row in rows})
+            for key in ("scenario", "metamodel")
+        )
+        return cls(rows, cells, scenarios, metamodels)
 
     def curve(self, scenario: str, metamodel: str, acquisition: str, key: str) -> tuple[Vector, Vector, Vector]:
         """Return (m,) runs, (m,) means and (m,) standard deviations over the seeds of one column."""
@@ -79,12 +80,12 @@ class Results:
 
 
 def write_figures(loaded: LoadedBenchmark, table: Path, folder: Path) -> list[Path]:
-    """Draw all figures of what is there and return their files (PNG).
+    """Draw all figures of the results so far and return their files (PNG).
 
     Args:
         loaded: the benchmark.
         table: its table.
-        folder: for the figures; is made where it is missing.
+        folder: for the figures; created where it is missing.
     """
     results = Results.of(loaded, table)
     folder.mkdir(parents=True, exist_ok=True)

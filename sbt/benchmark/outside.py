@@ -1,4 +1,4 @@
-"""Samplers of others, behind one small interface: ask for points, tell their margins."""
+"""Samplers of other libraries behind one interface: ask for points, tell their margins."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _WORST = 1e9  # stands for the margin of a failed run where a library takes no f
 
 
 class Outside(Protocol):
-    """A sampler with a memory of its own."""
+    """A sampler that keeps its own state."""
 
     def ask(self, n: int) -> Points:
         """Return the next n points (n, d) in the unit cube."""
         ...
 
     def tell(self, margins: Vector) -> None:
-        """Take the margins (n,) of the points asked for last; NaN where a run failed."""
+        """Take the margins (n,) of the points that `ask` returned last; NaN where a run failed."""
         ...
 
 
@@ -74,7 +74,7 @@ class Cma:
         _require("cma_es", "cma")
         self._rng, self._dimension = stream(seed, "compare", "cma"), dimension
         self._strategy: Any = None
-        self._asked: list[Any] = []
+        self._generation: list[Any] = []
 
     def ask(self, n: int) -> Points:
         """Return the next generation."""
@@ -87,12 +87,12 @@ class Cma:
             }  # fmt: skip
             start = np.full(self._dimension, 0.5) if self._strategy is None else self._rng.random(self._dimension)
             self._strategy = cma.CMAEvolutionStrategy(start.tolist(), 0.3, options)
-        self._asked = self._strategy.ask(n)
-        return np.clip(np.array(self._asked), 0.0, 1.0).reshape(n, -1)
+        self._generation = self._strategy.ask(n)
+        return np.clip(np.array(self._generation), 0.0, 1.0).reshape(n, -1)
 
     def tell(self, margins: Vector) -> None:
         """Adapt to the generation."""
-        self._strategy.tell(self._asked, np.where(np.isfinite(margins), margins, _WORST).tolist())
+        self._strategy.tell(self._generation, np.where(np.isfinite(margins), margins, _WORST).tolist())
 
 
 class Tpe:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sbt.benchmark.keeping import opened
+from sbt.benchmark.stores import open_store
 from sbt.campaigns.settings import PlainConclusion
 from sbt.config.assemble import assemble
 from sbt.config.load import Loaded
@@ -38,11 +38,11 @@ class _RandomStage:
     name: str = VALIDATION
 
     def stop(self, log: Log) -> str | None:
-        """Return `budget` once all runs are there."""
+        """Return `budget` once all runs are done."""
         return "budget" if len(log.history) >= self.n else None
 
     def propose(self, log: Log) -> Batch:
-        """Return the next chunk; run k is the same however many are asked for."""
+        """Return the next chunk; run k does not depend on how many are requested."""
         start, space = len(log.history), self.scenario.space
         stop = min(start - start % _CHUNK + _CHUNK, self.n)
         rng = stream(self.seed, "reference", start // _CHUNK)
@@ -73,7 +73,7 @@ def make_reference(loaded: Loaded, workers: int, progress: Callable[[Progress], 
     if parts.scenario.pool is not None:
         return None
     folder = Path(config.store)
-    with opened(folder, loaded, parts.scenario) as store:
+    with open_store(folder, loaded, parts.scenario) as store:
         done = store.counts
         if sum(done.values()) - done.get("planned", 0) >= config.budget and not done.get("planned", 0):
             return folder
@@ -82,8 +82,8 @@ def make_reference(loaded: Loaded, workers: int, progress: Callable[[Progress], 
         executor: Executor = SerialExecutor(parts.spec, limit) if workers == 1 else LocalExecutor(parts.spec, workers, limit)
         with executor:
             run_stages(
-                Campaign((stage,), lambda log: (PlainConclusion({}), None)), store, executor, seed=config.seed, budget=config.budget,
-                requirement=parts.scenario.requirement, versions="", listener=progress or (lambda _: None),
+                Campaign((stage,), lambda log: (PlainConclusion({}), None)), store, executor, seed=config.seed,
+                budget=config.budget, requirement=parts.scenario.requirement, versions="", listener=progress or (lambda _: None),
             )  # fmt: skip
     return folder
 
@@ -92,7 +92,7 @@ def reference_rows(folder: Path, scenario: LogicalScenario, n: int) -> tuple[Poi
     """Return x (m, d) and y (m,) of the first n reference runs, m <= n: without those that failed.
 
     Raises:
-        InputError: fewer than n runs are there.
+        InputError: the store has fewer than n runs.
     """
     with Store.read(folder) as store:
         history = store.history()

@@ -22,12 +22,12 @@ SCORES = (
 )  # fmt: skip
 TIMES = ("fit_seconds", "scoring_seconds", "sampling_seconds", "sampled", "candidates", "method")
 COLUMNS = (*KEYS, *SCORES, "critical_fraction", *TIMES)
-"""Of the table. `sampling_seconds`, `sampled`, `candidates` and `method` tell of the batch that was drawn
+"""Of the table. `sampling_seconds`, `sampled`, `candidates` and `method` describe the batch that was drawn
 from the metamodel of this row; they are empty in the last iteration."""
 
 
 def rows_of(cell: Cell) -> Iterator[dict[str, Any]]:
-    """Yield one row for each finished iteration of a cell; none where it has not begun."""
+    """Yield one row for each finished iteration of a cell; none where the cell has not begun."""
     if not Store.begun(cell.folder):
         return
     with Store.read(cell.folder) as store:
@@ -43,7 +43,8 @@ def rows_of(cell: Cell) -> Iterator[dict[str, Any]]:
             "fit_seconds": fit.fit_seconds, "scoring_seconds": fit.scoring_seconds,
             "sampling_seconds": None if batch is None else batch.sampling_seconds,
             "candidates": None if batch is None else batch.candidates,
-            "sampled": None if batch is None else int((history.iteration == k).sum()), "method": None if batch is None else batch.method,
+            "sampled": None if batch is None else int((history.iteration == k).sum()),
+            "method": None if batch is None else batch.method,
         }  # fmt: skip
 
 

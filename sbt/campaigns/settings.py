@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from sbt.errors import InputError
@@ -14,7 +14,7 @@ from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.history import History
-from sbt.store.records import from_json
+from sbt.store.records import from_json, to_json
 
 __all__ = ["Acquisition", "CampaignKind", "Gate", "PlainConclusion", "Settings"]
 
@@ -132,6 +132,28 @@ class CampaignKind:
             raise InputError(f"a campaign must be a CampaignKind or a recipe (settings) -> Campaign, but '{name}' is neither")
         lines = (getattr(found, "__doc__", None) or "").strip().splitlines()
         return cls(lines[0] if lines else "", found)
+
+    @property
+    def name(self) -> str:
+        """Name of the recipe, by which a campaign goes that was given as an object."""
+        return str(getattr(self.recipe, "__name__", type(self.recipe).__name__))
+
+    def described(self) -> dict[str, Any]:
+        """Return what it declares as JSON data, so that a store can be read where its code is not at hand."""
+        code = ("recipe", "conclusion")
+        found: dict[str, Any] = to_json({f.name: getattr(self, f.name) for f in fields(self) if f.name not in code})
+        return found
+
+    @classmethod
+    def absent(cls, name: str, described: Mapping[str, Any]) -> CampaignKind:
+        """Return a kind of this declaration that cannot be run, and whose conclusion is values by name."""
+
+        def recipe(settings: Settings) -> Campaign:
+            raise InputError(f"campaign '{name}' is known by its description only: its code must be at hand to run it")
+
+        known = {f.name for f in fields(cls)}
+        given = {key: tuple(v) if isinstance(v, list) else v for key, v in described.items() if key in known}
+        return cls(**{**given, "recipe": recipe})
 
     def read(self, data: Mapping[str, Any]) -> Conclusion:
         """Return a conclusion from its JSON."""

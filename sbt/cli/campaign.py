@@ -7,20 +7,17 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 from sbt.errors import InputError
 
-if TYPE_CHECKING:
-    from sbt.store.records import FitRecord
-
 __all__ = ["export", "merge", "report", "run", "status"]
 
 _SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
-"""What `status` tells of the last validation."""
+"""Scores of the last validation that `status` prints."""
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign (its store).")]
 FailOnCritical = Annotated[bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")]
@@ -54,13 +51,12 @@ def run(
     if workers is not None:
         overrides.append(f"executor.workers={workers}")
     with resumable() as work, clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:
-        from sbt.loop.stages import Shard
         from sbt.workflows.running import run_study
         from sbt.workflows.study import Study
 
-        study, part = Study.from_file(config, overrides), None if shard is None else Shard.parse(shard)
-        if part is not None and store is None:
-            study = study.with_store(Path(study.config.store) / f"shard-{part.number}-of-{part.of}")
+        study, part = Study.from_file(config, overrides), None
+        if shard is not None:
+            study, part = study.sharded(shard, apart=store is None)
         work.folder = Path(study.config.store)
         result = run_study(study, progress=show, shard=part).to_dict()
     _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
@@ -83,7 +79,7 @@ def merge(
 
 
 def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path | None, as_json: bool) -> None:
-    """Print the result of a campaign, and end with the exit code that it deserves."""
+    """Print the result of a campaign; raise the exit of its verdict, where that is not 0."""
     if junit is not None:
         from sbt.report.junit import write_junit
 
@@ -113,7 +109,7 @@ def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
         if key == "convergence":
             continue  # a figure of the report
         if key == "warnings":
-            lines += [f"  warning: {told}" for told in value]
+            lines += [f"  warning: {warning}" for warning in value]
         elif isinstance(value, Mapping):
             lines.append(f"  {key.replace('_', ' ')}")
             lines += [f"    {name.replace('_', ' '):<24}{_number(item)}" for name, item in value.items()]
@@ -146,7 +142,7 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Repeat until the campaign is finished.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Say how far a campaign is, also while it runs."""
+    """Print the progress of a campaign, also while it runs."""
     found = _status(folder)
     try:
         while watch and found["conclusion"] is None and not getattr(sys.stdout, "gone", False):
@@ -164,25 +160,10 @@ def status(
 
 def _status(folder: Path) -> dict[str, Any]:
     """Return counts, iteration, last validation and conclusion."""
-    from sbt.store.database import Store
+    with clean_stdout():
+        from sbt.workflows.status import read_status
 
-    with clean_stdout(), Store.read(_with_store(folder)) as store:
-        iterations, fits = store.iterations(), store.fits()
-        return {
-            "store": str(folder),
-            "runs": store.counts,
-            "iterations": len(iterations),
-            "stage": iterations[-1].stage if iterations else None,
-            "validation": _validation(fits[-1]) if fits else None,
-            "conclusion": store.conclusion,
-        }
-
-
-def _validation(fit: FitRecord) -> dict[str, Any]:
-    """Return the numbers of the last fit."""
-    shares = {name: getattr(fit, name) for name in ("critical_fraction", "expected_misclassified", "ambiguous_volume")}
-    scores = {} if fit.validation is None else fit.validation.to_dict()
-    return {"runs": fit.runs, "iteration": fit.iteration, "learned": fit.learned, **scores, **shares}
+        return read_status(_with_store(folder))
 
 
 def _status_lines(found: Mapping[str, Any]) -> list[str]:

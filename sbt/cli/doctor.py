@@ -30,7 +30,7 @@ _NO_WAL = ("nfs", "nfs4", "lustre", "gpfs", "beegfs", "cifs", "smb3", "fuse.sshf
 
 @dataclass(frozen=True)
 class Check:
-    """One look at the environment; `state` is ok, warning or broken."""
+    """One check of the environment; `state` is ok, warning or broken."""
 
     name: str
     state: str
@@ -39,7 +39,7 @@ class Check:
 
 
 def examine(folder: Path) -> list[Check]:
-    """Return all checks; `folder` is where results shall go, it need not exist."""
+    """Return all checks; `folder` is for results and need not exist."""
     home = os.environ.get("SUMO_HOME")  # before libsumo sets it
     checks = [_python(), *(_package(name) for name in _PACKAGES)]
     checks += [_guarded(name, look) for name, look in (
@@ -56,7 +56,7 @@ def examine(folder: Path) -> list[Check]:
 
 
 def _guarded(name: str, look: Callable[[], Check]) -> Check:
-    """Return a check; one that itself fails is broken and says why."""
+    """Return the result of a check, broken with the error where the check itself raised."""
     try:
         return look()
     except Exception as error:
@@ -68,7 +68,7 @@ def _python() -> Check:
 
 
 def _package(name: str) -> Check:
-    """Return whether a package is there and can be imported."""
+    """Return whether a package is installed and can be imported."""
     try:
         found = version(name)
         importlib.import_module(_MODULES.get(name, name))
@@ -134,7 +134,7 @@ def _cores() -> Check:
 
 
 def _cuda() -> Check:
-    """Return whether `device: cuda` can be asked for; nothing needs it."""
+    """Return whether `device: cuda` can be used; nothing needs it."""
     import torch
 
     if torch.cuda.is_available():
@@ -163,7 +163,7 @@ def _disk(folder: Path) -> Check:
 
 
 def _file_system(place: Path) -> str:
-    """Return the kind of the file system that holds a folder, where /proc tells."""
+    """Return the kind of the file system that holds a folder, where /proc/mounts lists it."""
     mounts = Path("/proc/mounts")
     if not mounts.is_file():
         return "unknown file system"
@@ -177,7 +177,7 @@ def _file_system(place: Path) -> str:
 
 
 def _sqlite(folder: Path) -> Check:
-    """Return how long a commit takes there that waits for the disk: a running campaign pays it ten times a second."""
+    """Return how long a durable commit takes in the folder: a running campaign makes ten of them a second."""
     place = _existing(folder)
     if not os.access(place, os.W_OK):
         return Check("sqlite", "broken", f"{place} cannot be written", "choose another folder with --store")

@@ -2,76 +2,35 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from sbt.cli.console import Exit, clean_stdout, print_json
-from sbt.errors import InputError, PluginError, did_you_mean
+from sbt.errors import InputError
+from sbt.plugins import KINDS
 
 __all__ = ["doctor", "list_", "schema"]
 
-_KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
-_WRITTEN = {"table": "table:FOLDER", "testbed": "testbed:NAME", "yaml": "FOLDER/scenario.yaml"}
-"""How the sources of this package are asked for a scenario; others as PREFIX:REST."""
-
-
 def list_(
-    kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help=" | ".join(_KINDS))] = None,
+    kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help=" | ".join(KINDS))] = None,
     *,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """List what is installed, with a line on each."""
-    if kind is not None and kind not in _KINDS:
-        raise InputError(f"KIND must be one of {', '.join(_KINDS)}, but got '{kind}'{did_you_mean(kind, _KINDS)}")
     with clean_stdout():
-        found = {each: _entries(each) for each in ([kind] if kind is not None else _KINDS)}
+        from sbt.workflows.front import installed
+
+        found = {each: installed(each) for each in ([kind] if kind is not None else KINDS)}
     if as_json:
-        print_json(found)
+        print_json({each: [{"name": n, "summary": s} for n, s in entries.items()] for each, entries in found.items()})
         return
     for each, entries in found.items():
         print(f"{each}:" if entries else f"{each}: none installed")
-        for entry in entries:
-            print(f"  {entry['name']:<28} {entry['summary']}".rstrip())
-
-
-def _entries(kind: str) -> list[dict[str, str]]:
-    """Return name and summary of everything of one kind; what cannot be loaded says so."""
-    from sbt.plugins import load, names
-
-    if kind == "campaigns":
-        from sbt.config.kinds import kinds
-
-        return [{"name": name, "summary": kind.description} for name, kind in kinds().items()]
-    if kind == "sources":
-        return _sources()
-    entries = []
-    for name in names(kind):
-        try:
-            summary = _summary(load(kind, name))
-        except PluginError as error:
-            summary = f"cannot be loaded: {error}"
-        entries.append({"name": name, "summary": summary})
-    return entries
-
-
-def _sources() -> list[dict[str, str]]:
-    """Return how scenarios are named that come from somewhere else, and the testbeds there are."""
-    from sbt import testbeds
-    from sbt.plugins import load, names
-
-    found = [{"name": _WRITTEN.get(n, f"{n}:REST"), "summary": _summary(load("sources", n))} for n in names("sources")]
-    return found + [{"name": f"testbed:{n}", "summary": testbeds.find(n).title} for n in testbeds.names()]
-
-
-def _summary(thing: Any) -> str:
-    """Return the first line of a description or docstring."""
-    text = getattr(thing, "description", "") or inspect.getdoc(thing) or ""
-    unit = f" ({thing.unit})" if getattr(thing, "unit", "") else ""
-    return (text.strip().splitlines() or [""])[0] + unit
+        for name, summary in entries.items():
+            print(f"  {name:<28} {summary}".rstrip())
 
 
 def schema(
@@ -95,7 +54,7 @@ def doctor(
     *,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Look at the environment: versions, SUMO, disk; say what to do where something is amiss."""
+    """Check the environment: versions, SUMO, disk; print advice where something is wrong."""
     with clean_stdout():
         from sbt.cli.doctor import examine
 

@@ -23,7 +23,7 @@ def metrics(
     ] = "within=100",
     length: Annotated[float, typer.Option(help="Length of vehicles whose length is not in the file (m).")] = 5.0,
     width: Annotated[float, typer.Option(help="Width of vehicles whose width is not in the file (m).")] = 1.8,
-    out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write the table there.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write the table to this file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Compute every installed metric for every pair of road users of recorded traffic, each as ego in turn."""
@@ -67,7 +67,7 @@ def _within(text: str) -> float:
 
 
 def _value(metric: Any, trace: Any) -> float | None:
-    """Return a metric of a trace, None where it has none (a stranger's metric may need another actor)."""
+    """Return a metric of a trace, None where it has none (another package's metric may need another actor)."""
     try:
         return float(metric(trace))
     except RunError:

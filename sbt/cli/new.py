@@ -1,4 +1,4 @@
-"""The verb `new`: a commented scenario.yaml for SUMO files that are there."""
+"""The verb `new`: a commented scenario.yaml for existing SUMO files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb predict: what a campaign's metamodel believes."""
+"""The verb predict: predictions of a campaign's metamodel."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def predict(
     device: Annotated[str | None, typer.Option("--device", help="auto, cpu or cuda; default: where it was fitted.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Say what the campaign's metamodel believes about concrete scenarios: mean, sigma, P(critical)."""
+    """Predict concrete scenarios with the campaign's metamodel: mean, sigma, P(critical)."""
     with clean_stdout():
         _with_store(folder)
         from sbt.workflows.prediction import predict_rows

@@ -1,4 +1,4 @@
-"""The verb `replay`: a stored run again, and whether it is the same to the last bit."""
+"""The verb `replay`: executes a stored run again and compares the two bit by bit."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _show(
     export: Path | None,
     trace: Path | None,
 ) -> None:
-    """Show a run, or write it out, in the ways that are asked for."""
+    """Show a run or write it to files, as the options say."""
     from sbt.report.film import write_film
     from sbt.report.outside import write_csv, write_folder
     from sbt.sumo.gui import gui_program, run_in_gui

@@ -11,13 +11,11 @@ from sbt.cli.console import Exit, clean_stdout, fail, print_json
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
-    from sbt.execution.spec import ScenarioSpec
-    from sbt.problem.scenario import LogicalScenario
-    from sbt.problem.trace import Trace
+    from sbt.workflows.front import Run
 
 __all__ = ["check", "simulate"]
 
-Isolation = Annotated[str, typer.Option(metavar="auto|fresh|reuse|replicas", help="How SUMO is kept between runs.")]
+Isolation = Annotated[str, typer.Option(metavar="auto|fresh|reuse|replicas", help="When SUMO is loaded.")]
 
 
 def simulate(
@@ -40,62 +38,43 @@ def simulate(
     """Run one concrete scenario and print every metric and the verdict."""
     with clean_stdout():
         from sbt.execution.spec import ScenarioSpec
+        from sbt.workflows.front import simulate_scenario
 
         choices = _pairs("--ego", ego or []) or None
         _check_choices(choices, step, isolation)
-        logical = ScenarioSpec(scenario, str(Path.cwd()), choices, isolation, step).resolve()
-        values = logical.space.values({name: _number(name, v) for name, v in _pairs("input", inputs or []).items()})
-        result, states = _run(logical, values, seed, with_trace=trace is not None)
-        result = {"scenario": scenario, "seed": seed, "inputs": values, **result}
-        if trace is not None and states is not None:
-            _write_trace(trace, states)
+        values = _pairs("input", inputs or [])
+        if trace is not None and (logical := ScenarioSpec(scenario, str(Path.cwd())).resolve()).simulate is None:
+            raise InputError(f"--trace needs a scenario that is simulated, but {logical.name} gives its metrics directly")
+        run = simulate_scenario(scenario, values, seed=seed, ego=choices, step_length=step, isolation=isolation)
+        if trace is not None:
+            _write_trace(trace, run)
     if as_json:
-        print_json(result)
+        print_json(run.to_dict())
     else:
-        _print_result(result, logical)
-    if result["status"] != "ok":
+        _print_run(run)
+    if run.status != "ok":
         raise typer.Exit(int(Exit.FAILED_RUNS))
 
 
-def _run(
-    logical: LogicalScenario, values: dict[str, float], seed: int, *, with_trace: bool
-) -> tuple[dict[str, Any], Trace | None]:
-    """Return status, metrics, verdict, reason and seconds of one run, and its trace where there is one."""
-    if with_trace and logical.simulate is None:
-        raise InputError(f"--trace needs a scenario that is simulated, but {logical.name} gives its metrics directly")
-    from sbt.execution.worker import run_traced
-    from sbt.problem.outcome import Job
-
-    outcome, states = run_traced(logical, Job(0, values, seed))
-    metrics = dict(outcome.metrics)
-    need = logical.requirement
-    critical = need.critical.low <= metrics[need.metric] <= need.critical.high if metrics else None
-    return {
-        "status": str(outcome.status),
-        "metrics": metrics,
-        "critical": critical,
-        "reason": outcome.reason,
-        "seconds": outcome.seconds,
-    }, states
-
-
-def _print_result(result: dict[str, Any], logical: LogicalScenario) -> None:
-    print(f"{result['scenario']}, seed {result['seed']}: " + ", ".join(f"{k}={v:g}" for k, v in result["inputs"].items()))
-    if result["status"] != "ok":
-        print(f"  {result['status']}: {result['reason']}")
+def _print_run(run: Run) -> None:
+    print(f"{run.name}, seed {run.seed}: " + ", ".join(f"{k}={v:g}" for k, v in run.inputs.items()))
+    if run.critical is None:
+        print(f"  {run.status}: {run.reason}")
         return
-    units = {metric.name: metric.unit for metric in logical.metrics}
-    for name, value in result["metrics"].items():
+    units = {metric.name: metric.unit for metric in run.scenario.metrics}
+    for name, value in run.metrics.items():
         print(f"  {name:<24}{value:g} {units.get(name, '')}".rstrip())
-    need = logical.requirement
-    verdict = "critical" if result["critical"] else "not critical"
+    need = run.scenario.requirement
+    verdict = "critical" if run.critical else "not critical"
     print(f"{verdict} ({need.metric} critical in [{need.critical.low:g}, {need.critical.high:g}])")
 
 
-def _write_trace(path: Path, states: Trace) -> None:
+def _write_trace(path: Path, run: Run) -> None:
     import csv
 
-    rows = states.rows()
+    if run.states is None:
+        return
+    rows = run.states.rows()
     try:
         with path.open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]) if rows else ["time", "actor"])
@@ -112,41 +91,19 @@ def check(
     isolation: Isolation = "auto",
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as one JSON object.")] = False,
 ) -> None:
-    """Try out the contract of a scenario: corners run, same seed same trace, also elsewhere and reused."""
+    """Check a scenario: its corners run, and one seed gives one trace, in every process and at every isolation level."""
     with clean_stdout():
-        from sbt.workflows.checking import check_scenario
+        from sbt.workflows.front import check_target
 
         _check_choices(None, None, isolation)
-        spec, scenario = _target(target, isolation)
-        findings = check_scenario(spec, seed, scenario)
-    broken = sum(not finding.ok for finding in findings)
+        checked = check_target(target, seed=seed, isolation=isolation)
     if as_json:
-        print_json({"target": target, "ok": not broken, "findings": [vars(finding) for finding in findings]})
+        print_json({"target": target, **checked.to_dict()})
     else:
-        for finding in findings:
-            print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.rule}: {finding.detail}")
-    if broken:
-        raise fail(f"{target}: {broken} of {len(findings)} rules are broken", Exit.INPUT)
-
-
-def _target(target: str, isolation: str) -> tuple[ScenarioSpec, LogicalScenario | None]:
-    """Return the scenario of a configuration file (with its ranges), or the one with this name."""
-    from sbt.execution.spec import ScenarioSpec
-
-    if Path(target).suffix not in (".yaml", ".yml") or _is_scenario(Path(target)):
-        return ScenarioSpec(target, str(Path.cwd()), isolation=isolation), None
-    from sbt.config.assemble import assemble
-    from sbt.config.load import load
-
-    assembly = assemble(load(target))
-    return assembly.spec, assembly.scenario
-
-
-def _is_scenario(path: Path) -> bool:
-    """Return whether a YAML file describes a scenario, not a campaign."""
-    from sbt.config.scenario_file import is_scenario
-
-    return is_scenario(path)
+        print(checked)
+    if not checked.ok:
+        broken = sum(not finding.ok for finding in checked.findings)
+        raise fail(f"{target}: {broken} of {len(checked.findings)} rules are broken", Exit.INPUT)
 
 
 def _pairs(what: str, texts: list[str]) -> dict[str, Any]:
@@ -162,12 +119,6 @@ def _pairs(what: str, texts: list[str]) -> dict[str, Any]:
             raise InputError(f"{what} {name} must be given once, but got it twice")
         pairs[name] = read_yaml(value, f"{what} {name}")[0]
     return pairs
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"input {name} must be a number, but got {value!r}")
-    return float(value)
 
 
 def _check_choices(ego: dict[str, Any] | None, step: float | None, isolation: str) -> None:

@@ -12,6 +12,7 @@ sbt.config.source.ConfigError: my.yaml:3:1: bugdet: unknown key (did you mean 'b
 from __future__ import annotations
 
 import io
+import json
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -237,7 +238,7 @@ def schema() -> dict[str, Any]:
     keys["campaign"]["examples"] = list(campaigns)
     described = (f"{n}: {kind.description}" for n, kind in campaigns.items())
     keys["campaign"]["description"] += " Installed: " + "; ".join(described) + "."
-    learns = (f"{n}: {_shown(dict(kind.metamodel)) if kind.adaptive else 'none'}" for n, kind in campaigns.items())
+    learns = (f"{n}: {_flow(kind.metamodel) if kind.adaptive else 'none'}" for n, kind in campaigns.items())
     keys["metamodel"]["description"] += " Defaults: " + "; ".join(learns) + "."
     chooses = (f"{n}: {kind.acquisition} ({', '.join(kind.methods) or 'no methods'})" for n, kind in campaigns.items())
     keys["acquisition"]["description"] += " Defaults, and the methods of each: " + "; ".join(chooses) + "."
@@ -316,6 +317,11 @@ def _inner(kind: Any) -> Any:
     while get_origin(kind) in (Annotated, Union, UnionType):
         kind = next(k for k in get_args(kind) if k is not type(None))
     return kind
+
+
+def _flow(settings: Mapping[str, Any]) -> str:
+    """Return settings as YAML on one line."""
+    return "{" + ", ".join(f"{key}: {json.dumps(value)}" for key, value in settings.items()).replace('"', "") + "}"
 
 
 def _shown(value: Any) -> str:

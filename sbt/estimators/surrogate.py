@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.metamodels.base import Metamodel, Predictor, checked, named_errors, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
@@ -73,7 +73,7 @@ def fit_log_probability(
 
         def predict(inputs: Points) -> Prediction:
             with named_errors(metamodel, len(y)):
-                return checked(predictor(inputs), len(inputs))
+                return check_prediction(predictor(inputs), len(inputs))
 
         return predict
 

@@ -25,12 +25,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
-from sbt.errors import PluginError, SbtError
+from sbt.errors import PluginError, SbtError, described
 from sbt.execution.pool import broken, close_pool, open_pool
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.streams import open_missing
-from sbt.execution.worker import described, run_jobs
+from sbt.execution.worker import run_jobs
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.processes import scratch

@@ -7,9 +7,8 @@ from concurrent.futures import as_completed
 from typing import ParamSpec, TypeVar
 
 from sbt import interruption
-from sbt.errors import SbtError
+from sbt.errors import SbtError, described
 from sbt.execution.pool import broken, close_pool, open_pool
-from sbt.execution.worker import described
 from sbt.processes import scratch
 
 __all__ = ["each", "elsewhere"]

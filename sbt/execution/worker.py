@@ -13,12 +13,12 @@ from importlib.metadata import version
 import numpy as np
 
 from sbt import interruption
-from sbt.errors import InputError, RunError, place_of
+from sbt.errors import InputError, RunError, described
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["described", "run_job", "run_jobs", "run_traced", "versions"]
+__all__ = ["run_job", "run_jobs", "run_traced", "versions"]
 
 _Measured = tuple[dict[str, float], str]
 """Metrics, and SUMO's own collision list."""
@@ -158,15 +158,6 @@ def _check_trace(trace: Trace) -> None:
         wrong = ~np.isfinite(values) & trace.present
         if wrong.any() or not trace.present[:, 0].all():
             raise RunError(Status.FAILED, f"every state must be finite, but trace.{name} is not")
-
-
-def described(error: BaseException) -> str:
-    """Return type, message and place of an error, on one line where its message has one."""
-    try:
-        message = str(error)
-    except BaseException:  # an exception of a user's own
-        message = "(its message cannot be read)"
-    return f"{type(error).__name__}{': ' if message else ''}{message} ({place_of(error)})"
 
 
 def versions() -> str:

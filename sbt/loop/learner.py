@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, Screened, checked, log_ambiguity_bound, named_errors, with_target
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.arrays import Mask, Points, Vector
@@ -83,7 +83,7 @@ class Learner:
         def predict(points: Points) -> Prediction:
             inputs = space.metamodel_inputs(points)
             with named_errors(self.metamodel, learned):
-                return checked(predictor(inputs), len(inputs))
+                return check_prediction(predictor(inputs), len(inputs))
 
         return predict
 

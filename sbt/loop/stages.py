@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -37,12 +37,12 @@ class Batch:
 
     Args:
         runs: the concrete scenarios.
-        proposal: how they were chosen: a dataclass, written to the log as JSON and read back by `Iteration.read`.
+        proposal: how they were chosen: a dataclass or a mapping, written to the log as JSON and read back by `Iteration.read`.
         fitted: the metamodel that chose them, whose scores the log keeps.
     """
 
     runs: tuple[PlannedRun, ...]
-    proposal: object
+    proposal: object = field(default_factory=dict)
     fitted: FittedMetamodel | None = None
 
 

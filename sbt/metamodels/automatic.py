@@ -1,6 +1,6 @@
 """The default: a Gaussian process, extra-trees and a deep ensemble, mixed by how well they predict.
 
-What each is worth is decided by runs that it had not seen, not by the number of runs.
+Their weights come from runs that they were not fitted to, not from the number of runs.
 """
 
 from __future__ import annotations
@@ -17,43 +17,44 @@ from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.stacking import Bins, held_out, mixture_score, stacked, surely_better
+from sbt.metamodels.stacking import Bins, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.torch_tools import check_device
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Auto", "MixturePredictor", "ModelComparison"]
 
-_FEWEST = 10  # rows from which on a score on held-out rows says something
-_LEAST = 0.02  # weight below which a model is left out
+_FEWEST = 10  # rows from which on models are compared: with three folds each learns from at least six
+_LEAST = 0.02  # weight below which a model is left out: its predictions would cost more time than they change
+_PACED, _LEAST_PACED, _FASTEST = 1000, 200, 2.0  # rows below which the ensemble takes fewer steps; least; largest factor
 
 
 @dataclass(frozen=True)
 class Auto:
-    """Settings of the automatic choice.
+    """Settings of the automatic metamodel.
 
     Each model is scored on rows it was not fitted to (cross-validation); the weights are those of
     largest likelihood of the mixture there, shrunk a little to equal ones. Then the models that have a weight are
     fitted to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
     every batch, takes about a quarter of the time: a smaller ensemble, two folds of at most 400 rows, and none below 300.
 
-    A campaign that looks for the critical edge tells where it is (`with_target`). Then what counts is not the density of y
-    but the probability of the range that it fell into (see `Bins`), and the first model, `gp` with nu 2.5 and one noise, is
-    believed alone unless the mixture is better by three standard errors: rows crowd at the edge, where a mixture that
-    hedges looks better than it is over the space.
+    For a known critical interval (`with_target`) the score is not the density of y but the probability of the range that
+    it fell into (see `Bins`), and the first model, `gp` with nu 2.5 and one noise, is taken alone unless the mixture is
+    better by three standard errors: rows crowd at the edge, where a mixture that hedges looks better than it is over the
+    space.
 
     Args:
         folds: of the cross-validation, >= 2.
-        prior: rows >= 0 that speak for equal weights.
+        prior: weight >= 0 of equal weights, in rows.
         members: networks of the ensemble, >= 2.
-        pace: share in (0, 1] of the ensemble's steps that are taken.
+        pace: fraction in (0, 1] of the ensemble's steps that are taken.
         ensemble_rows: rows from which on the ensemble takes part, >= 2.
         gp_rows: rows up to which the Gaussian process takes part, >= 2.
-        compare_rows: most rows that the models are compared on, >= 10; chosen by the rng.
+        compare_rows: most rows that the models are compared on, >= 10; drawn by the rng.
         device: auto (CUDA where there is one), cpu or cuda; for the Gaussian process and the ensemble.
 
     Raises:
-        InputError: a value outside its range; at the fit, a device that is not there.
+        InputError: a value outside its range; at the fit, a device that is not available.
 
     Source:
         Yao et al. (2018), Using stacking to average Bayesian predictive distributions.
@@ -90,7 +91,7 @@ class Auto:
 
     @property
     def simplest(self) -> Metamodel:
-        """What is believed about the critical edge where there is no time to compare."""
+        """The metamodel of searches, where there is no time to compare: the process that a known target starts from."""
         return GaussianProcess(nu=2.5, input_noise=False, device=self.device)
 
     def with_target(self, critical: CriticalInterval) -> _TargetedAuto:
@@ -106,12 +107,12 @@ class Auto:
         else:
             rows = rng.permutation(n)[:compared] if compared < n else slice(None)
             rivals = self._models(n, compared, target_aware=target_aware).values()
-            scores = held_out(rivals, u[rows], y[rows], self.folds, rng, bins)
-            weights = stacked(scores, self.prior)
+            scores = held_out_scores(rivals, u[rows], y[rows], self.folds, rng, bins)
+            weights = stacking_weights(scores, self.prior)
         comparison = _explain(list(models), weights, scores, compared, self, bins)
-        kept = {name: model for name, model in models.items() if comparison.weights[name] > 0.0}
-        predictors = tuple(model.fit(u, y, rng) for model in kept.values())
-        return MixturePredictor(predictors, np.array([comparison.weights[name] for name in kept]), comparison)
+        weight = {name: comparison.weights[name] for name in models if comparison.weights[name] > 0.0}
+        predictors = tuple(models[name].fit(u, y, rng) for name in weight)
+        return MixturePredictor(predictors, np.array(list(weight.values())), comparison)
 
     def _models(self, n: int, learned: int, *, target_aware: bool) -> dict[str, Metamodel]:
         """Return the models that take part with n rows, to be fitted to `learned` of them."""
@@ -146,13 +147,14 @@ def _paced(n: int, full: Ensemble, pace: float) -> Ensemble:
     >>> [_paced(n, Ensemble(), 1.0).steps for n in (200, 500, 5000)]
     [500, 1250, 2500]
     """
-    share = min(max(n, 200) / 1000, 1.0)
-    return replace(full, steps=round(share * pace * full.steps), learning_rate=full.learning_rate * min(share**-0.5, 2.0))
+    fraction = min(max(n, _LEAST_PACED) / _PACED, 1.0)
+    faster = min(fraction**-0.5, _FASTEST)
+    return replace(full, steps=round(fraction * pace * full.steps), learning_rate=full.learning_rate * faster)
 
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """What was chosen and why.
+    """The models that were compared, and their weights.
 
     Attributes:
         weights: of each model that took part, by name; 0: left out.
@@ -173,7 +175,7 @@ class MixturePredictor:
     Args:
         predictors: of each model with a weight > 0.
         weight: of each, > 0, sum 1.
-        comparison: what was chosen and why.
+        comparison: of the models that took part.
     """
 
     predictors: tuple[Predictor, ...]
@@ -193,30 +195,30 @@ class MixturePredictor:
         return low, np.minimum(high, 1.0)
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, m) draws of y as a function at u (m, d), each from one of the predictors."""
+        """Return (n, m) draws of y as a function at u (m, d), each by one of the predictors."""
         counts = rng.multinomial(n, self.weight)
         return np.concatenate([sample_paths(p, u, k, rng) for p, k in zip(self.predictors, counts.tolist(), strict=True)])
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
+        """Return the prediction at u (n, d)."""
         return Prediction.mixture_of([predict(u) for predict in self.predictors], self.weight)
 
 
 def _explain(
     names: list[str], weights: Vector, held: Points | None, n: int, settings: Auto, bins: Bins | None
 ) -> ModelComparison:
-    """Return the choice, models with little weight left out."""
-    kept = np.where(weights >= _LEAST, weights, 0.0)
-    kept /= kept.sum()
-    alone = held is not None and bins is not None and not surely_better(held, kept)
-    chosen = np.eye(len(names))[0] if alone else kept
-    shares = {name: float(w) for name, w in zip(names, chosen, strict=True)}
-    mixed = ", ".join(f"{100 * w:.0f} % {name}" for name, w in shares.items() if w > 0.0)
+    """Return the comparison, with weight 0 for models that have little."""
+    mixture = np.where(weights >= _LEAST, weights, 0.0)
+    mixture /= mixture.sum()
+    alone = held is not None and bins is not None and not is_surely_better(held, mixture)
+    final = np.eye(len(names))[0] if alone else mixture
+    by_name = {name: float(w) for name, w in zip(names, final, strict=True)}
+    mixed = ", ".join(f"{100 * w:.0f} % {name}" for name, w in by_name.items() if w > 0.0)
     if held is None:
         reason = f"{mixed}: {n} rows are too few to compare models (from {_FEWEST} on)"
-        return ModelComparison(shares, {}, reason)
+        return ModelComparison(by_name, {}, reason)
     scores = {name: float(row.mean()) for name, row in zip(names, held, strict=True)}
-    scores["mixture"] = float(mixture_score(held, kept).mean())
+    scores["mixture"] = float(mixture_score(held, mixture).mean())
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
     what = "" if bins is None else f" to fall where they did, of the ranges cut at {', '.join(f'{cut:.3g}' for cut in bins.cuts)}"
     reason = f"{mixed}: mean log likelihood of {n} rows{what}, each predicted from other rows ({settings.folds} folds): {listed}"
@@ -226,4 +228,4 @@ def _explain(
         reason += f"; the ensemble takes part from {settings.ensemble_rows} rows on"
     if "gp" not in names:
         reason += f"; the gp takes part up to {settings.gp_rows} rows"
-    return ModelComparison(shares, scores, reason)
+    return ModelComparison(by_name, scores, reason)

@@ -29,14 +29,14 @@ from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError, SbtError, did_you_mean, place_of
+from sbt.errors import InputError, SbtError, described, did_you_mean
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "checked", "log_ambiguity_bound", "named_errors",
-    "sample_paths", "simplest", "split_validation", "standardise", "with_target",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "log_ambiguity_bound",
+    "named_errors", "sample_paths", "simplest", "split_validation", "standardise", "with_target",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -197,11 +197,11 @@ def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
     except SbtError:
         raise
     except Exception as error:
-        name, raised = type(metamodel).__name__, f"{type(error).__name__}: {error} ({place_of(error)})"
-        raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {raised}") from error
+        name = type(metamodel).__name__
+        raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {described(error)}") from error
 
 
-def checked(prediction: Prediction, n: int) -> Prediction:
+def check_prediction(prediction: Prediction, n: int) -> Prediction:
     """Return what a predictor returned for n points.
 
     Raises:

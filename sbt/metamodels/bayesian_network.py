@@ -1,6 +1,6 @@
 """A Bayesian neural network by concrete dropout: the paper's BNN, and a smaller one that is about as good.
 
-A draw of the dropout masks is one network. A predictor keeps its draws: each is a Gaussian of the
+A draw of the dropout masks is one network. A predictor keeps its draws: each is one Gaussian of the
 mixture, and the same function at all points.
 """
 
@@ -19,16 +19,27 @@ from numpy.typing import NDArray
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.torch_tools import centred, check_device, device_of, minibatches, single_threaded
+from sbt.metamodels.torch_tools import (
+    centred,
+    check_device,
+    device_of,
+    equal_mixture,
+    in_chunks,
+    initial_layer,
+    minibatches,
+    single_threaded,
+)
 from sbt.problem.arrays import Points, Vector
 
 __all__ = ["BayesianNetwork", "BayesianNetworkPredictor"]
 
-_CHUNK = 256  # points predicted at once
+_CHUNK = 256  # points predicted at once: the widest layer of the paper takes 42 MB for 50 networks
 _TEMPERATURE = 0.1  # of the relaxed masks; as Gal et al. (2017)
-_DRAWS = 10  # masks of a validation
+_DRAWS = 10  # masks of a validation: a few, for its cost
 _CHECK = 250  # minibatches between two validations
-_LOG_VARIANCE = (2.0 * math.log(0.01), 10.0)  # bounds, standardised
+_LOG_VARIANCE = (2.0 * math.log(0.01), 10.0)  # bounds, standardised: sigma is at least a hundredth of that of y
+_IMPROVEMENT = 0.1  # of the validation log likelihood that resets the patience
+_DROPPED = 0.1  # share of the units that is dropped at first, as Gal et al. (2017) start
 _Array = NDArray[np.float32]
 
 
@@ -53,7 +64,7 @@ class BayesianNetwork:
         device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
-        InputError: a value outside its range; at the fit, a device that is not there.
+        InputError: a value outside its range; at the fit, a device that is not available.
 
     Source:
         Gal et al. (2017), Concrete dropout, eqs. (3)-(5); preset: Winkelmann et al. (2022), table of
@@ -134,24 +145,12 @@ class BayesianNetworkPredictor:
     device: str
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
+        """Return the prediction at u (n, d)."""
         device = device_of(self.device)
         layers = [tuple(torch.from_numpy(a).to(device) for a in layer) for layer in self.layers]
         masks = [torch.from_numpy(mask).to(device) for mask in self.masks]
-        k, n = len(masks[0]), len(u)
-        mean, log_variance = np.empty((k, n)), np.empty((k, n))
-        with single_threaded(), torch.inference_mode():
-            for first in range(0, n, _CHUNK):
-                rows = slice(first, first + _CHUNK)
-                m, v = _forward(layers, masks, centred(u[rows]).to(device))
-                mean[:, rows], log_variance[:, rows] = m.cpu().numpy(), v.cpu().numpy()
-        variance = np.exp(log_variance)
-        return Prediction(
-            mean=self.shift + self.scale * mean,
-            std=self.scale * np.sqrt(variance),
-            weight=np.full(k, 1.0 / k),
-            noise=self.scale * np.sqrt(variance.mean(axis=0)),
-        )
+        mean, log_variance = in_chunks(lambda v: _forward(layers, masks, centred(v).to(device)), u, len(masks[0]), _CHUNK)
+        return equal_mixture(mean, np.exp(log_variance), self.shift, self.scale)
 
 
 def _mask(logit: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
@@ -178,8 +177,11 @@ def _train(
     """Return layers and dropout logits of the best validation likelihood."""
     device, n = device_of(settings.device), len(rows[1])
     sizes = [rows[0].shape[1], *settings.widths, 2]
-    layers = [_initial(a, b, rng, device) for a, b in pairwise(sizes)]
-    logits = [torch.full((), math.log(0.1 / 0.9), device=device, requires_grad=True) for _ in layers]
+    layers = [
+        tuple(torch.from_numpy(part).to(device).requires_grad_() for part in initial_layer(a, ((a, b), (b,)), rng))
+        for a, b in pairwise(sizes)
+    ]
+    logits = [torch.full((), math.log(_DROPPED / 0.9), device=device, requires_grad=True) for _ in layers]
     parameters = [*(p for layer in layers for p in layer), *logits]
     x, target = centred(rows[0]).to(device), torch.from_numpy(rows[1].astype(np.float32)).to(device)
     x_out, target_out = centred(held_out[0]).to(device), torch.from_numpy(held_out[1].astype(np.float32)).to(device)
@@ -201,19 +203,12 @@ def _train(
             value, since = _validate(layers, logits, sizes, x_out, target_out, source), since + _CHECK
             if value > best_value:
                 best, best_value = [p.detach().clone() for p in parameters], value
-            if value > mark + 0.1:
+            if value > mark + _IMPROVEMENT:
                 mark, since = value, 0
             if since >= settings.patience:
                 break
     arrays = [p.cpu().numpy() for p in best[: 2 * len(layers)]]
     return tuple(zip(arrays[::2], arrays[1::2], strict=True)), [float(p) for p in best[2 * len(layers) :]]
-
-
-def _initial(inputs: int, outputs: int, rng: np.random.Generator, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return random weights and biases, uniform within +-1/sqrt(inputs) as PyTorch draws them."""
-    bound = 1.0 / math.sqrt(inputs)
-    weight, bias = (rng.uniform(-bound, bound, s).astype(np.float32) for s in ((inputs, outputs), (outputs,)))
-    return tuple(torch.from_numpy(a).to(device).requires_grad_() for a in (weight, bias))  # type: ignore[return-value]
 
 
 def _draw(logits: list[torch.Tensor], sizes: list[int], n: int, source: torch.Generator) -> list[torch.Tensor]:

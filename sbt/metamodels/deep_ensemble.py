@@ -19,15 +19,25 @@ from numpy.typing import NDArray
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, standardise
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.torch_tools import centred, check_device, device_of, minibatches, single_threaded
+from sbt.metamodels.torch_tools import (
+    centred,
+    check_device,
+    device_of,
+    equal_mixture,
+    in_chunks,
+    initial_layer,
+    minibatches,
+    single_threaded,
+)
 from sbt.problem.arrays import Points, Vector
 
 __all__ = ["Ensemble", "EnsemblePredictor"]
 
-_ROWS = 2500  # up to which the number of steps does not grow
-_CHUNK = 1024  # points predicted at once
-_CHECKS = 50  # of the validation rows
-_VALIDATION = 500  # most validation rows of a member
+_ROWS = 2500  # up to which the number of steps does not grow: a batch of 32 sees each of them 32 times
+_CHUNK = 1024  # points predicted at once: hidden layers of all members stay in the cache
+_CHECKS = 50  # validations in a training
+_VALIDATION = 500  # most validation rows of a member: a likelihood is then known to a few hundredths
+_MOST_DECAY = 0.1  # of the weights that a step may take
 
 
 @dataclass(frozen=True)
@@ -50,7 +60,7 @@ class Ensemble:
         device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
-        InputError: a value outside its range; at the fit, a device that is not there.
+        InputError: a value outside its range; at the fit, a device that is not available.
 
     Source:
         Lakshminarayanan et al. (2017); loss: Seitzer et al. (2022), eq. (4).
@@ -107,22 +117,11 @@ class EnsemblePredictor:
     device: str
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
-        device = device_of(self.device)
+        """Return the prediction at u (n, d)."""
+        device, k = device_of(self.device), len(self.layers[0][0])
         layers = [tuple(torch.from_numpy(a).to(device) for a in layer) for layer in self.layers]
-        k, n = len(self.layers[0][0]), len(u)
-        mean, variance = np.empty((k, n)), np.empty((k, n))
-        with single_threaded(), torch.inference_mode():
-            for first in range(0, n, _CHUNK):
-                rows = slice(first, first + _CHUNK)
-                m, v = _forward(layers, centred(u[rows]).to(device), self.sigma_floor)
-                mean[:, rows], variance[:, rows] = m.cpu().numpy(), v.cpu().numpy()
-        return Prediction(
-            mean=self.shift + self.scale * mean,
-            std=self.scale * np.sqrt(variance),
-            weight=np.full(k, 1.0 / k),
-            noise=self.scale * np.sqrt(variance.mean(axis=0)),
-        )
+        mean, variance = in_chunks(lambda v: _forward(layers, centred(v).to(device), self.sigma_floor), u, k, _CHUNK)
+        return equal_mixture(mean, variance, self.shift, self.scale)
 
 
 def _forward(layers: Any, x: torch.Tensor, sigma_floor: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -135,14 +134,9 @@ def _forward(layers: Any, x: torch.Tensor, sigma_floor: float) -> tuple[torch.Te
 
 
 def _initial(settings: Ensemble, d: int, rng: np.random.Generator) -> list[list[NDArray[np.float32]]]:
-    """Return random weights and biases, uniform within +-1/sqrt(inputs) as PyTorch draws them."""
-    sizes = [d, *[settings.width] * settings.layers, 2]
-    layers = []
-    for inputs, outputs in pairwise(sizes):
-        bound = 1.0 / math.sqrt(inputs)
-        shapes = ((settings.members, inputs, outputs), (settings.members, 1, outputs))
-        layers.append([rng.uniform(-bound, bound, shape).astype(np.float32) for shape in shapes])
-    return layers
+    """Return random weights and biases of all layers."""
+    k, sizes = settings.members, [d, *[settings.width] * settings.layers, 2]
+    return [initial_layer(inputs, ((k, inputs, outputs), (k, 1, outputs)), rng) for inputs, outputs in pairwise(sizes)]
 
 
 def _folds(members: int, n: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -163,7 +157,7 @@ def _train(
     x, target = centred(u).to(device), torch.from_numpy(z.astype(np.float32)).to(device)
     validation, training = _folds(settings.members, n, rng)
     steps = round(settings.steps * max(1.0, n / _ROWS))
-    decay = min(settings.decay / n, 0.1 / settings.learning_rate)  # at most a tenth of the weights a step
+    decay = min(settings.decay / n, _MOST_DECAY / settings.learning_rate)
     adam = torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=decay, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(adam, settings.learning_rate, total_steps=steps + 1)
     best, best_loss = [p.detach().clone() for p in parameters], torch.full((settings.members,), math.inf, device=device)
@@ -180,8 +174,8 @@ def _train(
                 value = _loss(layers, x[validation], target[validation], settings, 0.0)
                 better = value < best_loss
                 best_loss = torch.where(better, value, best_loss)
-                for kept, parameter in zip(best, parameters, strict=True):
-                    kept[better] = parameter[better]
+                for snapshot, parameter in zip(best, parameters, strict=True):
+                    snapshot[better] = parameter[better]
     arrays = [p.cpu().numpy() for p in best]
     return tuple(zip(arrays[::2], arrays[1::2], strict=True))
 

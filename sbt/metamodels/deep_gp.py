@@ -33,7 +33,7 @@ class DeepGaussianProcess:
         device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
-        InputError: a value outside its range; at the fit, a device that is not there.
+        InputError: a value outside its range; at the fit, a device that is not available.
 
     Source:
         Salimbeni & Deisenroth (2017); preset: Winkelmann et al. (2022), table of hyperparameters.

@@ -24,8 +24,8 @@ __all__ = ["ExtraTrees", "ForestPredictor"]
 class ExtraTrees:
     """Settings of extra-trees (ET).
 
-    A tree believes in the Gaussian of its leaf; the forest in the mixture of its trees. The paper's
-    preset learns from the last 80 % of the rows and believes in the one Gaussian that has the
+    A tree predicts the Gaussian of its leaf; the forest the mixture of its trees. The paper's
+    preset learns from the last 80 % of the rows and predicts the one Gaussian that has the
     mixture's mean and variance (law of total variance).
 
     Args:
@@ -33,7 +33,7 @@ class ExtraTrees:
         min_samples_split: rows a node must hold to be split, >= 2.
         max_features: share of the inputs tried at a split, in (0, 1].
         sigma_floor: smallest sigma of a leaf, as a share > 0 of the standard deviation of y.
-        mixture: believe in the mixture of the trees; otherwise in one moment-matched Gaussian.
+        mixture: predict the mixture of the trees; otherwise one moment-matched Gaussian.
         hold_out: leave out the first 20 % of the rows, as the paper does.
 
     Raises:
@@ -100,7 +100,7 @@ class ExtraTrees:
 
 @dataclass(frozen=True, eq=False)
 class ForestPredictor:
-    """A grown forest: the trees find the leaf, the tables of all trees' nodes say what it believes.
+    """A grown forest: the trees find the leaf, the tables of all trees' nodes hold its mean and variance.
 
     Args:
         trees: k scikit-learn trees, used to find leaves only.
@@ -108,7 +108,7 @@ class ForestPredictor:
         mean: (nodes,) mean of y in a node.
         variance: (nodes,) variance of y in a node.
         floor: smallest standard deviation of a leaf.
-        mixture: believe in the mixture of the trees; otherwise in one moment-matched Gaussian.
+        mixture: predict the mixture of the trees; otherwise one moment-matched Gaussian.
     """
 
     trees: tuple[Any, ...]
@@ -119,21 +119,21 @@ class ForestPredictor:
     mixture: bool
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
+        """Return the prediction at u (n, d)."""
         node = self._nodes(u)
         mean, variance = self.mean[node], self.variance[node] + self.floor**2  # (k, n)
         noise = np.sqrt(variance.mean(axis=0))
         k = len(self.trees)
-        belief = Prediction(mean, np.sqrt(variance), np.full(k, 1.0 / k), noise)
-        return belief if self.mixture else Prediction.gaussian(belief.mu, belief.sigma, noise)
+        mixture = Prediction(mean, np.sqrt(variance), np.full(k, 1.0 / k), noise)
+        return mixture if self.mixture else Prediction.gaussian(mixture.mu, mixture.sigma, noise)
 
     def mu(self, u: Points) -> Vector:
-        """Return the (n,) mean of the trees, without the rest of the belief."""
+        """Return the (n,) mean of the trees, without their variance."""
         return np.asarray(self.mean[self._nodes(u)].mean(axis=0))
 
     @property
-    def most(self) -> float:
-        """No point has a larger mean of the trees."""
+    def largest_mu(self) -> float:
+        """Upper bound of `mu`: the mean of the trees' largest leaves."""
         return float(np.mean([part.max() for part in np.split(self.mean, self.offset[1:])]))
 
     def _nodes(self, u: Points) -> NDArray[np.int64]:

@@ -23,18 +23,22 @@ from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, diagonal, host, like, native, placed, solve, solve_right
-from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative
+from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative_variance
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import check_device, device_of, single_threaded
 from sbt.problem.arrays import Points, Vector
 
 __all__ = ["GaussianProcess", "GaussianProcessPredictor"]
 
-_BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter
+_BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
 _NOISE_FLOOR = 1e-4  # variance relative to that of y: keeps the covariance well conditioned
 _FOLDS = 5  # of the noise regression
-_FEWEST_FOR_NOISE = 2 * _FOLDS  # rows
-_FOREST = ExtraTrees(trees=10, min_samples_split=20)
+_FEWEST_FOR_NOISE = 2 * _FOLDS  # rows: two a fold
+_FOREST = ExtraTrees(trees=10, min_samples_split=20)  # of the noise: a smooth average, since squared residuals vary a lot
+_RESIDUAL_FLOOR = 1e-4  # of squared standardised residuals, before the logarithm
+_FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
+_ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
+_IMPROVEMENT = 0.01  # of the mean validation log likelihood that resets the patience
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class GaussianProcess:
         nu: smoothness of the kernel: 0.5, 1.5 or 2.5.
         input_noise: let the noise depend on the input (from 10 rows on).
         fit_rows: most rows that hyperparameters are fitted on, >= 2; chosen by the rng.
-        student_t: believe in a Student-t, from the leave-one-out residuals, instead of a Gaussian.
+        student_t: predict a Student-t, from the leave-one-out residuals, instead of a Gaussian.
         priors: fit under priors by L-BFGS; otherwise by Adam with early stopping.
         learning_rate: step of Adam, > 0.
         patience: epochs without an improvement of 0.01 of the mean validation log likelihood, >= 1.
@@ -58,7 +62,7 @@ class GaussianProcess:
         device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
-        InputError: a value outside its range; at the fit, a device that is not there.
+        InputError: a value outside its range; at the fit, a device that is not available.
 
     Source:
         Rasmussen & Williams (2006), algorithm 2.1, eqs. (5.9), (5.10)-(5.12); priors: Hvarfner et al.
@@ -119,11 +123,11 @@ def _fit_noise_spread(
     """Return how the noise depends on the input, and (n,) its values at the rows.
 
     A regression on the log of squared leave-one-out residuals, relative to their variance. The values at
-    the rows are cross-fitted: a row's own residual says nothing about its noise, or the process would
-    trust the rows it happens to fit.
+    the rows are cross-fitted: from its own residual the noise of a row would be too small where the process
+    happens to fit it.
     """
     residual, variance = _leave_one_out(_factor(hyper, u, np.full(len(z), hyper.noise), device), z)
-    log_ratio = np.log(residual**2 / variance + 1e-4)
+    log_ratio = np.log(residual**2 / variance + _RESIDUAL_FLOOR)
     fold = rng.permutation(len(z)) % _FOLDS
     at_rows, forests = np.zeros(len(z)), []
     for i in range(_FOLDS):
@@ -131,7 +135,7 @@ def _fit_noise_spread(
         forest = _FOREST.fit(u[rest], log_ratio[rest], rng)
         at_rows[~rest] = forest.mu(u[~rest])
         forests.append(forest)
-    return NoiseSpread(tuple(forests)), relative(at_rows)
+    return NoiseSpread(tuple(forests)), relative_variance(at_rows)
 
 
 def _factor(hyper: Hyperparameters, u: Points, noise: Vector, device: torch.device) -> Matrix:
@@ -246,8 +250,8 @@ def _fit_posterior(
 ) -> Hyperparameters:
     """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
     model = _Model.build(nu, u.shape[1], device, priors=True)
-    first = np.full(u.shape[1], 0.3 * math.sqrt(u.shape[1]))
-    model.assign(start if start is not None else Hyperparameters(nu, first, 1.0, 0.02))
+    first = np.full(u.shape[1], _FIRST_LENGTH * math.sqrt(u.shape[1]))
+    model.assign(start if start is not None else Hyperparameters(nu, first, 1.0, _FIRST_NOISE))
     x, parameters = torch.from_numpy(u).to(device), model.parameters()
 
     def loss(vector: Vector) -> tuple[float, Vector]:
@@ -258,7 +262,7 @@ def _fit_posterior(
     initial = torch.nn.utils.parameters_to_vector(parameters).detach().cpu().numpy().copy()
     found = minimize(
         loss, initial, jac=True, method="L-BFGS-B", bounds=[_BOUNDS] * len(initial),
-        options={"maxiter": 100, "ftol": 1e-6},
+        options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE},
     )  # fmt: skip
     torch.nn.utils.vector_to_parameters(torch.from_numpy(found.x).to(device), parameters)
     return model.hyperparameters()
@@ -284,7 +288,7 @@ def _fit_early_stopped(
         hyper = model.hyperparameters()
         value = _condition(settings, hyper, u, z, ones, None, 0.0, 1.0)(u_held_out).log_density(z_held_out).mean()
         since += 1
-        if value > best_value + 0.01:
+        if value > best_value + _IMPROVEMENT:
             best, best_value, since = hyper, value, 0
         if since >= settings.patience:
             break

@@ -17,13 +17,14 @@ from sbt.metamodels.torch_tools import device_of, single_threaded
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative"]
+__all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative_variance"]
 
-_CHUNK = 512  # points predicted at once
-_QUICK = 128  # points bounded at once: what is in between stays in the cache
+_CHUNK = 512  # points predicted at once: 2 MB a 500 rows
+_QUICK = 128  # points bounded at once: intermediate arrays stay in the cache
 _ROUNDED = 1e-6  # of a correlation in single precision: at most a dozen roundings of 6e-8
 _CANCELLED = 2e-15  # of a squared distance, relative to the squares that it is the difference of: a few roundings
-_LOG_CHI2 = 1.27036  # -E[log chi^2_1]: what the mean of log z^2 lacks to the log of the mean of z^2
+_LOG_CHI2 = 1.27036  # -E[log chi^2_1]: log of the mean of z^2 minus the mean of log z^2
+_CLIP = 6.9  # about log(1000): relative noise variances stay within [1e-3, 1e3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class GaussianProcessPredictor:
     device: str = "cpu"
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
+        """Return the prediction at u (n, d)."""
         with single_threaded():
             chunks = [self._moments(u[i : i + _CHUNK]) for i in range(0, max(len(u), 1), _CHUNK)]
         mean, variance = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
@@ -73,10 +74,10 @@ class GaussianProcessPredictor:
         """Return (n,) lower and (n,) upper bounds of P(y in M_c), from the mean and a bound of the variance.
 
         The variance given all rows is at most that given one of them, and P grows with it where the mean
-        lies outside of M_c, shrinks where it lies inside. Many times quicker than the belief itself.
+        lies outside of M_c, shrinks where it lies inside. Many times quicker than the prediction.
         """
         scale, noise = self.hyper.outputscale, self.hyper.noise
-        most = 1.0 if self.spread is None else self.spread.most
+        most = 1.0 if self.spread is None else self.spread.largest
         with single_threaded():
             b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
             scaled = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)])
@@ -84,13 +85,13 @@ class GaussianProcessPredictor:
             room = np.empty(shape), np.empty(shape, np.float32), np.empty(shape, np.float32)
             chunks = [self._quick(scaled[i : i + _QUICK], room) for i in range(0, max(len(u), 1), _QUICK)]
         quick, nearest = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
-        rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # a small noise need not be known
+        rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # an upper bound of a small noise will do
         at = np.full(len(u), most) if rough or self.spread is None else self.spread(u)
         mean = self.shift + self.scale * quick
-        margin = self.scale * self._off * scale * float(np.abs(self.alpha).sum())
+        margin = self.scale * self._off * scale * float(np.abs(self.alpha).sum())  # error of the mean
         latent = scale * (1.0 - np.maximum(nearest - self._off, 0.0) ** 2 * scale / (scale + noise * most))
         sigma = 1.000001 * self.scale * np.sqrt(latent + noise * at)
-        outside = np.maximum(np.maximum(critical.low - mean, mean - critical.high) - margin, 0.0)  # at least so far off
+        outside = np.maximum(np.maximum(critical.low - mean, mean - critical.high) - margin, 0.0)  # distance to M_c, at least
         below, above = mean - critical.low - margin, critical.high - mean - margin
         inside = (below > 0.0) & (above > 0.0)
         low, high = np.zeros(len(u)), np.zeros(len(u))
@@ -106,8 +107,8 @@ class GaussianProcessPredictor:
     def _quick(self, scaled: Points, room: tuple[Points, Any, Any]) -> tuple[Vector, Vector]:
         """Return (m,) means, standardised, and (m,) correlations with the nearest row, of scaled points (m, d + 2).
 
-        Correlations are in single precision and off by at most `_off`; sums are in double precision. All
-        is computed in `room`, three arrays (at least m, n): new ones for every chunk cost a sixth more.
+        Correlations are in single precision, with an error of at most `_off`; sums are in double precision. All
+        is computed in `room`, three arrays (at least m, n): new ones for every chunk cost a sixth more time.
         """
         across, weights = self._prepared
         squares, r, correlation = (part[: len(scaled)] for part in room)
@@ -125,12 +126,12 @@ class GaussianProcessPredictor:
 
     @cached_property
     def _off(self) -> float:
-        """No correlation that `_quick` finds in the unit cube is farther off; nu 0.5 has a slope at distance 0."""
+        """Upper bound of the error of a correlation that `_quick` computes in the unit cube; nu 0.5 has a slope at distance 0."""
         return _ROUNDED + (math.sqrt(2.0 * self._cancelled) if self.hyper.nu == 0.5 else 2.0 * self._cancelled)
 
     @cached_property
     def _cancelled(self) -> float:
-        """How far squared distances may be off, differences of squares as they are; added, so that none is below 0."""
+        """Upper bound of the rounding error of squared distances, computed as differences; added, so that none is < 0."""
         return _CANCELLED * 8.0 * self.hyper.nu * float((self.hyper.lengthscale**-2.0).sum())
 
     @cached_property
@@ -178,15 +179,15 @@ class NoiseSpread:
     forests: tuple[ForestPredictor, ...]
 
     @cached_property
-    def most(self) -> float:
-        """No point, and no row that was cross-fitted, has a larger relative noise variance."""
-        return float(relative(np.array([max(forest.most for forest in self.forests)]))[0])
+    def largest(self) -> float:
+        """Upper bound of the relative noise variance, at points and at the rows that were cross-fitted."""
+        return float(relative_variance(np.array([max(forest.largest_mu for forest in self.forests)]))[0])
 
     def __call__(self, u: Points) -> Vector:
         """Return the (n,) relative noise variance at u (n, d)."""
-        return relative(np.mean([forest.mu(u) for forest in self.forests], axis=0))
+        return relative_variance(np.mean([forest.mu(u) for forest in self.forests], axis=0))
 
 
-def relative(log_ratio: Vector) -> Vector:
+def relative_variance(log_ratio: Vector) -> Vector:
     """Return noise variances relative to the common one, from mean log squared residuals."""
-    return np.exp(np.clip(log_ratio + _LOG_CHI2, -6.9, 6.9))
+    return np.exp(np.clip(log_ratio + _LOG_CHI2, -_CLIP, _CLIP))

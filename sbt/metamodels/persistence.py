@@ -58,7 +58,7 @@ def save(predictor: Predictor, path: Path | str, info: Mapping[str, Any] | None 
     Args:
         predictor: what `fit` of a built-in metamodel returned.
         path: file to write, by custom `*.sbtmodel`.
-        info: what the predictor is about, as JSON: names and ranges of its inputs, the metric.
+        info: a description of the predictor, as JSON: names and ranges of its inputs, the metric.
 
     Raises:
         InputError: a predictor of another package, or `info` that JSON cannot hold.
@@ -84,13 +84,13 @@ def load(path: Path | str, device: str | None = None) -> Predictor:
 
     Args:
         path: what `save` wrote.
-        device: auto, cpu or cuda, where it shall predict; None: where it was fitted.
+        device: where it will predict: auto, cpu or cuda; None: where it was fitted.
 
     Raises:
         InputError: no such file, not a saved model, damaged, of another version, or no such device.
     """
     if device is not None:
-        device_of(device)  # refuses one that is not there
+        device_of(device)  # refuses one that is not available
     head, file = _open(path)
     with file:
         try:
@@ -103,7 +103,7 @@ def load(path: Path | str, device: str | None = None) -> Predictor:
 
 
 def read_info(path: Path | str) -> dict[str, Any]:
-    """Return what `save` was told about the predictor; the errors are those of `load`."""
+    """Return the `info` that `save` was given; the errors are those of `load`."""
     head, file = _open(path)
     file.close()
     return dict(head["info"])

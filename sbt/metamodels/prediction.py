@@ -1,4 +1,4 @@
-"""What a metamodel believes about the safety metric at n points: a Gaussian mixture per point.
+"""Predictions of the safety metric at n points: a Gaussian mixture per point.
 
 One component for a Gaussian process, one per tree, network or Monte Carlo draw otherwise. Everything
 is vectorised over points and computed in logs, so that the tails stay finite.
@@ -22,6 +22,7 @@ __all__ = ["Prediction"]
 
 _Matrix = NDArray[np.float64]
 _LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
+_NEWTON_STEPS, _ROUNDING = 100, 1e-13  # of a quantile: at most, and the relative step at which it ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +38,8 @@ class Prediction:
     Raises:
         InputError: wrong shapes, a mean that is not finite, std <= 0, or weights that do not sum to 1.
 
-    >>> belief = Prediction.gaussian(mu=np.array([0.0, 3.0]), sigma=np.ones(2))
-    >>> belief.probability(CriticalInterval(high=0.0)).round(4).tolist()
+    >>> prediction = Prediction.gaussian(mu=np.array([0.0, 3.0]), sigma=np.ones(2))
+    >>> prediction.probability(CriticalInterval(high=0.0)).round(4).tolist()
     [0.5, 0.0013]
     """
 
@@ -162,7 +163,7 @@ class Prediction:
         """Solve log P(Y <= y) = log_q between the smallest and the largest component quantile."""
         low, high = at.min(axis=0), at.max(axis=0)
         y: Vector = self.weight @ at
-        for _ in range(100):
+        for _ in range(_NEWTON_STEPS):
             log_cdf = self._mix(log_ndtr((y - self.mean) / self.std))
             below = log_cdf < log_q
             low, high = np.where(below, y, low), np.where(below, high, y)
@@ -170,7 +171,7 @@ class Prediction:
                 newton = y - (log_cdf - log_q) * np.exp(log_cdf - self.log_density(y))
             inside = (newton > low) & (newton < high)
             new = np.where(inside, newton, 0.5 * (low + high))
-            done = np.abs(new - y) <= 1e-13 * (np.abs(y) + self.std.min(axis=0))
+            done = np.abs(new - y) <= _ROUNDING * (np.abs(y) + self.std.min(axis=0))
             y = new
             if done.all():
                 break

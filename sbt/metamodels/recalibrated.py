@@ -1,4 +1,4 @@
-"""Recalibration: sigma of any metamodel scaled by how far off it was on rows that it had not seen.
+"""Recalibration: sigma of any metamodel scaled by its errors on held-out rows.
 
 Off by default: measured to help the likelihood of all runs a little and to hurt that of critical ones
 where sigma was wide on purpose (see docs/metamodels.md).
@@ -10,16 +10,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, check_rows, split_validation, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, check_rows, split_validation, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Recalibrated", "RecalibratedPredictor"]
 
-_FEWEST = 50  # rows from which on the held-out fifth says something about sigma
-_PRIOR = 5.0  # rows that speak for no change
-_LEAST = 1e-3  # of the factor: a belief that was exact by chance keeps a sigma
+_FEWEST = 50  # rows from which on sigma is scaled: ten held-out rows estimate a factor to about 20 %
+_PRIOR = 5.0  # weight of no change, in rows
+_LEAST = 1e-3  # of the factor: a prediction that was exact by chance keeps a sigma
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Recalibrated:
     metamodel: Metamodel
 
     def with_target(self, critical: CriticalInterval) -> Recalibrated:
-        """Return the same, the metamodel told of M_c."""
+        """Return the same for a known M_c."""
         return replace(self, metamodel=with_target(self.metamodel, critical))
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> RecalibratedPredictor:
@@ -48,8 +48,8 @@ class Recalibrated:
         factor = 1.0
         if len(y) >= _FEWEST:
             held_out, training = split_validation(len(y))
-            belief = self.metamodel.fit(u[training], y[training], rng)(u[held_out])
-            z = (y[held_out] - belief.mu) / belief.sigma
+            prediction = check_prediction(self.metamodel.fit(u[training], y[training], rng)(u[held_out]), held_out.stop)
+            z = (y[held_out] - prediction.mu) / prediction.sigma
             size = max(float(np.sqrt(np.mean(z**2))), _LEAST)
             factor = size ** (len(z) / (len(z) + _PRIOR))
         return RecalibratedPredictor(self.metamodel.fit(u, y, rng), factor)
@@ -63,6 +63,6 @@ class RecalibratedPredictor:
     factor: float
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
-        b = self.predictor(u)
-        return Prediction(b.mu + self.factor * (b.mean - b.mu), self.factor * b.std, b.weight, self.factor * b.noise)
+        """Return the prediction at u (n, d)."""
+        p = check_prediction(self.predictor(u), len(u))
+        return Prediction(p.mu + self.factor * (p.mean - p.mu), self.factor * p.std, p.weight, self.factor * p.noise)

@@ -1,4 +1,4 @@
-"""The yardsticks: how well beliefs agree with runs the metamodel has not seen.
+"""Scores: how well predictions agree with runs that the metamodel has not seen.
 
 The paper's likelihood and RMSE, over all runs and over the critical ones; precision, recall and
 calibration of P(y in M_c).
@@ -17,11 +17,11 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["precision_recall", "reliability", "scores"]
 
-_BINS = 15
+_BINS = 15  # of the calibration, as in Guo et al. (2017), On calibration of modern neural networks
 
 
 def scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> dict[str, float | int | None]:
-    """Return every yardstick of beliefs at n points against the values y (n,) observed there.
+    """Return every score of a prediction at n points against the values y (n,) observed there.
 
     Keys, in the unit of y where they have one:
 
@@ -48,7 +48,7 @@ def scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> dic
     observed = np.asarray(y, dtype=np.float64)
     if not np.isfinite(observed).all():
         raise InputError("scores need finite y, but got NaN or infinity")
-    with np.errstate(over="ignore"):  # squares of absurd errors: -inf, answered as None
+    with np.errstate(over="ignore"):  # squares of enormous errors: -inf, which becomes None
         return _scores(prediction, observed, critical)
 
 

@@ -36,7 +36,7 @@ class DeepSigmaPointProcess:
         device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
-        InputError: a value outside its range; at the fit, a device that is not there.
+        InputError: a value outside its range; at the fit, a device that is not available.
 
     Source:
         Jankowiak et al. (2020), Deep sigma point processes; preset: Winkelmann et al. (2022), table of

@@ -3,7 +3,7 @@
 A layer is a Gaussian process that is known through its values at inducing points (whitened variational
 posterior). A second layer takes the first one's output at `sites`: standard normal numbers (sampled deep
 GP) or learned quadrature points (deep sigma-point process). Each site is one Gaussian of the mixture.
-The sites are the same at all points, so that a belief does not depend on what else is asked about.
+The sites are the same at all points, so that a prediction does not depend on the other points.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from numpy.typing import NDArray
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.torch_tools import check_device, device_of, minibatches, single_threaded
+from sbt.metamodels.torch_tools import check_device, device_of, in_chunks, minibatches, single_threaded
 from sbt.problem.arrays import Points, Vector
 
 __all__ = ["KERNELS", "SparseLayer", "SparseMixture", "SparsePredictor", "Training", "train"]
 
 KERNELS = ("rq", "matern_0.5", "matern_1.5", "matern_2.5")
-_NOISE_FLOOR = 1e-4  # variance relative to that of y
-_JITTER = 1e-6
+_NOISE_FLOOR = 1e-4  # variance relative to that of y: keeps the likelihood finite
+_JITTER = 1e-6  # on the diagonal of correlations, as GPyTorch takes for variational processes in double precision
+_IMPROVEMENT = 0.01  # of the validation log likelihood that resets the patience
 _DIGITS = 10  # of z: training would amplify the last bits, which depend on the unit of y
-_CHUNK = 4096  # pairs of point and site predicted at once
+_CHUNK = 4096  # pairs of point and site predicted at once: their covariance with 200 inducing points takes 7 MB
 _QUIET = 1e-3  # variance of a hidden process at first, predictive objective: from 1 on it drowns the inputs and stays there
 _DRAWS = 10  # of the hidden layer, a training step; GPyTorch's default
 _Array = NDArray[np.float64]
@@ -137,23 +138,18 @@ class SparsePredictor:
     device: str
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
-        device = device_of(self.device)
+        """Return the prediction at u (n, d)."""
+        device, k = device_of(self.device), len(self.weight)
         layers = tuple(_as_tensors(layer, device) for layer in self.layers)
-        k, n = len(self.weight), len(u)
-        mean, variance = np.empty((k, n)), np.empty((k, n))
-        step = max(_CHUNK // k, 1)
-        with single_threaded(), torch.inference_mode():
-            sites = torch.from_numpy(self.sites)[:, None, :].to(device)
-            for first in range(0, n, step):
-                rows = slice(first, first + step)
-                m, v = _forward(layers, self.kernel, _centre(u[rows]).to(device), sites)
-                mean[:, rows], variance[:, rows] = m.cpu().numpy(), v.cpu().numpy()
+        sites = torch.from_numpy(self.sites)[:, None, :].to(device)
+        mean, variance = in_chunks(
+            lambda v: _forward(layers, self.kernel, _centre(v).to(device), sites), u, k, max(_CHUNK // k, 1)
+        )
         return Prediction(
             mean=self.shift + self.scale * mean,
             std=self.scale * np.sqrt(variance + self.noise),
             weight=self.weight,
-            noise=np.full(n, self.scale * math.sqrt(self.noise)),
+            noise=np.full(len(u), self.scale * math.sqrt(self.noise)),
         )
 
 
@@ -164,7 +160,7 @@ class SparseMixture:
     processes: tuple[SparsePredictor, ...]
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the belief at u (n, d)."""
+        """Return the prediction at u (n, d)."""
         k = len(self.processes)
         return Prediction.mixture_of([process(u) for process in self.processes], np.full(k, 1.0 / k))
 
@@ -274,11 +270,11 @@ def _optimise(
                 schedule.step()
         if how.patience is not None:
             state = model.state(how)
-            belief = SparsePredictor(shift=0.0, scale=1.0, **state)(held_out[0])
-            value, since = float(belief.log_density(held_out[1]).mean()), since + 1
+            prediction = SparsePredictor(shift=0.0, scale=1.0, **state)(held_out[0])
+            value, since = float(prediction.log_density(held_out[1]).mean()), since + 1
             if value > best_value:
                 best, best_value = state, value
-            if value > mark + 0.01:
+            if value > mark + _IMPROVEMENT:
                 mark, since = value, 0
             if since >= how.patience:
                 break

@@ -33,7 +33,7 @@ class SparseGaussianProcess:
         device: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
-        InputError: a value outside its range; at the fit, a device that is not there.
+        InputError: a value outside its range; at the fit, a device that is not available.
 
     Source:
         Hensman et al. (2015); objective: Jankowiak et al. (2020), Parametric Gaussian process regressors.

@@ -1,4 +1,4 @@
-"""What the models of a mixture are worth: scores on rows they had not seen, and the weights of the best mixture."""
+"""Stacking: scores of models on held-out rows, and the weights of the best mixture."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Bins", "held_out", "mixture_score", "stacked", "surely_better"]
+__all__ = ["Bins", "held_out_scores", "is_surely_better", "mixture_score", "stacking_weights"]
 
-_SURE = 3.0  # standard errors
+_SURE = 3.0  # standard errors: with two, mixtures were taken that lost on whole campaigns (docs/boundary.md)
+_ROUNDS, _MOVED = 500, 1e-6  # of expectation maximisation: at most, and the change of a weight at which it ends
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Bins:
     """Ranges of y that a score tells apart: on which side of the critical edge a run fell, and whether near it.
 
     The density of y, summed over all runs, says little about the edge: a model that knows the plateau of the runs
-    without a conflict to a thousandth wins there, whatever it believes about the few that matter. The probability of
+    without a conflict to a thousandth wins there, whatever it predicts for the few that matter. The probability of
     a range has no such spikes.
 
     Args:
@@ -52,52 +53,52 @@ class Bins:
         ends = [end for end in (self.critical.low, self.critical.high) if np.isfinite(end)]
         return np.unique([end + step for end in ends for step in (-self.near, 0.0, self.near)])
 
-    def log_score(self, belief: Prediction, y: Vector) -> Vector:
+    def log_score(self, prediction: Prediction, y: Vector) -> Vector:
         """Return (n,) log probabilities of the ranges that y (n,) fell into; M_c is closed."""
         ends, score = np.array([-np.inf, *self.cuts, np.inf]), np.empty(len(y))
         fell = np.searchsorted(self.cuts, y, side="right") - (y == self.critical.high)
         for k in np.unique(fell):
             mine = fell == k
-            score[mine] = belief.take(mine).log_probability(CriticalInterval(float(ends[k]), float(ends[k + 1])))[0]
+            score[mine] = prediction.take(mine).log_probability(CriticalInterval(float(ends[k]), float(ends[k + 1])))[0]
         return score
 
 
-def held_out(
+def held_out_scores(
     models: Iterable[Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator, bins: Bins | None
 ) -> Points:
     """Return (k, n) log scores of each row under k models fitted to the other folds: of its bin, or its log density."""
-    fold, chosen = rng.permutation(len(y)) % folds, list(models)
-    score = np.empty((len(chosen), len(y)))
+    fold, compared = rng.permutation(len(y)) % folds, list(models)
+    score = np.empty((len(compared), len(y)))
     for i in range(folds):
         out = fold == i
-        for row, model in zip(score, chosen, strict=True):
-            belief = model.fit(u[~out], y[~out], rng)(u[out])
-            row[out] = belief.log_density(y[out]) if bins is None else bins.log_score(belief, y[out])
+        for row, model in zip(score, compared, strict=True):
+            prediction = model.fit(u[~out], y[~out], rng)(u[out])
+            row[out] = prediction.log_density(y[out]) if bins is None else bins.log_score(prediction, y[out])
     return score
 
 
-def stacked(log_score: Points, prior: float) -> Vector:
+def stacking_weights(log_score: Points, prior: float) -> Vector:
     """Return the (k,) weights of the mixture of largest likelihood, by expectation maximisation.
 
     Args:
         log_score: (k, n) of each row under each model; -inf where a model excludes what happened.
-        prior: rows that speak for equal weights.
+        prior: weight of equal weights, in rows.
 
     Source:
         Yao et al. (2018), Using stacking to average Bayesian predictive distributions.
 
-    >>> stacked(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
+    >>> stacking_weights(np.log([[0.9, 0.8, 0.9], [0.1, 0.1, 0.1]]), prior=0.0).round(2).tolist()
     [1.0, 0.0]
     """
     k = len(log_score)
     log_score = np.maximum(log_score, -1e300)
     density = np.exp(log_score - log_score.max(axis=0))
     n, weights = log_score.shape[1], np.full(k, 1.0 / k)
-    for _ in range(500):
+    for _ in range(_ROUNDS):
         joint = weights[:, None] * density
         new = ((joint / joint.sum(axis=0)).sum(axis=1) + prior / k) / (n + prior)
         moved, weights = np.abs(new - weights).max(), new
-        if moved < 1e-6:
+        if moved < _MOVED:
             break
     return np.asarray(weights / weights.sum())
 
@@ -108,10 +109,10 @@ def mixture_score(log_score: Points, weights: Vector) -> Vector:
         return np.asarray(np.logaddexp.reduce(log_score + np.log(weights)[:, None], axis=0))
 
 
-def surely_better(log_score: Points, weights: Vector) -> bool:
-    """Say whether the mixture is better than the first of the k models by three standard errors of (k, n) scores.
+def is_surely_better(log_score: Points, weights: Vector) -> bool:
+    """Return whether the mixture is better than the first of the k models by three standard errors of (k, n) scores.
 
-    >>> surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
+    >>> is_surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
     True
     """
     gain = mixture_score(log_score, weights) - log_score[0]

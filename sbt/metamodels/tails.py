@@ -9,9 +9,9 @@ from sbt.problem.arrays import Vector
 
 __all__ = ["student_widths"]
 
-_COMPONENTS = 7
-_DEGREES = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0)
-_FEWEST = 30  # standardised residuals
+_COMPONENTS = 7  # widths: the kurtosis of a Student-t with few degrees of freedom needs several
+_DEGREES = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0)  # of freedom: from a finite variance on to nearly Gaussian
+_FEWEST = 30  # standardised residuals: tails of fewer are not seen
 _PRICE = 2.0  # of two more parameters, in log likelihood (Akaike's criterion)
 
 

@@ -1,4 +1,4 @@
-"""A monotone warp of the safety metric about the edge of the critical interval.
+"""A monotone warp of the safety metric around the edge of the critical interval.
 
 Searches fit their metamodel to the warped metric: near the edge nothing changes, far from it an
 outlier of 1e6 is a few units away. P(y in M_c) is the same before and after, because the warp is
@@ -36,7 +36,7 @@ class Warp:
 
     @classmethod
     def around_edge(cls, y: Vector, critical: CriticalInterval, quantile: float = 0.25) -> Warp:
-        """Return the warp for values y (n,), about the end of the interval that is nearer to their median.
+        """Return the warp for values y (n,), around the end of the interval that is nearer to their median.
 
         The scale is a quantile of the distances to the edge. A small one shrinks as runs gather at the edge, and
         with it the warp becomes a step; where they gather much, take a larger one.

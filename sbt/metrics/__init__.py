@@ -12,3 +12,8 @@ def __getattr__(name: str) -> Any:
     if name.startswith("_") or name not in plugins.names("metrics"):
         raise AttributeError(f"module 'sbt.metrics' has no attribute '{name}'; installed: {', '.join(plugins.names('metrics'))}")
     return plugins.load("metrics", name)
+
+
+def __dir__() -> list[str]:
+    """Return the names of those that are installed."""
+    return plugins.names("metrics")

@@ -44,8 +44,8 @@ def drawing_of_convergence(found: Findings) -> Iterator[tuple[str, str]]:
     plot_convergence(conclusion, figure.subplots())
     confidence = percent(conclusion.confidence)
     caption = (
-        f"The estimate after each batch that counts, with its {confidence} interval. Runs before the first point searched and"
-        " taught. The interval should narrow and the estimate stay within the earlier intervals; a jump tells of a critical"
-        " region that was found late."
+        f"The estimate after each batch that counts, with its {confidence} interval. Runs before the first point were for"
+        " search and training. The interval should narrow and the estimate stay within the earlier intervals; a jump"
+        " indicates a critical region that was found late."
     )
     yield caption, to_svg(figure, "convergence")

@@ -1,4 +1,4 @@
-"""Figures of the scores: how far to trust the metamodel, and what the campaign gained.
+"""Figures of the scores: how good the metamodel is, and how many critical runs the campaign found.
 
 Every function draws data on axes that it is given, and returns them.
 """
@@ -101,7 +101,7 @@ def plot_precision_recall(p: Vector, critical: Mask, ax: Axes) -> Axes:
 
 
 def plot_reliability(p: Vector, critical: Mask, ax: Axes, *, bins: int = 10) -> Axes:
-    """Draw how often runs are critical against the probability that the metamodel gave them.
+    """Draw the share of runs that were critical over the probability that the metamodel predicted.
 
     Bars are 95 % Clopper-Pearson intervals of the frequency; the numbers on top count the runs of the bins.
     """

@@ -1,7 +1,7 @@
 """Figures of the inputs: where the runs lie, and where the metamodel expects critical ones.
 
-Every function draws data on axes that it is given, and returns them. Marker and shade both tell the
-verdict, so that a grey print loses nothing: light circles are uncritical, dark triangles critical,
+Every function draws data on the axes that it is given, and returns them. Marker and lightness both show
+the verdict, so that a print in grey shows it too: light circles are uncritical, dark triangles critical,
 crosses failed; hollow ones are held out.
 """
 
@@ -24,7 +24,7 @@ from sbt.store.history import VALIDATION, History
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_prediction", "plot_metric", "plot_probability", "plot_runs"]
+__all__ = ["plot_metric", "plot_prediction", "plot_probability", "plot_runs"]
 
 _RASTER = 1500
 """More markers than this become an image inside the SVG, which keeps the file small."""
@@ -82,11 +82,12 @@ def plot_metric(
     return ax
 
 
-def plot_prediction(x: Vector, belief: Prediction, ax: Axes) -> Axes:
+def plot_prediction(x: Vector, prediction: Prediction, ax: Axes) -> Axes:
     """Draw the metamodel's mean of the metric over one input, and the band of its 5 % to 95 % quantiles."""
-    band = ax.fill_between(x, belief.quantile(0.05), belief.quantile(0.95), color=MODEL, alpha=0.18, linewidth=0, zorder=1.5)
+    low, high = prediction.quantile(0.05), prediction.quantile(0.95)
+    band = ax.fill_between(x, low, high, color=MODEL, alpha=0.18, linewidth=0, zorder=1.5)
     band.set_label("metamodel, 5 % to 95 %")
-    ax.plot(x, belief.mu, color=MODEL, linewidth=1.4, zorder=2, label="metamodel, mean")
+    ax.plot(x, prediction.mu, color=MODEL, linewidth=1.4, zorder=2, label="metamodel, mean")
     return ax
 
 
@@ -167,7 +168,7 @@ def _scatter(history: History, requirement: Requirement, x: Vector, y: Vector, a
             look["s"] *= size
             raster = bool(mask.sum() > _RASTER)
             if size < 8 and "x" not in look["marker"] and not held[mask].any():
-                look["linewidths"] = 0.0  # white rims would eat small markers
+                look["linewidths"] = 0.0  # white rims would hide small markers
             ax.scatter(x[mask], y[mask], label=f"{name}: {mask.sum():,}", zorder=3 + order, rasterized=raster, **look)
 
 

@@ -1,4 +1,4 @@
-"""A run as a small film: the scene from above, and below it what the metric has come to so far."""
+"""A run as an animated GIF: the scene from above, and below it the metric of the run so far."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 __all__ = ["metric_so_far", "write_film"]
 
 _FRAMES = 90
-"""At most so many; a long run is shown with fewer frames a second, at the same speed."""
+"""Largest number of frames; a long run has fewer frames a second, at the same speed."""
 _FASTEST = 0.08
 """Shortest time of a frame (s)."""
 _HOLD = 1.2
-"""The last frame stays for so long (s)."""
+"""Time for which the last frame is shown (s)."""
 _SIZE = (5.6, 3.6)
 _DPI = 96
 _COLORS = 48
 
 
 def metric_so_far(trace: Trace, metric: Metric, instants: Sequence[int]) -> Vector:
-    """Return the metric of the run up to each of these instants, nan where it says nothing yet.
+    """Return the metric of the run up to each of these instants, NaN where it has no value yet.
 
-    One that looks ahead on the paths that were driven knows them to their end.
+    A metric over the paths that were driven uses the whole paths at every instant.
 
     >>> import numpy as np
     >>> from sbt.problem.trace import Trace
@@ -132,12 +132,12 @@ def _frames(trace: Trace, metric: Metric, requirement: Requirement, lanes: Seque
 
 def _out_of_view(trace: Trace, k: int, middle: np.ndarray, half_x: float, half_y: float) -> str:
     """Return who moves outside the view, and how far from ego."""
-    told = []
+    hidden = []
     for j, name in enumerate(trace.actors[1:], start=1):
         outside = abs(trace.x[k, j] - middle[0]) > half_x or abs(trace.y[k, j] - middle[1]) > half_y
         if outside and trace.speed[:, j].max() > 0.0:
-            told.append(f"{name} {float(np.hypot(trace.x[k, j] - trace.x[k, 0], trace.y[k, j] - trace.y[k, 0])):.0f} m away")
-    return ", ".join(told[:3]) + (" ..." if len(told) > 3 else "")
+            hidden.append(f"{name} {float(np.hypot(trace.x[k, j] - trace.x[k, 0], trace.y[k, j] - trace.y[k, 0])):.0f} m away")
+    return ", ".join(hidden[:3]) + (" ..." if len(hidden) > 3 else "")
 
 
 def _draw_metric(axes: Any, trace: Trace, metric: Metric, requirement: Requirement, instants: list[int]) -> Any:

@@ -1,4 +1,4 @@
-"""Which figures a campaign's rows can fill, drawn, with a caption that says how to read each."""
+"""The figures that a campaign has data for, each with a caption that explains how to read it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.convergence import drawing_of_convergence
 from sbt.report.modes import drawing_of_modes
-from sbt.report.projection import Predict, log_probability, most_telling_pairs, probability_plane
+from sbt.report.projection import Predict, log_probability, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words
 from sbt.store.history import VALIDATION
@@ -43,7 +43,7 @@ def draw(
     predict: Predict | None,
     weights: Vector,
 ) -> list[Drawing]:
-    """Return every figure that the campaign can fill by now.
+    """Return every figure that the campaign has data for.
 
     Args:
         found: rows and requirement.
@@ -53,9 +53,9 @@ def draw(
         weights: (d,) importance of the inputs, to choose which are shown.
     """
     with figure_style():
-        drawn = [Drawing("convergence", "The estimate over the runs", *told) for told in drawing_of_convergence(found)]
+        drawn = [Drawing("convergence", "The estimate over the runs", *parts) for parts in drawing_of_convergence(found)]
         drawn += _runs(found, space, predict, weights)
-        drawn += [Drawing("modes", "Failure modes", *told) for told in drawing_of_modes(found, space, weights)]
+        drawn += [Drawing("modes", "Failure modes", *parts) for parts in drawing_of_modes(found, space, weights)]
         if predict is not None:
             drawn += [*_map(found, space, predict, weights), *_held_out(found, space, predict)]
         drawn += [*_validation(found, fits), *_counts(found)]
@@ -63,13 +63,13 @@ def draw(
 
 
 def _runs(found: Findings, space: ParameterSpace, predict: Predict | None, weights: Vector) -> Iterator[Drawing]:
-    """Yield the runs in input space: the metric over one input, one plane, or the most telling pairs."""
+    """Yield the runs in input space: the metric over one input, one plane, or the most influential pairs."""
     if len(found.history) == 0:
         return
     if space.dimension == 1:
         yield _runs_over_one(found, space, predict)
         return
-    pairs = most_telling_pairs(weights)
+    pairs = most_influential_pairs(weights)
     columns = min(len(pairs), 3)
     lines = -(-len(pairs) // columns)
     figure = new_figure(5.4 if columns == 1 else 11.0, 4.4 if columns == 1 else 0.35 + 3.3 * lines)
@@ -99,8 +99,8 @@ def _runs_over_one(found: Findings, space: ParameterSpace, predict: Predict | No
 
 
 def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vector) -> Iterator[Drawing]:
-    """Yield what the metamodel believes about where critical runs are."""
-    pair = (0,) if space.dimension == 1 else (most_telling_pairs(weights)[0] if space.dimension > 2 else (0, 1))
+    """Yield the map of P(critical) by the metamodel."""
+    pair = (0,) if space.dimension == 1 else (most_influential_pairs(weights)[0] if space.dimension > 2 else (0, 1))
     plane = probability_plane(predict, found.requirement.critical, space, pair)
     figure = new_figure(5.4, 4.4)
     ax = figures.plot_probability(plane, space, figure.subplots())
@@ -115,17 +115,18 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
     if space.dimension > 2:
         caption += (
             f" Each value is the mean over {plane.averaged} Sobol points of the other {space.dimension - 2}"
-            f" input{'s' if space.dimension > 3 else ''} in their ranges (marginal P): a middling shade may mean doubt,"
+            f" input{'s' if space.dimension > 3 else ''} in their ranges (marginal P): a medium shade may mean uncertainty,"
             " or that the other inputs decide."
         )
     if len(pair) == 2:
         caption += " Solid: P = 0.5" + (", the boundary as the metamodel sees it" if space.dimension == 2 else "")
-        caption += "; dashed: 0.1 and 0.9." + (" The gap between the dashed lines is its doubt." if space.dimension == 2 else "")
+        caption += "; dashed: 0.1 and 0.9."
+        caption += " The gap between the dashed lines is its uncertainty." if space.dimension == 2 else ""
     yield Drawing("probability", "Where critical runs are expected", caption, to_svg(figure, "probability"))
 
 
 def _held_out(found: Findings, space: ParameterSpace, predict: Predict) -> Iterator[Drawing]:
-    """Yield how the last metamodel does on runs it has not seen."""
+    """Yield the figures of the last metamodel on held-out runs."""
     mask = found.held_out
     if not mask.any():
         return
@@ -163,7 +164,7 @@ def _validation(found: Findings, fits: Sequence[FitRecord]) -> Iterator[Drawing]
         curves.plot_validation(fits, panel, ax, unit=found.unit)
     caption = (
         "Scores on held-out runs after each fit. Likelihood, average precision and precision should rise, RMSE and calibration"
-        " error fall. Curves that are still moving at the right end ask for more runs."
+        " error fall. Where curves still change at the right end, more runs would help."
     )
     yield Drawing("validation", "The metamodel over the campaign", caption, to_svg(figure, "validation"), wide=True)
 
@@ -182,7 +183,7 @@ def _counts(found: Findings) -> Iterator[Drawing]:
     figure = new_figure(5.4, 3.7)
     curves.plot_progress(found.history, found.requirement, figure.subplots())
     caption = (
-        "Critical runs found so far, by the stage that asked for them. Dashed: how many the same number of random runs would have"
-        " found, by the share among the held-out ones. A slope above it is what choosing runs gains."
+        "Critical runs found so far, by the stage that requested them. Dashed: the number expected of as many random runs,"
+        " from the share among the held-out ones. A steeper curve is the gain of choosing runs."
     )
     yield Drawing("progress", "Critical runs over the campaign", caption, to_svg(figure, "progress"))

@@ -1,4 +1,4 @@
-"""One self-contained page a campaign: what was asked, what was found, how far to trust it."""
+"""The report of a campaign as one self-contained page: the question, the result, and how reliable it is."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 from sbt.campaigns.wording import NOTHING, number
 from sbt.files import write_atomically
 from sbt.loop.stages import Conclusion
+from sbt.plugins import OBJECT
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
 from sbt.report.modes import mode_table
@@ -103,8 +104,8 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
     failed, planned = int((~history.ok).sum()), found.planned
     runs = f"{len(history):,} done, {int(found.critical.sum()):,} critical, {failed:,} failed"
     return [
-        ("campaign", str(configuration.get("campaign", NOTHING))),
-        ("scenario", str(configuration.get("scenario", scenario.name))),
+        ("campaign", str(configuration.get("campaign", NOTHING)).removeprefix(OBJECT)),
+        ("scenario", str(configuration.get("scenario", scenario.name)).removeprefix(OBJECT)),
         ("critical if", requirement_words(found.requirement, found.unit)),
         ("runs", runs + (f", {planned:,} planned" if planned else "")),
         ("seed", str(configuration.get("seed", NOTHING))),
@@ -138,6 +139,12 @@ def _scores(found: Findings) -> list[tuple[str, str]]:
 
 def _commands(found: Findings, store: Store) -> dict[str, str]:
     folder = str(found.ended.get("store") or store.folder)
+    if given := _objects(found.configuration):
+        return {
+            "run": f"sbt.run({f'{folder}/config.resolved.yaml'!r}, {given})",
+            "replay": f"sbt.open({folder!r}, {given}).replay(RUN)",
+            "export": f"sbt.open({folder!r}).export('csv')",
+        }
     return {
         "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml"]),
         "replay": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN",
@@ -145,6 +152,14 @@ def _commands(found: Findings, store: Store) -> dict[str, str]:
     }
 
 
+def _objects(configuration: Mapping[str, Any]) -> str:
+    """Return the arguments that give again what was defined in Python; "" where nothing was."""
+    choices = {key: configuration.get(key) for key in ("campaign", "scenario", "metamodel", "acquisition")}
+    named = {key: str(choice.get("kind") if isinstance(choice, Mapping) else choice) for key, choice in choices.items()}
+    own = {key: name.removeprefix(OBJECT) for key, name in named.items() if name.startswith(OBJECT)}
+    return ", ".join(f"{key}={name}" for key, name in own.items())
+
+
 def _configuration(found: Findings) -> str:
-    """Return the configuration as the user would write it, or all that the store keeps of it."""
+    """Return the configuration as the user would write it, or the whole snapshot in the store."""
     return str(found.configuration.get("yaml") or json.dumps(found.configuration, indent=2, ensure_ascii=False))

@@ -21,8 +21,9 @@ def write_junit(path: Path, result: Mapping[str, Any], *, fail_on_critical: bool
         fail_on_critical: add a case that fails where a run was critical.
     """
     name = f"{result['campaign']} of {result['scenario']}"
-    told = f"{result['failed']} of {result['runs']} runs failed"
-    cases: list[tuple[str, str | None, str]] = [("runs", "failed_runs" if 2 * result["failed"] > result["runs"] else None, told)]
+    summary = f"{result['failed']} of {result['runs']} runs failed"
+    too_many = "failed_runs" if 2 * result["failed"] > result["runs"] else None
+    cases: list[tuple[str, str | None, str]] = [("runs", too_many, summary)]
     gate = result["conclusion"].get("gate")
     if gate is not None:
         cases.append(("gate", None if gate["verdict"] == "pass" else gate["verdict"], gate["statement"]))

@@ -58,9 +58,9 @@ def _change(mode: FailureMode, space: ParameterSpace) -> str:
     spans = {p.name: p.bounds[1] - p.bounds[0] for p in space.parameters}
     units = {p.name: p.unit for p in space.parameters}
     ranked = sorted(safe.change.items(), key=lambda item: -abs(item[1]) / spans[item[0]])[:3]
-    told = ", ".join(f"{name} {change:+.3g} {units[name]}".strip() for name, change in ranked)
+    changes = ", ".join(f"{name} {change:+.3g} {units[name]}".strip() for name, change in ranked)
     rest = len(safe.change) - len(ranked)
-    return f"{told}{f' and {rest} more' if rest > 0 else ''}: {number(safe.metric)} (run {safe.run})"
+    return f"{changes}{f' and {rest} more' if rest > 0 else ''}: {number(safe.metric)} (run {safe.run})"
 
 
 def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) -> Iterator[tuple[str, str]]:

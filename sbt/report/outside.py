@@ -1,4 +1,4 @@
-"""A run as files that other programs read: trajectories as SUMO writes them, and a scene that sumo-gui opens."""
+"""A run as files for other programs: trajectories in SUMO's format, and a scene for sumo-gui."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["write_csv", "write_fcd", "write_folder"]
 
 _COLORS = ("31,111,180", "217,130,43", "77,146,33", "148,103,189", "140,86,75")
 _PERSON = 1.0
-"""What is round and at most so wide is a person (m)."""
+"""Largest width of a person (m); people are round."""
 
 
 def write_folder(folder: Path, trace: Trace, net: Path | None) -> list[Path]:
-    """Write what it takes to look at a run outside, and return the files.
+    """Write the files that show a run in other programs, and return them.
 
     `trace.csv` (centres, radians), `fcd.xml` (SUMO's own format and conventions), and where there is a
     network a copy of it, the paths and the first and last rectangles as `scene.add.xml`, and

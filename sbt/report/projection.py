@@ -25,13 +25,13 @@ __all__ = [
     "influence_from_runs",
     "influence_on_probability",
     "log_probability",
-    "most_telling_pairs",
+    "most_influential_pairs",
     "probability",
     "probability_plane",
 ]
 
 Predict = Callable[[Points], Prediction]
-"""(n, d) points of the unit cube to the metamodel's belief about the metric."""
+"""(n, d) points of the unit cube to the metamodel's prediction of the metric."""
 _CHUNK = 8192
 _BINS = 8
 
@@ -92,7 +92,7 @@ def influence_from_runs(history: History, requirement: Requirement) -> Vector:
     """Return (d,) how much of the rank of the margin each input explains alone, relative to the largest.
 
     The correlation ratio over eight bins of equally many runs: it also sees influences that are not
-    monotone. Without a metamodel it is what the runs themselves can say.
+    monotone. It needs no metamodel.
     """
     runs = history.where(history.ok)
     if len(runs) < 2 * _BINS:
@@ -114,10 +114,10 @@ def _relative(values: Vector) -> Vector:
     return values / top if top > 0 else np.zeros_like(values)
 
 
-def most_telling_pairs(weights: Vector, limit: int = 6) -> list[tuple[int, int]]:
+def most_influential_pairs(weights: Vector, limit: int = 6) -> list[tuple[int, int]]:
     """Return at most `limit` pairs of the four heaviest inputs, those with the largest joint weight first.
 
-    >>> most_telling_pairs(np.array([0.1, 1.0, 0.5]), limit=2)
+    >>> most_influential_pairs(np.array([0.1, 1.0, 0.5]), limit=2)
     [(1, 2), (0, 1)]
     """
     heaviest = np.argsort(-weights, kind="stable")[:4]
@@ -150,9 +150,9 @@ def probability_plane(
     u[:, :, rest] = others[None, :, :]
     flat = u.reshape(-1, space.dimension)
     weight = space.feasible(space.from_unit(flat)).reshape(len(mesh), len(others)).astype(np.float64)
-    belief = probability(predict, critical, flat).reshape(weight.shape)
+    p = probability(predict, critical, flat).reshape(weight.shape)
     total = weight.sum(axis=1)
-    values = np.where(total > 0, (weight * belief).sum(axis=1) / np.maximum(total, 1.0), np.nan)
+    values = np.where(total > 0, (weight * p).sum(axis=1) / np.maximum(total, 1.0), np.nan)
     shape = tuple(len(unit) for unit in reversed(units))
     axes = tuple(space.parameters[k].from_unit(unit) for k, unit in zip(pair, units, strict=True))
     return Plane(pair, axes, values.reshape(shape), len(others))

@@ -1,4 +1,4 @@
-"""The look of every figure: one palette, readable in grey print, and files that are the same twice."""
+"""The style of every figure: one palette, readable in greyscale, and reproducible files."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _STYLE: dict[Any, Any] = {
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Draw and save under the package's style, whatever the user's matplotlibrc says."""
+    """Draw and save under the package's style, without the user's matplotlibrc."""
     import matplotlib as mpl
 
     with mpl.rc_context(), warnings.catch_warnings():

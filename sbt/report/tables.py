@@ -1,4 +1,4 @@
-"""The tables of a report: cells with what is read, what is sorted by, and no markup."""
+"""The tables of a report: cells with a text and a key to sort by, without markup."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
+from sbt.plugins import OBJECT
 from sbt.problem.arrays import Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
@@ -139,7 +140,9 @@ def _listed(proposal: Mapping[str, Any]) -> str:
 
 
 def simulate_command(scenario: str, record: Record) -> str:
-    """Return the command that runs a concrete scenario again, its inputs to the last digit."""
+    """Return the command that runs a concrete scenario again, to the last digit; in Python where it was defined there."""
+    if scenario.startswith(OBJECT):
+        return f"sbt.simulate({scenario.removeprefix(OBJECT)}, {dict(record.inputs)!r}, seed={record.seed})"
     inputs = (f"{name}={value!r}" for name, value in record.inputs.items())
     return shlex.join(["sumo-sbt", "simulate", scenario, *inputs, "--seed", str(record.seed)])
 

@@ -43,7 +43,7 @@ _POOR_CALIBRATION = 0.1
 
 @dataclass(frozen=True)
 class Findings:
-    """What the sentences are about: the rows, the requirement, and what the campaign concluded.
+    """The facts behind the sentences: the rows, the requirement, and what the campaign concluded.
 
     Args:
         history: finished runs.
@@ -112,7 +112,8 @@ def distribution_words(distribution: Distribution | None) -> str:
     """Return a distribution as its kind and parameters."""
     if distribution is None or distribution.kind == "uniform":
         return "uniform"
-    parameters = ", ".join(f"{name} {value if isinstance(value, str) else format(value, 'g')}" for name, value in distribution.parameters)
+    values = ((name, value if isinstance(value, str) else f"{value:g}") for name, value in distribution.parameters)
+    parameters = ", ".join(f"{name} {value}" for name, value in values)
     return f"{distribution.kind} ({parameters})" if parameters else distribution.kind
 
 
@@ -161,24 +162,24 @@ def _about_progress(found: Findings) -> list[str]:
 
 def _about_runs(found: Findings) -> list[str]:
     history = found.history
-    said: list[str] = []
+    sentences: list[str] = []
     failed = history.where(~history.ok)
     if len(failed):
         reasons = (reason or status for reason, status in zip(failed.reason, failed.status, strict=True))
         reason, times = Counter(map(str, reasons)).most_common(1)[0]
-        said.append(
+        sentences.append(
             f"{len(failed):,} of {len(history):,} runs failed ({percent(len(failed) / len(history))}) and tell nothing"
             f" about safety. Most frequent reason ({times:,} times): {reason[:200]}"
         )
-    said += _about_far_side(found)
+    sentences += _about_far_side(found)
     if history.ok.any() and not found.critical.any():
         n = int(found.held_out.sum())
         most = percent(float(upper(0, n, 0.95)))
         bound = f" From the {n:,} random held-out runs alone, up to {most} may be critical (95 %)." if n else ""
-        said.append(f"No critical run was found. That is no proof that there is none.{bound}")
+        sentences.append(f"No critical run was found. That is no proof that there is none.{bound}")
     if len(set(history.versions)) > 1:
-        said.append("Runs were made with different versions of the software; see the header.")
-    return said
+        sentences.append("Runs were made with different versions of the software; see the header.")
+    return sentences
 
 
 def _about_far_side(found: Findings) -> list[str]:
@@ -195,20 +196,20 @@ def _about_far_side(found: Findings) -> list[str]:
 
 def _about_scores(found: Findings) -> list[str]:
     scores = found.validation
-    said: list[str] = []
+    sentences: list[str] = []
     if scores is None:
-        return said
+        return sentences
     n, critical, error = scores.n, scores.n_critical, scores.calibration_error
     if not n:
-        said.append("The metamodel was never tested: there are no held-out runs.")
+        sentences.append("The metamodel was never tested: there are no held-out runs.")
     elif critical < _FEW_CRITICAL:
         plural = "s" if critical != 1 else ""
-        said.append(
+        sentences.append(
             f"Only {critical} critical run{plural} among the {number(n)} held-out ones: precision and likelihood of critical"
             " runs are noisy, and whole critical regions may be missing from the test."
         )
     if error is not None and error > _POOR_CALIBRATION:
-        said.append(
+        sentences.append(
             f"Poor calibration: the metamodel's P(critical) is off by {error:.2f} on average. Do not read it as a probability."
         )
-    return said
+    return sentences

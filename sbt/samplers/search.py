@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.metamodels.base import Metamodel, Predictor, checked, named_errors, sample_paths, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sample_paths, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
@@ -94,7 +94,7 @@ class WarpedModel:
         """Return the prediction of the warped metric at u (n, d)."""
         inputs = self.columns(u)
         with named_errors(self.metamodel, self.n):
-            return checked(self.predictor(inputs), len(u))
+            return check_prediction(self.predictor(inputs), len(u))
 
     def log_probability(self, u: Points, inflation: float = 1.0) -> Vector:
         """Return (n,) log P(critical) at u, sigma multiplied by `inflation`."""

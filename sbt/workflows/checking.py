@@ -12,10 +12,9 @@ from functools import partial
 import numpy as np
 
 from sbt import interruption
-from sbt.errors import RunError, SbtError
+from sbt.errors import RunError, SbtError, described
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import elsewhere
-from sbt.execution.worker import described
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import builtins
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
@@ -19,17 +19,14 @@ from sbt.errors import InputError, PluginError, did_you_mean
 from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_traced
-from sbt.loop.stages import Progress
 from sbt.plugins import OBJECT, Scope
-from sbt.problem.description import scenario_differences
-from sbt.problem.distribution import Distribution
+from sbt.problem.description import describe_scenario, scenario_differences
 from sbt.problem.outcome import Job, Outcome, Status
-from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, metric_from
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.workflows.checking import Finding, check_scenario
+from sbt.workflows.keywords import CampaignKeys, Setting, as_data
 from sbt.workflows.result import Result
 from sbt.workflows.running import run_study
 from sbt.workflows.study import Study
@@ -44,39 +41,7 @@ if TYPE_CHECKING:
     from sbt.campaigns.estimation import EstimationConclusion
     from sbt.campaigns.failures import FalsificationConclusion
 
-__all__ = ["CampaignKeys", "Checked", "Run", "check_target", "installed", "open_result", "run_campaign", "simulate_scenario"]
-
-Setting = str | Mapping[str, Any]
-
-
-class CampaignKeys(TypedDict, total=False):
-    """Keys of a configuration (but `campaign`), as `run` takes them; see docs/configuration.md."""
-
-    scenario: LogicalScenario | str
-    requirement: Requirement | Mapping[str, Any]
-    inputs: Mapping[str, Any]
-    correlation: Sequence[Any]
-    constraints: Sequence[str]
-    features: Mapping[str, str]
-    metrics: Sequence[Metric | str | Callable[[Trace], float]]
-    ego: Setting | None
-    simulation: Mapping[str, Any]
-    seed: int
-    budget: int
-    initial: int
-    batch: int
-    validation: Mapping[str, Any]
-    metamodel: object
-    acquisition: object
-    stop: Mapping[str, Any]
-    gate: Mapping[str, float] | None
-    warm_start: Mapping[str, Any] | str | Path | None
-    executor: Setting
-    store: str | Path
-    workers: int
-    report: bool
-    progress: Callable[[Progress], None] | None
-
+__all__ = ["Checked", "Run", "check_target", "installed", "open_result", "run_campaign", "simulate_scenario"]
 
 @overload
 def run_campaign(*, campaign: Literal["boundary"], **keys: Unpack[CampaignKeys]) -> Result[BoundaryConclusion]: ...
@@ -112,7 +77,7 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
         if name not in known:
             raise InputError(f"run takes the keys of a configuration, but got '{name}'{did_you_mean(name, known)}")
     progress, report, workers = keys.pop("progress", None), keys.pop("report", True), keys.pop("workers", None)
-    data, objects = _as_data(keys)
+    data, objects = as_data(keys)
     if config is not None:
         overrides = [] if workers is None else [f"executor.workers={int(workers)}"]
         study = Study.from_file(config, overrides, changes=data, objects=objects)
@@ -124,67 +89,6 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
     return Result(Path(summary.store), objects)
 
 
-def _as_data(keys: Mapping[str, Any]) -> tuple[dict[str, Any], dict[tuple[str, str], Any]]:
-    """Return keywords as a configuration's plain data, and the objects among them by kind and name."""
-    objects: dict[tuple[str, str], Any] = {}
-
-    def named(kind: str, thing: Any) -> str:
-        """Return the name that stands for an object in the configuration."""
-        name = OBJECT + str(getattr(thing, "name", None) or getattr(thing, "__name__", None) or type(thing).__name__)
-        objects[kind, name] = thing
-        return name
-
-    def choice(kind: str, given: Any) -> Any:
-        if given is None:
-            return None
-        if isinstance(given, Mapping):
-            return {k: named(kind, v) if k == "kind" and not isinstance(v, str) else _plain(v) for k, v in given.items()}
-        return {"kind": str(given) if isinstance(given, str | Path) else named(kind, given)}
-
-    data: dict[str, Any] = {}
-    for key, given in keys.items():
-        if key in ("metamodel", "acquisition"):
-            data[key] = choice(f"{key}s", given)
-        elif key in ("scenario", "campaign"):
-            data[key] = str(given) if isinstance(given, str | Path) else named(f"{key}s", given)
-        elif key == "metrics":
-            data[key] = [m if isinstance(m, str) else named("metrics", metric_from(m)) for m in given]
-        elif key in ("ego", "executor") and isinstance(given, str):
-            data[key] = {"kind": given}
-        elif key == "warm_start" and isinstance(given, str | Path):
-            data[key] = {"store": str(given)}
-        elif key == "requirement" and isinstance(given, Requirement):
-            data[key] = {"metric": given.metric, "critical": [given.low, given.high]}
-        elif key == "inputs" and isinstance(given, Mapping):
-            data[key] = {name: _input(change) for name, change in given.items()}
-        else:
-            data[key] = _plain(given)
-    return data, objects
-
-
-def _input(change: Any) -> Any:
-    """Return the change of an input as plain data: of a range, a distribution, or a whole parameter."""
-    if isinstance(change, Parameter):
-        law = {} if change.distribution is None else {"distribution": change.distribution}
-        change = {"min": change.low, "max": change.high, **law}
-    if isinstance(change, Distribution):
-        change = {"distribution": change}
-    if isinstance(change, Mapping):
-        return {k: {"kind": v.kind, **dict(v.parameters)} if isinstance(v, Distribution) else _plain(v) for k, v in change.items()}
-    return _plain(change)
-
-
-def _plain(value: Any) -> Any:
-    """Return plain data: scalars and arrays of NumPy and paths become Python's own."""
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, builtins.list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return str(value) if isinstance(value, Path) else value
-
-
 def open_result(
     store: str | Path, *, scenario: LogicalScenario | None = None, metamodel: object = None, acquisition: object = None,
     metrics: Sequence[Metric | Callable[[Trace], float]] = (), campaign: object = None,
@@ -193,8 +97,11 @@ def open_result(
 
     Args:
         store: the folder.
-        scenario, metamodel, acquisition, metrics, campaign: objects that the store was made with, where something needs
-            them: to run is to need the scenario, to predict the metamodel.
+        scenario: the object that the store was made with, where runs are to be executed again: trace, film, replay.
+        metamodel: likewise, to predict and for figures of the metamodel.
+        acquisition: likewise.
+        metrics: likewise, beside the scenario.
+        campaign: likewise, for the type of the conclusion.
 
     Raises:
         StoreError: the folder holds no campaign.
@@ -202,12 +109,15 @@ def open_result(
     """
     folder = Path(store)
     given = {"scenario": scenario, "metamodel": metamodel, "acquisition": acquisition, "campaign": campaign}
-    _, objects = _as_data({key: value for key, value in given.items() if value is not None} | {"metrics": metrics})
+    for name, value in given.items():
+        if isinstance(value, str | Path):
+            raise InputError(f"{name} must be the object that the store was made with, but got '{value}'")
+    _, objects = as_data({key: value for key, value in given.items() if value is not None} | {"metrics": metrics})
     with Store.read(folder) as opened:
         study = Study.from_store(opened, objects=objects)
         _check_objects(study, objects, folder)
         if scenario is not None and not study.config.metrics:
-            changed = scenario_differences(study.kept["described"], Study(study.loaded).snapshot()["described"])
+            changed = scenario_differences(study.kept["described"], describe_scenario(study.runnable))
             if changed:
                 raise InputError(f"scenario {scenario.name} must be the one that {folder} was made with, but {changed}")
     return Result(folder, objects)
@@ -237,6 +147,7 @@ class Run:
         seed: of the run.
         outcome: status, metrics, or the reason why there are none.
         states: the trace; None where the scenario has none or the run failed.
+        name: of the scenario, as it was asked for.
     """
 
     scenario: LogicalScenario
@@ -244,6 +155,11 @@ class Run:
     seed: int
     outcome: Outcome
     states: Trace | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        """Take the scenario's own name where it was given as an object."""
+        object.__setattr__(self, "name", self.name or self.scenario.name)
 
     @property
     def status(self) -> Status:
@@ -288,7 +204,7 @@ class Run:
     def to_dict(self) -> dict[str, Any]:
         """Return what `simulate --json` prints."""
         return {
-            "scenario": self.scenario.name, "seed": self.seed, "inputs": dict(self.inputs), "status": str(self.status),
+            "scenario": self.name, "seed": self.seed, "inputs": dict(self.inputs), "status": str(self.status),
             "metrics": dict(self.metrics), "critical": self.critical, "reason": self.reason, "seconds": self.outcome.seconds,
         }  # fmt: skip
 
@@ -296,7 +212,7 @@ class Run:
         """Return status, metrics and verdict."""
         metrics = ", ".join(f"{name} {value:g}" for name, value in self.metrics.items())
         verdict = {True: "critical", False: "not critical", None: self.reason}[self.critical]
-        return f"<Run of {self.scenario.name}, seed {self.seed}: {self.status}, {metrics or 'no metrics'}; {verdict}>"
+        return f"<Run of {self.name}, seed {self.seed}: {self.status}, {metrics or 'no metrics'}; {verdict}>"
 
 
 def simulate_scenario(
@@ -321,19 +237,23 @@ def simulate_scenario(
     Raises:
         InputError: there is no such scenario, or it does not take these inputs or choices.
     """
-    spec = _spec(scenario, isolation)
     choice = {"kind": ego} if isinstance(ego, str) else ego
-    own = [metric_from(m) for m in metrics if not isinstance(m, str)]
-    spec = ScenarioSpec(
-        spec.name, spec.folder, choice, isolation, step_length, metrics=tuple(m for m in metrics if isinstance(m, str)),
-        carried=spec.carried,
-    )  # fmt: skip
-    found = spec.resolve()
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"seed must be a whole number >= 0, but got {seed!r}")
+    if step_length is not None and not 0 < step_length < math.inf:
+        raise InputError(f"step_length must be > 0 s, but got {step_length}")
+    named = tuple(m for m in metrics if isinstance(m, str))
+    own = tuple(metric_from(m) for m in metrics if not isinstance(m, str))
+    if isinstance(scenario, LogicalScenario) and not named:  # it stays in this process: no need to carry it
+        found = scenario.configured(choice, isolation, step_length)
+    else:
+        spec = _spec(scenario, isolation)
+        found = replace(spec, ego=choice, step_length=step_length, metrics=named).resolve()
     if own:
         found = replace(found, metrics=(*found.metrics, *own))
     values = found.space.values({name: _number(name, value) for name, value in (inputs or {}).items()})
-    outcome, states = run_traced(found, Job(0, values, seed))
-    return Run(found, values, seed, outcome, states)
+    outcome, states = run_traced(found, Job(0, values, int(seed)))
+    return Run(found, values, int(seed), outcome, states, "" if isinstance(scenario, LogicalScenario) else str(scenario))
 
 
 def _number(name: str, value: Any) -> float:
@@ -362,6 +282,10 @@ class Checked:
         """Whether every rule holds."""
         return all(finding.ok for finding in self.findings)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `check --json` prints, but the target."""
+        return {"ok": self.ok, "findings": [vars(finding) for finding in self.findings]}
+
     def __repr__(self) -> str:
         """Return a line a rule."""
         return "\n".join(f"{'ok  ' if f.ok else 'FAIL'}  {f.rule}: {f.detail}" for f in self.findings)
@@ -384,7 +308,6 @@ def check_target(target: LogicalScenario | str | Path, *, seed: int = 0, isolati
     return Checked(check_scenario(_spec(target, isolation), seed))
 
 
-_KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 _WRITTEN = {"table": "table:FOLDER", "testbed": "testbed:NAME", "yaml": "FOLDER/scenario.yaml"}
 """How the sources of this package are asked for a scenario; others as PREFIX:REST."""
 
@@ -398,8 +321,8 @@ def installed(kind: str = "scenarios") -> dict[str, str]:
     Raises:
         InputError: there is no such kind.
     """
-    if kind not in _KINDS:
-        raise InputError(f"KIND must be one of {', '.join(_KINDS)}, but got '{kind}'{did_you_mean(kind, _KINDS)}")
+    if kind not in plugins.KINDS:
+        raise InputError(f"KIND must be one of {', '.join(plugins.KINDS)}, but got '{kind}'{did_you_mean(kind, plugins.KINDS)}")
     if kind == "sources":
         from sbt import testbeds
 

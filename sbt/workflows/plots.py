@@ -39,7 +39,8 @@ class Plots:
 
         Args:
             ax: where; None: a new figure.
-            x, y: names of the inputs; None: the most influential ones.
+            x: name of the input along the axis; None: the most influential one.
+            y: likewise, upwards.
         """
         from sbt.report import figures
 
@@ -53,7 +54,8 @@ class Plots:
 
         Args:
             ax: where; None: a new figure.
-            x, y: names of the inputs; None: the most influential ones.
+            x: name of the input along the axis; None: the most influential one.
+            y: likewise, upwards.
         """
         from sbt.report import figures
         from sbt.report.projection import probability_plane
@@ -138,7 +140,7 @@ class Plots:
         from sbt.report.projection import influence_from_runs, influence_on_probability
 
         r = self.result
-        if r.fitted is not None:
+        if r.study.learns and r.fitted is not None:
             weights = influence_on_probability(r.fitted.predict, r.scenario.requirement.critical, r.scenario.space.dimension)
             if weights.any():
                 return weights
@@ -149,7 +151,7 @@ class Plots:
         """The metamodel."""
         fitted = self.result.fitted
         if fitted is None:
-            self._need(self.result.study.learner is not None, "metamodel (run with metamodel=...)")
+            self._need(self.result.study.learner is not None, "a metamodel (run with metamodel=...)")
             raise InputError(f"this figure needs two runs to learn from, but {self.result.store} has fewer")
         return fitted
 
@@ -164,7 +166,7 @@ class Plots:
         log_p, log_not = log_probability(self._fitted.predict, need.critical, space.to_unit(held.x))
         return log_p, log_not, need.critical_runs(held)
 
-    def _need(self, there: bool, what: str) -> None:  # noqa: FBT001
+    def _need(self, there: bool, what: str) -> None:
         if not there:
             raise InputError(f"this figure needs {what}, but {self.result.store} has none")
 

@@ -134,7 +134,8 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
     if not hasattr(given, "keys"):
         x = np.atleast_2d(np.asarray(given, dtype=np.float64))
         if x.ndim != 2 or x.shape[1] != space.dimension:
-            raise InputError(f"an array of inputs must be (n, {space.dimension}), for {', '.join(space.names)}, but got {x.shape}")
+            names = ", ".join(space.names)
+            raise InputError(f"an array of inputs must be (n, {space.dimension}), for {names}, but got {x.shape}")
         return _within(x, space), ()
     head = [str(name) for name in given]
     where = [_column(name, head) for name in space.names]
@@ -145,6 +146,9 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
         except (TypeError, ValueError) as error:
             raise InputError(f"column {key} must hold numbers, for input {name}, but {error}") from None
     sizes = {len(column) for column in columns}
+    if len(sizes - {1}) == 1:  # one number stands for a column
+        columns = [np.resize(column, max(sizes)) if len(column) == 1 and 0 not in sizes else column for column in columns]
+        sizes = {len(column) for column in columns}
     if len(sizes) > 1:
         raise InputError(f"columns of inputs must have one length, but got {', '.join(map(str, sorted(sizes)))}")
     return _within(np.column_stack(columns), space), tuple(name for name in head if name not in where)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from sbt.errors import InputError, StoreError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Facts
+from sbt.plugins import OBJECT
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
@@ -186,17 +187,20 @@ class Result(Generic[C]):
     def __repr__(self) -> str:
         """Return campaign, scenario and counts."""
         config, critical = self.study.config, int(self.scenario.requirement.critical_runs(self.history).sum())
-        return f"<Result: {config.campaign} of {config.scenario}, {len(self.history)} runs, {critical} critical, in {self.store}>"
+        what = f"{config.campaign} of {config.scenario}".replace(OBJECT, "")
+        return f"<Result: {what}, {len(self.history)} runs, {critical} critical, in {self.store}>"
 
     def _repr_html_(self) -> str:
         """Return the summary that a notebook shows."""
         config, ok = self.study.config, int(self.history.ok.sum())
         critical = int(self.scenario.requirement.critical_runs(self.history).sum())
         facts = {
-            "campaign": config.campaign, "scenario": config.scenario, "runs": f"{len(self.history):,}",
-            "critical": f"{critical:,}", "failed": f"{len(self.history) - ok:,}", "store": str(self.store),
+            "campaign": config.campaign.removeprefix(OBJECT), "scenario": config.scenario.removeprefix(OBJECT),
+            "runs": f"{len(self.history):,}", "critical": f"{critical:,}", "failed": f"{len(self.history) - ok:,}",
+            "store": str(self.store),
         }  # fmt: skip
-        rows = "".join(f"<tr><th style='text-align:left'>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())
+        pairs = ((html.escape(name), html.escape(value)) for name, value in facts.items())
+        rows = "".join(f"<tr><th style='text-align:left'>{name}</th><td>{value}</td></tr>" for name, value in pairs)
         said = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in self.sentences())
         return f"<div>{said}<table>{rows}</table></div>"
 

@@ -25,7 +25,7 @@ from sbt.workflows.study import RESOLVED, Study
 
 __all__ = ["Replay", "Summary", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
 
-_MAY_CHANGE = {"budget", "folder", "yaml", "described"}
+_MAY_CHANGE = {"budget", "folder", "yaml", "described", "kind"}
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
 
@@ -122,7 +122,7 @@ def summarise(store: Store, study: Study, finished: Finished) -> Summary:
 
 
 def rebuild_report(folder: Path, *, objects: Mapping[tuple[str, str], Any] | None = None) -> Path:
-    """Write the report of a store again, also while its campaign runs.
+    """Write the report of a store again, also while its campaign runs; without a metamodel whose code is not at hand.
 
     Raises:
         StoreError: the folder holds no campaign.
@@ -130,7 +130,7 @@ def rebuild_report(folder: Path, *, objects: Mapping[tuple[str, str], Any] | Non
     with Store.read(folder) as store:
         study, ended = Study.from_store(store, objects=objects), store.conclusion
         conclusion = None if ended is None else study.conclusion(ended["conclusion"])
-        return _report(store, study, conclusion, study.fit(store.history()))
+        return _report(store, study, conclusion, study.fit(store.history()) if study.learns else None)
 
 
 def _report(store: Store, study: Study, conclusion: Conclusion | None, fitted: FittedMetamodel | None) -> Path:
@@ -168,14 +168,15 @@ def replay_run(folder: Path, index: int, *, objects: Mapping[tuple[str, str], An
         InputError: the store has no finished run of this index.
     """
     with Store.read(folder) as store:
-        study, history = Study.from_store(store, objects=objects, live=True), store.history()
+        study, history = Study.from_store(store, objects=objects), store.history()
+    scenario = study.runnable
     rows = np.flatnonzero(history.index == index)
     if len(rows) == 0:
         have = f"{history.index[0]} to {history.index[-1]}" if len(history) else "none yet"
         raise InputError(f"a run must be a finished one of {folder} ({have}), but got {index}")
     record = history.record(int(rows[0]))
     outcome, trace = run_traced(study.spec.resolve(), Job(index, record.inputs, record.seed))
-    return Replay(record, outcome, trace, study.scenario)
+    return Replay(record, outcome, trace, scenario)
 
 
 def _check_same(store: Store, snapshot: Mapping[str, Any]) -> None:

@@ -8,8 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sbt.campaigns.settings import CampaignKind, Gate, PlainConclusion, Settings
-from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of
+from sbt.campaigns.settings import CampaignKind, Gate, Settings
+from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of, spec_of
 from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, resumed
 from sbt.config.model import Configuration
 from sbt.errors import InputError, PluginError
@@ -67,8 +67,14 @@ class Study:
             objects: what was given in Python when it was made, where that is needed.
             live: load the scenario's code, to run it.
         """
-        kept = store.configuration
-        loaded = parse(kept["yaml"], name=str(store.folder / RESOLVED), folder=Path(kept["folder"]), objects=objects)
+        kept, folder, given = store.configuration, Path(store.configuration["folder"]), dict(objects or {})
+        name = kept["campaign"]
+        try:
+            Scope(folder, given).load("campaigns", name)
+        except PluginError:
+            if "kind" in kept:
+                given["campaigns", name] = CampaignKind.absent(name, kept["kind"])
+        loaded = parse(kept["yaml"], name=str(store.folder / RESOLVED), folder=folder, objects=given)
         return cls(loaded, kept, live)
 
     def stored_in(self, store: Store) -> Study:
@@ -81,6 +87,20 @@ class Study:
     def with_store(self, folder: Path) -> Study:
         """Return the study with another store."""
         return replace(self, loaded=replace(self.loaded, config=self.config.model_copy(update={"store": str(folder)})))
+
+    def sharded(self, text: str, *, apart: bool) -> tuple[Study, Shard]:
+        """Return the study of one share of the runs, and which it is.
+
+        Args:
+            text: I/N, as on the command line.
+            apart: in a store of its own, in the folder of the study's.
+
+        Raises:
+            InputError: the text is no share.
+        """
+        shard = Shard.parse(text)
+        folder = Path(self.config.store) / f"shard-{shard.number}-of-{shard.of}"
+        return self.with_store(folder) if apart else self, shard
 
     @property
     def config(self) -> Configuration:
@@ -111,7 +131,25 @@ class Study:
     @property
     def spec(self) -> ScenarioSpec:
         """The scenario for other processes."""
-        return self._assembly.spec
+        return self._assembly.spec if self.live else spec_of(self.loaded)
+
+    @cached_property
+    def runnable(self) -> LogicalScenario:
+        """The scenario with its code, whatever else of the campaign is at hand.
+
+        Raises:
+            ConfigError: its code is not at hand, or it does not offer what is configured.
+        """
+        return scenario_of(self.loaded)
+
+    @property
+    def learns(self) -> bool:
+        """Whether there is a metamodel, and its code is at hand."""
+        choice = self.config.metamodel
+        try:
+            return choice is not None and self.loaded.scope.load("metamodels", choice.kind) is not None
+        except PluginError:
+            return False
 
     @cached_property
     def learner(self) -> Learner | None:
@@ -160,16 +198,14 @@ class Study:
         config = self.config
         return {
             **fingerprint(config), "budget": config.budget, "names": list(self.scenario.space.names),
-            "described": describe_scenario(self.scenario), "folder": str(Path(self.loaded.folder).resolve()), "yaml": dump(config),
+            "described": describe_scenario(self.scenario), "folder": str(Path(self.loaded.folder).resolve()),
+            "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
         }  # fmt: skip
 
     def conclusion(self, data: Mapping[str, Any]) -> Conclusion:
         """Return a conclusion from the JSON in the store; values by name where the campaign's own type is not at hand."""
-        try:
-            return self.kind.read(data)
-        except PluginError:
-            return PlainConclusion(dict(data))
+        return self.kind.read(data)
 
     def fit(self, history: History) -> FittedMetamodel | None:
         """Return the metamodel fitted to the runs that teach it, and scored; None where there is none."""

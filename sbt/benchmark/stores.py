@@ -9,32 +9,32 @@ from sbt.errors import InputError
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 
-__all__ = ["opened"]
+__all__ = ["open_store"]
 
 _IDENTITY = ("campaign", "scenario", "requirement", "inputs", "ego", "simulation", "seed", "batch", "metamodel", "acquisition")
 """What must stay the same of a configuration; other keys may come and go with versions."""
 
 
-def opened(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: object) -> Store:
-    """Open a store for this configuration: a new one, or the one that is there.
+def open_store(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: object) -> Store:
+    """Open the store of this configuration, a new one where there is none.
 
     Args:
         folder: of the store.
         loaded: configuration of the campaign.
         scenario: the configured one.
-        more: what else must not change between runs.
+        more: further settings that must not change between runs.
 
     Raises:
         InputError: the store was made with other settings.
         StoreError: it cannot be written.
     """
-    kept = {
+    snapshot = {
         **fingerprint(loaded.config), "budget": loaded.config.budget, "names": list(scenario.space.names),
         "folder": str(loaded.folder.resolve()), "yaml": dump(loaded.config), **more,
     }  # fmt: skip
-    store = Store.open(folder, kept)
-    if told := differences(store.configuration, kept, (*_IDENTITY, *more)):
+    store = Store.open(folder, snapshot)
+    if changes := differences(store.configuration, snapshot, (*_IDENTITY, *more)):
         store.close()
-        raise InputError(f"a cell belongs to one configuration, but {folder} was made with another ({told})")
-    store.update_configuration(kept)
+        raise InputError(f"a cell belongs to one configuration, but {folder} was made with another ({changes})")
+    store.update_configuration(snapshot)
     return store

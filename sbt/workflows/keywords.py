@@ -1,0 +1,115 @@
+"""The keywords of `run`: a configuration's keys, with objects where a file has names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+
+from sbt.loop.stages import Progress
+from sbt.plugins import OBJECT
+from sbt.problem.distribution import Distribution
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario, Metric, metric_from
+from sbt.problem.trace import Trace
+
+__all__ = ["CampaignKeys", "Setting", "as_data"]
+
+Setting = str | Mapping[str, Any]
+
+
+class CampaignKeys(TypedDict, total=False):
+    """Keys of a configuration (but `campaign`), as `run` takes them; see docs/configuration.md."""
+
+    scenario: LogicalScenario | str
+    requirement: Requirement | Mapping[str, Any]
+    inputs: Mapping[str, Any]
+    correlation: Sequence[Any]
+    constraints: Sequence[str]
+    features: Mapping[str, str]
+    metrics: Sequence[Metric | str | Callable[[Trace], float]]
+    ego: Setting | None
+    simulation: Mapping[str, Any]
+    seed: int
+    budget: int
+    initial: int
+    batch: int
+    validation: Mapping[str, Any]
+    metamodel: object
+    acquisition: object
+    stop: Mapping[str, Any]
+    gate: Mapping[str, float] | None
+    warm_start: Mapping[str, Any] | str | Path | None
+    executor: Setting
+    store: str | Path
+    workers: int
+    report: bool
+    progress: Callable[[Progress], None] | None
+
+
+def as_data(keys: Mapping[str, Any]) -> tuple[dict[str, Any], dict[tuple[str, str], Any]]:
+    """Return keywords as a configuration's plain data, and the objects among them by kind and name."""
+    objects: dict[tuple[str, str], Any] = {}
+
+    def named(kind: str, thing: Any) -> str:
+        """Return the name that stands for an object in the configuration."""
+        name = OBJECT + str(getattr(thing, "name", "") or getattr(thing, "__name__", None) or type(thing).__name__)
+        objects[kind, name] = thing
+        return name
+
+    def choice(kind: str, given: Any) -> Any:
+        if given is None:
+            return None
+        if isinstance(given, Mapping):
+            return {k: named(kind, v) if k == "kind" and not isinstance(v, str) else _plain(v) for k, v in given.items()}
+        return {"kind": str(given) if isinstance(given, str | Path) else named(kind, given)}
+
+    data: dict[str, Any] = {}
+    for key, given in keys.items():
+        if key in ("metamodel", "acquisition"):
+            data[key] = choice(f"{key}s", given)
+        elif key in ("scenario", "campaign"):
+            data[key] = str(given) if isinstance(given, str | Path) else named(f"{key}s", given)
+        elif key == "metrics":
+            data[key] = [m if isinstance(m, str) else named("metrics", metric_from(m)) for m in given]
+        elif key in ("ego", "executor") and isinstance(given, str):
+            data[key] = {"kind": given}
+        elif key == "warm_start" and isinstance(given, str | Path):
+            data[key] = {"store": str(given)}
+        elif key == "inputs" and isinstance(given, Mapping):
+            data[key] = {name: _input(change) for name, change in given.items()}
+        else:
+            data[key] = _plain(given)
+    return data, objects
+
+
+def _input(change: Any) -> Any:
+    """Return the change of an input as plain data: of a range, a distribution, or a whole parameter."""
+    if isinstance(change, Parameter):
+        law = {} if change.distribution is None else {"distribution": change.distribution}
+        change = {"min": change.low, "max": change.high, **law}
+    if isinstance(change, Distribution):
+        change = {"distribution": change}
+    if isinstance(change, Mapping):
+        return {k: _law(v) if isinstance(v, Distribution) else _plain(v) for k, v in change.items()}
+    return _plain(change)
+
+
+def _law(given: Distribution) -> dict[str, Any]:
+    return {"kind": given.kind, **dict(given.parameters)}
+
+
+def _plain(value: Any) -> Any:
+    """Return plain data: scalars and arrays of NumPy and paths become Python's own."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, Requirement):
+        return {"metric": value.metric, "critical": [value.low, value.high]}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return str(value) if isinstance(value, Path) else value
