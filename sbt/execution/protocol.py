@@ -18,9 +18,9 @@ from sbt.problem.scenario import Batched
 __all__ = ["CHUNK", "Executor", "SerialExecutor", "chunk_of"]
 
 CHUNK = 64
-"""So many runs are begun, at most, before the outcome of the first is known."""
+"""Largest number of runs that are started before the outcome of the first is known."""
 _QUICK = 0.02
-"""Runs of this process are reported together where they take less than so many seconds."""
+"""Runs in this process are reported together if they take less time than this (s)."""
 
 
 class Executor(Protocol):
