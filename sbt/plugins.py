@@ -9,12 +9,12 @@ from __future__ import annotations
 import importlib.util
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
@@ -27,6 +27,7 @@ OBJECT = "object:"
 KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -90,14 +91,7 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
     if name not in entries:
         known = ", ".join(sorted(entries)) or "nothing is installed"
         raise PluginError(f"{kind} must be one of {known}, or file.py:NAME, but got '{name}'{did_you_mean(name, entries)}")
-    try:
-        return entries[name].load()
-    except InputError:
-        raise
-    except BaseException as error:  # SystemExit too: it would end the program without a word
-        if interruption.is_interruption(error):
-            raise
-        raise PluginError(f"{kind[:-1]} '{name}' cannot be imported: {_what(error)}") from error
+    return _guarded(entries[name].load, lambda _: f"{kind[:-1]} '{name}' cannot be imported", InputError)
 
 
 @cache
@@ -110,18 +104,27 @@ def _module(path: str) -> Any:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
-    except BaseException as error:  # SystemExit too: it would end the program without a word
+        _guarded(
+            partial(spec.loader.exec_module, module),
+            lambda error: f"plug-in file {path}{_line_of(error, path)} raised on import",
+        )
+    except BaseException:
         del sys.modules[name]
-        if interruption.is_interruption(error):
-            raise
-        raise PluginError(f"plug-in file {path}{_line_of(error, path)} raised on import: {_what(error)}") from error
+        raise
     return module
 
 
-def _what(error: BaseException) -> str:
-    """Return type and message of an error."""
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
+def _guarded(action: Callable[[], T], what: Callable[[BaseException], str], *passing: type[BaseException]) -> T:
+    """Return what an import returns; what it raises is a PluginError, SystemExit too, which would end the program silently."""
+    with interruption.handled():
+        try:
+            return action()
+        except passing:
+            raise
+        except BaseException as error:
+            if interruption.is_interruption(error):
+                raise
+            raise PluginError(f"{what(error)}: {type(error).__name__}: {error}".removesuffix(": ")) from error
 
 
 def _line_of(error: BaseException, path: str) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
+from studies import run_loaded, settings_of
 from typer.testing import CliRunner
 
 from sbt import testbeds
@@ -32,7 +33,6 @@ from sbt.samplers.surface import crossings
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION, History, Record
-from studies import run_loaded, settings_of
 
 
 def test_particles_have_the_density_of_the_score():

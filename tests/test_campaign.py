@@ -267,8 +267,9 @@ def test_runs_concentrate_on_the_boundary(campaign: Run):
 
 
 def test_progress_counts_what_was_run(configured: Callable[..., Path]):
-    from sbt.config.load import load
     from studies import run_loaded
+
+    from sbt.config.load import load
 
     seen: list[Any] = []
     run_loaded(load(configured("c", "SOME_FAIL", budget=40)), progress=seen.append, report=False)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +14,10 @@ from typing import Any
 import pytest
 
 from sbt.errors import InputError
+from sbt.execution.carrying import carry
 from sbt.execution.protocol import SerialExecutor
 from sbt.execution.spec import ScenarioSpec
+from sbt.plugins import load
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.seeds import run_seed
 
@@ -76,6 +80,56 @@ def test_rows_are_those_of_the_serial_executor_and_bad_runs_have_the_same_fate(c
     assert (rows[11].status, rows[11].reason) == (
         Status.TIMEOUT, "a run must take at most 1 s: its process was stopped",
     )  # fmt: skip
+
+
+RUDE = '''
+import sys
+from deadly import SPACE, CriticalInterval, LogicalScenario, Requirement
+
+def rude(values, seed):
+    if values["a"] < 0.1:
+        sys.exit(3)
+    if values["a"] < 0.2:
+        raise KeyboardInterrupt
+    return {"y": values["a"]}
+
+SCENARIO = LogicalScenario("rude", SPACE, Requirement("y", CriticalInterval(high=0.0)), evaluate=rude, metric_names=("y",))
+'''
+
+
+def test_a_run_may_raise_anything(cluster: Any, tmp_path: Path):
+    (tmp_path / "rude.py").write_text(DEADLY.partition("SCENARIO =")[0] + RUDE.replace("from deadly import", "# of the above:"))
+    spec = ScenarioSpec("rude.py:SCENARIO", str(tmp_path))
+    work = [Job(k, {"a": k / 10 + 0.05}, k) for k in range(6)]
+    with DaskExecutor(spec, cluster.scheduler_address, 1) as executor:
+        rows = found(executor.run(work))
+    assert rows == found(SerialExecutor(spec).run(work))
+    assert [rows[k].status for k in range(3)] == ["failed", "failed", "ok"]
+
+
+@pytest.mark.parametrize("size", [10, 1_000_000])
+def test_a_scenario_is_carried_whatever_its_size(cluster: Any, tmp_path: Path, size: int):
+    harmless = DEADLY.replace("os.kill(os.getppid(), signal.SIGKILL)", "pass")
+    (tmp_path / "mine.py").write_text(harmless.replace("time.sleep(60)", f"return {{'y': len({'x' * size!r})}}"))
+    data = carry(load("scenarios", f"{tmp_path}/mine.py:SCENARIO"))
+    (tmp_path / "mine.py").unlink()
+    spec = ScenarioSpec("deadly", carried=data)
+    work = [Job(k, {"a": k / 10}, k) for k in range(10)]
+    with DaskExecutor(spec, cluster.scheduler_address, 1) as executor:
+        rows = found(executor.run(work))
+    assert rows == found(SerialExecutor(spec).run(work))
+    assert rows[0].metrics == {"y": float(size)}
+
+
+def test_drivers_that_are_killed_leave_no_process_and_no_folder():
+    """Neither dask's processes nor those below them."""
+    script = Path(__file__).resolve().parents[1] / "benchmarks" / "faults.py"
+    done = subprocess.run(
+        [sys.executable, script, "--kills", "2", "--executor", "dask", "--seed", "4"],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    left = [cell.strip() for cell in done.stdout.splitlines()[-1].strip("|").split("|")]
+    assert (left[2], left[5:]) == ("0", ["0", "0"]), done.stdout
 
 
 def test_a_worker_that_is_killed_costs_nothing(cluster: Any, analytic: Path):

@@ -21,11 +21,11 @@ from typer.testing import CliRunner
 from sbt.cli import app
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
-from sbt.metrics.geometry import part
+from sbt.metrics.geometry import select_instants
 from sbt.store.database import Store
 from sbt.sumo.files import options_of_command
 from sbt.sumo.template import template
-from sbt.workflows.running import run_study
+from sbt.workflows.running import Summary, run_study
 from sbt.workflows.study import Study
 
 pytestmark = pytest.mark.sumo
@@ -69,6 +69,10 @@ def check(path: Path, seconds: str = "") -> tuple[int, str]:
     return done.exit_code, " ".join(done.output.split())
 
 
+def campaign_of(config: Path) -> Summary:
+    return run_study(Study.from_file(config), report=False)
+
+
 def rows_of(path: Path) -> list[tuple[str, str]]:
     """Status and reason of the rows of a small campaign."""
     store = path.parent / "runs"
@@ -76,7 +80,7 @@ def rows_of(path: Path) -> list[tuple[str, str]]:
     settings = {"campaign": "coverage", "scenario": str(path), "budget": 3, "initial": 3, "executor": {"kind": "serial"},
                 "store": str(store)}  # fmt: skip
     config.write_text(json.dumps(settings))
-    run_study(Study.from_file(config), report=False)
+    campaign_of(config)
     with Store.read(store) as found:
         return [(record.status, record.reason) for record in found.history().records]
 
@@ -109,7 +113,7 @@ def test_numpy_scalars_are_numbers_in_files_and_loops(study):
 def test_what_is_recorded_follows_the_motion(study):
     _, trace = simulated(study(), gap=60.0, v_lead=10.0)
     for name in trace.actors:
-        actor = part(trace.actor(name), slice(int(trace.present[:, trace.actors.index(name)].sum())))  # who leaves stays away
+        actor = select_instants(trace.actor(name), slice(int(trace.present[:, trace.actors.index(name)].sum())))  # who leaves stays away
         moved = np.hypot(np.diff(actor.x), np.diff(actor.y))
         forward = np.abs(np.diff(actor.y)) < 0.1  # SUMO changes lanes in a jump
         assert moved[forward] == pytest.approx(actor.speed[1:][forward] * 0.1, abs=1e-6)
@@ -371,13 +375,13 @@ def test_a_formula_is_a_metric_here_and_the_requirement_of_a_campaign(study, tmp
     config = tmp_path / "formula.yaml"
     config.write_text("campaign: coverage\nscenario: cut_in\nbudget: 12\ninitial: 12\nexecutor: {kind: serial}\n"
                       f"store: {tmp_path / 'f'}\nrequirement: {{stl: 'G(gap > 2)'}}\n")  # fmt: skip
-    assert run_study(Study.from_file(config), report=False).ok == 12
+    assert campaign_of(config).ok == 12
     config.write_text(config.read_text().replace("gap > 2", "gab > 2"))
     with pytest.raises(InputError, match=r"formula.yaml:7:20: requirement.stl: stl, column 3: a signal must be one of"):
-        run_study(Study.from_file(config), report=False)
+        campaign_of(config)
     config.write_text(config.read_text().replace("cut_in", "testbed:four_branch_7"))
     with pytest.raises(InputError, match="needs the trace of a run"):
-        run_study(Study.from_file(config), report=False)
+        campaign_of(config)
 
 
 def test_a_stored_run_replays_bit_by_bit(study):

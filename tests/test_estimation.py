@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from studies import run_loaded, settings_of
 from typer.testing import CliRunner
 
 from sbt.campaigns.counting import counted_batches
@@ -21,7 +22,6 @@ from sbt.errors import InputError
 from sbt.loop.stages import Log
 from sbt.store.database import Store
 from sbt.testbeds import truth
-from studies import run_loaded, settings_of
 
 Run = Callable[..., dict[str, Any]]
 NEAREST = {"kind": "analytic.py:Nearest"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from sbt.errors import InputError, PluginError
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import run_job, run_traced
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.seeds import run_seed, stream
 
@@ -27,8 +29,8 @@ def jobs(n: int, kind: Callable[[int], float] = lambda k: 0.5) -> list[Job]:
     return [Job(k, {"a": kind(k), "b": k / n}, run_seed(0, k)) for k in range(n)]
 
 
-def spec(analytic: Path, name: str = "AWKWARD") -> ScenarioSpec:
-    return ScenarioSpec(f"analytic.py:{name}", str(analytic.parent))
+def spec(file: Path, name: str = "AWKWARD") -> ScenarioSpec:
+    return ScenarioSpec(f"{file.name}:{name}", str(file.parent))
 
 
 def by_index(outcomes: Iterator[Outcome]) -> dict[int, Outcome]:
@@ -68,6 +70,139 @@ def test_what_goes_wrong_in_a_run_is_its_row_with_the_place(analytic: Path):
     assert all(o.metrics == {} for o in found.values() if o.status != Status.OK)
     with LocalExecutor(spec(analytic), 1) as local:
         assert by_index(local.run(work[::-1])) == found
+
+
+RUDE = '''
+"""What a user's code may do to whoever calls it; input a says which of them."""
+import sys
+import numpy as np
+from sbt.errors import RunError
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.space import ParameterSpace
+from sbt.problem.trace import Trace
+
+class Mute(Exception):
+    def __str__(self):
+        raise ValueError("no words")
+
+def throw(error):
+    raise error
+
+def deeper():
+    return deeper()
+
+RUDE = [
+    lambda: sys.exit(), lambda: sys.exit(3), lambda: throw(KeyboardInterrupt), lambda: throw(GeneratorExit("x")),
+    lambda: throw(BaseException("x")), lambda: throw(Mute()), lambda: throw(MemoryError()), deeper,
+    lambda: throw(RunError("no status", "x")), lambda: {}, lambda: None, lambda: {"y": "much"}, lambda: {"y": 1.0, "z": 2.0},
+]
+SPACE = ParameterSpace((Parameter("a", 0.0, 100.0), Parameter("b", 0.0, 1.0)))
+NEED = Requirement("y", CriticalInterval(high=0.0))
+
+def rude(values, seed):
+    return RUDE[int(values["a"])]() if values["a"] < 99 else {"y": 1.0}
+
+def still(values, seed):
+    t = np.arange(3.0)
+    rows = np.zeros((3, 1))
+    trace = Trace(t, ("ego",), rows, rows, rows, rows, rows, np.ones(1), np.ones(1))
+    return (values["a"] < 99 and RUDE[int(values["a"])]()) or trace
+
+class Together:
+    """Runs all at once, rudely."""
+    batched = True
+
+    def __call__(self, values, seed):
+        return still(values, seed)
+
+    def simulate_many(self, work, at_work=None):
+        if any(values["a"] < 90 for values, _ in work):
+            return [still(values, seed) for values, seed in work]
+        return []
+
+def measure(trace):
+    return 1.0
+
+def leave(trace):
+    sys.exit("over")
+
+SCENARIO = LogicalScenario("rude", SPACE, NEED, evaluate=rude, metric_names=("y",))
+SIMULATED = LogicalScenario("simulated", SPACE, NEED, simulate=still, metrics=(Metric("y", measure),))
+TOGETHER = LogicalScenario("together", SPACE, NEED, simulate=Together(), metrics=(Metric("y", measure),))
+LEAVING = LogicalScenario("leaving", SPACE, NEED, simulate=still, metrics=(Metric("y", leave),))
+'''
+REASONS = [
+    r"SystemExit \(\S+rude.py:\d+\)", r"SystemExit: 3 \(\S+rude.py:\d+\)", r"KeyboardInterrupt \(\S+rude.py:\d+\)",
+    r"GeneratorExit: x \(.*", r"BaseException: x \(.*", r"Mute: \(its message cannot be read\) \(.*", r"MemoryError \(.*",
+    r"RecursionError: maximum recursion depth exceeded.*", r"RunError: x \(.*",
+]  # fmt: skip
+WRONG = [
+    "a run must give the metrics y, but gave none", r"AttributeError: .*", "ValueError: could not convert string to float: .*",
+    "a run must give the metrics y, but gave y, z",
+]  # fmt: skip
+
+
+@pytest.fixture
+def rude_file(tmp_path: Path) -> Path:
+    path = tmp_path / "rude.py"
+    path.write_text(RUDE)
+    return path
+
+
+@pytest.mark.parametrize("name", ["SCENARIO", "SIMULATED", "TOGETHER"])
+def test_a_run_may_raise_or_return_anything_and_is_a_row(rude_file: Path, name: str):
+    reasons = [*REASONS, *WRONG] if name == "SCENARIO" else REASONS
+    work = [Job(k, {"a": k / 1.0 if k < len(reasons) else 99.5, "b": 0.5}, k) for k in range(len(reasons) + 3)]
+    found = run(SerialExecutor(spec(rude_file, name)), work)
+    for k, reason in enumerate(reasons):
+        assert (found[k].status, found[k].metrics) == (Status.FAILED, {})
+        assert re.fullmatch(reason, found[k].reason, re.DOTALL), found[k].reason
+    assert {found[k].status for k in range(len(reasons), len(work))} == {Status.OK}
+    with LocalExecutor(spec(rude_file, name), 2) as local:
+        pids = sorted(local._pool._processes)
+        again = by_index(local.run(work))
+        assert sorted(local._pool._processes) == pids, "no worker died of it"
+    recursion = REASONS.index(REASONS[7])
+    assert {k: o for k, o in again.items() if k != recursion} == {k: o for k, o in found.items() if k != recursion}
+    assert again[recursion].status == Status.FAILED
+
+
+def test_a_metric_may_raise_anything(rude_file: Path):
+    work = [Job(0, {"a": 99.5, "b": 0.5}, 0)]
+    found = run(SerialExecutor(spec(rude_file, "LEAVING")), work)
+    assert re.fullmatch(r"SystemExit: over \(\S+rude.py:\d+\)", found[0].reason)
+    with LocalExecutor(spec(rude_file, "LEAVING"), 1) as local:
+        assert by_index(local.run(work)) == found
+
+
+def test_code_may_raise_anything_outside_the_main_thread_and_is_interrupted_by_a_signal_only(rude_file: Path):
+    found: dict[int, Outcome] = {}
+    job = Job(0, {"a": 2.0, "b": 0.5}, 0)
+    thread = threading.Thread(target=lambda: found.update(run(SerialExecutor(spec(rude_file, "SCENARIO")), [job])))
+    thread.start()
+    thread.join()
+    assert found[0].reason.startswith("KeyboardInterrupt (")
+    with pytest.raises(KeyboardInterrupt):  # without a handler of ours it may be anybody's
+        run_job(spec(rude_file, "SCENARIO").resolve(), job)
+
+
+def test_what_is_run_once_with_its_trace_is_what_is_run_without(rude_file: Path):
+    for name, a in (("SCENARIO", 99.5), ("SCENARIO", 1.0), ("SIMULATED", 99.5), ("SIMULATED", 1.0), ("LEAVING", 99.5)):
+        scenario, job = spec(rude_file, name).resolve(), Job(4, {"a": a, "b": 0.5}, 7)
+        outcome, trace = run_traced(scenario, job)
+        assert replace(outcome, seconds=0.0) == replace(run_job(scenario, job), seconds=0.0)
+        assert (trace is not None) is (name != "SCENARIO" and a > 99)
+
+
+@pytest.mark.sumo
+def test_a_run_with_its_trace_is_the_run_of_a_campaign():
+    scenario, job = ScenarioSpec("cut_in").resolve(), Job(0, {"d_v": 40.0, "d_t": 1.0}, 3)
+    outcome, trace = run_traced(scenario, job)
+    assert trace is not None
+    assert replace(outcome, seconds=0.0) == replace(run_job(scenario, job), seconds=0.0)
+    assert trace.identical(scenario.simulate(job.inputs, job.seed))
 
 
 def test_a_run_that_kills_its_worker_costs_itself_only(analytic: Path):
@@ -138,6 +273,7 @@ DRIVER = """
 import os, sys
 from sbt.execution.local import LocalExecutor
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import run_job, run_traced
 from sbt.problem.outcome import Job
 
 if __name__ == "__main__":
@@ -182,6 +318,70 @@ def test_workers_end_with_their_driver(analytic: Path):
         time.sleep(0.1)
     assert not [pid for pid in workers if alive(pid)]
     driver.stdout.close()
+
+
+def test_workers_outlive_the_thread_that_started_them(analytic: Path):
+    executor = LocalExecutor(spec(analytic), 2)
+    thread = threading.Thread(target=executor.__enter__)
+    thread.start()
+    thread.join()
+    try:
+        pids = sorted(executor._pool._processes)
+        time.sleep(0.3)
+        assert {o.status for o in executor.run(jobs(20))} == {Status.OK}
+        assert sorted(executor._pool._processes) == pids
+    finally:
+        executor.__exit__()
+    assert not [pid for pid in pids if alive(pid)]
+
+
+@pytest.mark.parametrize("error", ["sys.exit()", "sys.exit(0)", "raise KeyboardInterrupt", "raise BaseException('x')"])
+def test_a_file_that_ends_the_program_when_it_is_imported_is_told_with_its_line(tmp_path: Path, error: str):
+    (tmp_path / "leaving.py").write_text(f"import sys\n\n{error}\nSCENARIO = None\n")
+    with pytest.raises(PluginError, match=r"leaving.py:3 raised on import: (SystemExit|KeyboardInterrupt|BaseException)"):
+        ScenarioSpec("leaving.py:SCENARIO", str(tmp_path)).resolve()
+
+
+METRICS = """
+import sys
+from sbt.problem.scenario import Metric
+
+def farthest(trace):
+    return float(trace.x.max())
+
+SLOWEST = Metric("slowest", lambda trace: float(trace.speed.min()), "m/s")
+D_MIN = Metric("d_min", lambda trace: -1.0)
+NUMBER = 3
+
+def rude(trace):
+    sys.exit(3)
+"""
+
+
+@pytest.mark.sumo
+def test_metrics_of_ones_own_are_measured_in_any_scenario(tmp_path: Path):
+    (tmp_path / "mine.py").write_text(METRICS)
+    names = ("mine.py:farthest", "mine.py:SLOWEST", "mine.py:D_MIN", "jerk_max", "ttc_2d_min")
+    own = ScenarioSpec("cut_in", str(tmp_path), metrics=names)
+    plain, job = ScenarioSpec("cut_in").resolve(), Job(0, {"d_v": 40.0, "d_t": 1.0}, 3)
+    assert set(own.resolve().measured) == {*plain.measured, "farthest", "slowest", "jerk_max", "ttc_2d_min"}
+    found = run(SerialExecutor(own), [job])
+    trace = plain.simulate(job.inputs, job.seed)
+    assert (found[0].metrics["d_min"], found[0].metrics["farthest"]) == (-1.0, float(trace.x.max()))
+    assert found[0].metrics["ttc_min"] == run_job(plain, job).metrics["ttc_min"]
+    with LocalExecutor(own, 1) as local:
+        assert by_index(local.run([job])) == found
+    rude = run(SerialExecutor(replace(own, metrics=("mine.py:rude",))), [job])
+    assert rude[0].reason.startswith("SystemExit: 3 (")
+    with pytest.raises(InputError, match=r"must be a Metric, or a function of the trace .* 'mine.py:NUMBER' is a int"):
+        replace(own, metrics=("mine.py:NUMBER",)).resolve()
+    with pytest.raises(PluginError, match="metrics must be one of"):
+        replace(own, metrics=("ttc_minn",)).resolve()
+
+
+def test_metrics_need_a_trace(analytic: Path):
+    with pytest.raises(InputError, match="metric jerk_max needs the trace of a run, but scenario disc gives its metrics"):
+        replace(spec(analytic, "SCENARIO"), metrics=("jerk_max",)).resolve()
 
 
 def test_choices_that_do_not_exist_are_told_before_any_run(analytic: Path):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from studies import run_loaded
 from typer.testing import CliRunner
 
 from sbt.benchmark.compare import compare, table
@@ -28,7 +29,6 @@ from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION
 from sbt.testbeds import values
-from studies import run_loaded
 
 CASES = '''
 from dataclasses import replace

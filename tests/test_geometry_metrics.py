@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from sbt.metrics.encounter import conflict_type
+from sbt.metrics.conflict_types import conflict_type
 from sbt.metrics.geometry import contact_index, corners, rectangle_distance, swept_contact
 from sbt.metrics.longitudinal import BESIDE, HORIZON, OVERTAKEN, collision, d_min, drac_max, impact_speed, thw_min, ttc_min
 from sbt.problem.trace import ActorTrace, Trace

@@ -18,11 +18,11 @@ from sbt import plugins
 from sbt.errors import InputError
 from sbt.metrics.braking import btn, btn_max, drac, mdrac, mdrac_max, mttc_min
 from sbt.metrics.comfort import deceleration_max, jerk_max
-from sbt.metrics.conflict import distance_min, pet, severity, ttc_2d, ttc_2d_min
-from sbt.metrics.course import departure, heading_error_max, lateral_error_max
 from sbt.metrics.exposure import tet, tit
 from sbt.metrics.geometry import corners, rectangle_distance, time_to_contact
 from sbt.metrics.longitudinal import HORIZON, drac_max, impact_speed, ttc_min
+from sbt.metrics.planar import distance_min, pet, severity, ttc_2d, ttc_2d_min
+from sbt.metrics.reference_line import deviation, heading_error_max, lateral_error_max
 from sbt.metrics.rss import Rss, rss_lateral_min, rss_longitudinal_min, rss_violation
 from sbt.metrics.signals import signal
 from sbt.problem.scenario import Metric
@@ -257,15 +257,15 @@ def test_course_against_a_circle():
     one = np.ones(60)
     ego = np.stack([51.5 * np.cos(at), 51.5 * np.sin(at), at + math.pi / 2 + 0.1, one, 0 * one], axis=1)
     trace = record(ego, ego)
-    offset, turn = departure(trace.actor("ego"), line)
+    offset, turn = deviation(trace.actor("ego"), line)
     np.testing.assert_allclose(offset, -1.5, atol=1e-4)  # right of the line
     np.testing.assert_allclose(turn, 0.1, atol=1e-3)
     assert lateral_error_max(line)(trace) == pytest.approx(1.5, abs=1e-4)
     assert heading_error_max(line)(trace) == pytest.approx(0.1, abs=1e-3)
-    beyond = departure(record(path(-7.0, 2.0, math.pi), path()).actor("ego"), np.array([[0.0, 0.0], [10.0, 0.0]]))
+    beyond = deviation(record(path(-7.0, 2.0, math.pi), path()).actor("ego"), np.array([[0.0, 0.0], [10.0, 0.0]]))
     assert (beyond[0][0], beyond[1][0]) == (2.0, math.pi)
     with pytest.raises(ValueError, match="at least two points"):
-        departure(trace.actor("ego"), np.zeros((2, 2)))
+        deviation(trace.actor("ego"), np.zeros((2, 2)))
 
 
 # --- all of them -------------------------------------------------------------------------------------------------

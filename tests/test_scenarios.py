@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sbt.errors import InputError, RunError
-from sbt.metrics.lateral import Curve
+from sbt.metrics.reference_line import Curve
 from sbt.plugins import load, names
 from sbt.problem.parameter import Parameter
 from sbt.problem.scenario import LogicalScenario
@@ -278,7 +278,7 @@ def test_curve_projects_back_what_is_beside_it() -> None:
     curve = Curve((3.0, -2.0, 0.4), ((10.0, 0.0), (10.0, 1 / 30), (20.0, 1 / 30), (15.0, -1 / 40)))
     s = np.linspace(0.5, curve.length - 0.5, 40)
     for left in (-3.0, 0.0, 2.0):
-        found = np.array([curve.project(x, y) for x, y in curve.beside(s, left)])
+        found = np.array([curve.project(x, y) for x, y in curve.offset_points(s, left)])
         assert np.abs(found[:, 0] - s).max() < 5e-3
         assert np.abs(found[:, 1] - left).max() < 2e-3
 
@@ -310,7 +310,8 @@ def test_outline_lies_on_the_sides() -> None:
 def test_marking_sensor_finds_the_lane() -> None:
     s = np.arange(0.0, 60.0, 1.0)
     curve = Curve((0.0, 0.0, 0.0), ((1e-6, 1 / 40), (70.0, 1 / 40)))
-    sensor = MarkingSensor(np.random.Generator(np.random.PCG64(0)), curve.beside(s, 1.75), curve.beside(s, -1.75), lane=3.5)
+    left, right = curve.offset_points(s, 1.75), curve.offset_points(s, -1.75)
+    sensor = MarkingSensor(np.random.Generator(np.random.PCG64(0)), left, right, lane=3.5)
     own = State("ego", 5.0, 1.8)
     fits = np.array([sensor(own) for _ in range(200)])[100:]
     assert np.abs(fits[:, 0].mean()) < 0.05

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from studies import run_loaded
 from typer.testing import CliRunner
 
 from sbt.cli import app
@@ -23,7 +24,6 @@ from sbt.loop.stages import Shard
 from sbt.store.database import Store
 from sbt.workflows.merging import merge_shards
 from sbt.workflows.running import replay_run
-from studies import run_loaded
 
 Run = Callable[..., dict[str, Any]]
 Rows = Callable[[Path | str], dict[str, list[Any]]]

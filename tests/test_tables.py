@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from studies import run_loaded
 from typer.testing import CliRunner
 
 from sbt.cli import app
@@ -15,7 +16,6 @@ from sbt.plugins import load
 from sbt.samplers.pool import PoolSequence
 from sbt.seeds import stream
 from sbt.store.database import Store
-from studies import run_loaded
 
 CONFIG = """
 title: "Disc"

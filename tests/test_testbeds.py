@@ -26,7 +26,8 @@ from sbt.problem.parameter import Parameter
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.workflows.checking import check_scenario
-from studies import run_loaded
+from sbt.workflows.running import run_study
+from sbt.workflows.study import Study
 
 ORACLE = Path(__file__).resolve().parents[2] / "shared" / "data" / "reference_problems.py"
 NAMES = testbeds.names()
@@ -236,8 +237,8 @@ def test_a_testbed_keeps_the_contract_of_scenarios() -> None:
 @pytest.mark.parametrize("scenario", ["testbed:four_branch_7", "testbed:four_branch_7:box"])
 def test_a_coverage_campaign_runs(tmp_path: Path, scenario: str) -> None:
     config = f"campaign: coverage\nscenario: {scenario}\nbudget: 64\nexecutor: {{kind: serial}}\nstore: {tmp_path / 's'}\n"
-    result = run_loaded(parse(config), report=False)
-    assert (result["runs"], result["ok"], result["failed"]) == (64, 64, 0)
+    summary = run_study(Study(parse(config)), report=False)
+    assert (summary.runs, summary.ok, summary.failed) == (64, 64, 0)
     with Store.read(tmp_path / "s") as store:
         history = store.history()
     np.testing.assert_allclose(history.y("y"), testbeds.values("four_branch_7", history.x), rtol=1e-12)

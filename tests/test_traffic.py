@@ -15,9 +15,9 @@ from sbt.config.assemble import assemble
 from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.execution.spec import ScenarioSpec
-from sbt.metrics.conflict import post_encroachment_time, time_behind, ttc_2d
 from sbt.metrics.paths import ttc_on_paths
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.metrics.planar import post_encroachment_time, time_behind, ttc_2d
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.plugins import load
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
@@ -252,7 +252,7 @@ def test_time_behind_counts_only_who_comes_after_ego() -> None:
     assert time_behind(first, "ego", "co_0") == pytest.approx(expected, abs=0.01)
     assert time_behind(first, "ego", "co_0") == pytest.approx(post_encroachment_time(first, "ego", "co_0"), abs=0.01)
     assert time_behind(second, "ego", "co_0") == 10.0
-    assert time_left(horizon=5.0)(second) == 5.0
+    assert pet_ego_first(horizon=5.0)(second) == 5.0
     assert time_behind(first, "ego", "co_0", zone=(0.0, 0.0, 8.0)) == pytest.approx(expected, abs=0.01)
     assert time_behind(first, "ego", "co_0", 4.0, zone=(40.0, 0.0, 8.0)) == 4.0
 
@@ -262,14 +262,14 @@ def test_ttc_on_paths_is_gap_by_closing_speed_and_knows_bends() -> None:
     follow = trace((12.0 * t, 0.0 * t), (24.0 + 6.0 * t, 0.0 * t))
     found = ttc_on_paths(follow, "ego", "co_0")
     assert found[:20] == pytest.approx((20.0 - 6.0 * t[:20]) / 6.0, abs=1e-6)
-    assert nearest_ttc()(follow) == pytest.approx(found.min())
+    assert ttc_path_min()(follow) == pytest.approx(found.min())
     angle = np.arange(0.0, 6.0, 0.1) * 0.5
     ring = trace(*((18.0 * np.cos(angle + p), 18.0 * np.sin(angle + p)) for p in (0.0, 1.2)))
     inner = slice(1, len(angle) - 40)
     assert ttc_2d(ring, "ego", "co_0").min() > 0
     assert ttc_on_paths(ring, "ego", "co_0")[inner].min() == 5.0, "equal speeds on one ring never meet"
     head_on = trace((10.0 * t, 0.0 * t), (100.0 - 10.0 * t, 3.0 + 0.0 * t))
-    assert nearest_ttc()(head_on) == 5.0
+    assert ttc_path_min()(head_on) == 5.0
 
 
 def test_metrics_among_many_take_the_worst_of_all() -> None:
@@ -278,12 +278,13 @@ def test_metrics_among_many_take_the_worst_of_all() -> None:
     braking = (60.0 + 10.0 * t - 2.0 * t**2, 0.0 * t)
     struck_one = (9.0 + 6.0 * t, 0.0 * t)
     calm, worse, crash = trace(ego, far), trace(ego, far, braking), trace(ego, far, struck_one)
-    assert (nearest_distance()(calm), struck()(calm), struck_speed()(calm)) == (38.0, 0.0, 0.0)
-    assert others_braking()(calm) == pytest.approx(0.0, abs=1e-9)
-    assert others_braking()(worse) == pytest.approx(4.0)
-    assert (struck()(crash), nearest_distance()(crash), nearest_ttc()(crash), time_left()(crash)) == (1.0, 0.0, 0.0, 0.0)
-    assert struck_speed()(crash) == pytest.approx(4.0)
-    assert struck()(trace(far)) == 0.0
+    assert (nearest_distance()(calm), any_collision()(calm), any_impact_speed()(calm)) == (38.0, 0.0, 0.0)
+    assert others_braking_max()(calm) == pytest.approx(0.0, abs=1e-9)
+    assert others_braking_max()(worse) == pytest.approx(4.0)
+    worst = [metric(crash) for metric in (any_collision(), nearest_distance(), ttc_path_min(), pet_ego_first())]
+    assert worst == [1.0, 0.0, 0.0, 0.0]
+    assert any_impact_speed()(crash) == pytest.approx(4.0)
+    assert any_collision()(trace(far)) == 0.0
 
 
 @pytest.mark.sumo

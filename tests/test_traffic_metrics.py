@@ -13,11 +13,11 @@ from sbt.errors import InputError, RunError
 from sbt.execution.worker import run_job
 from sbt.metrics import longitudinal
 from sbt.metrics.comfort import deceleration_max
-from sbt.metrics.conflict import distance_min
 from sbt.metrics.longitudinal import FAR, HORIZON, collision, drac_max, ttc_min
-from sbt.metrics.others import in_traffic, stretches, worst_signal
+from sbt.metrics.pairwise import in_traffic, joint_intervals, worst_signal
+from sbt.metrics.planar import distance_min
 from sbt.metrics.stl import stl
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, ttc_path_min
 from sbt.problem.outcome import Job, Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
@@ -57,7 +57,7 @@ def test_the_contact_of_a_pair_is_looked_for_once_per_trace_and_forgotten_with_i
     real = longitudinal.contact_index
     monkeypatch.setattr(longitudinal, "contact_index", lambda a, b: (asked.append(None), real(a, b))[1])
     trace = traffic(**{f"car_{k}": (30.0 * k, 0.0, 10.0, ALL) for k in range(1, 20)})
-    metrics = (nearest_distance("v"), struck("v"), struck_speed("v"), nearest_ttc("v"))
+    metrics = (nearest_distance("v"), any_collision("v"), any_impact_speed("v"), ttc_path_min("v"))
     first = [metric(trace) for metric in metrics]
     assert len(asked) == 19
     assert [metric(dataclasses.replace(trace)) for metric in metrics] == first
@@ -71,13 +71,13 @@ def test_the_contact_of_a_pair_is_looked_for_once_per_trace_and_forgotten_with_i
 def test_who_comes_and_goes_is_measured_while_there():
     """Far away at first and at last; a car that jumps in from NaN sweeps over nobody."""
     trace = traffic(one=(45.0, 0.0, 10.0, slice(10, 20)), two=(200.0, 0.0, 20.0, slice(0, 5)))
-    parts = stretches(trace, "v", "one")
+    parts = joint_intervals(trace, "v", "one")
     assert [(i.start, i.stop, part.actors) for i, part in parts] == [(10, 20, ("ego", "co"))]
     gap = 45.0 - 10.0 * TIME[19] - 5.0
     assert in_traffic(ttc_min(passed=HORIZON), "v")(trace) == pytest.approx(gap / 10.0)
     assert in_traffic(collision(), "v")(trace) == 0.0
     twice = np.r_[5:10, 20:25]
-    assert len(stretches(traffic(one=(45.0, 0.0, 10.0, twice)), "v", "one")) == 2
+    assert len(joint_intervals(traffic(one=(45.0, 0.0, 10.0, twice)), "v", "one")) == 2
 
 
 def test_without_anybody_the_metric_has_its_value_without():
@@ -102,7 +102,7 @@ def test_signals_in_traffic_are_the_worst_at_every_instant():
     assert stl("G(gap > 20)", ego="v", other=None)(trace) == pytest.approx(first[19] - 20.0)
     with pytest.raises(InputError, match=r"in traffic 'lateral' needs a road user, such as lead\.lateral"):
         stl("G(lateral > 1)", ego="v", other=None)(trace)
-    with pytest.raises(RunError, match=r"one\.speed must be there at every instant"):
+    with pytest.raises(RunError, match=r"one\.speed must be defined at every instant"):
         stl("G(one.speed > 1)", ego="v", other=None)(trace)
 
 

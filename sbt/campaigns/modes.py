@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sbt.metrics.encounter import NAME as CONFLICT_TYPE
-from sbt.metrics.encounter import conflict_type_in_words
+from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
+from sbt.metrics.conflict_types import describe_conflict_type
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import WarpedModel
@@ -173,7 +173,7 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, confirmed:
     conflict = history.y(CONFLICT_TYPE)[at]
     return FailureMode(
         int(history.index[at]), inputs, float(y[at]), len(mode.rows),
-        conflict_type_in_words(-1.0 if np.isnan(conflict) else float(conflict)),
+        describe_conflict_type(-1.0 if np.isnan(conflict) else float(conflict)),
         tuple(int(history.index[k]) for k in mode.rows),
         float(critical.contains(confirmed).mean()) if len(confirmed) else None, len(confirmed),
         RunPoint(int(history.index[likely]), history.inputs(likely), float(y[likely])),

@@ -11,7 +11,7 @@ from sbt.cli import campaign, inform, metrics, scenario
 from sbt.cli.benchmark import benchmark
 from sbt.cli.compare import compare
 from sbt.cli.compare_ego import compare_ego
-from sbt.cli.console import prepare_streams, verb
+from sbt.cli.console import process, verb
 from sbt.cli.new import new
 from sbt.cli.predict import predict
 from sbt.cli.replay import replay
@@ -62,5 +62,5 @@ def _options(
 
 def main() -> None:
     """Run the command line; ends the process."""
-    prepare_streams()
-    app(prog_name="sumo-sbt")
+    with process():
+        app(prog_name="sumo-sbt")

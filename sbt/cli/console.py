@@ -25,7 +25,7 @@ from sbt.execution.streams import SteadyStream, open_missing
 if TYPE_CHECKING:
     from sbt.loop.stages import Progress
 
-__all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "prepare_streams", "print_json", "resumable", "verb"]
+__all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "print_json", "process", "resumable", "verb"]
 
 P = ParamSpec("P")
 _QUIET_SECONDS = 10.0
@@ -57,7 +57,7 @@ def verb(function: Callable[P, None]) -> Callable[P, None]:
 
     @functools.wraps(function)
     def reported(*args: P.args, **kwargs: P.kwargs) -> None:
-        with _Interruptions():
+        with _handled():
             try:
                 function(*args, **kwargs)
             except typer.Exit:
@@ -82,42 +82,40 @@ def _verdict(error: BaseException) -> tuple[str, Exit]:
     return f"internal error: {what} (SBT_DEBUG=1 shows where)", Exit.INTERNAL
 
 
-class _Interruptions:
-    """What the command line does when a signal ends it: says so at once, and ends at once where it is asked again."""
+@contextlib.contextmanager
+def _handled() -> Iterator[None]:
+    """Let a signal interrupt, and say so at once where work can be resumed; the second one ends the process and its workers."""
+    first, stderr = math.inf, -1
+    with contextlib.suppress(OSError):
+        stderr = os.dup(2)  # during a run SUMO's output has taken the place of descriptor 2
 
-    def __init__(self) -> None:
-        self._stack = contextlib.ExitStack()
-        self._first = math.inf
-        self._stderr = -1
-
-    def __enter__(self) -> None:
-        with contextlib.suppress(OSError):
-            self._stderr = os.dup(2)  # SUMO's own output takes the place of descriptor 2 during a run
-        self._stack.enter_context(interruption.handled(*_SIGNALS, notify=self._notify))
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-        with contextlib.suppress(OSError):
-            os.close(self._stderr)
-
-    def _notify(self, number: int) -> bool:
-        """Return whether a signal interrupts; the second one ends the process, whose workers end with it."""
+    def notify(number: int) -> bool:
+        nonlocal first
         now = time.monotonic()
-        if self._first == math.inf:
-            self._first = now
+        if first == math.inf:
+            first = now
             if _resumable:
                 name = signal.Signals(number).name
-                self._say(f"stopping ({name}): {_resumable[-1].consequence()}; a second signal stops at once")
+                _write(stderr, f"stopping ({name}): {_resumable[-1].consequence()}; a second signal stops at once")
             return True
-        if now - self._first > _ONCE:
-            self._say("stopped at once")
+        if now - first > _ONCE:
+            _write(stderr, "stopped at once")
             os._exit(int(Exit.INTERRUPTED))
         return False
 
-    def _say(self, text: str) -> None:
-        with contextlib.suppress(OSError):  # nobody is there to read it
-            start = "\n" if os.isatty(self._stderr) else ""
-            os.write(self._stderr, f"{start}{text}\n".encode())
+    try:
+        with interruption.handled(*_SIGNALS, notify=notify):
+            yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.close(stderr)
+
+
+def _write(descriptor: int, line: str) -> None:
+    """Write a line without the streams, which a signal may have found in the middle of another."""
+    with contextlib.suppress(OSError):  # nobody is there to read it
+        start = "\n" if os.isatty(descriptor) else ""
+        os.write(descriptor, f"{start}{line}\n".encode())
 
 
 class _Resumable:
@@ -158,10 +156,24 @@ def resumable(pattern: str = "campaign.sqlite", again: str = "run again to resum
         _resumable.pop()
 
 
-def prepare_streams() -> None:
-    """Let nobody's closed terminal or pipe end a command: what can no longer be written is dropped."""
+@contextlib.contextmanager
+def process() -> Iterator[None]:
+    """Be the process of a command: nobody's closed terminal or pipe ends it, and one that a signal ends, ends with 130."""
     open_missing()
     sys.stdout, sys.stderr = SteadyStream(sys.stdout), SteadyStream(sys.stderr, any_error=True)
+    interrupted = False
+    try:
+        with _handled():
+            try:
+                yield
+            finally:
+                interrupted = interruption.requested()
+    except SystemExit as end:
+        if not interrupted or not end.code:
+            raise
+        # Python kills itself with SIGINT, whatever the exit code, where that has interrupted an `exec` (of a dataclass, say).
+        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+        raise SystemExit(int(Exit.INTERRUPTED)) from end
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 
 from sbt.config.scenario_model import MetricEntry
 from sbt.errors import InputError
-from sbt.metrics.others import in_traffic
+from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.stl import stl
 from sbt.plugins import load
 from sbt.problem.scenario import Metric

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import io
 import json
 import subprocess
 import sys
@@ -51,15 +52,13 @@ def carry(scenario: LogicalScenario) -> bytes:
     Raises:
         InputError: something in it cannot leave the process, such as an open file or a lock.
     """
-    pickle = _cloudpickle()
-    with _LOCK, _by_value(pickle):
+    with _LOCK, _by_value():
         try:
-            data: bytes = pickle.dumps(scenario)
+            data = _dumps(scenario)
         except Exception as error:
-            where, reason = _culprit(pickle, scenario, error)
             raise InputError(
-                f"a scenario must be made of plain data and code to reach its workers, but {where} of scenario {scenario.name} "
-                f"cannot: {reason}; make it inside the function that uses it"
+                f"a scenario must be made of plain data and code to reach its workers, but in scenario {scenario.name} "
+                f"{_culprit(scenario, error)}; make such an object inside the function that uses it"
             ) from None
     _ORIGINALS[data] = scenario
     return data
@@ -91,9 +90,25 @@ def _cloudpickle() -> Any:
     return cloudpickle
 
 
+def _dumps(part: Any) -> bytes:
+    """Return an object as bytes; an open file is refused, which cloudpickle would replace by its text."""
+    file = io.BytesIO()
+    base = _cloudpickle().CloudPickler
+
+    class Pickler(base):  # type: ignore[misc, valid-type]  # cloudpickle has no types
+        def reducer_override(self, value: Any) -> Any:
+            if isinstance(value, io.TextIOWrapper) and value not in (sys.stdout, sys.stderr):
+                raise TypeError("an open file belongs to its process")
+            return super().reducer_override(value)
+
+    Pickler(file).dump(part)
+    return file.getvalue()
+
+
 @contextmanager
-def _by_value(pickle: Any) -> Iterator[None]:
+def _by_value() -> Iterator[None]:
     """Let modules that other processes cannot import travel by value."""
+    pickle = _cloudpickle()
     before = pickle.list_registry_pickle_by_value()
     added = [module for module in _own_modules() if module.__name__ not in before]
     for module in added:
@@ -153,23 +168,23 @@ def _lies_in(module: types.ModuleType, places: list[str] | tuple[str, ...]) -> b
     return any(place and (file == Path(place).resolve() or Path(place).resolve() in file.parents) for place in places)
 
 
-def _culprit(pickle: Any, scenario: LogicalScenario, error: Exception) -> tuple[str, str]:
-    """Return a name for the innermost part that cannot travel, and why."""
+def _culprit(scenario: LogicalScenario, error: Exception) -> str:
+    """Return which innermost part cannot travel, and why."""
     where, part, seen = "a part", scenario, set[int]()
     for _ in range(_DEPTH):
         for name, child in _parts(part, where):
-            if id(child) not in seen and (found := _refusal(pickle, child)) is not None:
+            if id(child) not in seen and (found := _refusal(child)) is not None:
                 seen.add(id(child))
                 where, part, error = name, child, found
                 break
         else:
             break
-    return where, f"{type(part).__name__}, {type(error).__name__}: {error}" if where != "a part" else described(error)
+    return f"{where} is a {type(part).__name__} ({type(error).__name__}: {error})"
 
 
-def _refusal(pickle: Any, part: Any) -> Exception | None:
+def _refusal(part: Any) -> Exception | None:
     try:
-        pickle.dumps(part)
+        _dumps(part)
     except Exception as error:
         return error
     return None

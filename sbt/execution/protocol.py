@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -42,17 +41,14 @@ class SerialExecutor:
 
     def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
         self._scenario = spec.resolve().limited(timeout)
-        self._signals = ExitStack()
 
     def __enter__(self) -> Self:
-        """Tell Ctrl-C from a KeyboardInterrupt that the scenario's code raises, and return the executor."""
+        """Return the executor."""
         open_missing()
-        self._signals.enter_context(interruption.handled())
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave Ctrl-C to whoever handled it before."""
-        self._signals.close()
+        """Do nothing."""
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome a job, in order.
@@ -63,7 +59,9 @@ class SerialExecutor:
         simulate = self._scenario.simulate
         size = CHUNK if isinstance(simulate, Batched) and simulate.batched else 1
         for first in range(0, len(jobs), size):
-            yield from run_jobs(self._scenario, jobs[first : first + size], lambda _: None)
+            with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
+                outcomes = run_jobs(self._scenario, jobs[first : first + size], lambda _: None)
+            yield from outcomes
 
 
 def chunk_of(queue: deque[Job], size: float, workers: int) -> list[Job]:

@@ -15,8 +15,8 @@ from typing import Any
 
 from sbt.errors import InputError, PluginError
 from sbt.execution.carrying import delivered
-from sbt.metrics.encounter import conflict_type
-from sbt.metrics.others import in_traffic, without_verdict
+from sbt.metrics.conflict_types import conflict_type
+from sbt.metrics.pairwise import in_traffic, without_overtaking
 from sbt.plugins import load
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
@@ -133,7 +133,7 @@ def _metric(name: str, folder: Path, scenario: LogicalScenario) -> Metric:
         raise InputError(f"metric {name} needs the trace of a run, but scenario {scenario.name} gives its metrics directly")
     found = load("metrics", name, folder)
     if isinstance(found, Metric):
-        return found if ".py:" in name else in_traffic(without_verdict(found), scenario.roles.ego)
+        return found if ".py:" in name else in_traffic(without_overtaking(found), scenario.roles.ego)
     if ".py:" in name and callable(found) and not isinstance(found, type):
         return Metric(getattr(found, "__name__", name.rpartition(":")[2]), found)
     raise InputError(

@@ -59,8 +59,13 @@ class SteadyStream:
         if closed:
             self._stream = open(os.devnull, "w")  # noqa: PTH123, SIM115  (lives as long as the process)
             return
+        own = self._stream.fileno()
+        numbers = {own}
+        if isinstance(error, OSError) and error.errno in _GONE:
+            numbers |= {number for number in (1, 2) if os.path.sameopenfile(number, own)}  # `2>&1`: one pipe, two descriptors
         nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, self._stream.fileno())
+        for number in numbers:
+            os.dup2(nowhere, number)
         os.close(nowhere)
 
 

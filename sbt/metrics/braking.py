@@ -1,7 +1,7 @@
-"""What it takes to avoid the road user ahead: DRAC and its kin, and TTC at constant accelerations.
+"""Deceleration needed to avoid the road user ahead (DRAC, MDRAC, BTN), and TTC at constant accelerations (MTTC).
 
-All along the ego's heading, like `sbt.metrics.longitudinal`, and while the other is ahead in the path.
-Each is a signal, (t,) numbers, and a metric, the worst of them.
+All are measured along the ego's heading while the other is ahead in the path, as in `sbt.metrics.longitudinal`.
+Each exists as a signal, (t,) numbers, and as a metric, the worst of them.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ __all__ = ["CAPABILITY", "REACTION", "btn", "btn_max", "drac", "mdrac", "mdrac_m
 REACTION = 1.0
 """Reaction time of MDRAC (s), the default of SUMO's SSM device."""
 CAPABILITY = 8.0
-"""Deceleration the ego can reach (m/s^2), about a dry road's."""
-_TOUCH = 1e-9
-"""Smallest gap that is divided by (m)."""
+"""Deceleration that the ego can reach (m/s^2), about that on a dry road."""
+_TINY_GAP = 1e-9
+"""Lower bound of gaps in denominators (m)."""
 
 
 def _deceleration(e: Encounter, values: Vector) -> Vector:
-    """Return (t,) decelerations within [0, DRAC_LIMIT], 0 while nobody is ahead, the limit from a rear-end contact on."""
-    return e.held(np.where(e.ahead, np.clip(values, 0.0, DRAC_LIMIT), 0.0), DRAC_LIMIT)
+    """Return the (t,) decelerations within [0, DRAC_LIMIT]: 0 while nobody is ahead, the limit from a rear-end collision on."""
+    return e.after_contact(np.where(e.ahead, np.clip(values, 0.0, DRAC_LIMIT), 0.0), DRAC_LIMIT)
 
 
 def drac(trace: Trace, ego: str, other: str, margin: float) -> Vector:
     """Return the (t,) deceleration rate to avoid a crash (m/s^2): closing^2 / (2 gap)."""
     e = encounter(trace, ego, other, margin)
-    return _deceleration(e, np.maximum(e.closing, 0.0) ** 2 / (2 * np.maximum(e.gap, _TOUCH)))
+    return _deceleration(e, np.maximum(e.closing, 0.0) ** 2 / (2 * np.maximum(e.gap, _TINY_GAP)))
 
 
 def mdrac(trace: Trace, ego: str, other: str, margin: float, reaction: float = REACTION) -> Vector:
-    """Return the (t,) DRAC that is left after a reaction time at constant speeds (m/s^2)."""
+    """Return the (t,) DRAC after a reaction time at constant speeds (m/s^2)."""
     e = encounter(trace, ego, other, margin)
     left = e.gap - np.maximum(e.closing, 0.0) * reaction
-    return _deceleration(e, np.maximum(e.closing, 0.0) ** 2 / (2 * np.maximum(left, _TOUCH)))
+    return _deceleration(e, np.maximum(e.closing, 0.0) ** 2 / (2 * np.maximum(left, _TINY_GAP)))
 
 
 def mdrac_max(ego: str = "ego", other: str = "co", margin: float = 0.0, reaction: float = REACTION) -> Metric:
-    """Return the largest modified DRAC (m/s^2), with a reaction time (s); 0 without closing in, at most 100."""
+    """Return the largest modified DRAC (m/s^2), with a reaction time (s); 0 if the gap does not shrink, at most 100."""
     return Metric(
         "mdrac_max", lambda trace: float(mdrac(trace, ego, other, margin, reaction).max()), "m/s^2", "high", 0.0,
         "largest deceleration that would just avoid the collision after a reaction time",
@@ -51,26 +51,26 @@ def mdrac_max(ego: str = "ego", other: str = "co", margin: float = 0.0, reaction
 
 
 def btn(trace: Trace, ego: str, other: str, margin: float, capability: float = CAPABILITY) -> Vector:
-    """Return the (t,) brake threat number: needed constant deceleration of ego by the possible one.
+    """Return the (t,) brake threat number: the constant deceleration that the ego needs, divided by the one it can reach.
 
-    The other keeps its acceleration; where it brakes it stays where it comes to stand. Without an
-    acceleration of the other this is DRAC by `capability`.
+    The other keeps its acceleration, and stays where it comes to a standstill if it brakes. Without an acceleration of
+    the other this is DRAC divided by `capability`.
     """
     e, b = encounter(trace, ego, other, margin), trace.actor(other)
     turn = np.cos(b.heading - trace.actor(ego).heading)
-    speed, braking = b.speed * turn, -b.acceleration * turn  # of the other, along ego's heading
-    gap, closing = np.maximum(e.gap, _TOUCH), np.maximum(e.closing, 0.0)
+    speed, braking = b.speed * turn, -b.acceleration * turn  # of the other, along the ego's heading
+    gap, closing = np.maximum(e.gap, _TINY_GAP), np.maximum(e.closing, 0.0)
     needed = closing**2 / (2 * gap) + np.where(speed > 0, braking, 0.0)
     stops = (speed > 0) & (braking > 0)
-    standstill = speed / np.maximum(braking, 1e-9)  # s until the other stands, where it stops
-    first = stops & (2 * gap > closing * standstill)  # before the speeds would be equal
+    standstill = speed / np.maximum(braking, 1e-9)  # time until the other stands still (s), where it brakes
+    first = stops & (2 * gap > closing * standstill)  # it stands still before the speeds would be equal
     until = gap + 0.5 * speed * standstill
-    needed = np.where(first, e.speed**2 / (2 * np.maximum(until, _TOUCH)), np.where(closing > 0, needed, 0.0))
+    needed = np.where(first, e.speed**2 / (2 * np.maximum(until, _TINY_GAP)), np.where(closing > 0, needed, 0.0))
     return _deceleration(e, needed) / capability
 
 
 def btn_max(ego: str = "ego", other: str = "co", margin: float = 0.0, capability: float = CAPABILITY) -> Metric:
-    """Return the largest brake threat number, >= 1 where braking with `capability` (m/s^2) is no longer enough."""
+    """Return the largest brake threat number; from 1 on, braking with `capability` (m/s^2) no longer avoids a collision."""
     return Metric(
         "btn_max", lambda trace: float(btn(trace, ego, other, margin, capability).max()), "", "high", 0.0,
         "largest share of the possible deceleration that would just avoid the collision",
@@ -82,15 +82,15 @@ def btn_max(ego: str = "ego", other: str = "co", margin: float = 0.0, capability
 def mttc(trace: Trace, ego: str, other: str, margin: float) -> Vector:
     """Return the (t,) time to collision at constant accelerations (s): the first t > 0 at which the gap is 0.
 
-    The root of gap = closing t + a t^2 / 2 in the form that does not cancel; accelerations go on past
-    a standstill.
+    The root of gap = closing t + a t^2 / 2, in a form without cancellation; accelerations are extrapolated beyond a
+    standstill.
     """
     e, a, b = encounter(trace, ego, other, margin), trace.actor(ego), trace.actor(other)
     relative = a.acceleration - b.acceleration * np.cos(b.heading - a.heading)
     square = e.closing**2 + 2 * relative * e.gap
     rate = e.closing + np.sqrt(np.maximum(square, 0.0))
     meets = e.ahead & (square >= 0) & (2 * e.gap < HORIZON * rate)
-    return e.held(np.where(meets, 2 * e.gap / np.where(meets, rate, 1.0), HORIZON), 0.0)
+    return e.after_contact(np.where(meets, 2 * e.gap / np.where(meets, rate, 1.0), HORIZON), 0.0)
 
 
 def mttc_min(ego: str = "ego", other: str = "co", margin: float = 0.0) -> Metric:

@@ -1,4 +1,4 @@
-"""How the ego drives, whoever else is there: jerk and braking."""
+"""Metrics of the ego alone: jerk and braking."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ __all__ = ["deceleration_max", "jerk", "jerk_max"]
 
 
 def jerk(actor: ActorTrace, time: Vector) -> Vector:
-    """Return the (t,) rate of the acceleration over the step that led to each instant (m/s^3).
+    """Return the (t,) rate of change of the acceleration over the step before each instant (m/s^3).
 
-    0 at the first two instants: a trace's first acceleration is not measured, so that there is no
-    change of it either.
+    0 at the first two instants, because the first acceleration of a trace is not measured.
     """
     result = np.zeros(len(time))
     result[2:] = np.diff(actor.acceleration[1:]) / np.diff(time[1:])
@@ -23,7 +22,7 @@ def jerk(actor: ActorTrace, time: Vector) -> Vector:
 
 
 def jerk_max(ego: str = "ego") -> Metric:
-    """Return the largest absolute jerk along the heading (m/s^3), from steps as long as the trace's."""
+    """Return the largest absolute jerk along the heading (m/s^3), by differences over the steps of the trace."""
 
     def function(trace: Trace) -> float:
         return float(np.abs(jerk(trace.actor(ego), trace.time)).max())
@@ -32,7 +31,7 @@ def jerk_max(ego: str = "ego") -> Metric:
 
 
 def deceleration_max(ego: str = "ego") -> Metric:
-    """Return the strongest braking (m/s^2), 0 where the ego never brakes."""
+    """Return the strongest deceleration (m/s^2), 0 if the ego never brakes."""
 
     def function(trace: Trace) -> float:
         return float(max(0.0, -trace.actor(ego).acceleration.min()))

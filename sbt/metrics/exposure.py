@@ -1,4 +1,4 @@
-"""How long a trace is exposed to danger: TET and TIT, integrals over time by the trapezoidal rule."""
+"""Exposure to critical TTC over time: TET and TIT, integrals by the trapezoidal rule."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from sbt.problem.trace import Trace
 __all__ = ["THRESHOLD", "integral", "tet", "tit"]
 
 THRESHOLD = 3.0
-"""TTC below which two are exposed (s)."""
+"""TTC below which road users are exposed (s)."""
 
 
 def integral(trace: Trace, values: Vector | Mask, ego: str, other: str) -> float:
     """Return the time integral of (t,) values until the end or the first contact of the two.
 
-    Of a condition it is for how long it holds (s); a step at whose one end it holds counts half.
+    For a condition it is the time during which it holds (s); a step at whose ends it differs counts half.
     """
     k = first_contact(trace, ego, other)
     end = len(trace.time) if k is None else k + 1
     return float(np.trapezoid(values[:end].astype(np.float64), trace.time[:end]))
 
 
-def _depth(trace: Trace, ego: str, other: str, margin: float, threshold: float) -> Vector:
-    """Return (t,) how far TTC is below the threshold (s), 0 while nobody is ahead in the path."""
+def _shortfall(trace: Trace, ego: str, other: str, margin: float, threshold: float) -> Vector:
+    """Return the (t,) difference of the threshold and the TTC below it (s), 0 while nobody is ahead in the path."""
     e = encounter(trace, ego, other, margin)
-    depth = np.where(e.ahead, np.maximum(threshold - time_to_collision(e), 0.0), 0.0)
-    return e.held(depth, threshold)
+    shortfall = np.where(e.ahead, np.maximum(threshold - time_to_collision(e), 0.0), 0.0)
+    return e.after_contact(shortfall, threshold)
 
 
 def tet(ego: str = "ego", other: str = "co", margin: float = 0.0, threshold: float = THRESHOLD) -> Metric:
-    """Return the time exposed: how long TTC is below a threshold (s) while the other is ahead."""
+    """Return the time exposed TTC: how long TTC is below a threshold (s) while the other is ahead."""
     return Metric(
-        "tet", lambda trace: integral(trace, _depth(trace, ego, other, margin, threshold) > 0, ego, other), "s", "high", 0.0,
+        "tet", lambda trace: integral(trace, _shortfall(trace, ego, other, margin, threshold) > 0, ego, other), "s", "high", 0.0,
         f"time exposed to a TTC below {threshold:g} s",
         "Minderhoud and Bovy (2001), Extended time-to-collision measures for road traffic safety assessment, "
         "doi 10.1016/S0001-4575(00)00019-1",
@@ -43,9 +43,9 @@ def tet(ego: str = "ego", other: str = "co", margin: float = 0.0, threshold: flo
 
 
 def tit(ego: str = "ego", other: str = "co", margin: float = 0.0, threshold: float = THRESHOLD) -> Metric:
-    """Return the time integrated: the area between TTC and a threshold above it (s^2) while the other is ahead."""
+    """Return the time integrated TTC: the area between TTC and a threshold above it (s^2) while the other is ahead."""
     return Metric(
-        "tit", lambda trace: integral(trace, _depth(trace, ego, other, margin, threshold), ego, other), "s^2", "high", 0.0,
+        "tit", lambda trace: integral(trace, _shortfall(trace, ego, other, margin, threshold), ego, other), "s^2", "high", 0.0,
         f"area between the TTC and {threshold:g} s while the TTC is below it",
         "Minderhoud and Bovy (2001), Extended time-to-collision measures for road traffic safety assessment, "
         "doi 10.1016/S0001-4575(00)00019-1",

@@ -1,11 +1,11 @@
 """Recorded traffic: SUMO's floating car data (FCD) as traces of pairs of road users.
 
-Reads XML (also gzipped), CSV (`,` or `;`, also gzipped) and Parquet, with SUMO's own names of elements
-and columns (`timestep_time`, `vehicle_x`, `person_x`, ...) or the bare ones (`time`, `id`, `x`, `y`,
-`angle`, `speed`). SUMO's positions are those of the front bumper's centre and its angles are degrees
-clockwise from north: both are converted here, once. Sizes and accelerations are taken where the file
-has them (`length`, `width`, `acceleration`); else sizes are the reader's arguments, and accelerations
-are differences of the speeds. SUMO writes two digits by default: `--precision 6` is worth its bytes.
+Reads XML, CSV (separated by `,` or `;`), both also gzipped, and Parquet, with SUMO's names of elements and columns
+(`timestep_time`, `vehicle_x`, `person_x`, ...) or plain ones (`time`, `id`, `x`, `y`, `angle`, `speed`). SUMO's
+positions are those of the front bumper, and its angles are degrees clockwise from north; both are converted here.
+Sizes and accelerations are read where the file has them (`length`, `width`, `acceleration`); otherwise sizes are
+arguments of the reader, and accelerations are finite differences of the speeds. SUMO writes two decimal places by
+default; `--precision 6` is recommended.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sbt.errors import InputError
-from sbt.metrics.longitudinal import FAR, HORIZON, d_min, ttc_min
+from sbt.metrics.pairwise import without_overtaking
 from sbt.plugins import load, names
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
@@ -35,8 +35,8 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
-_FASTEST = 150.0
-"""A road user whose position changes faster was taken elsewhere (m/s): it starts anew there."""
+_MAX_SPEED = 150.0
+"""A road user whose position changes faster was teleported (m/s); its trace is split there."""
 _COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width")
 _REQUIRED = ("time", "id", "x", "y", "angle", "speed")
 _KINDS = ("vehicle", "person")
@@ -46,17 +46,20 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """States of m road users, a row each at a time, sorted by road user and then by time.
+    """States of m road users, one row per road user and time step, sorted by road user and then by time.
 
     Attributes:
         names: of the road users.
-        time: (s,) the time steps of the file (s).
-        start: (m + 1,) where the rows of each road user start.
-        step: (n,) index of each row's time.
-        x, y: (n,) centre of the rectangle (m).
+        time: (s,) time steps of the file (s).
+        start: (m + 1,) index of the first row of each road user.
+        step: (n,) index of the time step of each row.
+        x: (n,) of the centre (m).
+        y: (n,) of the centre (m).
         heading: (n,) radians, counter-clockwise from +x.
-        speed, acceleration: (n,) along the heading (m/s, m/s^2).
-        length, width: (m,) size of the rectangles (m).
+        speed: (n,) along the heading (m/s).
+        acceleration: (n,) along the heading (m/s^2).
+        length: (m,) of the rectangles (m).
+        width: (m,) of the rectangles (m).
     """
 
     names: tuple[str, ...]
@@ -77,8 +80,8 @@ def read_fcd(path: Path, *, length: float = 5.0, width: float = 1.8) -> Recordin
 
     Args:
         path: `.xml`, `.xml.gz`, `.csv`, `.csv.gz` or `.parquet`.
-        length: of vehicles whose length is not in the file (m).
-        width: of vehicles whose width is not in the file (m).
+        length: of vehicles without a length in the file (m).
+        width: of vehicles without a width in the file (m).
 
     Raises:
         InputError: it cannot be read, is not FCD, or declares a document type or entities.
@@ -99,7 +102,15 @@ def read_fcd(path: Path, *, length: float = 5.0, width: float = 1.8) -> Recordin
 
 
 def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: tuple[float, float]) -> Recording:
-    """Return sorted and converted rows; (n,) `ids`, `kinds` (1: a person) and columns, NaN where there is nothing."""
+    """Return the recording with sorted and converted rows.
+
+    Args:
+        path: for messages.
+        ids: (n,) of the road users.
+        kinds: (n,) 0 for a vehicle, 1 for a person.
+        columns: (n,) numbers by name, NaN where the file has none.
+        size: length and width of vehicles without a size in the file (m).
+    """
     users, user = np.unique(np.asarray(ids, dtype=str), return_inverse=True)
     data = {name: np.asarray(values, dtype=np.float64) for name, values in columns.items()}
     for name in (*_REQUIRED[2:], "time"):
@@ -109,9 +120,9 @@ def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: 
     order = np.lexsort((step, user))
     user, step = user[order], step[order]
     data = {name: values[order] for name, values in data.items()}
-    twice = np.flatnonzero((np.diff(user) == 0) & (np.diff(step) == 0))
-    if twice.size:
-        k = int(twice[0])
+    duplicates = np.flatnonzero((np.diff(user) == 0) & (np.diff(step) == 0))
+    if duplicates.size:
+        k = int(duplicates[0])
         where = f"'{users[user[k]]}' at {time[step[k]]:g} s"
         raise InputError(f"a road user of an FCD file must be there once at a time, but in '{path}' {where} is not")
     start = np.searchsorted(user, np.arange(len(users) + 1))
@@ -132,7 +143,7 @@ def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: 
 
 
 def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
-    """Check that the road users move as far as their speeds say, at least about."""
+    """Check that the road users move about as far as their speeds imply."""
     same = np.diff(user) == 0
     moved = np.hypot(np.diff(data["x"]), np.diff(data["y"]))[same].sum()
     expected = (np.diff(data["time"]) * data["speed"][1:])[same].sum()
@@ -144,16 +155,16 @@ def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
 
 
 def _differences(speed: Vector, time: Vector, start: Integers) -> Vector:
-    """Return (n,) the rate of the speed since the row before, 0 in a road user's first row."""
+    """Return the (n,) rate of change of the speed since the previous row, 0 in the first row of a road user."""
     rate = np.zeros(len(speed))
-    gone = np.diff(time)
-    rate[1:] = np.diff(speed) / np.where(gone > 0, gone, np.inf)
+    elapsed = np.diff(time)
+    rate[1:] = np.diff(speed) / np.where(elapsed > 0, elapsed, np.inf)
     rate[start[:-1]] = 0.0
     return rate
 
 
 def _read_xml(path: Path) -> tuple[list[str], array[int], dict[str, array[float]]]:
-    """Return ids, kinds and columns of an XML file, which is never held as a whole."""
+    """Return ids, kinds and columns of an XML file, which is never in memory as a whole."""
     parser = expat.ParserCreate()
     ids: list[str] = []
     kinds: array[int] = array("b")
@@ -193,7 +204,7 @@ def _read_xml(path: Path) -> tuple[list[str], array[int], dict[str, array[float]
 
 
 def _seconds(text: str) -> float:
-    """Return a time of SUMO, which may be written as [days:]hours:minutes:seconds."""
+    """Return a time in SUMO's format, seconds or [days:]hours:minutes:seconds, in s."""
     seconds, parts = 0.0, text.split(":")
     for part, unit in zip(parts[::-1], (1.0, 60.0, 3600.0, 86400.0), strict=False):
         seconds += float(part) * unit
@@ -213,7 +224,7 @@ def _read_table(path: Path) -> tuple[Any, Any, dict[str, Any]]:
             table = pd.read_csv(path, sep=separator, dtype={"id": str, "vehicle_id": str, "person_id": str}, low_memory=False)
     except ImportError:
         raise InputError(f"reading '{path}' needs pyarrow: pip install 'sumo-sbt[parquet]'") from None
-    except (ValueError, EOFError) as error:  # what pandas and pyarrow raise for files that are none
+    except (ValueError, EOFError) as error:  # raised by pandas and pyarrow for files of another format
         raise InputError(f"an FCD file must be a table, but '{path}' cannot be read: {str(error).splitlines()[0]}") from None
     parts = []
     for kind, prefix in enumerate(("", *(f"{name}_" for name in _KINDS))):
@@ -234,13 +245,12 @@ def _read_table(path: Path) -> tuple[Any, Any, dict[str, Any]]:
 
 
 def catalogue() -> tuple[Metric, ...]:
-    """Return every installed metric, as it is meant for recorded traffic, where to have overtaken is no verdict."""
-    recorded = {m.name: m for m in (ttc_min(passed=HORIZON), d_min(passed=FAR))}
-    return tuple(recorded.get(name) or load("metrics", name) for name in names("metrics"))
+    """Return all installed metrics for recorded traffic."""
+    return tuple(without_overtaking(load("metrics", name)) for name in names("metrics"))
 
 
 def near_pairs(recording: Recording, within: float) -> list[tuple[int, int]]:
-    """Return the pairs of road users whose centres are at some time at most `within` apart (m), sorted."""
+    """Return the sorted pairs of road users whose centres come within a distance of each other (m) at some time."""
     m = len(recording.names)
     user = np.repeat(np.arange(m), np.diff(recording.start))
     order = np.argsort(recording.step, kind="stable")
@@ -256,10 +266,10 @@ def near_pairs(recording: Recording, within: float) -> list[tuple[int, int]]:
 
 
 def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
-    """Yield a trace of the actors `ego` and `co` for every stretch of time steps at which both are there.
+    """Yield a trace of the actors `ego` and `co` for every interval in which both are present.
 
-    A stretch ends where a time step of the file lacks one of them, or where one was taken elsewhere. Its
-    time starts at the file's.
+    An interval ends where a time step of the file lacks one of them, or where one of them was teleported. Times are
+    those of the file.
     """
     spans = [slice(recording.start[k], recording.start[k + 1]) for k in (ego, other)]
     step_ego, step_other = (recording.step[s] for s in spans)
@@ -267,7 +277,7 @@ def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
     rows = np.stack([at_ego + spans[0].start, at_other + spans[1].start], axis=1)  # (t, 2)
     time = recording.time[steps]
     moved = np.hypot(np.diff(recording.x[rows], axis=0), np.diff(recording.y[rows], axis=0)).max(axis=1)
-    cut = (np.diff(steps) > 1) | (moved > _FASTEST * np.diff(time))
+    cut = (np.diff(steps) > 1) | (moved > _MAX_SPEED * np.diff(time))
     who = [ego, other]
     for part in np.split(np.arange(len(steps)), np.flatnonzero(cut) + 1):
         if len(part) > 1:
@@ -279,11 +289,11 @@ def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
 
 
 def encounters(recording: Recording, within: float) -> Iterator[tuple[str, str, Trace]]:
-    """Yield ego, other and trace of every pair that comes near, each of the two as ego in turn.
+    """Yield ego, other and trace of every pair that comes close, with each of the two as the ego in turn.
 
     Args:
-        recording: the traffic.
-        within: largest distance of the centres at which two matter to each other (m).
+        recording: the recorded traffic.
+        within: distance of the centres below which a pair is considered (m).
     """
     for one, two in near_pairs(recording, within):
         for ego, other in ((one, two), (two, one)):

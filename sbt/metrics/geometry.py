@@ -1,4 +1,4 @@
-"""Oriented rectangles: overlap while moving, and distance; vectorised over time."""
+"""Oriented rectangles: contact while moving, and distance; vectorised over time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace
 
 __all__ = [
-    "contact_index", "contact_share", "corners", "part", "rectangle_distance", "swept_contact", "time_to_contact",
+    "contact_index",
+    "contact_share",
+    "corners",
+    "rectangle_distance",
+    "select_instants",
+    "swept_contact",
+    "time_to_contact",
 ]  # fmt: skip
 
 
@@ -37,28 +43,27 @@ def _reach(actor: ActorTrace, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
 
 
 def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
-    """Return (t,) the share of the step before each instant after which the rectangles touch.
+    """Return (t,) the fraction of the step before each instant after which the rectangles touch; inf without a contact.
 
-    Between instants the centres move on straight lines and the headings are those at the end of the
-    step; the relative motion is tested against the separating axes, so that no crossing is missed
-    however coarse the step. inf where there is no contact; the first instant has no step before it
-    and gives 0 on overlap.
+    Between instants the centres move on straight lines, and the headings are those at the end of the step. The
+    relative motion is tested on the separating axes, so that no contact is missed, whatever the step. The first
+    instant has no step before it; its value is 0 if the rectangles overlap.
 
     Source:
-        separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
+        Separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
     """
     dx, dy = b.x - a.x, b.y - a.y
     return contact_share(a, b, np.concatenate([dx[:1], dx[:-1]]), np.concatenate([dy[:1], dy[:-1]]))
 
 
 def contact_share(a: ActorTrace, b: ActorTrace, dx: Vector, dy: Vector) -> Vector:
-    """Return (t,) the share of a step after which the rectangles touch, each step by itself; inf: they do not.
+    """Return (t,) the fraction of each of t independent steps after which the rectangles touch; inf without a contact.
 
     Args:
-        a: at the end of each step, its heading that of the whole step.
+        a: states at the end of the steps; the heading is that during the whole step.
         b: likewise.
-        dx: (t,) from a's centre to b's at the start of each step (m).
-        dy: likewise.
+        dx: (t,) x from the centre of a to that of b at the start of the steps (m).
+        dy: (t,) y, likewise (m).
     """
     cos, sin = _axes(a, b)
     reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)
@@ -70,9 +75,12 @@ def contact_share(a: ActorTrace, b: ActorTrace, dx: Vector, dy: Vector) -> Vecto
 
 
 def _overlap_span(start: np.ndarray, rate: np.ndarray, reach: np.ndarray) -> tuple[Vector, Vector]:
-    """Return (t,) when moving boxes begin and end to overlap on all four axes; begin > end: never.
+    """Return (t,) the times at which moving rectangles begin and end to overlap on all four axes; begin > end if never.
 
-    (t, 4) each: distance of the centres along each axis at time 0, its rate, and the half extents' sum.
+    Args:
+        start: (t, 4) distance of the centres along each axis at time 0.
+        rate: (t, 4) its rate of change.
+        reach: (t, 4) sum of the half extents.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         first = (-np.sign(rate) * reach - start) / rate
@@ -85,13 +93,12 @@ def _overlap_span(start: np.ndarray, rate: np.ndarray, reach: np.ndarray) -> tup
 
 
 def time_to_contact(a: ActorTrace, b: ActorTrace) -> Vector:
-    """Return (t,) the time after each instant at which the rectangles would touch (s), inf: never.
+    """Return (t,) the time from each instant until the rectangles touch at constant speeds and headings (s), inf if never.
 
-    Both go on with the speed along their heading and do not turn; 0 where they overlap. Exact: moving
-    rectangles touch once their shadows overlap on the axes of both.
+    0 where they overlap. Exact: convex bodies touch when their projections overlap on all separating axes.
 
     Source:
-        separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
+        Separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
     """
     cos, sin = _axes(a, b)
     reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)
@@ -103,21 +110,21 @@ def time_to_contact(a: ActorTrace, b: ActorTrace) -> Vector:
 
 
 def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
-    """Return the first instant at which, or in the step before which, the rectangles touch; None: never."""
+    """Return the index of the first instant at which, or in the step before which, the rectangles touch; None if never."""
     dx, dy = b.x - a.x, b.y - a.y
     reach = 0.5 * (math.hypot(a.length, a.width) + math.hypot(b.length, b.width))
     moved = max(float(np.abs(d[1:] - d[:-1]).max(initial=0.0)) for d in (dx, dy))
-    (near,) = (dx * dx + dy * dy <= (reach + 1.5 * moved) ** 2).nonzero()  # circles: the exact test only there
+    (near,) = (dx * dx + dy * dy <= (reach + 1.5 * moved) ** 2).nonzero()  # circumscribed circles first
     if near.size == 0:
         return None
     first = max(int(near[0]) - 1, 0)
     i = slice(first, int(near[-1]) + 1)
-    hits = np.flatnonzero(np.isfinite(swept_contact(part(a, i), part(b, i))))
+    hits = np.flatnonzero(np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i))))
     return first + int(hits[0]) if hits.size else None
 
 
-def part(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:
-    """Return the instants i of an actor."""
+def select_instants(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:
+    """Return an actor at some instants only."""
     return ActorTrace(actor.x[i], actor.y[i], actor.heading[i], actor.speed[i], actor.acceleration[i], actor.length, actor.width)
 
 

@@ -1,8 +1,8 @@
-"""Criticality metrics of two road users that share a path: TTC, distance, THW, DRAC, collision.
+"""Criticality metrics of two road users on the same path: TTC, gap, THW, DRAC, collision.
 
-All are measured along the ego's heading between rectangles. The other one counts as *in the path*
-while the lateral clearance between the two rectangles is below `margin`: 0 means the rectangles
-would touch, half the free width of the lane means it has crossed the marking.
+All are measured between rectangles along the ego's heading. The other road user is *in the path* while the
+lateral clearance between the two rectangles is below `margin`: with a margin of 0 the rectangles would touch,
+with half the free width of the lane the other one has crossed the lane marking.
 
 Source of the definitions unless stated: Westhofen et al. (2023), Criticality Metrics for Automated
 Driving: A Review and Suitability Analysis of the State of the Art, doi 10.1007/s11831-022-09788-7.
@@ -22,33 +22,35 @@ from sbt.problem.trace import Trace
 
 __all__ = [
     "BESIDE", "DRAC_LIMIT", "FAR", "HORIZON", "OVERTAKEN", "Encounter", "collision", "d_min", "drac_max", "encounter",
-    "first_contact", "impact_speed", "thw_min", "time_to_collision", "ttc_min",
+    "first_contact", "impact_speed", "longitudinal_metrics", "relative_speed_at_contact", "thw_min", "time_to_collision",
+    "ttc_min",
 ]  # fmt: skip
 
 HORIZON = 10.0
-"""TTC and THW from which on there is no interaction (s)."""
+"""TTC and THW of road users that do not interact, and the largest value reported (s)."""
 BESIDE = -5.0
-"""Smallest TTC of two that drive side by side (s)."""
+"""Smallest TTC of road users side by side (s)."""
 OVERTAKEN = -10.0
-"""TTC that says the ego had passed before the other came into its path (s)."""
+"""TTC (s) and gap (m) reported if the ego had passed the other before it entered the path."""
 FAR = 1000.0
-"""Distance of two that never share a path (m)."""
+"""Gap of road users that never share a path (m)."""
 DRAC_LIMIT = 100.0
-"""Largest DRAC reported (m/s^2); the formula has no limit as the gap closes."""
+"""Largest DRAC reported (m/s^2); the formula has no limit as the gap approaches 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Encounter:
-    """How ego and one other stand to each other over a trace, (t,) each.
+    """Relative position and motion of the ego and another road user over a trace, (t,) each.
 
     Attributes:
-        gap: from ego's front to the other's rear along ego's heading (m), negative beside or behind.
+        gap: from the ego's front to the other's rear along the ego's heading (m); negative beside or behind it.
         closing: rate at which the gap shrinks (m/s).
-        in_path: the other is in ego's path.
-        ahead, beside: it is in the path and ahead of ego's front, or level with ego.
-        speed: of ego (m/s).
-        contact: first index with contact, None without; nobody is in the path after it.
-        rear_end: the contact came from behind.
+        in_path: the other is in the ego's path; never after the first contact.
+        ahead: it is in the path and ahead of the ego's front.
+        beside: it is in the path and level with the ego.
+        speed: of the ego (m/s).
+        contact: index of the first contact, None without one.
+        rear_end: the contact is a rear-end collision of the ego.
         overtaken: at the end the ego is past the other.
     """
 
@@ -62,8 +64,8 @@ class Encounter:
     rear_end: bool
     overtaken: bool
 
-    def held(self, values: Vector, at_contact: float) -> Vector:
-        """Return (t,) values that are `at_contact` from a rear-end contact on."""
+    def after_contact(self, values: Vector, at_contact: float) -> Vector:
+        """Return the (t,) values, replaced by `at_contact` from a rear-end collision on."""
         if self.contact is None or not self.rear_end:
             return values
         return np.where(np.arange(len(values)) >= self.contact, at_contact, values)
@@ -71,13 +73,13 @@ class Encounter:
 
 @per_trace
 def first_contact(trace: Trace, ego: str, other: str) -> int | None:
-    """Return the index of the first contact of two actors, None without one; kept for the last few traces."""
+    """Return the index of the first contact of two actors, None without one."""
     return contact_index(trace.actor(ego), trace.actor(other))
 
 
 @per_trace
 def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Encounter:
-    """Return how `ego` and `other` stand to each other; kept for the last few traces."""
+    """Return the relative position and motion of two actors."""
     a, b = trace.actor(ego), trace.actor(other)
     cos, sin = np.cos(a.heading), np.sin(a.heading)
     dx, dy = b.x - a.x, b.y - a.y
@@ -87,7 +89,7 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
     in_path = offset < 0.5 * (a.width + b.width) + margin
     behind = gap <= -(a.length + b.length)
     contact = first_contact(trace, ego, other)
-    if contact is not None:  # what follows the first contact does not count
+    if contact is not None:  # nothing counts after the first contact
         in_path[contact + 1 :] = False
         behind[contact + 1 :] = behind[contact]
     ahead = in_path & (gap >= 0)
@@ -99,7 +101,7 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
 
 
 def time_to_collision(e: Encounter) -> Vector:
-    """Return the (t,) TTC along ego's heading (s); it means something where the other is in the path."""
+    """Return the (t,) time to collision along the ego's heading (s); meaningful where the other is in the path."""
     closes = e.closing > 0
     ratio = e.gap / np.where(closes, e.closing, np.inf)
     ttc = np.where(closes, np.minimum(ratio, HORIZON), HORIZON)
@@ -119,10 +121,10 @@ def _ttc_min(trace: Trace, ego: str, other: str, margin: float, passed: float) -
 
 
 def ttc_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: float = OVERTAKEN) -> Metric:
-    """Return the smallest time to collision along ego's heading (s).
+    """Return the smallest time to collision along the ego's heading (s).
 
-    0 for a rear-end collision; in [-5, 0) where the other comes into the path beside ego; `passed` where
-    ego had passed it by then; 10 where they do not close in, or take longer than that to.
+    0 for a rear-end collision, in [-5, 0) if the other enters the path beside the ego, `passed` if the ego
+    had passed it before, and 10 if the gap does not shrink or the time is longer.
     """
     return Metric(
         "ttc_min", lambda trace: _ttc_min(trace, ego, other, margin, passed), "s", "low", HORIZON,
@@ -141,10 +143,10 @@ def _d_min(trace: Trace, ego: str, other: str, margin: float, passed: float) -> 
 
 
 def d_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: float = OVERTAKEN) -> Metric:
-    """Return the smallest gap along ego's heading while the other is in the path (m).
+    """Return the smallest gap along the ego's heading while the other is in the path (m).
 
-    0 for a rear-end collision, negative beside, `passed` where ego had passed before, 1,000 without a
-    shared path.
+    0 for a rear-end collision, negative beside the ego, `passed` if the ego had passed the other before it
+    entered the path, and 1,000 without a shared path.
     """
     return Metric(
         "d_min", lambda trace: _d_min(trace, ego, other, margin, passed), "m", "low", FAR,
@@ -178,7 +180,7 @@ def _drac_max(trace: Trace, ego: str, other: str, margin: float) -> float:
 
 
 def drac_max(ego: str = "ego", other: str = "co", margin: float = 0.0) -> Metric:
-    """Return the largest deceleration rate to avoid a crash (m/s^2), 0 without closing in, at most 100."""
+    """Return the largest deceleration rate to avoid a crash (m/s^2), 0 if the gap does not shrink, at most 100."""
     return Metric(
         "drac_max", lambda trace: _drac_max(trace, ego, other, margin), "m/s^2", "high", 0.0,
         "largest constant deceleration that would just avoid the collision",
@@ -187,7 +189,7 @@ def drac_max(ego: str = "ego", other: str = "co", margin: float = 0.0) -> Metric
 
 
 def collision(ego: str = "ego") -> Metric:
-    """Return 1 where ego's rectangle touches another's at any time, steps in between included, else 0."""
+    """Return 1 if the ego's rectangle touches another one, at or between the recorded instants, else 0."""
 
     def function(trace: Trace) -> float:
         return float(any(first_contact(trace, ego, other) is not None for other in trace.actors if other != ego))
@@ -195,19 +197,35 @@ def collision(ego: str = "ego") -> Metric:
     return Metric("collision", function, "", "high", 0.0, "the ego's rectangle touched another one")
 
 
+def relative_speed_at_contact(trace: Trace, ego: str, other: str) -> float:
+    """Return the relative speed of two actors at their first contact (m/s), 0 without one."""
+    k = first_contact(trace, ego, other)
+    if k is None:
+        return 0.0
+    a, b = trace.actor(ego), trace.actor(other)
+    dx = a.speed[k] * np.cos(a.heading[k]) - b.speed[k] * np.cos(b.heading[k])
+    dy = a.speed[k] * np.sin(a.heading[k]) - b.speed[k] * np.sin(b.heading[k])
+    return float(np.hypot(dx, dy))
+
+
 def impact_speed(ego: str = "ego", other: str = "co") -> Metric:
-    """Return the speed of ego relative to the other at the first contact (m/s), 0 without one."""
+    """Return the relative speed at the first contact (m/s), 0 without one."""
+    return Metric(
+        "impact_speed", lambda trace: relative_speed_at_contact(trace, ego, other), "m/s", "high", 0.0,
+        "relative speed at the first contact",
+    )  # fmt: skip
 
-    def function(trace: Trace) -> float:
-        k = first_contact(trace, ego, other)
-        if k is None:
-            return 0.0
-        a, b = trace.actor(ego), trace.actor(other)
-        dx = a.speed[k] * np.cos(a.heading[k]) - b.speed[k] * np.cos(b.heading[k])
-        dy = a.speed[k] * np.sin(a.heading[k]) - b.speed[k] * np.sin(b.heading[k])
-        return float(np.hypot(dx, dy))
 
-    return Metric("impact_speed", function, "m/s", "high", 0.0, "relative speed at the first contact")
+def longitudinal_metrics(margin: float = 0.0) -> tuple[Metric, ...]:
+    """Return the metrics of this module for the actors `ego` and `co`, with a margin of the path (m)."""
+    return (
+        ttc_min(margin=margin),
+        d_min(margin=margin),
+        collision(),
+        impact_speed(),
+        thw_min(margin=margin),
+        drac_max(margin=margin),
+    )
 
 
 TTC_MIN = ttc_min()

@@ -1,7 +1,7 @@
-"""Time to collision along the paths that were driven: for roads that bend and turn, where straight courses mislead.
+"""Time to collision along the paths that were driven: for bends and turns, where straight extrapolation misleads.
 
-On a ring or in a turn the headings of two that never come near each other point at one another all the
-time. Here both are taken to go on along their own recorded paths at the speeds they have; only the speeds are extrapolated.
+On a roundabout or in a turn, road users that never come close may point at each other all the time. Here both are
+assumed to follow their own recorded paths; only their speeds are extrapolated.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from sbt.problem.trace import ActorTrace, Trace
 __all__ = ["HORIZON", "ttc_on_paths"]
 
 HORIZON = 5.0
-"""Time to collision from which on there is no interaction (s)."""
+"""Time to collision of road users that do not interact, and the largest value reported (s)."""
 _STEP = 0.2
-"""Grid of the look ahead (s); between its instants centres move on straight lines and contacts are found exactly."""
+"""Step of the prediction (s); in between, centres move on straight lines and contacts are found exactly."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Ahead:
-    """Where one actor would be: (t, k) positions and headings for k instants after each of t."""
+class _Prediction:
+    """Predicted positions and headings of one actor, (t, k): at k times after each of t instants."""
 
     x: np.ndarray
     y: np.ndarray
@@ -33,9 +33,9 @@ class _Ahead:
 
 
 def ttc_on_paths(trace: Trace, ego: str = "ego", other: str = "co") -> Vector:
-    """Return the (t,) time until the rectangles touch if both follow their recorded paths at their present speeds (s).
+    """Return the (t,) time until the rectangles touch if both follow their recorded paths at their current speeds (s).
 
-    At most 5 s; 0 at a contact. Past the end of its path an actor goes straight on.
+    At most 5 s, and 0 from the first contact on. Beyond the end of its path an actor goes straight ahead.
     """
     a, b = trace.actor(ego), trace.actor(other)
     after = np.arange(0.0, HORIZON + 0.5 * _STEP, _STEP)
@@ -44,11 +44,11 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str = "co") -> Vector:
     farthest = HORIZON * (np.abs(a.speed) + np.abs(b.speed)) + reach
     near = np.flatnonzero(np.hypot(b.x - a.x, b.y - a.y) <= farthest)
     if near.size:
-        p, q = _ahead(a, near, after), _ahead(b, near, after)
+        p, q = _predict(a, near, after), _predict(b, near, after)
         dx, dy = q.x - p.x, q.y - p.y  # (t, k)
         moved = np.hypot(np.diff(dx, axis=1), np.diff(dy, axis=1))
-        rows, steps = np.nonzero(np.hypot(dx[:, 1:], dy[:, 1:]) <= reach + moved)  # circles: the exact test only there
-        share = contact_share(_picked(a, p, rows, steps + 1), _picked(b, q, rows, steps + 1), dx[rows, steps], dy[rows, steps])
+        rows, steps = np.nonzero(np.hypot(dx[:, 1:], dy[:, 1:]) <= reach + moved)  # circumscribed circles first
+        share = contact_share(_states(a, p, rows, steps + 1), _states(b, q, rows, steps + 1), dx[rows, steps], dy[rows, steps])
         np.minimum.at(times, near[rows], _STEP * (steps + share))
     contact = first_contact(trace, ego, other)
     if contact is not None:
@@ -56,21 +56,21 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str = "co") -> Vector:
     return np.minimum(times, HORIZON)
 
 
-def _ahead(actor: ActorTrace, rows: np.ndarray, after: Vector) -> _Ahead:
-    """Return where the actor would be so long after each of these instants."""
+def _predict(actor: ActorTrace, rows: np.ndarray, after: Vector) -> _Prediction:
+    """Return the prediction for the times `after` (s) each of the instants `rows`."""
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(actor.x), np.diff(actor.y)))])
     heading = np.unwrap(actor.heading)
-    asked = way[rows, None] + actor.speed[rows, None] * after
-    beyond = np.maximum(asked - way[-1], 0.0)
-    return _Ahead(
-        np.interp(asked, way, actor.x) + beyond * np.cos(heading[-1]),
-        np.interp(asked, way, actor.y) + beyond * np.sin(heading[-1]),
-        np.interp(asked, way, heading),
+    travelled = way[rows, None] + actor.speed[rows, None] * after
+    beyond = np.maximum(travelled - way[-1], 0.0)
+    return _Prediction(
+        np.interp(travelled, way, actor.x) + beyond * np.cos(heading[-1]),
+        np.interp(travelled, way, actor.y) + beyond * np.sin(heading[-1]),
+        np.interp(travelled, way, heading),
     )
 
 
-def _picked(actor: ActorTrace, ahead: _Ahead, rows: np.ndarray, steps: np.ndarray) -> ActorTrace:
-    """Return the states at some of the instants ahead, one behind the other."""
+def _states(actor: ActorTrace, prediction: _Prediction, rows: np.ndarray, steps: np.ndarray) -> ActorTrace:
+    """Return the predicted states at the given rows and steps, one after another."""
     still = np.zeros(len(rows))
-    x, y, heading = (field[rows, steps] for field in (ahead.x, ahead.y, ahead.heading))
+    x, y, heading = (field[rows, steps] for field in (prediction.x, prediction.y, prediction.heading))
     return ActorTrace(x, y, heading, still, still, actor.length, actor.width)

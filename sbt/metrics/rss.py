@@ -1,16 +1,17 @@
-"""Responsibility-Sensitive Safety: safe distances lengthwise and sideways, and their violation.
+"""Responsibility-Sensitive Safety (RSS): safe longitudinal and lateral distances, and their violation.
 
 Source: Shalev-Shwartz, Shammah and Shashua (2017), On a formal model of safe and scalable self-driving
 cars, arXiv 1708.06374: the safe longitudinal distances in the same and in opposite directions, the
 safe lateral distance, and the dangerous situation, where both are violated.
 
-Measured in ego's frame, for road users in about the same or the opposite direction (within 45 degrees);
-crossing traffic, for which RSS needs the right of way, is not judged. Lengthwise the duty is that of
-the one behind: there is nothing to violate for ego where the other is wholly behind it.
+Measured in the ego's frame, for road users in about the same or the opposite direction (within 45 degrees).
+Crossing traffic is not assessed, because RSS would need the right of way. The longitudinal distance is the duty of
+the road user behind: the ego cannot violate it where the other is completely behind it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -25,25 +26,26 @@ from sbt.problem.trace import Trace
 __all__ = ["Rss", "lateral_margin", "longitudinal_margin", "rss_lateral_min", "rss_longitudinal_min", "rss_violation"]
 
 _SOURCE = "Shalev-Shwartz, Shammah and Shashua (2017), arXiv 1708.06374"
-_ALIGNED = np.cos(np.pi / 4)
+_MIN_COS = np.cos(np.pi / 4)
+"""Of the angle between the courses of road users that are assessed."""
 
 
 @dataclass(frozen=True)
 class Rss:
-    """The constants of RSS, which the paper leaves to the regulator; these are this package's choice.
+    """The parameters of RSS, which the paper leaves to the regulator; the defaults are the choice of this package.
 
     Args:
         response: response time (s).
         acceleration: largest acceleration during the response time (m/s^2).
-        braking: deceleration at least applied after it (m/s^2).
-        hard_braking: deceleration at most applied by the one ahead (m/s^2).
-        correct_braking: deceleration at least applied by the one in its own lane, towards oncoming traffic (m/s^2).
-        lateral_acceleration: largest acceleration to the side during the response time (m/s^2).
-        lateral_braking: deceleration to the side at least applied after it (m/s^2).
-        lateral_margin: distance that is kept sideways at least, mu of the paper (m).
+        braking: smallest deceleration after the response time (m/s^2).
+        hard_braking: largest deceleration of the road user ahead (m/s^2).
+        correct_braking: smallest deceleration of a road user in its own lane towards oncoming traffic (m/s^2).
+        lateral_acceleration: largest lateral acceleration during the response time (m/s^2).
+        lateral_braking: smallest lateral deceleration after it (m/s^2).
+        lateral_margin: smallest lateral distance, mu of the paper (m).
 
     Raises:
-        InputError: a negative constant, or a deceleration of 0.
+        InputError: a parameter is negative, or a deceleration is 0.
     """
 
     response: float = 1.0
@@ -58,18 +60,18 @@ class Rss:
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
-            above = "braking" in entry.name
-            if not (0 < value < np.inf or (value == 0 and not above)):
-                raise InputError(f"rss.{entry.name} must be {'> 0' if above else '>= 0'} and finite, but got {value}")
+            positive = "braking" in entry.name
+            if not (0 < value < np.inf or (value == 0 and not positive)):
+                raise InputError(f"rss.{entry.name} must be {'> 0' if positive else '>= 0'} and finite, but got {value}")
 
     def same_direction(self, rear: Vector, front: Vector) -> Vector:
-        """Return the (t,) safe distance between two in one direction (m), from their speeds >= 0 (m/s)."""
+        """Return the (t,) safe distance of road users in the same direction (m), from their speeds >= 0 (m/s)."""
         fastest = rear + self.response * self.acceleration
         covered = rear * self.response + 0.5 * self.acceleration * self.response**2 + fastest**2 / (2 * self.braking)
         return np.maximum(covered - front**2 / (2 * self.hard_braking), 0.0)
 
     def opposite_direction(self, own: Vector, oncoming: Vector) -> Vector:
-        """Return the (t,) safe distance between two that meet (m); `own` is in its lane, speeds >= 0 (m/s)."""
+        """Return the (t,) safe distance of oncoming road users (m), from their speeds >= 0 (m/s); `own` is in its own lane."""
 
         def covered(speed: Vector, braking: float) -> Vector:
             fastest = speed + self.response * self.acceleration
@@ -80,11 +82,11 @@ class Rss:
     def sideways(self, towards: Vector, away: Vector) -> Vector:
         """Return the (t,) safe lateral distance (m).
 
-        A speed that is apart after the response time is not counted on: that one may stop at once.
+        A lateral motion apart after the response time is not relied on, as it may end at once.
 
         Args:
-            towards: (t,) lateral speed of the one, positive towards the other (m/s).
-            away: (t,) lateral speed of the other in the same direction, so positive away from the one (m/s).
+            towards: (t,) lateral speed of one road user, positive towards the other (m/s).
+            away: (t,) lateral speed of the other in the same direction, positive away from the first (m/s).
         """
         change = self.response * self.lateral_acceleration
         one, two = towards + change, away - change  # after the response time
@@ -98,7 +100,7 @@ DEFAULT = Rss()
 
 @dataclass(frozen=True, eq=False)
 class _Relation:
-    """Where the other is in ego's frame, (t,) each: `gap` < 0 while level, `clearance` < 0 while in ego's path."""
+    """Position of the other in the ego's frame, (t,) each: `gap` < 0 while level, `clearance` < 0 while in the path."""
 
     gap: Vector
     clearance: Vector
@@ -119,60 +121,58 @@ def _relation(trace: Trace, ego: str, other: str) -> _Relation:
 
 
 def longitudinal_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
-    """Return the (t,) distance lengthwise less the safe one (m), 1,000 where ego has no duty, wherever the other is sideways."""
+    """Return the (t,) longitudinal distance minus the safe one (m), at any lateral position; 1,000 where the ego has no duty."""
     r, own = _relation(trace, ego, other), trace.actor(ego).speed
     cos = np.cos(r.turn)
     along = np.abs(trace.actor(other).speed * cos)
     same = rules.same_direction(np.where(r.ahead, own, along), np.where(r.ahead, along, own))
     safe = np.where(cos > 0, same, rules.opposite_direction(own, along))
-    judged = (np.abs(cos) >= _ALIGNED) & (r.ahead | (r.gap < 0))
-    return np.where(judged, np.minimum(r.gap - safe, FAR), FAR)
+    assessed = (np.abs(cos) >= _MIN_COS) & (r.ahead | (r.gap < 0))
+    return np.where(assessed, np.minimum(r.gap - safe, FAR), FAR)
 
 
 def lateral_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
-    """Return the (t,) distance sideways less the safe one (m), at most 1,000, wherever the other is lengthwise."""
+    """Return the (t,) lateral distance minus the safe one (m), at any longitudinal position; at most 1,000."""
     r = _relation(trace, ego, other)
     leftwards = trace.actor(other).speed * np.sin(r.turn)
     safe = rules.sideways(np.zeros(len(trace.time)), np.where(r.left, leftwards, -leftwards))
-    return np.where(np.abs(np.cos(r.turn)) >= _ALIGNED, np.minimum(r.clearance - safe, FAR), FAR)
+    return np.where(np.abs(np.cos(r.turn)) >= _MIN_COS, np.minimum(r.clearance - safe, FAR), FAR)
 
 
-def _worst(values: Vector, where: Mask) -> float:
-    return float(values[where].min()) if where.any() else FAR
+def _smallest(name: str, margin: Callable[[Trace], Vector], where: Callable[[Trace], Mask], description: str) -> Metric:
+    """Return the smallest margin at the instants where a condition holds as a metric."""
+
+    def function(trace: Trace) -> float:
+        instants = where(trace)
+        return float(margin(trace)[instants].min()) if instants.any() else FAR
+
+    return Metric(name, function, "m", "low", FAR, description, _SOURCE)
 
 
 def rss_longitudinal_min(ego: str = "ego", other: str = "co", margin: float = 0.0, rules: Rss = DEFAULT) -> Metric:
-    """Return the smallest distance lengthwise less the safe one while the other is in ego's path (m)."""
-
-    def function(trace: Trace) -> float:
-        in_path = _relation(trace, ego, other).clearance < margin
-        return _worst(longitudinal_margin(trace, ego, other, rules=rules), in_path)
-
-    return Metric(
-        "rss_longitudinal_min", function, "m", "low", FAR,
-        "smallest gap less the safe longitudinal distance of RSS, while the other is in the ego's path", _SOURCE,
+    """Return the smallest longitudinal distance minus the safe one while the other is in the ego's path (m)."""
+    return _smallest(
+        "rss_longitudinal_min", lambda trace: longitudinal_margin(trace, ego, other, rules=rules),
+        lambda trace: _relation(trace, ego, other).clearance < margin,
+        "smallest gap less the safe longitudinal distance of RSS, while the other is in the ego's path",
     )  # fmt: skip
 
 
 def rss_lateral_min(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -> Metric:
-    """Return the smallest distance sideways less the safe one while the two are level (m)."""
-
-    def function(trace: Trace) -> float:
-        level = _relation(trace, ego, other).gap < 0
-        return _worst(lateral_margin(trace, ego, other, rules=rules), level)
-
-    return Metric(
-        "rss_lateral_min", function, "m", "low", FAR,
-        "smallest lateral clearance less the safe lateral distance of RSS, while the two are level", _SOURCE,
+    """Return the smallest lateral distance minus the safe one while the two are level (m)."""
+    return _smallest(
+        "rss_lateral_min", lambda trace: lateral_margin(trace, ego, other, rules=rules),
+        lambda trace: _relation(trace, ego, other).gap < 0,
+        "smallest lateral clearance less the safe lateral distance of RSS, while the two are level",
     )  # fmt: skip
 
 
 def rss_violation(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -> Metric:
-    """Return for how long both safe distances are violated (s), the dangerous situation of RSS, until a collision."""
+    """Return the time during which both safe distances are violated (s), the dangerous situation of RSS, until a collision."""
 
     def function(trace: Trace) -> float:
-        lengthwise = longitudinal_margin(trace, ego, other, rules=rules)
-        dangerous = (lengthwise < 0) & (lateral_margin(trace, ego, other, rules=rules) < 0)
+        longitudinal = longitudinal_margin(trace, ego, other, rules=rules)
+        dangerous = (longitudinal < 0) & (lateral_margin(trace, ego, other, rules=rules) < 0)
         return integral(trace, dangerous, ego, other)
 
     return Metric(

@@ -1,29 +1,28 @@
-"""Named signals of a trace: what is measured at every instant, (t,) numbers, all finite.
+"""Named signals of a trace: quantities at every instant, (t,) finite numbers.
 
-They are what the scalar metrics take the worst of, and what formulas of `sbt.metrics.stl` speak about.
-Where nothing is there to measure a signal takes its value without an interaction; from a rear-end
-collision on it keeps the value of that collision.
+Scalar metrics are their worst values, and formulas of `sbt.metrics.stl` refer to them. Without an interaction
+a signal has a fixed value; from a rear-end collision on it keeps the value at that collision.
 
-Of ego and the other road user:
+Of the ego and the other road user:
 
-    gap              m      from ego's front to the other's rear along ego's heading; 1,000 where not in the path
-    ttc              s      time to collision along ego's heading, at most 10; negative beside
+    gap              m      from the ego's front to the other's rear along the ego's heading; 1,000 if not in the path
+    ttc              s      time to collision along the ego's heading, at most 10; negative beside
     thw              s      time headway, at most 10
     mttc             s      time to collision at constant accelerations, at most 10
-    drac             m/s^2  deceleration that avoids the collision, 0 without closing in, at most 100
+    drac             m/s^2  deceleration that avoids the collision, 0 if the gap does not shrink, at most 100
     mdrac            m/s^2  the same after a reaction time of 1 s
-    btn              -      brake threat number: deceleration needed by deceleration possible (8 m/s^2)
+    btn              -      brake threat number: required deceleration divided by 8 m/s^2
     ttc2d            s      time until the two moving rectangles touch, at most 10
     distance         m      between the rectangles, at most 1,000
     closing          m/s    rate at which the gap shrinks
-    lateral          m      of the other's centre from ego's centre line, positive to ego's left
-    rss_longitudinal m      gap less the safe distance of RSS, at most 1,000
-    rss_lateral      m      lateral clearance less the safe distance of RSS, at most 1,000
+    lateral          m      offset of the other's centre from the ego's centre line, positive to the left
+    rss_longitudinal m      gap minus the safe distance of RSS, at most 1,000
+    rss_lateral      m      lateral clearance minus the safe distance of RSS, at most 1,000
 
 Of one road user: `speed` (m/s), `acceleration` (m/s^2), `jerk` (m/s^3), `x`, `y` (m), `heading` (rad).
 And `time` (s).
 
-A bare name is ego's own, or of ego and the other; `NAME.speed` is of the actor NAME, `NAME.gap` of ego and NAME.
+A bare name refers to the ego, or to the ego and the other; `NAME.speed` to the actor NAME, `NAME.gap` to the ego and NAME.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.braking import btn, drac, mdrac, mttc
 from sbt.metrics.comfort import jerk
-from sbt.metrics.conflict import distance, ttc_2d
 from sbt.metrics.longitudinal import FAR, HORIZON, encounter, time_to_collision
+from sbt.metrics.planar import distance, ttc_2d
 from sbt.metrics.rss import lateral_margin, longitudinal_margin
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, Trace
@@ -45,30 +44,30 @@ __all__ = ["ACTOR_SIGNALS", "PAIR_SIGNALS", "check_signal", "signal"]
 
 
 def gap(trace: Trace, ego: str, other: str, margin: float) -> Vector:
-    """Return the (t,) gap while the other is in ego's path (m)."""
+    """Return the (t,) gap while the other is in the ego's path (m)."""
     e = encounter(trace, ego, other, margin)
-    return e.held(np.where(e.ahead | e.beside, np.minimum(e.gap, FAR), FAR), 0.0)
+    return e.after_contact(np.where(e.ahead | e.beside, np.minimum(e.gap, FAR), FAR), 0.0)
 
 
 def ttc(trace: Trace, ego: str, other: str, margin: float) -> Vector:
-    """Return the (t,) time to collision along ego's heading (s)."""
+    """Return the (t,) time to collision along the ego's heading (s)."""
     e = encounter(trace, ego, other, margin)
-    return e.held(np.where(e.ahead | e.beside, time_to_collision(e), HORIZON), 0.0)
+    return e.after_contact(np.where(e.ahead | e.beside, time_to_collision(e), HORIZON), 0.0)
 
 
 def thw(trace: Trace, ego: str, other: str, margin: float) -> Vector:
     """Return the (t,) time headway (s)."""
     e = encounter(trace, ego, other, margin)
-    return e.held(np.where(e.ahead, np.minimum(e.gap / np.maximum(e.speed, 1e-3), HORIZON), HORIZON), 0.0)
+    return e.after_contact(np.where(e.ahead, np.minimum(e.gap / np.maximum(e.speed, 1e-3), HORIZON), HORIZON), 0.0)
 
 
 def closing(trace: Trace, ego: str, other: str, margin: float) -> Vector:
-    """Return the (t,) rate at which the gap shrinks (m/s), whether the other is in the path or not."""
+    """Return the (t,) rate at which the gap shrinks (m/s), also while the other is not in the path."""
     return encounter(trace, ego, other, margin).closing
 
 
 def lateral(trace: Trace, ego: str, other: str, margin: float) -> Vector:
-    """Return the (t,) offset of the other's centre to the left of ego's centre line (m)."""
+    """Return the (t,) offset of the other's centre to the left of the ego's centre line (m)."""
     a, b = trace.actor(ego), trace.actor(other)
     return np.cos(a.heading) * (b.y - a.y) - np.sin(a.heading) * (b.x - a.x)
 
@@ -78,7 +77,7 @@ PAIR_SIGNALS: dict[str, Callable[[Trace, str, str, float], Vector]] = {
     "distance": distance, "closing": closing, "lateral": lateral,
     "rss_longitudinal": longitudinal_margin, "rss_lateral": lateral_margin,
 }  # fmt: skip
-"""Name to function of trace, ego, other and the margin of the path."""
+"""Signals of two actors: name to a function of trace, ego, other and the margin of the path."""
 
 ACTOR_SIGNALS: dict[str, Callable[[ActorTrace, Vector], Vector]] = {
     "speed": lambda actor, time: actor.speed,
@@ -88,14 +87,14 @@ ACTOR_SIGNALS: dict[str, Callable[[ActorTrace, Vector], Vector]] = {
     "y": lambda actor, time: actor.y,
     "heading": lambda actor, time: actor.heading,
 }
-"""Name to function of an actor and the times."""
+"""Signals of one actor: name to a function of the actor and the times."""
 
 
 def check_signal(name: str) -> None:
-    """Check that there is a signal of this name; whether there is the actor only a trace can tell.
+    """Check that a signal of this name exists; the actor can be checked in a trace only.
 
     Raises:
-        InputError: there is none.
+        InputError: it does not.
     """
     actor, dot, what = name.rpartition(".")
     if name == "time" or what in ACTOR_SIGNALS or what in PAIR_SIGNALS:
@@ -112,8 +111,8 @@ def signal(trace: Trace, name: str, ego: str = "ego", other: str = "co", margin:
         trace: t instants.
         name: as listed above, bare or `actor.name`.
         ego: the road user under test.
-        other: the one a bare name of two road users speaks of.
-        margin: lateral clearance below which the other is in ego's path (m).
+        other: the other road user of a bare name of two.
+        margin: lateral clearance below which the other is in the ego's path (m).
 
     Returns:
         (t,) numbers.

@@ -1,4 +1,4 @@
-"""The grammar of `sbt.metrics.stl`: text to a formula, with the column of every mistake.
+"""Parser of `sbt.metrics.stl`: from text to a formula; errors point at the column.
 
     implication = or { "->" implication }
     or          = and { "or" and }
@@ -11,7 +11,7 @@
     sign        = "-" sign | number | signal | "(" implication ")"
     bounds      = "[" number "," (number | "inf") "]"
 
-Arithmetic wants numbers and signals, logic wants comparisons: a mixture is refused.
+Arithmetic applies to numbers and signals, logic to comparisons; mixtures are refused.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _TOKEN = re.compile(
 )
 _WORDS = ("and", "or", "not", "G", "F", "U", "inf")
 _COMPARISONS = (">", ">=", "<", "<=")
-_LONGEST = 1000
-_DEEPEST = 40
-"""Parentheses and prefixes within one another; a formula of people has three."""
+_MAX_TOKENS = 1000
+_MAX_DEPTH = 40
+"""Nested parentheses and prefix operators: far more than in practice, and far below the recursion limit."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Unary:
-    """`neg` of a number; `not`, `G`, `F` of a formula, the last two over [low, high] (s)."""
+    """`neg` of a number; `not`, `G` or `F` of a formula, the last two over [low, high] (s)."""
 
     op: str
     of: Term
@@ -76,19 +76,19 @@ Term = Number | Signal | Unary | Binary
 
 
 def is_formula(term: Term) -> bool:
-    """Return whether a term is true or false, rather than a number."""
+    """Return whether a term is logical, rather than numeric."""
     return isinstance(term, Unary | Binary) and term.op not in ("neg", "+", "-", "*", "/")
 
 
 def parse(text: str, check: Callable[[str], None] = lambda name: None) -> Term:
-    """Return the formula that a text means.
+    """Return the formula that a text represents.
 
     Args:
-        text: as in `G[0,20](gap > 2 and ttc > 1.5)`.
-        check: raises `InputError` for a name that is no signal.
+        text: such as `G[0,20](gap > 2 and ttc > 1.5)`.
+        check: raises an `InputError` for a name that is not a signal.
 
     Raises:
-        InputError: the text is no formula; the message points at the column.
+        InputError: the text is not a formula; the message points at the column.
     """
     parser = _Parser(text, check)
     term = parser.implication()
@@ -97,7 +97,7 @@ def parse(text: str, check: Callable[[str], None] = lambda name: None) -> Term:
 
 
 class _Parser:
-    """Recursive descent over the tokens (kind, text, column from 0)."""
+    """Recursive descent parser; tokens are (kind, text, column from 0)."""
 
     def __init__(self, text: str, check: Callable[[str], None]):
         self._text = text
@@ -116,8 +116,8 @@ class _Parser:
             kind = str(match.lastgroup)
             tokens.append((kind, match[kind], match.start(kind)))
             at = match.end()
-            if len(tokens) > _LONGEST:
-                self._fail(match.start(kind), f"a formula must have at most {_LONGEST} words and marks")
+            if len(tokens) > _MAX_TOKENS:
+                self._fail(match.start(kind), f"a formula must have at most {_MAX_TOKENS} words and marks")
         return [*tokens, ("end", "the end", end)]
 
     def _fail(self, column: int, why: str) -> NoReturn:
@@ -155,7 +155,7 @@ class _Parser:
         return self._tokens[self._at][2]
 
     def _chain(self, ops: tuple[str, ...], part: Callable[[], Term], ensure: Callable[[Term, int, str], Term]) -> Term:
-        """Return left-associative operations of one rank."""
+        """Parse left-associative operators of equal precedence."""
         start = self._column()
         term = part()
         while self._peek() in ops:
@@ -166,9 +166,9 @@ class _Parser:
         return term
 
     def implication(self) -> Term:
-        self._depth += 1
-        if self._depth > _DEEPEST:
-            self._fail(self._column(), f"formulas must be nested at most {_DEEPEST} deep")
+        return self._nested(self._implication)
+
+    def _implication(self) -> Term:
         start = self._column()
         term = self._chain(("or",), self._and, self.formula)
         if self._peek() == "->":
@@ -176,7 +176,6 @@ class _Parser:
             self.formula(term, start, "left of '->'")
             start = self._column()
             term = Binary("->", term, self.formula(self.implication(), start, "right of '->'"))
-        self._depth -= 1
         return term
 
     def _and(self) -> Term:
@@ -204,8 +203,8 @@ class _Parser:
 
     def _nested(self, part: Callable[[], Term]) -> Term:
         self._depth += 1
-        if self._depth > _DEEPEST:
-            self._fail(self._column(), f"formulas must be nested at most {_DEEPEST} deep")
+        if self._depth > _MAX_DEPTH:
+            self._fail(self._column(), f"formulas must be nested at most {_MAX_DEPTH} deep")
         term = part()
         self._depth -= 1
         return term

@@ -1,6 +1,6 @@
-"""Criticality metrics of the ego among many: the worst over all other actors, whoever they are.
+"""Criticality metrics of the ego among any number of road users: the worst over all of them.
 
-A run with background traffic has other actors every time; these metrics name none of them.
+Runs with background traffic have different actors every time; these metrics refer to none of them by name.
 """
 
 from __future__ import annotations
@@ -9,21 +9,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sbt.metrics.conflict import distance, time_behind
-from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, impact_speed
-from sbt.metrics.paths import HORIZON as CONFLICT
+from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
+from sbt.metrics.paths import HORIZON as PATH_HORIZON
 from sbt.metrics.paths import ttc_on_paths
+from sbt.metrics.planar import distance, time_behind
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
-__all__ = ["nearest_distance", "nearest_ttc", "others_braking", "struck", "struck_speed", "time_left"]
+__all__ = ["any_collision", "any_impact_speed", "nearest_distance", "others_braking_max", "pet_ego_first", "ttc_path_min"]
 
 Pairwise = Callable[[Trace, str, str], float]
 
 
-def _over_all(pairwise: Pairwise, ego: str, worst: Callable[[list[float]], float], without: float) -> Callable[[Trace], float]:
-    """Return the worst of a pairwise metric over all other actors, `without` where there are none."""
+def _over_others(pairwise: Pairwise, ego: str, worst: Callable[[list[float]], float], without: float) -> Callable[[Trace], float]:
+    """Return the worst of a pairwise metric over all other actors; `without` if there are none."""
 
     def function(trace: Trace) -> float:
         values = [pairwise(trace, ego, other) for other in trace.actors if other != ego]
@@ -32,42 +32,43 @@ def _over_all(pairwise: Pairwise, ego: str, worst: Callable[[list[float]], float
     return function
 
 
-def nearest_ttc(ego: str = "ego") -> Metric:
-    """Return the smallest time to collision with anyone along the paths driven (s): 0 for a collision, 5 without a conflict."""
+def ttc_path_min(ego: str = "ego") -> Metric:
+    """Return the smallest time to collision with any road user along the paths driven (s), 0 for a collision, at most 5."""
 
     def over_time(trace: Trace) -> Vector:
-        times = np.full(len(trace.time), CONFLICT)
+        times = np.full(len(trace.time), PATH_HORIZON)
         for other in trace.actors:
             if other != ego:
                 np.minimum(times, ttc_on_paths(trace, ego, other), out=times)
         return times
 
     return Metric(
-        "ttc_path_min", lambda trace: float(over_time(trace).min()), "s", "low", CONFLICT,
+        "ttc_path_min", lambda trace: float(over_time(trace).min()), "s", "low", PATH_HORIZON,
         "smallest time until ego and anyone else would touch on the paths they drive at their present speeds",
         over_time=over_time,
     )  # fmt: skip
 
 
 def nearest_distance(ego: str = "ego") -> Metric:
-    """Return the smallest distance to anyone (m), 0 for a collision, at most 1,000."""
+    """Return the smallest distance to any road user (m), 0 for a collision, at most 1,000."""
     return Metric(
-        "distance_min", _over_all(lambda t, a, b: float(distance(t, a, b).min()), ego, min, FAR), "m", "low", FAR,
+        "distance_min", _over_others(lambda t, a, b: float(distance(t, a, b).min()), ego, min, FAR), "m", "low", FAR,
         "smallest distance between ego's rectangle and anyone else's",
     )  # fmt: skip
 
 
-def time_left(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float, float, float] | None = None) -> Metric:
-    """Return the smallest time after which anyone comes where ego has been (s): 0 for a collision.
+def pet_ego_first(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float, float, float] | None = None) -> Metric:
+    """Return the smallest post-encroachment time of a conflict that the ego passes first (s): 0 for a collision.
 
     Args:
-        ego: whose conflicts.
-        horizon: the value where nobody comes there by then (s); run so long after the last conflict.
-        zone: x, y and radius of a circle (m): only where ego was in it counts; None: everywhere.
+        ego: the road user under test.
+        horizon: value if no other road user follows within this time (s); runs should go on this long after the conflict.
+        zone: x, y and radius of a circle (m) in which the ego must be; None: anywhere.
     """
+
     def function(trace: Trace) -> float:
         least = horizon
-        for other in trace.actors:  # what came before need not be looked for again
+        for other in trace.actors:  # larger times than the smallest one so far are of no interest
             least = least if other == ego else time_behind(trace, ego, other, least, zone)
         return least
 
@@ -78,24 +79,24 @@ def time_left(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float, flo
     )  # fmt: skip
 
 
-def struck(ego: str = "ego") -> Metric:
-    """Return 1 where ego touched anyone, else 0."""
+def any_collision(ego: str = "ego") -> Metric:
+    """Return 1 if the ego touched any road user, else 0."""
     return Metric(
-        "collision", _over_all(lambda t, a, b: float(first_contact(t, a, b) is not None), ego, max, 0.0), "", "high", 0.0,
+        "collision", _over_others(lambda t, a, b: float(first_contact(t, a, b) is not None), ego, max, 0.0), "", "high", 0.0,
         "ego and anyone else touched",
     )  # fmt: skip
 
 
-def struck_speed(ego: str = "ego") -> Metric:
-    """Return the relative speed at ego's first contact with anyone (m/s), 0 without one."""
+def any_impact_speed(ego: str = "ego") -> Metric:
+    """Return the largest relative speed at the first contact of the ego with each road user (m/s), 0 without a contact."""
     return Metric(
-        "impact_speed", _over_all(lambda t, a, b: impact_speed(a, b)(t), ego, max, 0.0), "m/s", "high", 0.0,
+        "impact_speed", _over_others(relative_speed_at_contact, ego, max, 0.0), "m/s", "high", 0.0,
         "relative speed at the first contact of ego and anyone else",
     )  # fmt: skip
 
 
-def others_braking(ego: str = "ego") -> Metric:
-    """Return the hardest braking of anyone but ego (m/s^2, positive), 0 without any."""
+def others_braking_max(ego: str = "ego") -> Metric:
+    """Return the strongest deceleration of any other road user (m/s^2, positive), 0 without braking."""
 
     def function(trace: Trace) -> float:
         others = [k for k, name in enumerate(trace.actors) if name != ego]
@@ -106,6 +107,6 @@ def others_braking(ego: str = "ego") -> Metric:
     )
 
 
-OTHERS_BRAKING_MAX = others_braking()
-PET_EGO_FIRST = time_left()
-TTC_PATH_MIN = nearest_ttc()
+OTHERS_BRAKING_MAX = others_braking_max()
+PET_EGO_FIRST = pet_ego_first()
+TTC_PATH_MIN = ttc_path_min()

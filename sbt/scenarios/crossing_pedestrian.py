@@ -1,7 +1,7 @@
-"""Crossing pedestrian: someone walks over a zebra crossing of a real town as ego comes, among other walkers and cars.
+"""Crossing pedestrian: a pedestrian uses a zebra crossing of a real town as the ego approaches, among other road users.
 
 The streets are those around Wagner-Regeny-Strasse in Berlin-Adlershof, imported from OpenStreetMap data (c) OpenStreetMap
-contributors, ODbL (`sumo_nets/town`); the zebra crossing is ours.
+contributors, ODbL (`sumo_nets/town`); the zebra crossing has been added.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, struck, struck_speed
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -25,33 +25,34 @@ __all__ = ["SCENARIO"]
 LIMIT = 50 / 3.6
 """Speed limit of the street (m/s)."""
 BEFORE, GAP, BLOCK = 167.58, 14.4, 60.96
-"""Lengths of ego's street before the junction, across it, and from it to the crossing (m), of `town`."""
+"""Lengths of the ego's street before the junction, across it, and from it to the crossing (m), in `town`."""
 DISTANCE = 90.0
-"""From ego's front to the crossing at the start (m)."""
+"""Initial distance from the ego's front to the crossing (m)."""
 STREET = ("15", "14#0", "14#1", "13")
 BACK = ("-13", "-14#1", "-14#0", "-15")
 OVER = ("14#0", "-14#0", "-15")
-"""Where the pedestrian walks: along ego's side, over the crossing, and back along the other."""
+"""Route of the pedestrian: along the ego's side of the street, over the crossing, and back along the other side."""
 PACE = 0.05
-"""Standard deviation of the pedestrian's speed as a share of `v_ped`: nobody walks by the clock."""
+"""Standard deviation of the pedestrian's speed relative to `v_ped`: the speed of a person varies."""
 WALKER = VehicleType(0.5, 0.5, (("vClass", "pedestrian"), ("minGap", "0.25")))
 ONCOMING = TrafficStream("oncoming", BACK, 1, LIMIT, spread=0.05)
 NEAREST = 60.0
-"""Foremost start of an oncoming car, on the 95 m before the junction behind the crossing (m): none leaves the town in time."""
+"""Foremost initial position of an oncoming car, on the 95 m before the junction behind the crossing (m), so that none
+leaves the network during a run."""
 PAVEMENTS = (("14#1", "13"), ("-14#0", "-15"))
 WALKERS = 3.0
-"""Mean number of other walkers."""
+"""Mean number of other pedestrians."""
 PASSED = 10.0
-"""How far behind the crossing ego has passed it (m)."""
+"""Distance behind the crossing at which the ego has passed it (m)."""
 CROSSING = (297.46, 285.96)
-"""Middle of the crossing (m)."""
+"""x, y of the centre of the crossing (m)."""
 DURATION = 23.0
-"""Longest time that is looked at (s)."""
+"""Longest simulated time (s)."""
 EGO = Ego.of("sumo", jmCrossingGap={"min": 0.0, "max": 10.0}, decel={"min": 2.5, "max": 5.0})
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego, the pedestrian who reaches the kerb `t_ped` after ego would reach the crossing, and the others."""
+    """Return the ego, the pedestrian, who reaches the kerb `t_ped` after the ego would reach the crossing, and the others."""
     speed, walk = values["v_ego"] / 3.6, values["v_ped"]
     pace = walk * (1.0 + PACE * float(np.clip(rng.standard_normal(), -2.0, 2.0)))
     driver = ego.driver(rng, speed)
@@ -66,7 +67,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def walkers(rng: np.random.Generator) -> tuple[Actor, ...]:
-    """Return the other walkers of a run, who stay on the pavements of the block."""
+    """Draw the other pedestrians, who stay on the pavements of the block."""
     return tuple(
         Actor(f"walker_{k}", PAVEMENTS[int(rng.integers(2))], 0, float(rng.uniform(1.0, 30.0)), float(rng.uniform(0.8, 1.6)),
               type=WALKER, person=True)
@@ -75,7 +76,7 @@ def walkers(rng: np.random.Generator) -> tuple[Actor, ...]:
 
 
 def end_condition(t: float, states: Mapping[str, State]) -> str | None:
-    """End the run once ego has passed the crossing."""
+    """End the run when the ego has passed the crossing."""
     ego = states["ego"]
     ahead = (CROSSING[0] - ego.x) * ego.cos + (CROSSING[1] - ego.y) * ego.sin
     return "passed" if ahead < -PASSED else None
@@ -98,6 +99,6 @@ SCENARIO = LogicalScenario(
         )
     ),
     simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",)),
-    metrics=(nearest_ttc(), nearest_distance(), struck(), struck_speed()),
+    metrics=(ttc_path_min(), nearest_distance(), any_collision(), any_impact_speed()),
     requirement=Requirement("ttc_path_min", high=0.5),
 )

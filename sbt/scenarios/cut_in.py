@@ -1,8 +1,8 @@
-"""Cut-in on a three-lane motorway: a slower car in the right lane shears in ahead of the ego.
+"""Cut-in on a three-lane motorway: a slower car changes from the right lane into the lane of the ego.
 
 Inputs, ranges, metric and critical interval are those of the scenario `Cut-In` of the Driving
-Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882). What its text
-leaves open is chosen here and named as a constant.
+Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882). What the paper
+leaves open is chosen here, as named constants.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
+from sbt.metrics.longitudinal import longitudinal_metrics
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Roles
@@ -24,20 +24,22 @@ from sbt.sumo.simulation import SumoSimulation
 __all__ = ["SCENARIO"]
 
 CO_SPEED = 80 / 3.6
-"""Speed of the car that cuts in (m/s), from the data set's text."""
+"""Speed of the car that cuts in (m/s), as in the paper."""
 LANE_CHANGE = 3.0
-"""Duration of the lane change (s): a brisk one, naturalistic cut-ins last about 3 to 6 s."""
+"""Duration of the lane change (s): a quick one; naturalistic cut-ins take about 3 to 6 s."""
 LANE_WIDTH = 3.5
+"""Of the network `straight` (m)."""
 DURATION = 6.0
-"""Longest time that is looked at (s): the lane change and three seconds more."""
+"""Longest simulated time (s): the lane change and three more seconds."""
 START = 20.0
+"""Initial position of the ego's front (m)."""
 CAR = VehicleType(length=5.0, width=1.8)
 MARGIN = (LANE_WIDTH - CAR.width) / 2
-"""Lateral clearance at which a car has crossed the marking (m): from then on it is in ego's path."""
+"""Lateral clearance at which a car has crossed the lane marking (m): from then on it is in the ego's path."""
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego in the middle lane, d_v faster, and co in the right lane, a time gap d_t ahead."""
+    """Return the ego in the middle lane, d_v faster than co, and co in the right lane, a time gap d_t ahead."""
     speed = CO_SPEED + values["d_v"] / 3.6
     gap = values["d_t"] * speed
     return Scene(
@@ -50,7 +52,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition() -> EndCondition:
-    """Return the rule that ends the run: ego has passed co, or can no longer come closer to it."""
+    """Return the end condition: the ego has passed co, or cannot come closer to it any more."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
         ego, co = states["ego"], states["co"]
@@ -84,14 +86,7 @@ SCENARIO = LogicalScenario(
         lane_change_duration=LANE_CHANGE,
         isolations=("fresh", "reuse", "replicas"),
     ),
-    metrics=(
-        ttc_min(margin=MARGIN),
-        d_min(margin=MARGIN),
-        collision(),
-        impact_speed(),
-        thw_min(margin=MARGIN),
-        drac_max(margin=MARGIN),
-    ),
+    metrics=longitudinal_metrics(MARGIN),
     requirement=Requirement("ttc_min", -5.0, 0.5),
     roles=Roles(margin=MARGIN),
 )

@@ -1,4 +1,4 @@
-"""Emergency braking: the car ahead in the same lane brakes at once.
+"""Emergency braking: the car ahead in the same lane brakes suddenly.
 
 Inputs, ranges, metric and critical interval are those of the scenario `Emergency Braking` of the
 Driving Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882).
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
+from sbt.metrics.longitudinal import longitudinal_metrics
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -23,13 +23,14 @@ from sbt.sumo.simulation import SumoSimulation
 __all__ = ["SCENARIO"]
 
 DURATION = 20.0
-"""Longest time that is looked at (s)."""
+"""Longest simulated time (s)."""
 START = 20.0
+"""Initial position of the ego's front (m)."""
 CAR = VehicleType(length=5.0, width=1.8)
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego at its set speed, a time gap d_t behind co, which brakes from the start."""
+    """Return the ego at its set speed, a time gap d_t behind co, and co, which brakes from the start."""
     v_ego, v_co = values["v_ego"] / 3.6, values["v_co"] / 3.6
     gap = values["d_t"] * v_ego
     final = values["v_co_min_frac"] * v_co
@@ -43,7 +44,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition(final: float) -> EndCondition:
-    """Return the rule that ends the run: co has braked, and ego no longer closes in on it."""
+    """Return the end condition: co has reached its final speed, and the ego is not faster."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
         ego, co = states["ego"], states["co"]
@@ -70,13 +71,7 @@ SCENARIO = LogicalScenario(
             Parameter("v_ego", 80.0, 150.0, "km/h", description="speed of ego at the start, also its set speed"),
         )
     ),
-    simulate=SumoSimulation(
-        net="straight",
-        scene=scene,
-        duration=DURATION,
-        step_length=0.05,
-        isolations=("fresh", "reuse", "replicas"),
-    ),
-    metrics=(ttc_min(), d_min(), collision(), impact_speed(), thw_min(), drac_max()),
+    simulate=SumoSimulation("straight", scene, DURATION, isolations=("fresh", "reuse", "replicas")),
+    metrics=longitudinal_metrics(),
     requirement=Requirement("ttc_min", high=0.1),
 )

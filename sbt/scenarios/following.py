@@ -1,8 +1,8 @@
-"""Following: stop-and-go behind a car that starts, holds its speed and brakes to a stop.
+"""Following: stop-and-go behind a car that accelerates, keeps its speed and brakes to a standstill.
 
 Inputs, ranges, metric and critical interval are those of the scenario `Following` of the Driving
 Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882). Eight of its
-inputs belong to the AV under test: limits of its ACC and AEB, and its dynamics.
+inputs are settings of the AV under test: limits of its ACC and AEB, and its dynamics.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metrics.longitudinal import collision, d_min, drac_max, impact_speed, thw_min, ttc_min
+from sbt.metrics.longitudinal import longitudinal_metrics
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -25,15 +25,16 @@ from sbt.sumo.simulation import SumoSimulation
 __all__ = ["SCENARIO"]
 
 SET_SPEED = 70 / 3.6
-"""Cruising speed of ego (m/s): above co's fastest, so that co decides."""
+"""Cruising speed of the ego (m/s): above the largest speed of co, so that co determines the speed."""
 DURATION = 70.0
-"""Longest time that is looked at (s): the slowest stop-and-go of co takes 54 s."""
+"""Longest simulated time (s): the slowest stop-and-go of co takes 54 s."""
 START = 20.0
+"""Initial position of the ego's front (m)."""
 CAR = VehicleType(length=5.0, width=1.8)
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego and co standing, d_0 apart; the inputs that are ego's own go into its controller."""
+    """Return the ego and co at standstill, d_0 apart; the inputs of the ego are settings of its controller."""
     distance = values["f_safetyDistanceMin"]
     driver = ego.driver(
         rng, SET_SPEED,
@@ -55,7 +56,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition(end: float) -> EndCondition:
-    """Return the rule that ends the run: co stands again, and ego stands behind it."""
+    """Return the end condition: co stands still again, and so does the ego."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
         if t >= end and states["ego"].speed <= 0.0:
@@ -89,13 +90,7 @@ SCENARIO = LogicalScenario(
             Parameter("v_delay", 0.02, 0.3, "s", description="dead time of ego's longitudinal dynamics"),
         )
     ),
-    simulate=SumoSimulation(
-        net="straight",
-        scene=scene,
-        duration=DURATION,
-        step_length=0.05,
-        isolations=("fresh", "reuse", "replicas"),
-    ),
-    metrics=(ttc_min(), d_min(), collision(), impact_speed(), thw_min(), drac_max()),
+    simulate=SumoSimulation("straight", scene, DURATION, isolations=("fresh", "reuse", "replicas")),
+    metrics=longitudinal_metrics(),
     requirement=Requirement("ttc_min", high=0.1),
 )

@@ -1,4 +1,4 @@
-"""Highway merge: ego comes from an on-ramp and has to find its place in dense traffic before the acceleration lane ends."""
+"""Highway merge: the ego enters dense motorway traffic from an on-ramp before the acceleration lane ends."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -21,27 +21,27 @@ __all__ = ["SCENARIO"]
 LIMIT = 120 / 3.6
 """Speed limit (m/s)."""
 DESIRED = 100 / 3.6
-"""Speed that ego wants to drive (m/s)."""
+"""Desired speed of the ego (m/s)."""
 RAMP = 250.0
 """Length of the ramp (m); its last 150 m are parallel to the motorway."""
 DISTANCE = 100.0
-"""From ego's front to the nose at the start (m)."""
+"""Initial distance from the ego's front to the nose, the end of the ramp (m)."""
 NEAREST, FARTHEST = 890.0, 250.0
-"""Fronts of the cars on the motorway at the start; the nose is at 900 m (m)."""
+"""Range of the initial positions of the cars on the motorway (m); the nose is at 900 m."""
 LANE_CHANGE = 3.0
 """Duration of a lane change (s)."""
 MERGED = 400.0
-"""x at which ego has left the acceleration lane well behind (m); it ends at 250 m."""
+"""x at which the ego is well past the acceleration lane (m), which ends at 250 m."""
 HORIZON = 5.0
-"""A car that comes later to where ego has been was not bothered (s)."""
+"""Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 30.0
-"""Longest time that is looked at (s)."""
+"""Longest simulated time (s)."""
 EGO = Ego.of("sumo", tau={"min": 0.4, "max": 1.6}, lcAssertive={"min": 1.0, "max": 5.0}, accel={"min": 1.5, "max": 3.5})
 LANES = tuple(TrafficStream(name, ("main", "merge", "after"), lane, LIMIT) for lane, name in enumerate(("right", "left")))
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego on the ramp and two columns of cars on the motorway, the left one 10 % faster."""
+    """Return the ego on the ramp and a stream of cars in each lane of the motorway, the left one 10 % faster."""
     speed, flow = values["v_ego"] / 3.6, values["flow_co"]
     driver = ego.driver(rng, speed)
     right, left = (
@@ -54,7 +54,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition(t: float, states: Mapping[str, State]) -> str | None:
-    """End the run once ego is well past the acceleration lane."""
+    """End the run when the ego is well past the acceleration lane."""
     return "merged" if states["ego"].x > MERGED else None
 
 
@@ -82,6 +82,13 @@ SCENARIO = LogicalScenario(
         isolations=("fresh",),
         lane_change_duration=LANE_CHANGE,
     ),
-    metrics=(nearest_ttc(), time_left(horizon=HORIZON), nearest_distance(), struck(), struck_speed(), others_braking()),
+    metrics=(
+        ttc_path_min(),
+        pet_ego_first(horizon=HORIZON),
+        nearest_distance(),
+        any_collision(),
+        any_impact_speed(),
+        others_braking_max(),
+    ),
     requirement=Requirement("ttc_path_min", high=2.0),
 )

@@ -1,9 +1,9 @@
-"""Jaywalking: a child steps out behind a vending machine on a suburban street.
+"""Jaywalking: a child steps onto a suburban street from behind a vending machine.
 
 Inputs, ranges, metric and critical interval are those of the scenario `Jaywalking` of the Driving
 Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/ITSC55140.2022.9922091), whose
-runs were made in CARLA with the agent Pylot. What weather does to sight and friction is modelled here
-openly, each number a named constant.
+runs were simulated in CARLA with the agent Pylot. The effect of the weather on visibility and friction is
+modelled explicitly here, with named constants.
 """
 
 from __future__ import annotations
@@ -30,55 +30,57 @@ from sbt.sumo.simulation import SumoSimulation
 __all__ = ["SCENARIO", "friction", "sight"]
 
 LANE = -1.625
-"""y of the middle of ego's lane (m), of the network `street`."""
+"""y of the centre of the ego's lane (m), in the network `street`."""
 START = 60.0
-"""Front of ego at the start (m)."""
+"""Initial position of the ego's front (m)."""
 BESIDE = 4.0
-"""Lateral distance of the child from ego's centre line (m), as in Euro NCAP's Car-to-Pedestrian Nearside Child."""
+"""Lateral distance of the child from the ego's centre line (m), as in Euro NCAP's Car-to-Pedestrian Nearside Child."""
 CAR = VehicleType(length=5.0, width=1.8)
 CHILD = VehicleType(length=0.5, width=0.5, attributes=(("vClass", "pedestrian"),))
-"""The child is a circle of 0.5 m: with it the data set's largest min_dist beside a passing car (2.845 m) comes out."""
+"""A circle of 0.5 m, which reproduces the largest min_dist beside a passing car in the data set (2.845 m)."""
 MACHINE = (0.8, 1.0)
 """Size of the vending machine along and across the street (m)."""
 BEHIND = 0.25
-"""Clearance between the machine and the child (m)."""
+"""Initial clearance between the machine and the child (m)."""
 MACHINE_BESIDE = 3.6
-"""Lateral distance of the machine's middle from ego's centre line (m)."""
+"""Lateral distance of the centre of the machine from the ego's centre line (m)."""
 FRICTION_DRY, FRICTION_WET = 0.9, 0.5
-"""Tyre-road friction in the dry and in the heaviest rain, linear in between; our choice of usual values of asphalt,
-the wet one with a film of standing water (review: Wallman and Astrom 2001, VTI meddelande 911A)."""
+"""Tyre-road friction without rain and in the heaviest rain, linear in between: usual values of asphalt, the wet one with
+a film of standing water (review: Wallman and Astrom 2001, VTI meddelande 911A)."""
 RANGE_DAY, RANGE_NIGHT = 80.0, 40.0
-"""Range of the camera for a child in clear air (m): by day its resolution limits it, at night the low beam."""
+"""Detection range of the camera for a child in clear air (m): limited by its resolution by day, by the low beam at night."""
 VISIBILITY_CLEAR, VISIBILITY_FOG = 2000.0, 40.0
-"""Meteorological visibility without and in the densest fog (m), in between by its logarithm."""
+"""Meteorological visibility without fog and in the densest fog (m); its logarithm is linear in between."""
 CONTRAST_NEEDED, CONTRAST_NIGHT, CONTRAST_RAIN = 0.2, 0.5, 0.7
-"""Contrast that the detector needs; share of it left at night and through a wet windscreen in the heaviest rain."""
+"""Contrast that the detector needs; factors on the contrast at night, and through the windscreen in the heaviest rain."""
 LATITUDE = math.radians(50.0)
-"""Of the place, for the height of the sun at the equinox."""
+"""Of the location (rad), for the elevation of the sun at the equinox."""
 GUST = 0.2
-"""Standard deviation of the child's speed from the strongest wind, along and across (m/s); gusts of some 2 s."""
+"""Standard deviation of the child's speed in the strongest wind, along and across (m/s); gusts take about 2 s."""
 DURATION = 30.0
+"""Longest simulated time (s)."""
 FAR_SIDE = 1.0
-"""Clearance beside ego at which the child has crossed (m)."""
+"""Lateral clearance to the ego at which the child has crossed (m)."""
 RADIUS = 0.5 * CHILD.width
+"""Of the child (m)."""
 
 
 def friction(rain: float) -> float:
-    """Return the tyre-road friction for rain in 0..1."""
+    """Return the tyre-road friction for an intensity of rain in [0, 1]."""
     return FRICTION_DRY + (FRICTION_WET - FRICTION_DRY) * rain
 
 
 def daylight(hour: float) -> float:
-    """Return 0 at night to 1 by day, smooth through the twilight (sun 6 degrees below to 6 above the horizon)."""
-    height = math.asin(math.cos(LATITUDE) * math.cos(math.pi * (hour - 12.0) / 12.0))
-    share = min(max(0.5 + math.degrees(height) / 12.0, 0.0), 1.0)
+    """Return the daylight, 0 at night and 1 by day, smooth in between (sun 6 degrees below to 6 above the horizon)."""
+    elevation = math.asin(math.cos(LATITUDE) * math.cos(math.pi * (hour - 12.0) / 12.0))
+    share = min(max(0.5 + math.degrees(elevation) / 12.0, 0.0), 1.0)
     return share * share * (3.0 - 2.0 * share)
 
 
 def sight(rain: float, fog: float, hour: float) -> float:
-    """Return the distance at which the camera sees the child (m).
+    """Return the distance at which the camera detects the child (m).
 
-    Contrast falls with the distance by Koschmieder's law, with the extinction 3 / visibility.
+    The contrast decreases with the distance by Koschmieder's law, with an extinction coefficient of 3 / visibility.
 
     >>> sight(0.0, 0.0, 12.0), sight(0.0, 0.0, 0.0)
     (80.0, 40.0)
@@ -92,7 +94,7 @@ def sight(rain: float, fog: float, hour: float) -> float:
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego at v_av, the child d_0 ahead of its front and 4 m beside, and the machine between them."""
+    """Return the ego at v_av, the child d_0 ahead of its front and 4 m to the right, and the machine between them."""
     speed, x = values["v_av"], START + values["d_0"]
     depth, across = MACHINE
     machine = Obstacle("machine", (x - RADIUS - BEHIND - 0.5 * depth, LANE - MACHINE_BESIDE, 0.0), depth, across)
@@ -118,7 +120,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition() -> EndCondition:
-    """Return the rule that ends the run: ego touches the child, has passed it, or it has crossed."""
+    """Return the end condition: the ego touches the child, has passed it, or the child has crossed."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
         ego, child = states["ego"], states["child"]
@@ -136,13 +138,13 @@ def end_condition() -> EndCondition:
 
 @per_trace
 def distances(trace: Trace) -> tuple[float, float | None]:
-    """Return the smallest distance of ego's rectangle and the child's circle, and ego's speed at the contact.
+    """Return the smallest distance of the ego's rectangle and the child's circle, and the ego's speed at the contact.
 
-    Both are found between the instants too: within a step both move straight, and the distance to a
-    rectangle is convex along a line, so that it is halved down to the minimum.
+    Accounts for the motion between two instants: within a step both move on straight lines, and the distance from
+    a rectangle is convex along a line, so that a ternary search finds its minimum.
 
     Returns:
-        metres > 0 and None, or 0 and the speed at the first contact (m/s).
+        (distance > 0 (m), None), or (0, speed at the first contact (m/s)).
     """
     ego, child = trace.actor("ego"), trace.actor("child")
     cos, sin = np.cos(ego.heading), np.sin(ego.heading)
@@ -155,7 +157,7 @@ def distances(trace: Trace) -> tuple[float, float | None]:
 
     start, step = place[:-1], np.diff(place, axis=0)
     low, high = np.zeros(len(step)), np.ones(len(step))
-    for _ in range(60):  # ternary search in all steps at once
+    for _ in range(60):  # ternary search in all steps simultaneously
         a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
         nearer = clearance(start + a[:, None] * step) <= clearance(start + b[:, None] * step)
         low, high = np.where(nearer, low, a), np.where(nearer, b, high)
@@ -166,7 +168,7 @@ def distances(trace: Trace) -> tuple[float, float | None]:
         return float(smallest.min(initial=float(clearance(place[:1])[0]))), None
     k = int(hits[0])
     first, last = 0.0, float(best[k]) if clearance((start + best[:, None] * step)[k : k + 1])[0] <= 0.0 else 1.0
-    for _ in range(50):  # the share of the step at which they touch
+    for _ in range(50):  # bisection of the fraction of the step after which they touch
         middle = 0.5 * (first + last)
         if clearance((start[k] + middle * step[k])[None])[0] <= 0.0:
             last = middle

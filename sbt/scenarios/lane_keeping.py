@@ -1,9 +1,9 @@
-"""Lane keeping: a winding road whose markings are hidden in places.
+"""Lane keeping: a winding road with lane markings that are occluded in places.
 
 Inputs, ranges, metric and critical interval are those of the scenario `Lane-Keeping` of the Driving
-Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882), whose frame is
-kept: the middle of ego's lane passes (-38, 121) at 3.9 degrees. What its text leaves open, the road's
-course and where the bars stand, is chosen here and named as a constant.
+Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882), whose coordinate
+system is kept: the centre line of the ego's lane passes (-38, 121) at 3.9 degrees. The course of the road and the
+positions of the bars, which the paper leaves open, are chosen here, as named constants.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metrics.lateral import Curve, lateral_metrics
+from sbt.metrics.reference_line import Curve, lateral_metrics
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
@@ -28,13 +28,13 @@ from sbt.sumo.simulation import SumoSimulation
 __all__ = ["BARS", "ROAD", "SCENARIO", "bars"]
 
 BEFORE = 30.0
-"""Road behind the start (m), so that the sensor sees markings all around."""
+"""Length of the road before the start (m)."""
 _HEADING = math.radians(3.9)
 ROAD = Curve(
     (-38.0 - BEFORE * math.cos(_HEADING), 121.0 - BEFORE * math.sin(_HEADING), _HEADING),
     (
         (BEFORE + 15.0, 0.0),
-        (15.0, 1 / 40), (42.0, 1 / 40),     # the left-hand bend
+        (15.0, 1 / 40), (42.0, 1 / 40),     # left-hand bend
         (20.0, -1 / 45), (35.0, -1 / 45),   # right-hand bends
         (15.0, -1 / 35), (32.0, -1 / 35), (15.0, 0.0),
         (25.0, 0.0),
@@ -42,36 +42,37 @@ ROAD = Curve(
         (30.0, 0.0),
     ),
 )  # fmt: skip
-"""Middle of the lane; the network `winding` has this shape. Clothoids join straights and arcs."""
+"""Centre line of the lane, as in the network `winding`. Clothoids connect straight lines and arcs."""
 LANE = 3.5
 """Width of the lane (m)."""
 DASH, DASH_GAP = 4.0, 8.0
-"""Lengths of the dashes on the left and of the gaps between them (m); the right marking is continuous."""
+"""Lengths of the dashes of the left marking and of the gaps between them (m); the right marking is continuous."""
 SPACING = 1.0
-"""Distance of the points along a marking that the sensor tells apart (m)."""
+"""Distance of the points of a marking that the sensor detects (m)."""
 BAR = (20.0, 4.0)
 """Length and width of a bar (m)."""
 BARS = ((52.0, 2.0), (92.0, -2.0), (150.0, 2.0), (262.0, -2.0))
-"""Where the middle of each bar is: distance after the start along the road, and to the left of the middle of the
-lane (m), just beyond the marking. There it turns with its input: along the road it lies beside it and over its edge,
-else across it. It hides what lies behind a metre of it, but bars nobody's way."""
+"""Centres of the bars: distance from the start along the road, and to the left of the centre line (m), just beyond the
+marking. The inputs turn the bars about their centres: parallel to the road they lie along its edge, otherwise across
+it. A bar occludes what is behind a metre of it, but is no obstacle for driving."""
 END = 20.0
-"""The run ends so far before the end of the road (m)."""
+"""Distance before the end of the road at which the run ends (m)."""
 LOST = 6.0
-"""Distance from the middle of the lane at which the run ends as lost (m)."""
-LOOK = 0.2
-"""Period at which the end of the run is looked for (s)."""
-BLIND = 1.0
-"""Time for which one marking is wholly unseen before it counts as lost (s)."""
+"""Distance from the centre line at which the run ends because the ego has left the road (m)."""
+CHECK_PERIOD = 0.2
+"""Period at which the end condition is checked (s)."""
+BLIND_TIME = 1.0
+"""Time without any visible point of one marking after which the lane counts as lost (s)."""
 DURATION = 70.0
+"""Longest simulated time (s)."""
 CAR = VehicleType(length=5.0, width=1.8)
 
 
 def bars(values: Mapping[str, float]) -> tuple[Obstacle, ...]:
-    """Return the four bars, turned as the inputs say."""
+    """Return the four bars, turned by the inputs."""
     placed = []
     for k, (s, left) in enumerate(BARS, start=1):
-        x, y = ROAD.beside(np.array([BEFORE + s]), left)[0]
+        x, y = ROAD.offset_points(np.array([BEFORE + s]), left)[0]
         placed.append(Obstacle(f"bar_{k}", (float(x), float(y), math.radians(values[f"theta_obs_{k}"])), *BAR))
     return tuple(placed)
 
@@ -79,19 +80,19 @@ def bars(values: Mapping[str, float]) -> tuple[Obstacle, ...]:
 def markings() -> tuple[np.ndarray, np.ndarray]:
     """Return the (n, 2) points of the dashed left and of the continuous right marking."""
     s = np.arange(0.0, ROAD.length, SPACING)
-    return ROAD.beside(s[s % (DASH + DASH_GAP) <= DASH], 0.5 * LANE), ROAD.beside(s, -0.5 * LANE)
+    return ROAD.offset_points(s[s % (DASH + DASH_GAP) <= DASH], 0.5 * LANE), ROAD.offset_points(s, -0.5 * LANE)
 
 
 LEFT, RIGHT = markings()
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego at its pose, and the bars."""
+    """Return the ego at its initial pose, and the bars."""
     speed = values["v_ego"] / 3.6
-    hidden_by = bars(values)
+    obstacles = bars(values)
     driver = ego.driver(
         rng, speed, preview=values["f_t"], p=values["f_p"], i=values["f_i"], d=values["f_d"], lag_1=values["v_t_1"],
-        lag_2=values["v_t_2"], delay=values["v_delay"], left=LEFT, right=RIGHT, lane=LANE, obstacles=hidden_by,
+        lag_2=values["v_t_2"], delay=values["v_delay"], left=LEFT, right=RIGHT, lane=LANE, obstacles=obstacles,
     )  # fmt: skip
     if driver is None:
         raise InputError("ego.kind must be a controller in lane_keeping: SUMO's own models see no markings")
@@ -100,18 +101,18 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     if isinstance(driver, LaneKeeping):
         sensor = driver.sensor
         signals = {"seen_left": lambda: sensor.seen[0], "seen_right": lambda: sensor.seen[1]}
-    return Scene((Actor("ego", ("road",), 0, BEFORE, speed, driver, CAR, pose),), end_condition(), hidden_by, signals)
+    return Scene((Actor("ego", ("road",), 0, BEFORE, speed, driver, CAR, pose),), end_condition(), obstacles, signals)
 
 
 def end_condition() -> EndCondition:
-    """Return the rule that ends the run: ego has come to the end of the road, or lost it; looked at every 0.2 s."""
+    """Return the end condition: the ego has reached the end of the road, or left the road."""
     due = 0.0
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
         nonlocal due
         if t < due - 1e-9:
             return None
-        due = t + LOOK
+        due = t + CHECK_PERIOD
         s, left, _ = ROAD.project(states["ego"].x, states["ego"].y)
         if abs(left) > LOST:
             return "lost"
@@ -125,11 +126,11 @@ def _lane_lost(trace: Trace) -> float:
         return 0.0
     blind = np.minimum(trace.signal("seen_left"), trace.signal("seen_right")) < 1.0
     last_seen = np.maximum.accumulate(np.where(blind, -np.inf, trace.time))
-    return float(np.any(trace.time - np.maximum(last_seen, 0.0) >= BLIND))
+    return float(np.any(trace.time - np.maximum(last_seen, 0.0) >= BLIND_TIME))
 
 
 LANE_LOST = Metric(
-    "lane_lost", _lane_lost, "", "high", 0.0, f"the sensor saw nothing of one marking for {BLIND:g} s (0 for an own ego)"
+    "lane_lost", _lane_lost, "", "high", 0.0, f"the sensor saw nothing of one marking for {BLIND_TIME:g} s (0 for an own ego)"
 )
 
 SCENARIO = LogicalScenario(

@@ -1,8 +1,8 @@
-"""Parking: a car drives out of a bay between two others that hide it from the AV.
+"""Parking: a car leaves a parking space between two others that occlude it from the AV.
 
 Inputs, ranges, metric and critical interval are those of the scenario `Parking` of the Driving
-Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882). Ego drives to
-the west along the aisle (-x); the bays are to its left, their cars look north into the aisle (+y).
+Scenario Input Output Dataset (Winkelmann et al. 2022, doi 10.1109/TITS.2022.3206882). The ego drives west
+along the aisle (-x); the parking spaces are to its left, and the parked cars face north to the aisle (+y).
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ from sbt.sumo.simulation import SumoSimulation
 __all__ = ["SCENARIO"]
 
 BAY = 3.0
-"""Distance of the middles of two bays (m): cars 1.8 m wide have room for their offsets and angles."""
+"""Distance of the centres of two parking spaces (m), with room for the offsets and angles of cars 1.8 m wide."""
 NOSES = -0.6
-"""y of the noses of cars without an offset (m): with the largest offset and angle they stay clear of ego at y_ego = 1 m."""
+"""y of the fronts of cars without an offset (m): with the largest offset and angle they do not touch an ego at y = 1 m."""
 CAR = VehicleType(length=5.0, width=1.8)
 NORTH, WEST = 0.5 * math.pi, math.pi
 PAST = 1.0
-"""The run ends once ego's rear is so far past co 1 (m)."""
+"""Distance of the ego's rear behind co 1 at which the run ends (m)."""
 DURATION = 45.0
+"""Longest simulated time (s)."""
 
 
 def bay(number: int, values: Mapping[str, float]) -> Pose:
-    """Return where a car stands: co 1 in the middle, co 2 to its west, co 3 to its east, where ego comes from."""
+    """Return the initial pose of a car: co 1 in the middle, co 2 to its west, co 3 to its east, where the ego comes from."""
     column = {1: 0.0, 2: -BAY, 3: BAY}[number]
     heading = NORTH + math.radians(values.get(f"theta_co_{number}", 0.0))
     x = column + values[f"x_offset_co_{number}"]
@@ -47,7 +48,7 @@ def bay(number: int, values: Mapping[str, float]) -> Pose:
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego in the aisle, co 1 about to leave, and the two that hide it."""
+    """Return the ego in the aisle, co 1 about to leave, and the two cars beside it."""
     speed = values["v_ego"] / 3.6
     driver = ego.driver(
         rng, speed, threshold=values["d_detect_min"], delay=values["t_delay_ego"], braking=-values["a_ego"],
@@ -71,7 +72,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition(end: float) -> EndCondition:
-    """Return the rule that ends the run: ego has passed co 1, or both stand."""
+    """Return the end condition: the ego has passed co 1, or both stand still."""
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
         ego, co = states["ego"], states["co_1"]
@@ -86,12 +87,12 @@ def end_condition(end: float) -> EndCondition:
 
 @per_trace
 def _impact(trace: Trace) -> tuple[float, float] | None:
-    """Return the speeds of ego and co 1 when they touch (km/h), None without a collision."""
+    """Return the speeds of the ego and co 1 at their first contact (km/h), None without a collision."""
     ego, co = trace.actor("ego"), trace.actor("co_1")
     k = contact_index(ego, co)
     if k is None:
         return None
-    share = float(swept_contact(ego, co)[k])  # of the step before, at which they touch
+    share = float(swept_contact(ego, co)[k])  # of the step before, after which they touch
 
     def speed(of: ActorTrace) -> float:
         before = float(of.speed[max(k - 1, 0)])

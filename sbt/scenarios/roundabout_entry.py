@@ -1,6 +1,6 @@
-"""Roundabout entry: ego gives way to circulating traffic, some of which leaves just before it.
+"""Roundabout entry: the ego yields to circulating traffic, part of which leaves just before the ego's entry.
 
-A one-lane compact roundabout, 18 m to the middle of the lane (an inscribed circle of some 40 m).
+A compact roundabout with one lane, whose centre line has a radius of 18 m (inscribed circle diameter about 40 m).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -25,19 +25,19 @@ __all__ = ["SCENARIO"]
 LIMIT, RING_LIMIT = 50 / 3.6, 30 / 3.6
 """Speed limits of the arms and of the ring (m/s)."""
 ARM = 600.0
-"""From the middle of the roundabout to the end of an arm (m)."""
+"""From the centre of the roundabout to the end of an arm (m)."""
 DISTANCE = 80.0
-"""From ego's front to the middle of the roundabout at the start (m)."""
+"""Initial distance from the ego's front to the centre of the roundabout (m)."""
 NEAREST, FARTHEST = 560.0, 60.0
-"""Fronts of the circulating cars at the start, on the western arm (m)."""
+"""Range of the initial positions of the circulating cars, on the western arm (m)."""
 CLEAR = 35.0
-"""y at which ego has left the roundabout behind (m)."""
+"""y at which the ego has left the roundabout (m)."""
 ENTRY = (0.0, -18.0, 12.0)
-"""Circle around the point where ego enters the ring (m): what follows is car following, not giving way."""
+"""x, y and radius of a circle around the ego's entry (m): beyond it the ego follows other cars and does not yield."""
 HORIZON = 5.0
-"""A car that comes later to where ego has been was not bothered (s)."""
+"""Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 27.0
-"""Longest time that is looked at (s); the fastest car is still there then."""
+"""Longest simulated time (s); even the fastest car has not arrived by then."""
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
 RING = ("ring_south_east", "ring_east_north", "out_north")
 PASSING = TrafficStream("co", ("in_west", "ring_west_south", *RING), 0, RING_LIMIT)
@@ -45,7 +45,7 @@ LEAVING = ("in_west", "ring_west_south", "out_south")
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego on the southern arm and cars from the western one, which pass ego's entry or leave before it."""
+    """Return the ego on the southern arm and cars from the western one, which pass the ego's entry or leave before it."""
     speed = values["v_ego"] / 3.6
     driver = ego.driver(rng, speed)
     cars = PASSING.with_driver(tau=values["tau_co"]).draw(
@@ -58,7 +58,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition(t: float, states: Mapping[str, State]) -> str | None:
-    """End the run once ego is on the northern arm: whom it bothered at its entry has come there."""
+    """End the run when the ego is on the northern arm: a car in conflict at its entry has passed there by then."""
     return "passed" if states["ego"].y > CLEAR else None
 
 
@@ -81,12 +81,12 @@ SCENARIO = LogicalScenario(
     ),
     simulate=SumoSimulation(net="roundabout", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
     metrics=(
-        time_left(horizon=HORIZON, zone=ENTRY),
-        nearest_ttc(),
+        pet_ego_first(horizon=HORIZON, zone=ENTRY),
+        ttc_path_min(),
         nearest_distance(),
-        struck(),
-        struck_speed(),
-        others_braking(),
+        any_collision(),
+        any_impact_speed(),
+        others_braking_max(),
     ),
     requirement=Requirement("pet_ego_first", high=1.5),
 )

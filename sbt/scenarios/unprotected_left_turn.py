@@ -1,4 +1,4 @@
-"""Unprotected left turn: ego crosses the oncoming traffic of a main road where nothing but the right of way protects it.
+"""Unprotected left turn: the ego turns left across oncoming traffic at a junction without traffic lights.
 
 Gap acceptance at a permissive left turn is the pre-crash scenario "left turn across path, opposite direction"
 (Najm, Smith and Yanagisawa 2007, Pre-Crash Scenario Typology for Crash Avoidance Research, DOT HS 810 767).
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sbt.metrics.traffic import nearest_distance, nearest_ttc, others_braking, struck, struck_speed, time_left
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -25,23 +25,23 @@ __all__ = ["SCENARIO"]
 LIMIT = 50 / 3.6
 """Speed limit of all roads (m/s)."""
 ARM = 1000.0
-"""Length of the western arm up to the middle of the junction (m), of the network `left_turn`."""
+"""Length of the western arm up to the centre of the junction (m), in the network `left_turn`."""
 DISTANCE = 80.0
-"""From ego's front to the middle of the junction at the start (m)."""
+"""Initial distance from the ego's front to the centre of the junction (m)."""
 NEAREST, FARTHEST = 880.0, 100.0
-"""Fronts of the oncoming cars at the start, on the 900 m from the east to the junction (m)."""
+"""Range of the initial positions of the oncoming cars, on the 900 m from the east to the junction (m)."""
 CLEAR = 15.0
-"""y beyond which ego has left the junction (m)."""
+"""y beyond which the ego has left the junction (m)."""
 HORIZON = 5.0
-"""A car that comes later to where ego has been was not bothered (s)."""
+"""Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 38.0
-"""Longest time that is looked at (s); the fastest oncoming car is still there then."""
+"""Longest simulated time (s); even the fastest oncoming car has not arrived by then."""
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
 ONCOMING = TrafficStream("oncoming", ("in_east", "out_west"), 0, LIMIT)
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
-    """Return ego ahead of the junction, about to turn left, and a column of cars that comes the other way."""
+    """Return the ego before the junction, about to turn left, and a stream of oncoming cars."""
     speed = values["v_ego"] / 3.6
     driver = ego.driver(rng, speed)
     cars = ONCOMING.draw(rng, values["flow_co"], values["v_co"] / 3.6, NEAREST, FARTHEST)
@@ -50,7 +50,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition() -> EndCondition:
-    """Return the rule that ends the run: ego left the junction `HORIZON` ago."""
+    """Return the end condition: the ego left the junction `HORIZON` ago."""
     left: list[float] = []
 
     def over(t: float, states: Mapping[str, State]) -> str | None:
@@ -77,6 +77,13 @@ SCENARIO = LogicalScenario(
         )
     ),
     simulate=SumoSimulation(net="left_turn", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
-    metrics=(time_left(horizon=HORIZON), nearest_ttc(), nearest_distance(), struck(), struck_speed(), others_braking()),
+    metrics=(
+        pet_ego_first(horizon=HORIZON),
+        ttc_path_min(),
+        nearest_distance(),
+        any_collision(),
+        any_impact_speed(),
+        others_braking_max(),
+    ),
     requirement=Requirement("pet_ego_first", high=1.5),
 )

@@ -1,7 +1,7 @@
 """Analytic problems with known truth, as logical scenarios: `testbed:NAME`.
 
-Campaigns are measured on them: a truth, not another estimate, says what is right. `testbed:NAME:box`
-is the same problem with every input uniform in its box, for searches that ignore the law.
+They serve to assess campaigns against exact or precise reference values. `testbed:NAME:box` is the same problem
+with all inputs uniform in a box, for searches that do not use the distribution.
 
 >>> scenario = from_name("four_branch_7", Path())
 >>> scenario.space.names, scenario.requirement.critical.high
@@ -29,15 +29,15 @@ _BOX = ":box"
 
 
 def names() -> list[str]:
-    """Return the names of all testbeds; each of them also takes the ending `:box`."""
+    """Return the names of all testbeds; each of them also exists with the suffix `:box`."""
     return list(_PROBLEMS)
 
 
 def find(name: str) -> Problem:
-    """Return a testbed by name, `NAME:box` with every input uniform in its box.
+    """Return a testbed by name; `NAME:box` has all inputs uniform in their box.
 
     Raises:
-        InputError: there is none of this name.
+        InputError: there is no testbed of this name.
     """
     plain = name.removesuffix(_BOX)
     if plain not in _PROBLEMS:
@@ -51,27 +51,27 @@ def from_name(name: str, folder: Path) -> LogicalScenario:
     """Return the logical scenario `testbed:NAME`; its only metric is `y`.
 
     Raises:
-        InputError: there is none of this name.
+        InputError: there is no testbed of this name.
     """
     return find(name).scenario()
 
 
 def truth(name: str) -> Truth:
-    """Return what is known about a testbed: probability, standard error, modes, critical share of the box.
+    """Return the reference values of a testbed: failure probability, modes, critical fraction of the box.
 
     Raises:
-        InputError: there is none of this name.
+        InputError: there is no testbed of this name.
     """
     return find(name).truth
 
 
 def values(name: str, x: Points, rng: np.random.Generator | None = None) -> Vector:
-    """Return the metric at many points at once.
+    """Return the metric at n points.
 
     Args:
         name: of the testbed.
         x: (n, d) physical values.
-        rng: draws the noise where the testbed has some; None: without noise.
+        rng: draws the noise of a noisy testbed; None: without noise.
 
     Returns:
         (n,) metrics.

@@ -1,4 +1,4 @@
-"""What a testbed is: inputs with their law, a vectorised function, a critical interval and the truth."""
+"""The structure of a testbed: inputs with their distributions, a vectorised function, a critical interval and the truth."""
 
 from __future__ import annotations
 
@@ -19,27 +19,31 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 
-__all__ = ["METRIC", "Function", "Input", "Problem", "Truth", "analytic", "noisy", "parameters_of"]
+__all__ = [
+    "METRIC", "NEGATIVE", "Function", "Input", "Problem", "Truth", "analytic", "lognormal", "noisy", "normal", "parameters_of",
+]  # fmt: skip
 
 METRIC = "y"
 """The only metric of an analytic scenario."""
+NEGATIVE = CriticalInterval(high=0.0)
+"""The critical interval of a limit-state function."""
 
 Function = Callable[[Points], Vector]
-"""(n, d) physical values to (n,) metrics, each from its own row alone."""
+"""(n, d) physical values to (n,) metrics; a row does not depend on the others."""
 Input = tuple[float, float] | Distribution | Parameter
-"""An input: uniform between two ends, a law on its whole support, or a parameter (its name is replaced)."""
+"""An input: uniform between two bounds, a distribution on its whole support, or a parameter (its name is replaced)."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known about a testbed.
+    """The reference values of a testbed.
 
     Args:
-        probability: P(y in M_c) under the law of the inputs, and of the noise where there is some.
-        std_error: its standard error; 0 where it is a closed form or a quadrature.
-        modes: number of separate failures: local maxima of the density within the critical region, where
-            the law is uniform the region's connected parts; None: not counted.
-        box_fraction: share of the box that is critical, uniform measure: what a random tester sees.
+        probability: P(y in M_c) under the distribution of the inputs, and of the noise if there is any.
+        std_error: its standard error; 0 for a closed form or a quadrature.
+        modes: number of separate failures: local maxima of the density within the critical region or, for uniform
+            inputs, its connected components; None: not counted.
+        box_fraction: critical fraction of the box under the uniform distribution.
         box_std_error: its standard error.
     """
 
@@ -57,13 +61,13 @@ class Problem:
     Args:
         name: as in `testbed:NAME`.
         title: one line for people.
-        parameters: the inputs; unbounded laws are not cut off.
+        parameters: the inputs; unbounded distributions are not truncated.
         function: vectorised metric; its docstring has the formula and the source.
         critical: M_c.
-        truth: the known answers.
+        truth: reference values.
         noise: standard deviation of normal noise on y, drawn from the seed of the run.
-        box: (low, high) of each input for searches that ignore the law; None: the bounds of the
-            parameters, which are the 1e-6 quantiles where an input is unbounded.
+        box: (low, high) of each input for searches that do not use the distribution; None: the bounds of the
+            parameters, which are the 1e-6 quantiles if an input is unbounded.
     """
 
     name: str
@@ -76,7 +80,7 @@ class Problem:
     box: tuple[tuple[float, float], ...] | None = None
 
     def in_box(self) -> Problem:
-        """Return the same problem with every input uniform in the box, for boundary work and falsification."""
+        """Return the same problem with all inputs uniform in the box, for boundary identification and falsification."""
         ends = self.box if self.box is not None else tuple(p.bounds for p in self.parameters)
         parameters = tuple(
             replace(p, low=low, high=high, distribution=None) for p, (low, high) in zip(self.parameters, ends, strict=True)
@@ -109,17 +113,17 @@ def analytic(
     """Return a vectorised function as a logical scenario with the metric `y`.
 
     Args:
-        function: (n, d) physical values to (n,) metrics, a column an input in the order of `inputs`.
-        inputs: by name: (low, high) for a uniform law, a `Distribution` on its whole support, or a
-            `Parameter` with range, unit and law (the key is its name).
-        critical: (low, high) of M_c, closed; either end may be infinite.
-        name: as written in reports.
+        function: (n, d) physical values, columns in the order of `inputs`, to (n,) metrics.
+        inputs: by name: (low, high) for a uniform distribution, a `Distribution` on its whole support, or a
+            `Parameter` with range, unit and distribution (the key is its name).
+        critical: (low, high) of M_c, closed; either bound may be infinite.
+        name: of the scenario, for reports.
         correlation: (d, d) correlation of the normal scores (Gaussian copula); None: independent.
         noise: standard deviation >= 0 of normal noise on y, drawn from the seed of the run.
         description: for people; default: the function's docstring.
 
     Raises:
-        InputError: an input, the interval, the correlation or the noise is impossible.
+        InputError: an input, the interval, the correlation or the noise is invalid.
 
     >>> scenario = analytic(
     ...     lambda x: np.hypot(x[:, 0], x[:, 1]),
@@ -146,7 +150,7 @@ def parameters_of(inputs: Mapping[str, Input]) -> tuple[Parameter, ...]:
 
 
 def _documentation(function: Function) -> str:
-    """Return the docstring of a function, also of a partial one."""
+    """Return the docstring of a function or of a partial of one."""
     return inspect.getdoc(function.func if isinstance(function, partial) else function) or ""
 
 
@@ -174,6 +178,16 @@ class _Pointwise:
         if self.noise:
             y += self.noise * float(stream(seed, "testbed", self.name).standard_normal())
         return {METRIC: y}
+
+
+def normal(mean: float, std: float) -> Distribution:
+    """Return a normal distribution."""
+    return Distribution.of(kind="normal", mean=mean, std=std)
+
+
+def lognormal(mean: float, std: float) -> Distribution:
+    """Return a lognormal distribution with this mean and standard deviation."""
+    return Distribution.of(kind="lognormal", mean=mean, std=std)
 
 
 def noisy(y: Vector, noise: float, rng: np.random.Generator | None) -> Vector:

@@ -13,24 +13,15 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval
-from sbt.testbeds.problem import Input, Problem, Truth, parameters_of
+from sbt.testbeds.problem import NEGATIVE, Input, Problem, Truth, lognormal, normal, parameters_of
 
 __all__ = ["PROBLEMS"]
 
-_NEGATIVE = CriticalInterval(high=0.0)
-
-
-def _normal(mean: float, std: float) -> Distribution:
-    return Distribution.of(kind="normal", mean=mean, std=std)
-
-
-def _lognormal(mean: float, std: float) -> Distribution:
-    return Distribution.of(kind="lognormal", mean=mean, std=std)
 
 
 def _standard(d: int) -> tuple[Parameter, ...]:
     """Return d independent standard-normal inputs x1 ... xd."""
-    return parameters_of({f"x{k + 1}": _normal(0.0, 1.0) for k in range(d)})
+    return parameters_of({f"x{k + 1}": normal(0.0, 1.0) for k in range(d)})
 
 
 def four_branch(x: Points, k: float) -> Vector:
@@ -142,11 +133,11 @@ def borehole(x: Points) -> Vector:
     """Flow of water through a borehole between two aquifers (m^3/yr).
 
     2 pi tu (hu - hl) / (log(r / rw) (1 + 2 l tu / (log(r / rw) rw^2 kw) + tu / tl)); a radius below
-    1e-9 m, which the normal law of rw allows with probability 3e-10, counts as 1e-9 m.
+    1e-9 m, which the normal distribution of rw allows with probability 3e-10, counts as 1e-9 m.
 
     Source:
         Harper and Gupta (1983), report BMI/ONWI-516; Morris, Mitchell, Ylvisaker (1993), Technometrics
-        35. The level of 190 is ours.
+        35. The threshold of 190 is a choice of this package.
     """
     rw, r, tu, hu, tl, hl, length, kw = x.T
     rw = np.maximum(rw, 1e-9)
@@ -167,23 +158,23 @@ def sphere(x: Points, radius: float) -> Vector:
     """The outside of a sphere, radius^2 - |x|^2: no most likely point at all.
 
     Source:
-        Exact: P is the upper tail of the chi-square law with d degrees of freedom.
+        Exact: P is the upper tail of the chi-square distribution with d degrees of freedom.
     """
     return radius**2 - (x**2).sum(axis=1)
 
 
 _OSCILLATOR: Mapping[str, Input] = {
-    "c1": _normal(1.0, 0.1), "c2": _normal(0.1, 0.01), "m": _normal(1.0, 0.05), "r": _normal(0.5, 0.05),
-    "t1": _normal(1.0, 0.2), "f1": _normal(1.0, 0.2),
+    "c1": normal(1.0, 0.1), "c2": normal(0.1, 0.01), "m": normal(1.0, 0.05), "r": normal(0.5, 0.05),
+    "t1": normal(1.0, 0.2), "f1": normal(1.0, 0.2),
 }  # fmt: skip
 _DAMPED: Mapping[str, Input] = {
-    "mp": _lognormal(1.5, 0.15), "ms": _lognormal(0.01, 0.001), "kp": _lognormal(1.0, 0.2),
-    "ks": _lognormal(0.01, 0.002), "zp": _lognormal(0.05, 0.02), "zs": _lognormal(0.02, 0.01),
-    "s0": _lognormal(100.0, 10.0), "fs": _lognormal(15.0, 1.5),
+    "mp": lognormal(1.5, 0.15), "ms": lognormal(0.01, 0.001), "kp": lognormal(1.0, 0.2),
+    "ks": lognormal(0.01, 0.002), "zp": lognormal(0.05, 0.02), "zs": lognormal(0.02, 0.01),
+    "s0": lognormal(100.0, 10.0), "fs": lognormal(15.0, 1.5),
 }  # fmt: skip
 _INFLUENCE = Distribution.of(kind="scipy", name="lognorm", s=1.0056, scale=math.exp(7.71))
 _BOREHOLE: Mapping[str, Input] = {
-    "rw": Parameter("rw", -math.inf, math.inf, "m", _normal(0.10, 0.0161812), description="radius of the borehole"),
+    "rw": Parameter("rw", -math.inf, math.inf, "m", normal(0.10, 0.0161812), description="radius of the borehole"),
     "r": Parameter("r", -math.inf, math.inf, "m", _INFLUENCE, description="radius of influence"),
     "tu": Parameter("tu", 63070.0, 115600.0, "m^2/yr", description="transmissivity of the upper aquifer"),
     "hu": Parameter("hu", 990.0, 1110.0, "m", description="head of the upper aquifer"),
@@ -193,8 +184,8 @@ _BOREHOLE: Mapping[str, Input] = {
     "kw": Parameter("kw", 9855.0, 12045.0, "m/yr", description="hydraulic conductivity"),
 }
 _RP38: Mapping[str, Input] = {
-    "x1": _normal(350.0, 35.0), "x2": _normal(50.8, 5.08), "x3": _normal(3.81, 0.381), "x4": _normal(173.0, 17.3),
-    "x5": _normal(9.38, 0.938), "x6": _normal(33.1, 3.31), "x7": _normal(0.036, 0.0036),
+    "x1": normal(350.0, 35.0), "x2": normal(50.8, 5.08), "x3": normal(3.81, 0.381), "x4": normal(173.0, 17.3),
+    "x5": normal(9.38, 0.938), "x6": normal(33.1, 3.31), "x7": normal(0.036, 0.0036),
 }  # fmt: skip
 _SIX = ((-6.0, 6.0), (-6.0, 6.0))
 _FOUR = ((-4.0, 4.0), (-4.0, 4.0))
@@ -206,38 +197,38 @@ _BOREHOLE_BOX = ((0.05, 0.15), (100.0, 50000.0), (63070.0, 115600.0), (990.0, 11
 def _sphere(d: int, radius: float, box_fraction: float, box_std_error: float = 0.0) -> Problem:
     exact = float(gammaincc(d / 2.0, radius**2 / 2.0))
     return Problem(
-        f"chi2_d{d}", f"The outside of a sphere in {d} dimensions", _standard(d), partial(sphere, radius=radius), _NEGATIVE,
+        f"chi2_d{d}", f"The outside of a sphere in {d} dimensions", _standard(d), partial(sphere, radius=radius), NEGATIVE,
         Truth(exact, 0.0, 1, box_fraction, box_std_error),
     )  # fmt: skip
 
 
 def _linear(d: int, box_fraction: float, box_std_error: float = 0.0) -> Problem:
     return Problem(
-        f"linear_d{d}", f"A hyperplane in {d} dimensions", _standard(d), partial(linear, beta=3.5), _NEGATIVE,
+        f"linear_d{d}", f"A hyperplane in {d} dimensions", _standard(d), partial(linear, beta=3.5), NEGATIVE,
         Truth(float(ndtr(-3.5)), 0.0, 1, box_fraction, box_std_error),
     )  # fmt: skip
 
 
 PROBLEMS = (
-    Problem("four_branch_6", "Four failure modes, k = 6", _standard(2), partial(four_branch, k=6.0), _NEGATIVE,
+    Problem("four_branch_6", "Four failure modes, k = 6", _standard(2), partial(four_branch, k=6.0), NEGATIVE,
             Truth(0.0044573315, 0.0, 4, 0.699915), box=_SIX),
-    Problem("four_branch_7", "Four failure modes, k = 7", _standard(2), partial(four_branch, k=7.0), _NEGATIVE,
+    Problem("four_branch_7", "Four failure modes, k = 7", _standard(2), partial(four_branch, k=7.0), NEGATIVE,
             Truth(0.0022227951, 0.0, 4, 0.630316), box=_SIX),
-    Problem("four_branch_noisy", "Four failure modes under noise", _standard(2), partial(four_branch, k=7.0), _NEGATIVE,
+    Problem("four_branch_noisy", "Four failure modes under noise", _standard(2), partial(four_branch, k=7.0), NEGATIVE,
             Truth(0.0033196576, 0.0, 4, 0.630687), noise=0.3, box=_SIX),
-    Problem("rastrigin_ak", "Many islands of failure", _standard(2), rastrigin, _NEGATIVE,
+    Problem("rastrigin_ak", "Many islands of failure", _standard(2), rastrigin, NEGATIVE,
             Truth(0.07296933, 0.0, None, 0.517412), box=_FOUR),
-    Problem("gayton_hat", "A smooth rare failure", _standard(2), gayton_hat, _NEGATIVE,
+    Problem("gayton_hat", "A smooth rare failure", _standard(2), gayton_hat, NEGATIVE,
             Truth(2.8745361e-05, 0.0, 1, 0.044102)),
-    Problem("metaball", "Merged hills that mislead", _standard(2), metaball, _NEGATIVE,
+    Problem("metaball", "Merged hills that mislead", _standard(2), metaball, NEGATIVE,
             Truth(1.1283373e-05, 0.0, 4, 0.074773)),
-    Problem("rp38", "Seven inputs of a black-box challenge", parameters_of(_RP38), rp38, _NEGATIVE,
+    Problem("rp38", "Seven inputs of a black-box challenge", parameters_of(_RP38), rp38, NEGATIVE,
             Truth(0.0080527503, 3.1e-06, 1, 0.209159, 2.4e-05)),
-    Problem("rp110", "The visible branch is the wrong one", _standard(2), rp110, _NEGATIVE,
+    Problem("rp110", "The visible branch is the wrong one", _standard(2), rp110, NEGATIVE,
             Truth(3.1957884e-05, 0.0, 2, 0.079250)),
-    Problem("oscillator", "An undamped oscillator", parameters_of(_OSCILLATOR), oscillator, _NEGATIVE,
+    Problem("oscillator", "An undamped oscillator", parameters_of(_OSCILLATOR), oscillator, NEGATIVE,
             Truth(0.0285923, 3.7e-05, 1, 0.196923, 2.3e-05), box=_OSCILLATOR_BOX),
-    Problem("damped_oscillator_15", "A two-mass oscillator, capacity 15", parameters_of(_DAMPED), damped_oscillator, _NEGATIVE,
+    Problem("damped_oscillator_15", "A two-mass oscillator, capacity 15", parameters_of(_DAMPED), damped_oscillator, NEGATIVE,
             Truth(0.0047770912, 2.2e-06, 1, 0.003839, 1.4e-05)),
     Problem("borehole_1e-3", "Too much flow through a borehole", parameters_of(_BOREHOLE), borehole, CriticalInterval(low=190.0),
             Truth(0.0015840019, 6.9e-07, 1, 0.015074, 1.8e-05), box=_BOREHOLE_BOX),

@@ -1,6 +1,6 @@
-"""Problems of search and level sets on the unit cube: needles, deception, idle inputs, several regions.
+"""Search and level-set problems on the unit cube: needles, deceptive trends, inactive inputs, several regions.
 
-The law is uniform, so the probability is the critical share of the box.
+The inputs are uniform, so that the failure probability is the critical fraction of the box.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ from scipy.special import gamma
 
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
-from sbt.testbeds.problem import Function, Problem, Truth, parameters_of
+from sbt.testbeds.problem import NEGATIVE, Function, Problem, Truth, parameters_of
 
 __all__ = ["PROBLEMS"]
 
-_NEGATIVE = CriticalInterval(high=0.0)
 _WEIGHT = np.array([1.0, 1.2, 3.0, 3.2])
 _STEEPNESS = np.array([
     [10.0, 3.0, 17.0, 3.5, 1.7, 8.0], [0.05, 10.0, 17.0, 0.1, 8.0, 14.0],
@@ -88,7 +87,7 @@ _WELLS = (
     ((0.75, 0.8, 0.2, 0.8), 0.08, 0.12),
     ((0.5, 0.5, 0.5, 0.15), 0.08, 0.10),
 )
-"""centre, radius and reach of each"""
+"""Centre, radius and reach of each well."""
 
 
 def multi_needle(x: Points) -> Vector:
@@ -168,17 +167,17 @@ def wavy_level(x: Points) -> Vector:
 def _uniform(
     name: str, title: str, d: int, function: Function, critical: CriticalInterval, share: float, error: float, modes: int
 ) -> Problem:
-    """Return a testbed on the unit cube, where box and law are one."""
+    """Return a testbed with uniform inputs on the unit cube."""
     inputs = parameters_of({f"x{k + 1}": (0.0, 1.0) for k in range(d)})
     return Problem(name, title, inputs, function, critical, Truth(share, error, modes, share, error))
 
 
 def _needle(centre: tuple[float, ...], reach: float) -> Problem:
-    """Return a needle of volume 1e-3 whose funnel reaches so many radii."""
+    """Return a needle of volume 1e-3 with a funnel of width `reach`, in radii."""
     d, share = len(centre), 1e-3
     radius = ball_radius(d, share)
     function = partial(needle, centre=np.array(centre), radius=radius, reach=reach * radius)
-    return _uniform(f"needle_d{d}_1e-3", f"A needle in {d} dimensions", d, function, _NEGATIVE, share, 0.0, 1)
+    return _uniform(f"needle_d{d}_1e-3", f"A needle in {d} dimensions", d, function, NEGATIVE, share, 0.0, 1)
 
 
 _FIVE_BALLS = sum(ball_volume(4, radius) for _, radius, _ in _WELLS)
@@ -190,11 +189,11 @@ PROBLEMS = (
              0.002547708, 3.5e-06, 2),
     _needle((0.7459630321032713, 0.35837893752960165), 2.0),
     _needle((0.3286308868556369, 0.49966682244093397, 0.5468289934227222, 0.28254801512248573), 1.0),
-    _uniform("multi_needle_d4", "Five needles", 4, multi_needle, _NEGATIVE, _FIVE_BALLS, 0.0, 5),
-    _uniform("deceptive_d2", "A trend to the wrong corner", 2, partial(deceptive, radius=_SMALL), _NEGATIVE,
+    _uniform("multi_needle_d4", "Five needles", 4, multi_needle, NEGATIVE, _FIVE_BALLS, 0.0, 5),
+    _uniform("deceptive_d2", "A trend to the wrong corner", 2, partial(deceptive, radius=_SMALL), NEGATIVE,
              ball_volume(2, _SMALL), 0.0, 1),
-    _uniform("goldstein_price_partx", "Goldstein-Price below 50", 2, goldstein_price, _NEGATIVE, 0.025970937, 3e-06, 1),
-    _uniform("himmelblau_partx", "Himmelblau below 40", 2, himmelblau, _NEGATIVE, 0.17649613, 7.9e-06, 3),
+    _uniform("goldstein_price_partx", "Goldstein-Price below 50", 2, goldstein_price, NEGATIVE, 0.025970937, 3e-06, 1),
+    _uniform("himmelblau_partx", "Himmelblau below 40", 2, himmelblau, NEGATIVE, 0.17649613, 7.9e-06, 3),
     _uniform("interval_ring_d3", "A thin shell", 3, interval_ring, CriticalInterval(0.0, 0.02), 0.00089661055, 3.6e-06, 1),
     _uniform("wavy_level_d3", "Several sheets", 3, wavy_level, CriticalInterval(low=0.55), 0.09103315, 6.4e-05, 1),
 )  # fmt: skip

@@ -1,7 +1,6 @@
-"""Closed-form traffic: what a simulation of automated driving does to an algorithm, in microseconds.
+"""Closed-form traffic situations with the typical difficulties of simulated driving, evaluated in microseconds.
 
-All are constructed for this purpose: plateaus without interaction, jumps at contact, critical intervals
-inside the range of the metric.
+They have plateaus without interaction, jumps at contact, and critical intervals inside the range of the metric.
 """
 
 from __future__ import annotations
@@ -11,14 +10,12 @@ import math
 import numpy as np
 
 from sbt.problem.arrays import Points, Vector
-from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval
-from sbt.testbeds.problem import Problem, Truth, parameters_of
+from sbt.testbeds.problem import NEGATIVE, Problem, Truth, lognormal, normal, parameters_of
 
 __all__ = ["PROBLEMS"]
 
-_NEGATIVE = CriticalInterval(high=0.0)
 _GRAVITY = 9.81
 _NO_CONFLICT = 10.0
 
@@ -83,37 +80,29 @@ def plateau_ttc(x: Points) -> Vector:
     return np.where((apart < 0.35) & (x[:, 4] > 0.8), -1.0, funnel)
 
 
-def _lognormal(mean: float, std: float) -> Distribution:
-    return Distribution.of(kind="lognormal", mean=mean, std=std)
-
-
-def _normal(mean: float, std: float) -> Distribution:
-    return Distribution.of(kind="normal", mean=mean, std=std)
-
-
 _CUT_IN = (
-    Parameter("gap", -math.inf, math.inf, "m", _lognormal(30.0, 12.0), description="gap after the cut-in"),
-    Parameter("closing_speed", -math.inf, math.inf, "m/s", _normal(2.0, 3.0), description="ego minus other"),
-    Parameter("delay", -math.inf, math.inf, "s", _lognormal(0.8, 0.25), description="until the ego brakes"),
-    Parameter("deceleration", 3.0, 10.0, "m/s^2", _normal(7.0, 1.2), description="of the braking ego"),
+    Parameter("gap", -math.inf, math.inf, "m", lognormal(30.0, 12.0), description="gap after the cut-in"),
+    Parameter("closing_speed", -math.inf, math.inf, "m/s", normal(2.0, 3.0), description="ego minus other"),
+    Parameter("delay", -math.inf, math.inf, "s", lognormal(0.8, 0.25), description="until the ego brakes"),
+    Parameter("deceleration", 3.0, 10.0, "m/s^2", normal(7.0, 1.2), description="of the braking ego"),
 )
 _CUT_IN_BOX = ((2.0, 120.0), (-10.0, 20.0), (0.2, 3.0), (3.0, 10.0))
 _PEDESTRIAN = (
-    Parameter("speed", 4.0, 9.0, "m/s", _normal(6.0, 0.8), description="of the ego"),
-    Parameter("walking_speed", -math.inf, math.inf, "m/s", _lognormal(1.25, 0.35), description="of the pedestrian"),
+    Parameter("speed", 4.0, 9.0, "m/s", normal(6.0, 0.8), description="of the ego"),
+    Parameter("walking_speed", -math.inf, math.inf, "m/s", lognormal(1.25, 0.35), description="of the pedestrian"),
     Parameter("distance", 0.0, 50.0, "m", description="from the ego's front to the crossing line"),
-    Parameter("delay", -math.inf, math.inf, "s", _lognormal(0.9, 0.35), description="until the ego brakes"),
-    Parameter("friction", 0.25, 1.0, "", _normal(0.7, 0.12), description="of tyre and road"),
+    Parameter("delay", -math.inf, math.inf, "s", lognormal(0.9, 0.35), description="until the ego brakes"),
+    Parameter("friction", 0.25, 1.0, "", normal(0.7, 0.12), description="of tyre and road"),
 )
 _PEDESTRIAN_BOX = ((4.0, 9.0), (0.4, 3.0), (0.0, 50.0), (0.2, 3.0), (0.25, 1.0))
 
 PROBLEMS = (
-    Problem("cut_in_crash", "Cut-in with delayed braking: collision", _CUT_IN, cut_in, _NEGATIVE,
+    Problem("cut_in_crash", "Cut-in with delayed braking: collision", _CUT_IN, cut_in, NEGATIVE,
             Truth(0.0015176718, 4.8e-07, 1, 0.144300, 2.1e-05), box=_CUT_IN_BOX),
     Problem("cut_in_near_miss", "Cut-in with delayed braking: near miss, no collision", _CUT_IN, cut_in,
             CriticalInterval(0.0, 0.6), Truth(0.00080271207, 4.7e-07, 1, 0.006017, 2.1e-05), box=_CUT_IN_BOX),
-    Problem("pedestrian", "A pedestrian steps out", _PEDESTRIAN, pedestrian, _NEGATIVE,
+    Problem("pedestrian", "A pedestrian steps out", _PEDESTRIAN, pedestrian, NEGATIVE,
             Truth(0.0933851, 6.5e-05, None, 0.152653, 2.5e-05), box=_PEDESTRIAN_BOX),
     Problem("plateau_ttc_d6", "A funnel in a plateau", parameters_of({f"x{k + 1}": (0.0, 1.0) for k in range(6)}), plateau_ttc,
-            _NEGATIVE, Truth(0.042 * 0.056 * 0.2, 0.0, 1, 0.042 * 0.056 * 0.2)),
+            NEGATIVE, Truth(0.042 * 0.056 * 0.2, 0.0, 1, 0.042 * 0.056 * 0.2)),
 )  # fmt: skip

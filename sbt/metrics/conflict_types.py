@@ -1,6 +1,6 @@
-"""The type of a conflict: on which side of ego, and on what course, the nearest other was when it was nearest.
+"""The type of a conflict: the side of the ego and the course of the nearest road user at the smallest distance.
 
-Runs that fail in the same way have the same type; falsification tells failure modes apart by it.
+Runs that fail in the same way have the same type; falsification distinguishes failure modes by it.
 """
 
 from __future__ import annotations
@@ -14,21 +14,23 @@ from sbt.metrics.longitudinal import FAR
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["NAME", "conflict_type", "conflict_type_in_words"]
+__all__ = ["METRIC_NAME", "conflict_type", "describe_conflict_type"]
 
-NAME = "conflict_type"
+METRIC_NAME = "conflict_type"
+"""Name of the metric."""
 _SIDES = ("ahead of ego", "left of ego", "behind ego", "right of ego")
 _COURSES = ("same direction", "crossing from the right", "oncoming", "crossing from the left")
-_ALONE = -1
+_NOBODY = -1
+"""Value if there is no other road user within 1 km."""
 
 
 def conflict_type(ego: str = "ego") -> Metric:
-    """Return the metric `conflict_type`: 4 side + course at the instant of the smallest distance, -1 with nobody within 1 km.
+    """Return the metric `conflict_type`: 4 side + course at the smallest distance; -1 with nobody within 1 km.
 
-    Side: 0 ahead, 1 left, 2 behind, 3 right of ego's rectangle, whichever face the other is farther outside of.
-    Course: the other's heading relative to ego's, 0 the same, 1 turned left by 45 to 135 degrees (it comes from the
-    right), 2 oncoming, 3 turned right. A road user that is not there at an instant (NaN) does not count. Where nobody has
-    the name `ego`, ego is the first actor: a scenario need not say how it calls its own.
+    Side: 0 ahead, 1 left, 2 behind, 3 right of the ego's rectangle, by the side that the other is farther away from.
+    Course: heading of the other relative to the ego's; 0 the same, 1 turned left by 45 to 135 degrees (it comes from
+    the right), 2 oncoming, 3 turned right. Absent road users (NaN) do not count. If no actor has the name `ego`, the
+    first actor is the ego.
     """
 
     def function(trace: Trace) -> float:
@@ -37,8 +39,8 @@ def conflict_type(ego: str = "ego") -> Metric:
         reach = 0.5 * np.hypot(trace.length, trace.width)
         centres = np.hypot(trace.x - own.x[:, None], trace.y - own.y[:, None])  # (t, m)
         least = np.where(np.isfinite(centres), centres, np.inf).min(axis=0) - reach - reach[column]
-        best, code = FAR, _ALONE
-        for k in np.argsort(least, kind="stable").tolist():  # the nearest first
+        best, code = FAR, _NOBODY
+        for k in np.argsort(least, kind="stable").tolist():  # the nearest ones first
             if k != column and least[k] < best:
                 other = trace.actor(trace.actors[k])
                 distance, at = _nearest(own, other)
@@ -47,12 +49,13 @@ def conflict_type(ego: str = "ego") -> Metric:
         return float(code)
 
     return Metric(
-        NAME, function, "", "low", _ALONE, "side of ego and course of the nearest other, when nearest: 4 side + course, -1 nobody"
-    )
+        METRIC_NAME, function, "", "low", _NOBODY,
+        "side of ego and course of the nearest other, when nearest: 4 side + course, -1 nobody",
+    )  # fmt: skip
 
 
 def _nearest(ego: ActorTrace, other: ActorTrace) -> tuple[float, int]:
-    """Return the smallest distance of the rectangles (m, inf where they never meet) and its first instant."""
+    """Return the smallest distance of the rectangles (m, inf if they are never present together) and its instant."""
     distance = rectangle_distance(ego, other)
     distance = np.where(np.isfinite(distance), distance, np.inf)
     k = int(distance.argmin())
@@ -72,10 +75,10 @@ def _code(ego: ActorTrace, other: ActorTrace, k: int) -> int:
     return 4 * side + round(turned / (0.5 * math.pi)) % 4
 
 
-def conflict_type_in_words(code: float) -> str:
-    """Return the type in words; "" without anyone.
+def describe_conflict_type(code: float) -> str:
+    """Return a conflict type as text; "" for nobody.
 
-    >>> conflict_type_in_words(0.0), conflict_type_in_words(13.0), conflict_type_in_words(-1.0)
+    >>> describe_conflict_type(0.0), describe_conflict_type(13.0), describe_conflict_type(-1.0)
     ('ahead of ego, same direction', 'right of ego, crossing from the right', '')
     """
     return "" if code < 0 else f"{_SIDES[int(code) // 4]}, {_COURSES[int(code) % 4]}"

@@ -1,0 +1,129 @@
+"""Pairwise metrics and signals in traffic: computed for the ego and every other road user, of which the worst counts.
+
+In recorded traffic road users come and go, and their states are NaN while they are absent. A pairwise metric is
+computed on every interval of time in which both road users are present, as the actors `ego` and `co`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sbt.errors import InputError
+from sbt.metrics.cache import per_trace
+from sbt.metrics.longitudinal import D_MIN, FAR, HORIZON, TTC_MIN, d_min, ttc_min
+from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, signal
+from sbt.problem.arrays import Vector
+from sbt.problem.scenario import Metric
+from sbt.problem.trace import Trace
+
+__all__ = ["in_traffic", "joint_intervals", "without_overtaking", "worst_signal"]
+
+_ABSENT = {
+    "gap": FAR, "ttc": HORIZON, "thw": HORIZON, "mttc": HORIZON, "ttc2d": HORIZON, "distance": FAR,
+    "rss_longitudinal": FAR, "rss_lateral": FAR, "drac": 0.0, "mdrac": 0.0, "btn": 0.0,
+}  # fmt: skip
+"""Pairwise signals that can be compared between road users, with their value while nobody else is present."""
+_HIGH_IS_WORST = ("drac", "mdrac", "btn")
+
+
+@per_trace
+def joint_intervals(trace: Trace, ego: str, other: str) -> tuple[tuple[slice, Trace], ...]:
+    """Return the instants and the trace (actors `ego` and `co`) of every interval in which both are present.
+
+    A single instant is an interval only if the trace has no other.
+    """
+    return tuple(_joint_intervals(trace, ego, other))
+
+
+def _joint_intervals(trace: Trace, ego: str, other: str) -> Iterator[tuple[slice, Trace]]:
+    columns = [trace.actors.index(name) for name in (ego, other)]
+    present = trace.present[:, columns].all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
+    for first, last in edges.reshape(-1, 2).tolist():
+        if last - first > 1 or len(trace.time) == 1:
+            instants = slice(first, last)
+            yield instants, _part(trace, instants, columns)
+
+
+def _part(trace: Trace, i: slice, at: list[int]) -> Trace:
+    """Return some instants of one or two actors, named ego and co."""
+    return Trace(
+        trace.time[i], ("ego", "co")[: len(at)], trace.x[i][:, at], trace.y[i][:, at], trace.heading[i][:, at],
+        trace.speed[i][:, at], trace.acceleration[i][:, at], trace.length[at], trace.width[at], trace.ended,
+    )  # fmt: skip
+
+
+def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "") -> Metric:
+    """Return a metric of `ego` and `co` as a metric of an ego in traffic.
+
+    Args:
+        metric: of the actors `ego` and `co`, or of the ego alone.
+        ego: its name in the traces.
+        other: the road user to be considered; None: all others, of which the worst counts.
+        name: of the new metric; "": that of the given one.
+
+    Returns:
+        A metric whose value is `without` while nobody else is present. It raises a `RunError` if a named
+        `other` is not in the trace.
+    """
+
+    def function(trace: Trace) -> float:
+        if metric.alone:
+            return metric.function(_part(trace, slice(None), [trace.actors.index(ego)]))
+        if other is not None:
+            trace.actor(other)
+        values = [
+            metric.function(part)
+            for actor in trace.actors
+            if actor != ego and other in (None, actor)
+            for _, part in joint_intervals(trace, ego, actor)
+        ]
+        worst = max if metric.direction == "high" else min
+        return worst(values, default=metric.without)
+
+    return replace(metric, name=name or metric.name, function=function)
+
+
+def without_overtaking(metric: Metric) -> Metric:
+    """Return an installed metric; `ttc_min` and `d_min` in the variant that reports no interaction for an overtaking ego.
+
+    In a test, having overtaken before the other enters the path is a result of its own; in traffic it is not.
+    """
+    if metric is TTC_MIN:
+        return ttc_min(passed=HORIZON)
+    return d_min(passed=FAR) if metric is D_MIN else metric
+
+
+def worst_signal(trace: Trace, name: str, ego: str, margin: float = 0.0) -> Vector:
+    """Return a named signal of an ego in traffic; a pairwise signal without an actor is the worst over all others.
+
+    Args:
+        trace: t instants.
+        name: as in `sbt.metrics.signals.signal`; `NAME.gap` refers to the ego and the actor NAME.
+        ego: its name in the trace.
+        margin: lateral clearance below which another road user is in the ego's path (m).
+
+    Returns:
+        (t,) numbers; NaN for a signal of a single actor while it is absent.
+
+    Raises:
+        InputError: a pairwise signal without an actor cannot be compared between road users.
+        RunError: there is no such actor in the trace.
+    """
+    actor, _, what = name.rpartition(".")
+    if name == "time" or what in ACTOR_SIGNALS:
+        return signal(trace, name, ego)
+    if what not in _ABSENT and not actor:
+        raise InputError(f"in traffic '{what}' needs a road user, such as lead.{what}; bare ones are {', '.join(_ABSENT)}")
+    if actor:
+        trace.actor(actor)
+    worst: Callable[[Vector, Vector], Vector] = np.maximum if what in _HIGH_IS_WORST else np.minimum
+    result = np.full(len(trace.time), _ABSENT.get(what, np.nan))
+    for other in [actor] if actor else [a for a in trace.actors if a != ego]:
+        for instants, part in joint_intervals(trace, ego, other):
+            values = PAIR_SIGNALS[what](part, "ego", "co", margin)
+            result[instants] = worst(result[instants], values) if what in _ABSENT else values
+    return result

@@ -1,0 +1,408 @@
+"""Nothing outlives a campaign, whatever ends it; and nothing ends it but a signal."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sbt import interruption
+from sbt.execution.streams import SteadyStream
+from sbt.execution.tasks import each
+from sbt.processes import ProcessId, remove_abandoned, scratch
+
+ROOT = Path(__file__).resolve().parents[1]
+SBT = [sys.executable, "-m", "sbt"]
+pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+TAG = "SBT_TEST_FAULTS"
+
+
+def tagged(tag: str) -> list[int]:
+    """Return the living processes with this tag in their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            wanted = f"{TAG}={tag}".encode() in (folder / "environ").read_bytes().split(b"\0")
+            if wanted and (folder / "stat").read_text().rpartition(")")[2].split()[0] != "Z":
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+def until(condition: Callable[[], Any], seconds: float = 30.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+@pytest.fixture
+def temporary(tmp_path: Path) -> Path:
+    """A folder for temporary files that a campaign has to itself."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def started(temporary: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start a process as a terminal does, in a group of its own; kill what is left of it in the end."""
+    running: list[subprocess.Popen[str]] = []
+
+    def start(*command: str, **more: Any) -> subprocess.Popen[str]:
+        environment = {**os.environ, TAG: str(temporary), "TMPDIR": str(temporary)}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | more
+        running.append(subprocess.Popen(command, text=True, env=environment, start_new_session=True, **pipes))
+        return running[-1]
+
+    yield start
+    for process in running:
+        process.kill()
+        process.communicate()
+    for pid in tagged(str(temporary)):
+        os.kill(pid, signal.SIGKILL)
+
+
+def finished(store: Path) -> int:
+    """Return how many runs are in a store."""
+    found = subprocess.run([*SBT, "status", str(store), "--json"], capture_output=True, text=True, check=False)
+    return sum(n for name, n in json.loads(found.stdout)["runs"].items() if name != "planned") if found.returncode == 0 else 0
+
+
+def begun(store: Path) -> bool:
+    return until(lambda: (store / "campaign.sqlite").is_file()) and until(lambda: finished(store) > 0)
+
+
+@pytest.mark.parametrize(
+    ("number", "executor"),
+    [
+        (signal.SIGINT, {"kind": "local", "workers": 2}),
+        (signal.SIGHUP, {"kind": "local", "workers": 2}),
+        (signal.SIGQUIT, {"kind": "serial"}),
+        (signal.SIGTERM, {"kind": "local", "workers": 1}),
+    ],
+    ids=["INT", "HUP", "QUIT", "TERM"],
+)
+def test_a_signal_is_answered_at_once_and_leaves_nothing(
+    number: int, executor: dict[str, Any], configured: Callable[..., Path], started: Any, temporary: Path,
+    campaign: Callable[..., dict[str, Any]], rows: Any,
+):  # fmt: skip
+    config = configured("c", "SLOW", budget=400, batch=400, campaign="coverage", executor=executor)
+    driver = started(*SBT, "run", str(config), "--quiet")
+    store = config.parent / "c"
+    assert begun(store)
+    at = time.monotonic()
+    os.killpg(driver.pid, number)  # as a terminal does: to the driver and its workers
+    line = driver.stderr.readline()
+    assert time.monotonic() - at < 1.5, "alone on a machine it takes some milliseconds"
+    name = signal.Signals(number).name
+    assert line == f"stopping ({name}): run again to resume; a second signal stops at once\n"
+    _, rest = driver.communicate(timeout=20)
+    assert (driver.returncode, rest) == (130, "interrupted, run again to resume\n")
+    assert until(lambda: not tagged(str(temporary)), 5.0)
+    assert list(temporary.iterdir()) == []
+    assert finished(store) < 400
+    keys = {"budget": 400, "batch": 400, "campaign": "coverage"}
+    assert rows(campaign("c", "SLOW", **keys)["store"]) == rows(campaign("d", "SLOW", **keys)["store"])
+
+
+RUDE = """
+import os, time
+from pathlib import Path
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+MARK = Path(__file__).parent / "running"
+
+def deaf(values, seed):
+    try:
+        MARK.write_text("")
+        time.sleep(1.0)
+    except BaseException:
+        pass
+    return {"y": 1.0}
+
+def printing(values, seed):
+    print("much " * 4000)
+    os.write(1, b"noise of C")
+    return {"y": 1.0}
+
+SPACE = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
+DEAF, PRINTING = (
+    LogicalScenario(f.__name__, SPACE, Requirement("y", CriticalInterval(high=0.0)), evaluate=f, metric_names=("y",))
+    for f in (deaf, printing)
+)
+"""
+
+
+@pytest.fixture
+def rude(analytic: Path) -> Path:
+    path = analytic.parent / "rude.py"
+    path.write_text(RUDE)
+    return path
+
+
+def test_a_run_that_catches_everything_cannot_catch_ctrl_c(configured: Callable[..., Path], rude: Path, started: Any):
+    config = configured("c", scenario="SCENARIO", campaign="coverage", budget=30, batch=30)
+    driver = started(*SBT, "run", str(config), "--set", "scenario=rude.py:DEAF", "--quiet")
+    assert until((rude.parent / "running").exists)
+    os.kill(driver.pid, signal.SIGINT)
+    at = time.monotonic()
+    _, told = driver.communicate(timeout=30)
+    assert time.monotonic() - at < 5.0
+    assert (driver.returncode, told.splitlines()[-1]) == (130, "interrupted, run again to resume")
+    assert finished(config.parent / "c") <= 1, "the run that was interrupted is no row"
+
+
+def test_before_there_is_a_store_an_interruption_says_so(configured: Callable[..., Path], rude: Path, started: Any):
+    rude.write_text("import time\nfrom pathlib import Path\nPath(__file__).with_name('running').touch()\ntime.sleep(60)\n")
+    config = configured("c")
+    driver = started(*SBT, "run", str(config), "--set", "scenario=rude.py:DEAF")
+    assert until((rude.parent / "running").exists)
+    os.kill(driver.pid, signal.SIGINT)
+    _, told = driver.communicate(timeout=20)
+    assert driver.returncode == 130
+    assert told.splitlines() == [
+        "stopping (SIGINT): nothing was run yet; a second signal stops at once", "interrupted, nothing was run yet",
+    ]  # fmt: skip
+
+
+def test_ignored_signals_stay_ignored(configured: Callable[..., Path], started: Any):
+    """As under nohup."""
+    config = configured("c", "SLOW", campaign="coverage", budget=300, batch=300)
+    driver = started("bash", "-c", f"trap '' HUP; exec {' '.join(SBT)} run {config} --quiet --json")
+    assert begun(config.parent / "c")
+    os.kill(driver.pid, signal.SIGHUP)
+    out, _ = driver.communicate(timeout=60)
+    assert (driver.returncode, json.loads(out)["runs"]) == (0, 300)
+
+
+NOTEBOOK = """
+import os, signal, sys, threading, time
+from sbt.execution.{module} import {executor}
+from sbt.execution.spec import ScenarioSpec
+from sbt.problem.outcome import Job
+
+before = signal.getsignal(signal.SIGINT)
+threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    with {executor}(ScenarioSpec("analytic.py:SLOW", {folder!r}){more}) as executor:
+        for outcome in executor.run([Job(k, {{"a": 0.5, "b": 0.5}}, k) for k in range(100_000)]):
+            assert outcome.status == "ok"
+except KeyboardInterrupt:
+    print("interrupted")
+assert signal.getsignal(signal.SIGINT) is before
+again = SerialExecutor(ScenarioSpec("analytic.py:SLOW", {folder!r}))
+print(len(list(again.run([Job(0, {{"a": 0.5, "b": 0.5}}, 0)]))))
+"""
+
+
+@pytest.mark.parametrize(("module", "executor", "more"), [("protocol", "SerialExecutor", ""), ("local", "LocalExecutor", ", 1")])
+def test_the_library_is_interrupted_as_a_notebook_expects(
+    module: str, executor: str, more: str, analytic: Path, started: Any, temporary: Path
+):
+    text = NOTEBOOK.format(module=module, executor=executor, more=more, folder=str(analytic.parent))
+    script = "from sbt.execution.protocol import SerialExecutor\n" + text
+    done = started(sys.executable, "-c", script)
+    out, err = done.communicate(timeout=60)
+    assert (done.returncode, out, err) == (0, "interrupted\n1\n", "")
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_signal_is_told_from_what_code_raises():
+    with interruption.handled():
+        assert not interruption.is_interruption(KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert interruption.requested()
+        assert interruption.is_interruption(ValueError("what the code made of it"))
+        with pytest.raises(KeyboardInterrupt):
+            interruption.check()
+        with interruption.handled():
+            assert interruption.requested(), "an inner one forgets nothing"
+    assert not interruption.requested()
+    assert interruption.is_interruption(KeyboardInterrupt()), "nobody knows without a handler"
+    interruption.check()
+    found: list[bool] = []
+    thread = threading.Thread(target=lambda: found.append(interruption.is_interruption(KeyboardInterrupt())))
+    thread.start()
+    thread.join()
+    assert found == [False]
+
+
+def test_drivers_that_are_killed_leave_no_process_and_no_folder():
+    """A few kills of those that `benchmarks/faults.py` makes."""
+    done = subprocess.run(
+        [sys.executable, ROOT / "benchmarks" / "faults.py", "--kills", "6", "--seed", "2"],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    names, _, values = ([cell.strip() for cell in line.strip("|").split("|")] for line in done.stdout.splitlines()[-3:])
+    found = dict(zip(names, values, strict=True))
+    assert (found["kills"], found["processes left"], found["folders after one more campaign"]) == ("6", "0", "0")
+    assert found["its exit code"] == "0"
+
+
+DRIVER = """
+import sys
+from sbt.execution.local import LocalExecutor
+from sbt.execution.spec import ScenarioSpec
+from sbt.problem.outcome import Job
+
+with LocalExecutor(ScenarioSpec("analytic.py:AWKWARD", sys.argv[1]), 2) as executor:
+    for outcome in executor.run([Job(k, {"a": 0.05, "b": 0.5}, k) for k in range(1000)]):
+        print(outcome.index, flush=True)
+"""
+
+
+@pytest.mark.parametrize("moment", [0.0, 0.2])
+def test_a_driver_that_dies_while_its_workers_start_leaves_none(moment: float, analytic: Path, started: Any, temporary: Path):
+    driver = started(sys.executable, "-c", DRIVER, str(analytic.parent))
+
+    def starting() -> bool:
+        found = (Path(f"/proc/{pid}/cmdline") for pid in tagged(str(temporary)))
+        return any("popen_loky_posix" in path.read_text(errors="replace") for path in found if path.exists())
+
+    assert until(starting)
+    time.sleep(moment)
+    driver.kill()
+    assert until(lambda: not tagged(str(temporary)), 10.0), "5 s on a machine of one's own"
+
+
+def test_a_worker_that_lets_no_other_code_run_ends_with_its_driver(analytic: Path, started: Any, temporary: Path):
+    """As a hanging step of SUMO: the interpreter's lock is held, so that no thread of the worker can look for the driver."""
+    (analytic.parent / "holding.py").write_text(
+        analytic.read_text() + "\n\ndef hold(values, seed):\n    import ctypes\n    print('holding', flush=True)\n"
+        "    ctypes.PyDLL(None).sleep(60)\n\n\nAWKWARD = scenario(hold)\n"
+    )
+    driver = started(sys.executable, "-c", DRIVER.replace("analytic", "holding"), str(analytic.parent))
+    assert driver.stdout.readline() == "holding\n"
+    driver.kill()
+    assert until(lambda: not tagged(str(temporary)), 5.0)
+
+
+def test_tasks_end_with_their_driver(analytic: Path, started: Any, temporary: Path):
+    script = "import time\nfrom sbt.execution.tasks import each\nfor _ in each(time.sleep, [60.0, 60.0], 2): pass\n"
+    driver = started(sys.executable, "-c", script)
+    assert until(lambda: len(tagged(str(temporary))) >= 3)
+    driver.kill()
+    assert until(lambda: not tagged(str(temporary)), 10.0)
+
+
+def raising(item: int) -> int:
+    if item == 1:
+        sys.exit("over")
+    if item == 2:
+        os._exit(3)
+    return item
+
+
+def test_a_task_may_raise_anything():
+    assert [reason and reason.partition(" (")[0] for _, reason in each(raising, [0, 1], 1)] == [None, "SystemExit: over"]
+
+
+@pytest.mark.parametrize("kind", ["local", "serial"])
+def test_a_campaign_leaves_no_temporary_folder(kind: str, started: Any, configured: Callable[..., Path], temporary: Path):
+    executor = {"kind": kind} | ({"workers": 2} if kind == "local" else {})
+    config = configured("c", campaign="coverage", budget=20, batch=20, executor=executor)
+    driver = started(*SBT, "run", str(config), "--json", "--set", "scenario=cut_in")
+    out, err = driver.communicate(timeout=90)
+    assert (driver.returncode, json.loads(out)["ok"]) == (0, 20), err
+    assert list(temporary.iterdir()) == []
+
+
+def test_folders_of_processes_that_have_ended_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.delenv("SBT_SCRATCH", raising=False)
+    with scratch("test") as own:
+        name = Path(own).name
+        own_id, dead = ProcessId.current(), subprocess.Popen(["true"])
+        dead.wait()
+        assert f"-{own_id.pid}-{own_id.start}-" in name
+        of_dead = name.replace(f"-{own_id.pid}-", f"-{dead.pid}-")
+        of_earlier = name.replace(f"-{own_id.start}-", f"-{own_id.start - 1}-")  # the identifier was used again
+        elsewhere = re.sub(r"-\w{8}-", "-00000000-", of_dead, count=1)  # on another machine, in another container
+        for folder in (of_dead, of_earlier, elsewhere, "sbt-notes", "other"):
+            (tmp_path / folder / "sub").mkdir(parents=True)
+        remove_abandoned(tmp_path)
+        assert {path.name for path in tmp_path.iterdir()} == {name, elsewhere, "sbt-notes", "other"}
+        monkeypatch.setenv("SBT_SCRATCH", own)
+        with scratch("inner") as inner:
+            assert Path(inner).parent == Path(own)
+    assert not Path(own).exists()
+
+
+def test_a_process_is_known_by_its_identifier_and_its_start():
+    own = ProcessId.current()
+    assert own.alive
+    assert not ProcessId(own.pid, own.start - 1).alive
+    zombie = subprocess.Popen(["true"])
+    assert until(lambda: not ProcessId(zombie.pid, 0).alive or Path(f"/proc/{zombie.pid}/stat").read_text().split()[2] == "Z")
+    fields = Path(f"/proc/{zombie.pid}/stat").read_text().rpartition(")")[2].split()
+    assert not ProcessId(zombie.pid, int(fields[19])).alive
+    zombie.wait()
+
+
+@pytest.mark.parametrize(
+    ("kind", "ending"),
+    [
+        ("serial", "2>&-"), ("serial", ">&-"), ("serial", "2>&1 >/dev/null | head -1"), ("serial", ">&- 2>&- <&-"),
+        ("local", "2>&-"), ("local", "2>&1 | head -1"),
+    ],
+)  # fmt: skip
+def test_closed_streams_end_nothing(
+    kind: str, ending: str, configured: Callable[..., Path], rude: Path, started: Any, rows: Any
+):
+    """Although every run prints a lot."""
+    executor = {"kind": kind} | ({"workers": 1} if kind == "local" else {})
+    config = configured("c", campaign="coverage", budget=20, batch=10, executor=executor)
+    command = f"set -o pipefail; {' '.join(SBT)} run {config} --set scenario=rude.py:PRINTING {ending}"
+    done = started("bash", "-c", command)
+    done.communicate(timeout=90)
+    found = rows(config.parent / "c")["runs"]
+    assert [row[6] for row in found] == ["ok"] * 20
+    assert done.returncode == 0
+    assert (config.parent / "c" / "report.html").is_file()
+
+
+def test_a_full_disk_is_an_error_for_results_and_none_for_progress():
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    with Path("/dev/full").open("w") as full:
+        result = SteadyStream(full)
+        result.write("x")
+        with pytest.raises(OSError, match="No space"):
+            result.flush()
+        progress = SteadyStream(full, any_error=True)
+        progress.flush()
+        progress.write("y")
+        progress.flush()
+        assert progress.gone
+
+
+def test_check_tells_what_code_raises(rude: Path):
+    text = rude.read_text().replace("    try:\n", "    import sys\n    sys.exit('no')\n    try:\n", 1)
+    rude.write_text(text)
+    done = subprocess.run([*SBT, "check", "rude.py:DEAF"], cwd=rude.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "failed; at a=0.5, b=0.5: failed: SystemExit: no (" in done.stdout
+    done = subprocess.run([*SBT, "simulate", "rude.py:DEAF"], cwd=rude.parent, capture_output=True, text=True, check=False)
+    assert (done.returncode, "failed: SystemExit: no (" in done.stdout) == (4, True)
+    rude.write_text("import sys\n\nsys.exit()\n")
+    done = subprocess.run([*SBT, "simulate", "rude.py:DEAF"], cwd=rude.parent, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"plug-in file {rude}:3 raised on import: SystemExit\n"
