@@ -14,4 +14,12 @@ from sbt.workflows.contracts import (
     check_scenario,
 )
 
-__all__ = ["ContractError", "check_acquisition", "check_campaign", "check_metamodel", "check_metric", "check_sampler", "check_scenario"]
+__all__ = [
+    "ContractError",
+    "check_acquisition",
+    "check_campaign",
+    "check_metamodel",
+    "check_metric",
+    "check_sampler",
+    "check_scenario",
+]

@@ -18,9 +18,9 @@ from typing import Any, Self
 
 from sbt.errors import InputError, SbtError
 from sbt.execution.local import LocalExecutor
-from sbt.execution.starting import start_apart
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.starting import start_apart
 from sbt.execution.streams import open_missing
 from sbt.execution.worker import versions
 from sbt.problem.outcome import Job, Outcome, Status
