@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 
 from sbt import testbeds
 from sbt.acquisitions import expected_feasibility, straddle
-from sbt.campaigns.exploration import EXPLORED, fruitless_runs, should_explore
+from sbt.campaigns.exploration import fruitless_runs, should_explore
+from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.settings import Settings
 from sbt.cli import app
 from sbt.config.load import parse
@@ -33,6 +34,7 @@ from sbt.samplers.surface import crossings
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION, History, Record
+from sbt.store.records import FitRecord, Iteration, to_json
 
 
 def test_particles_have_the_density_of_the_score():
@@ -151,7 +153,7 @@ def test_campaigns_that_look_for_the_edge_tell_the_metamodel_where_it_is(campaig
     ]
     assert settings.learner is not None
     learner = replace(settings.learner, metamodel=Recalibrated(asking))
-    learner.train(History(names, tuple(runs)))
+    learner.train(History.of(names, runs))
     assert asking.told == [CriticalInterval(0.0, 0.6)] * times
 
 
@@ -206,11 +208,12 @@ def test_shares_of_the_mix(tmp_path: Path, share: float, filling: int):
     keys = {"scenario": "'testbed:cut_in_crash:box'", "budget": 120, "initial": 40, "batch": 20}
     run(tmp_path, **keys, validation=f"{{share: {share}}}")
     with Store.read(tmp_path / "store") as store:
-        hows = store.iterations()[1:]
-    assert [how["method"] for how in hows] == ["mix"] * 4
-    counted = {k: sum(how[k] for how in hows) for k in ("hunted", "filling", "representative", "greedy", "held_out")}
+        proposals = [batch.read(BatchProposal) for batch in store.iterations()[1:]]
+    assert [proposal.method for proposal in proposals] == ["mix"] * 4
+    parts = ("explored", "filling", "representative", "greedy", "held_out")
+    counted = {name: sum(getattr(proposal, name) for proposal in proposals) for name in parts}
     assert sum(counted.values()) == 80
-    assert counted["hunted"] == 0  # 14 % of the space is critical
+    assert counted["explored"] == 0  # 14 % of the space is critical
     assert counted["filling"] + counted["held_out"] == 8
     assert counted["filling"] == filling
     assert counted["representative"] == pytest.approx(0.8 * 72, abs=1)
@@ -235,40 +238,42 @@ def test_representative_picks_leave_little_doubt_far_from_a_run():
     assert len(select_representative(u, np.where(u[:, 0] < 0.5, 1.0, 0.0), u[u[:, 0] < 0.5], 3, scale)) == 0  # no doubt is left
 
 
-def hunting_log(batches: list[tuple[int, list[tuple[float, float]]]]) -> Log:
+def log_of(batches: list[tuple[int, list[tuple[float, float]]]]) -> Log:
     """Return a log of batches (runs that explored, x and y of each run); critical is y <= 0, one input."""
-    rows, hows = [], []
+    rows, iterations = [], []
     for k, (explored, runs) in enumerate(batches):
-        hows.append({"iteration": k, EXPLORED: explored})
+        iterations.append(Iteration(k, "boundary", to_json(BatchProposal("mix", 0, explored=explored))))
         for x, y in runs:
             rows.append(Record(len(rows), "boundary", k, {"x": x}, 0, "ok", {"y": y}, "", None, 0.0, "", ""))
-    return Log(History(("x",), tuple(rows)), tuple(hows), ())
+    return Log(History.of(("x",), rows), tuple(iterations), ())
 
 
-def hunter(budget: int) -> Settings:
+def settings_for(budget: int) -> Settings:
     scenario = testbeds.analytic(lambda x: x[:, 0], inputs={"x": (0.0, 1.0)}, critical=(-math.inf, 0.0), name="line")
     learner = Learner(scenario, GaussianProcess(), 0)
-    return Settings(scenario, 0, budget, 5, 5, 0.0, 0, learner, None)
+    return Settings(scenario=scenario, seed=0, budget=budget, initial=5, batch=5, learner=learner)
 
 
 NEVER, HIT = [(0.2, 1.0), (0.4, 1.0), (0.6, 1.0)], [(0.1, -1.0), (0.2, 1.0), (0.3, 1.0)]
 
 
-def test_a_hunt_ends_when_it_was_in_vain_for_a_fifth_of_the_budget():
-    rare, common = (FittedMetamodel(lambda u: Prediction.gaussian(u, u), {"critical_fraction": p}, 9, 0.0) for p in (1e-3, 0.1))
-    nothing = hunting_log([(0, NEVER)] + [(2, NEVER)] * 9)
-    assert fruitless_runs(hunter(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
-    assert should_explore(hunter(40), rare, nothing)
-    assert not should_explore(hunter(40), common, nothing)
+def test_exploration_ends_when_a_fifth_of_the_budget_found_nothing_new():
+    rare, common = (
+        FittedMetamodel(lambda u: Prediction.gaussian(u, u), FitRecord(9, p, 0.0, 0.0, ""), 0.0) for p in (1e-3, 0.1)
+    )
+    nothing = log_of([(0, NEVER)] + [(2, NEVER)] * 9)
+    assert fruitless_runs(settings_for(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
+    assert should_explore(settings_for(40), rare, nothing)
+    assert not should_explore(settings_for(40), common, nothing)
     before = [(0, NEVER), (2, HIT)]
-    spent = [fruitless_runs(hunter(40), hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
+    spent = [fruitless_runs(settings_for(40), log_of(before + [(2, NEVER)] * n)) for n in range(6)]
     assert spent == [0, 2, 4, 6, 8, 10]
-    on = [should_explore(hunter(40), rare, hunting_log(before + [(2, NEVER)] * n)) for n in range(6)]
+    on = [should_explore(settings_for(40), rare, log_of(before + [(2, NEVER)] * n)) for n in range(6)]
     assert on == [True] * 4 + [False] * 2
-    same = hunting_log([*before, (2, NEVER), (2, [(0.15, -1.0), (0.3, 1.0)])])
-    another = hunting_log([*before, (2, NEVER), (2, [(0.3, 1.0), (0.9, -1.0)])])
-    by_doubt = hunting_log([*before, (2, NEVER), (1, [(0.3, 1.0), (0.9, -1.0)])])
-    assert [fruitless_runs(hunter(40), log) for log in (same, another, by_doubt)] == [4, 0, 3]
+    same = log_of([*before, (2, NEVER), (2, [(0.15, -1.0), (0.3, 1.0)])])
+    another = log_of([*before, (2, NEVER), (2, [(0.3, 1.0), (0.9, -1.0)])])
+    by_doubt = log_of([*before, (2, NEVER), (1, [(0.3, 1.0), (0.9, -1.0)])])
+    assert [fruitless_runs(settings_for(40), log) for log in (same, another, by_doubt)] == [4, 0, 3]
 
 
 SMALL = """
@@ -282,14 +287,14 @@ DISCS = analytic(discs, inputs={"a": (0.0, 1.0), "b": (0.0, 1.0)}, critical=(-np
 """
 
 
-def test_small_regions_are_hunted_until_all_are_known(tmp_path: Path):
+def test_small_regions_are_searched_until_all_are_known(tmp_path: Path):
     (tmp_path / "small.py").write_text(SMALL)
     run(tmp_path, scenario=f"'{tmp_path / 'small.py'}:DISCS'", budget=100, initial=10, batch=10, seed=4)
     with Store.read(tmp_path / "store") as store:
-        hows, history = store.iterations(), store.history()
+        batches, history = store.iterations(), store.history()
     hits = history.x[history.y("y") <= 0.0]
     assert len(np.unique(hits[:, 0] > 0.5)) == 2  # both regions
-    explored = np.array([how.get(EXPLORED, 0) for how in hows])
+    explored = np.array([batch.read(BatchProposal).explored or 0 for batch in batches])
     assert explored[1] > 0
     assert explored[-1] == 0
 
@@ -324,14 +329,14 @@ def test_boundary_points_are_exported(tmp_path: Path):
 
 
 @pytest.mark.parametrize("recalibrate", [False, True])
-def test_auto_says_in_the_campaign_what_it_believed(campaign, tmp_path, recalibrate):
+def test_auto_says_in_the_campaign_what_it_chose_and_why(campaign, tmp_path, recalibrate):
     metamodel = {"kind": "auto", "preset": "quick", "recalibrate": recalibrate}
     result = campaign(campaign="boundary", budget=40, metamodel=metamodel, store=str(tmp_path / "s"), report=True)
     found = result["conclusion"]
     assert set(found["weights"]) == {"gp", "et"}
     assert sum(found["weights"].values()) == pytest.approx(1.0)
-    assert all((f" % {name}" in found["believed"].split(":")[0]) == (weight > 0) for name, weight in found["weights"].items())
+    assert all((f" % {name}" in found["chosen_because"].split(":")[0]) == (weight > 0) for name, weight in found["weights"].items())
     page = (tmp_path / "s" / "report.html").read_text()
-    assert f"What the metamodel chose to believe: {found['believed'][:20]}" in page
+    assert f"The metamodel chose among its members: {found['chosen_because'][:20]}" in page
     with Store.read(tmp_path / "s") as store:
-        assert all("believed" in fit for fit in store.fits())
+        assert all(fit.chosen_because for fit in store.fits())
