@@ -93,7 +93,8 @@ LANGUAGES = {"bash", "console", "python", "text", "toml", "xml", "yaml"}
 RUN = {
     "README.md": {"bash", "yaml"}, "docs/benchmark.md": {"bash"}, "docs/boundary.md": {"console", "python"},
     "docs/clusters.md": {"bash", "yaml"}, "docs/configuration.md": {"yaml"}, "docs/estimation.md": {"yaml"},
-    "docs/extending.md": {"python", "toml", "yaml"}, "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
+    "docs/extending.md": {"python", "toml", "yaml"}, "docs/falsification.md": {"yaml"},
+    "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
     "docs/python.md": {"python"}, "docs/scenarios.md": {"python"}, "docs/testbeds.md": {"console", "python", "yaml"},
     "docs/tutorials/actors.md": {"bash", "python", "yaml"}, "docs/tutorials/own_files.md": {"bash", "xml", "yaml"},
     "docs/tutorials/traci_loop.md": {"bash", "python", "xml", "yaml"},
