@@ -14,6 +14,7 @@ from sbt.plugins import KINDS
 
 __all__ = ["doctor", "list_", "schema"]
 
+
 def list_(
     kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help=" | ".join(KINDS))] = None,
     *,

@@ -21,7 +21,6 @@ from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.persistence import load, read_info, save
-from sbt.metamodels.torch_tools import device_of
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
@@ -180,6 +179,8 @@ def _predictor(folder: Path, learner: Learner, training: History, settings: str,
     """Return the fitted metamodel, from the file beside the store where that has learned from the same runs."""
     path, key = folder / MODEL, _key(learner, training, settings)
     if device is not None:
+        from sbt.metamodels.torch_tools import device_of
+
         device_of(device)  # refuses one that is not there
     if path.is_file():
         try:
