@@ -34,7 +34,7 @@ from sbt.samplers.surface import crossings
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.store.history import VALIDATION, History, Record
-from sbt.store.records import FitRecord, Iteration, to_json
+from sbt.store.records import FitRecord, Iteration
 
 
 def test_particles_have_the_density_of_the_score():
@@ -129,13 +129,13 @@ def run(folder: Path, **keys: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Asking:
-    """Wants to know what is critical, and tells."""
+class Targeted:
+    """Keeps the critical intervals that it was given."""
 
-    told: list[CriticalInterval] = field(default_factory=list)
+    targets: list[CriticalInterval] = field(default_factory=list)
 
-    def with_target(self, critical: CriticalInterval) -> Asking:
-        self.told.append(critical)
+    def with_target(self, critical: CriticalInterval) -> Targeted:
+        self.targets.append(critical)
         return self
 
     def fit(self, u: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> Any:
@@ -143,18 +143,18 @@ class Asking:
 
 
 @pytest.mark.parametrize(("campaign", "times"), [("boundary", 1), ("falsification", 1), ("estimation", 1), ("coverage", 0)])
-def test_campaigns_that_look_for_the_edge_tell_the_metamodel_where_it_is(campaign: str, times: int):
+def test_campaigns_that_look_for_the_edge_hand_it_to_the_metamodel(campaign: str, times: int):
     loaded = parse(f"campaign: {campaign}\nscenario: 'testbed:cut_in_near_miss:box'\nmetamodel: {{kind: et}}\n")
-    settings, asking = settings_of(loaded), Asking()
+    settings, targeted = settings_of(loaded), Targeted()
     names, metric = settings.scenario.space.names, settings.scenario.requirement.metric
     runs = [
-        Record(i, "initial", 0, dict(zip(names, x, strict=True)), i, "ok", {metric: float(i)}, "", None, 0.0, "", "")
+        Record(i, "initial", 0, dict(zip(names, x, strict=True)), i, "ok", {metric: float(i)})
         for i, x in enumerate(settings.scenario.space.from_unit(stream(0, "runs").random((3, len(names)))).tolist())
     ]
     assert settings.learner is not None
-    learner = replace(settings.learner, metamodel=Recalibrated(asking))
+    learner = replace(settings.learner, metamodel=Recalibrated(targeted))
     learner.train(History.of(names, runs))
-    assert asking.told == [CriticalInterval(0.0, 0.6)] * times
+    assert targeted.targets == [CriticalInterval(0.0, 0.6)] * times
 
 
 def test_a_bound_spares_scores_and_changes_no_particle():
@@ -174,7 +174,7 @@ def test_a_bound_spares_scores_and_changes_no_particle():
     assert sum(asked) < 0.7 * without
 
 
-def test_what_auto_alone_believes_draws_functions_as_the_process_does():
+def test_a_process_alone_in_a_mixture_draws_functions_as_it_does_itself():
     u = stream(0, "rows").random((60, 2))
     y = np.sin(5 * u[:, 0]) + u[:, 1]
     mixed = Auto(ensemble_rows=10**6).with_target(CriticalInterval(high=0.0)).fit(u, y, stream(0, "fit"))
@@ -208,10 +208,10 @@ def test_shares_of_the_mix(tmp_path: Path, share: float, filling: int):
     keys = {"scenario": "'testbed:cut_in_crash:box'", "budget": 120, "initial": 40, "batch": 20}
     run(tmp_path, **keys, validation=f"{{share: {share}}}")
     with Store.read(tmp_path / "store") as store:
-        proposals = [batch.read(BatchProposal) for batch in store.iterations()[1:]]
-    assert [proposal.method for proposal in proposals] == ["mix"] * 4
+        batches = [batch.read(BatchProposal) for batch in store.iterations()[1:]]
+    assert [batch.method for batch in batches] == ["mix"] * 4
     parts = ("explored", "filling", "representative", "greedy", "held_out")
-    counted = {name: sum(getattr(proposal, name) for proposal in proposals) for name in parts}
+    counted = {part: sum(getattr(batch, part) for batch in batches) for part in parts}
     assert sum(counted.values()) == 80
     assert counted["explored"] == 0  # 14 % of the space is critical
     assert counted["filling"] + counted["held_out"] == 8
@@ -219,7 +219,7 @@ def test_shares_of_the_mix(tmp_path: Path, share: float, filling: int):
     assert counted["representative"] == pytest.approx(0.8 * 72, abs=1)
 
 
-def test_representative_picks_leave_little_doubt_far_from_a_run():
+def test_representative_picks_leave_little_weight_far_from_a_run():
     rng = stream(7, "representative")
     u, weight, there = rng.random((300, 3)), rng.random(300), rng.random((10, 3))
     scale = np.array([1.0, 0.5, 0.05])
@@ -235,20 +235,20 @@ def test_representative_picks_leave_little_doubt_far_from_a_run():
     random = [left(tuple(rng.choice(300, 6, replace=False))) for _ in range(200)]
     assert left(picks) < min(random)
     assert len(select_representative(there, np.ones(10), there, 3, scale)) == 0  # nobody's duplicate
-    assert len(select_representative(u, np.where(u[:, 0] < 0.5, 1.0, 0.0), u[u[:, 0] < 0.5], 3, scale)) == 0  # no doubt is left
+    assert len(select_representative(u, np.where(u[:, 0] < 0.5, 1.0, 0.0), u[u[:, 0] < 0.5], 3, scale)) == 0  # no weight is left
 
 
 def log_of(batches: list[tuple[int, list[tuple[float, float]]]]) -> Log:
     """Return a log of batches (runs that explored, x and y of each run); critical is y <= 0, one input."""
     rows, iterations = [], []
     for k, (explored, runs) in enumerate(batches):
-        iterations.append(Iteration(k, "boundary", to_json(BatchProposal("mix", 0, explored=explored))))
+        iterations.append(Iteration(k, "boundary", {"method": "mix", "next_position": 0, "explored": explored}))
         for x, y in runs:
-            rows.append(Record(len(rows), "boundary", k, {"x": x}, 0, "ok", {"y": y}, "", None, 0.0, "", ""))
+            rows.append(Record(len(rows), "boundary", k, {"x": x}, 0, "ok", {"y": y}))
     return Log(History.of(("x",), rows), tuple(iterations), ())
 
 
-def settings_for(budget: int) -> Settings:
+def with_budget(budget: int) -> Settings:
     scenario = testbeds.analytic(lambda x: x[:, 0], inputs={"x": (0.0, 1.0)}, critical=(-math.inf, 0.0), name="line")
     learner = Learner(scenario, GaussianProcess(), 0)
     return Settings(scenario=scenario, seed=0, budget=budget, initial=5, batch=5, learner=learner)
@@ -257,23 +257,22 @@ def settings_for(budget: int) -> Settings:
 NEVER, HIT = [(0.2, 1.0), (0.4, 1.0), (0.6, 1.0)], [(0.1, -1.0), (0.2, 1.0), (0.3, 1.0)]
 
 
-def test_exploration_ends_when_a_fifth_of_the_budget_found_nothing_new():
-    rare, common = (
-        FittedMetamodel(lambda u: Prediction.gaussian(u, u), FitRecord(9, p, 0.0, 0.0, ""), 0.0) for p in (1e-3, 0.1)
-    )
+def test_exploration_ends_when_it_found_nothing_new_for_a_fifth_of_the_budget():
+    records = (FitRecord(9, p, 0.0, 0.0, "") for p in (1e-3, 0.1))
+    rare, common = (FittedMetamodel(lambda u: Prediction.gaussian(u, u), record, 0.0) for record in records)
     nothing = log_of([(0, NEVER)] + [(2, NEVER)] * 9)
-    assert fruitless_runs(settings_for(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
-    assert should_explore(settings_for(40), rare, nothing)
-    assert not should_explore(settings_for(40), common, nothing)
+    assert fruitless_runs(with_budget(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
+    assert should_explore(with_budget(40), rare, nothing)
+    assert not should_explore(with_budget(40), common, nothing)
     before = [(0, NEVER), (2, HIT)]
-    spent = [fruitless_runs(settings_for(40), log_of(before + [(2, NEVER)] * n)) for n in range(6)]
+    spent = [fruitless_runs(with_budget(40), log_of(before + [(2, NEVER)] * n)) for n in range(6)]
     assert spent == [0, 2, 4, 6, 8, 10]
-    on = [should_explore(settings_for(40), rare, log_of(before + [(2, NEVER)] * n)) for n in range(6)]
+    on = [should_explore(with_budget(40), rare, log_of(before + [(2, NEVER)] * n)) for n in range(6)]
     assert on == [True] * 4 + [False] * 2
     same = log_of([*before, (2, NEVER), (2, [(0.15, -1.0), (0.3, 1.0)])])
     another = log_of([*before, (2, NEVER), (2, [(0.3, 1.0), (0.9, -1.0)])])
-    by_doubt = log_of([*before, (2, NEVER), (1, [(0.3, 1.0), (0.9, -1.0)])])
-    assert [fruitless_runs(settings_for(40), log) for log in (same, another, by_doubt)] == [4, 0, 3]
+    by_the_mix = log_of([*before, (2, NEVER), (1, [(0.3, 1.0), (0.9, -1.0)])])
+    assert [fruitless_runs(with_budget(40), log) for log in (same, another, by_the_mix)] == [4, 0, 3]
 
 
 SMALL = """
@@ -287,14 +286,14 @@ DISCS = analytic(discs, inputs={"a": (0.0, 1.0), "b": (0.0, 1.0)}, critical=(-np
 """
 
 
-def test_small_regions_are_searched_until_all_are_known(tmp_path: Path):
+def test_small_regions_are_searched_for_until_all_are_known(tmp_path: Path):
     (tmp_path / "small.py").write_text(SMALL)
     run(tmp_path, scenario=f"'{tmp_path / 'small.py'}:DISCS'", budget=100, initial=10, batch=10, seed=4)
     with Store.read(tmp_path / "store") as store:
-        batches, history = store.iterations(), store.history()
+        batches, history = [batch.read(BatchProposal) for batch in store.iterations()], store.history()
     hits = history.x[history.y("y") <= 0.0]
     assert len(np.unique(hits[:, 0] > 0.5)) == 2  # both regions
-    explored = np.array([batch.read(BatchProposal).explored or 0 for batch in batches])
+    explored = np.array([batch.explored or 0 for batch in batches])
     assert explored[1] > 0
     assert explored[-1] == 0
 
@@ -329,14 +328,14 @@ def test_boundary_points_are_exported(tmp_path: Path):
 
 
 @pytest.mark.parametrize("recalibrate", [False, True])
-def test_auto_says_in_the_campaign_what_it_chose_and_why(campaign, tmp_path, recalibrate):
+def test_a_campaign_says_the_weights_of_auto_and_why(campaign, tmp_path, recalibrate):
     metamodel = {"kind": "auto", "preset": "quick", "recalibrate": recalibrate}
     result = campaign(campaign="boundary", budget=40, metamodel=metamodel, store=str(tmp_path / "s"), report=True)
     found = result["conclusion"]
     assert set(found["weights"]) == {"gp", "et"}
     assert sum(found["weights"].values()) == pytest.approx(1.0)
-    assert all((f" % {name}" in found["chosen_because"].split(":")[0]) == (weight > 0) for name, weight in found["weights"].items())
-    page = (tmp_path / "s" / "report.html").read_text()
-    assert f"The metamodel chose among its members: {found['chosen_because'][:20]}" in page
+    reason = found["chosen_because"]
+    assert all((f" % {name}" in reason.split(":")[0]) == (weight > 0) for name, weight in found["weights"].items())
+    assert reason[:20] in (tmp_path / "s" / "report.html").read_text()
     with Store.read(tmp_path / "s") as store:
         assert all(fit.chosen_because for fit in store.fits())
