@@ -1,6 +1,6 @@
-"""The user's own SUMO files and loops: what runs is what was asked for, and what is wrong is said in words."""
+"""A user's own SUMO files and loops: the run is the requested one, and mistakes are reported with their place."""
 
-# ruff: noqa: E501  (one mistake a line, with what is said of it)
+# ruff: noqa: E501  (one mistake per line, with its message)
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ from sbt.sumo.files import options_of_command
 from sbt.sumo.template import template
 from sbt.workflows.running import Summary, run_study
 from sbt.workflows.study import Study
-
-pytestmark = pytest.mark.sumo
 
 TUTORIALS = Path(__file__).resolve().parent.parent / "docs" / "tutorials"
 Changed = Callable[..., Path]
@@ -89,7 +87,8 @@ CARS, ROAD, YAML = "cars.rou.xml", "road.net.xml", "scenario.yaml"
 EGO = 'departPos="100" departSpeed="30" insertionChecks="none"'
 
 
-def test_placeholders_become_numbers_and_the_start_is_the_one_asked_for(study):
+@pytest.mark.sumo
+def test_placeholders_become_numbers_and_the_initial_state_is_the_requested_one(study):
     path = study()
     _, trace = simulated(path, gap=20.0, v_lead=12.5)
     lead, ego = trace.actor("lead"), trace.actor("ego")
@@ -100,6 +99,7 @@ def test_placeholders_become_numbers_and_the_start_is_the_one_asked_for(study):
     assert "${" in (path.parent / CARS).read_text(), "the user's files stay as they are"
 
 
+@pytest.mark.sumo
 def test_numpy_scalars_are_numbers_in_files_and_loops(study):
     loop = "import numpy as np\ndef simulate(sumo, values, rng):\n    assert {type(v) for v in values.values()} == {float}\n"
     loop += "    while True:\n        sumo.simulation.step()\n        sumo.vehicle.setSpeed('lead', np.float32(3.5))\n"
@@ -110,7 +110,8 @@ def test_numpy_scalars_are_numbers_in_files_and_loops(study):
         assert trace.identical(scenario.simulate({"gap": number(60), "v_lead": number(12)}, np.int64(0)))
 
 
-def test_what_is_recorded_follows_the_motion(study):
+@pytest.mark.sumo
+def test_the_recorded_states_are_consistent(study):
     _, trace = simulated(study(), gap=60.0, v_lead=10.0)
     for name in trace.actors:
         actor = select_instants(trace.actor(name), slice(int(trace.present[:, trace.actors.index(name)].sum())))  # who leaves stays away
@@ -120,6 +121,7 @@ def test_what_is_recorded_follows_the_motion(study):
         assert actor.acceleration[1:] == pytest.approx(np.diff(actor.speed) / 0.1)
 
 
+@pytest.mark.sumo
 def test_seed_is_the_runs_and_repeats(study):
     path = study()
     scenario, first = simulated(path, seed=3)
@@ -129,7 +131,7 @@ def test_seed_is_the_runs_and_repeats(study):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({CARS: [("${105 + gap}", "${105 + gapp}")]}, r"cars.rou.xml:5:5: .*a placeholder must be one of gap, v_lead, but got 'gapp' \(did you mean 'gap'"),
         ({CARS: [("${105 + gap}", "150")]}, r"scenario.yaml:3:3: inputs.gap: an input must stand as a placeholder \$\{gap\}"),
@@ -150,10 +152,10 @@ def test_seed_is_the_runs_and_repeats(study):
         ({YAML: [("metric: ttc_min", "metric: pet")]}, r"requirement.metric: a metric must be one of ttc_min"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_the_files_is_said_before_any_run(study, changes, said):
+def test_mistakes_in_the_files_are_reported_before_any_run(study, changes, message):
     path = study(changes)
     code, output = check(path)
-    assert (code, bool(re.search(said, output))) == (2, True), output
+    assert (code, bool(re.search(message, output))) == (2, True), output
     done = CliRunner().invoke(app, ["run", str(path.parent / "campaign.yaml")])
     assert done.exit_code == 2
     assert not (path.parent / "results").exists()
@@ -166,13 +168,14 @@ def test_a_scenario_is_no_campaign(study):
     assert {"sumo", "inputs", "ego", "duration", "requirement"} <= set(schema["properties"])
 
 
-def test_check_passes_on_what_sumo_warns_of(study):
+@pytest.mark.sumo
+def test_check_reports_warnings_of_sumo(study):
     person = '    <person id="p" depart="0"><walk edges="road" departPos="300" arrivalPos="400"/></person>\n</routes>'
     code, output = check(study({CARS: [("</routes>", person)]}))
     assert (code, "SUMO warns: The attribute departPos is no longer supported for walks" in output) == (0, True), output
 
 
-def test_everything_wrong_is_told_at_once(study):
+def test_all_mistakes_are_reported_at_once(study):
     path = study({YAML: [("ego: ego", "ego: egon"), ("- ttc_min", "- ttc_mim")], CARS: [("${105 + gap}", "150")]})
     with pytest.raises(InputError) as raised:
         ScenarioSpec(str(path)).resolve()
@@ -192,8 +195,9 @@ class Mad:
 """
 
 
+@pytest.mark.sumo
 @pytest.mark.parametrize(
-    ("changes", "status", "said"),
+    ("changes", "status", "message"),
     [
         ({CARS: [(EGO, EGO.replace(' insertionChecks="none"', ""))], YAML: [("max: 80", "max: 40")]}, "invalid",
          r"cars.rou.xml:7:5: 'ego' must depart at t = 0 s, [\d.]+ m behind 'lead', but SUMO inserted it at t = [\d.]+ s, [\d.]+ m behind 'lead': "
@@ -211,14 +215,15 @@ class Mad:
     ],
     ids=["held back", "too late", "before the beginning", "leaves", "no such actor", "no such edge", "NaN", "too fast"],
 )  # fmt: skip
-def test_what_goes_wrong_in_a_run_is_said_by_check_and_is_a_row(study, changes, status, said):
+def test_errors_of_a_run_are_reported_by_check_and_stored_as_a_row(study, changes, status, message):
     path = study(changes)
     code, output = check(path)
-    assert (code, bool(re.search(said, output))) == (2, True), output
+    assert (code, bool(re.search(message, output))) == (2, True), output
     rows = rows_of(path)
-    assert all(re.fullmatch(status, found) and re.search(said, reason) for found, reason in rows), rows
+    assert all(re.fullmatch(status, found) and re.search(message, reason) for found, reason in rows), rows
 
 
+@pytest.mark.sumo
 def test_a_route_that_is_not_connected(study):
     two = """<edge id="lane" from="south" to="north" priority="-1">
         <lane id="lane_0" index="0" speed="50.00" length="100.00" shape="0.00,100.00 100.00,100.00"/></edge>
@@ -231,6 +236,7 @@ def test_a_route_that_is_not_connected(study):
     assert {status for status, _ in rows_of(path)} == {"failed"}
 
 
+@pytest.mark.sumo
 def test_a_gzipped_net_relative_includes_and_placeholders_everywhere(study, tmp_path):
     """In a configuration's value, in a file that an additional file includes, in the routes and in the network itself."""
     path = study({
@@ -258,6 +264,7 @@ def test_a_gzipped_net_relative_includes_and_placeholders_everywhere(study, tmp_
     )
 
 
+@pytest.mark.sumo
 def test_a_loop_over_files_only_steps(study):
     """With files in the scenario SUMO is started already; what the loop does shows, and starting again is refused."""
     loop = "def simulate(sumo, values, rng):\n    while True:\n"
@@ -291,7 +298,8 @@ def test_commands_of_a_loop_are_understood(tmp_path):
         options_of_command(["my.sumocfg"], tmp_path)
 
 
-def test_who_drives_decides(study):
+@pytest.mark.sumo
+def test_the_driver_of_the_ego_makes_the_difference(study):
     """By the files, by another of SUMO's models, by a controller: three different drives, the same start."""
     path = study()
     scenario = ScenarioSpec(str(path)).resolve()
@@ -310,6 +318,7 @@ def test_who_drives_decides(study):
 LOOP = "loop.py"
 
 
+@pytest.mark.sumo
 def test_a_loop_runs_the_same_under_sumo_itself(study):
     """What `replay --gui` does, with the program that has no window."""
     program = shutil.which("sumo")
@@ -324,8 +333,9 @@ def test_a_loop_runs_the_same_under_sumo_itself(study):
     assert trace.identical(other)
 
 
+@pytest.mark.sumo
 @pytest.mark.parametrize(
-    ("changes", "status", "said"),
+    ("changes", "status", "message"),
     [
         ([("sumo.close()", "pass"), ('brake(sumo, "lead"', 'brake(sumo, "leed"')], "failed", r"SUMO: Vehicle 'leed' is not known.* \(.*loop.py:\d+\)"),
         ([("        sumo.simulationStep()\n", "        sumo.simulationStep()\n        1 / 0\n")], "failed", r"ZeroDivisionError: .* \(.*loop.py:15\)"),
@@ -339,13 +349,14 @@ def test_a_loop_runs_the_same_under_sumo_itself(study):
     ],
     ids=["unknown vehicle", "raises", "no file", "held back", "no step", "no start", "NaN"],
 )  # fmt: skip
-def test_what_goes_wrong_in_a_loop_is_a_row(study, changes, status, said):
+def test_errors_of_a_loop_are_stored_as_rows(study, changes, status, message):
     path = study({LOOP: changes, YAML: [("duration: 8", "duration: 8\nwait: 20")]}, page="traci_loop")
     rows = rows_of(path)
-    assert all(found == status and re.search(said, reason) for found, reason in rows), rows
+    assert all(found == status and re.search(message, reason) for found, reason in rows), rows
 
 
-def test_a_loop_cannot_hold_the_end_of_a_run(study):
+@pytest.mark.sumo
+def test_a_loop_cannot_prevent_the_end_of_a_run(study):
     """Neither `except Exception` nor a bare one, nor going on stepping."""
     path = study({LOOP: [("        sumo.simulationStep()\n", "        try:\n            sumo.simulationStep()\n        except:\n            continue\n")]},
                  page="traci_loop")  # fmt: skip
@@ -360,6 +371,7 @@ def test_a_loop_cannot_hold_the_end_of_a_run(study):
     assert (trace.ended, len(trace.time)) == ("duration", 81)
 
 
+@pytest.mark.sumo
 def test_a_formula_is_a_metric_here_and_the_requirement_of_a_campaign(study, tmp_path):
     path = study()
     scenario, trace = simulated(path, gap=40.0, v_lead=10.0)
@@ -384,6 +396,7 @@ def test_a_formula_is_a_metric_here_and_the_requirement_of_a_campaign(study, tmp
         campaign_of(config)
 
 
+@pytest.mark.sumo
 def test_a_stored_run_replays_bit_by_bit(study):
     path = study()
     rows_of(path)
@@ -391,18 +404,21 @@ def test_a_stored_run_replays_bit_by_bit(study):
     assert (done.exit_code, json.loads(done.stdout)["identical"]) == (0, True), done.output
 
 
+@pytest.mark.sumo
 def test_a_run_ends_at_its_deadline(study):
     scenario = ScenarioSpec(str(study({YAML: [("duration: 10", "duration: 10000"), ("ego: ego", "ego: {id: ego, may_leave: true}")]}))).resolve()
     with pytest.raises(RunError, match="must take at most 1e-06 s"):
         scenario.limited(1e-6).simulate({"gap": 80.0, "v_lead": 30.0}, 0)
 
 
+@pytest.mark.sumo
 def test_an_ego_that_may_leave_ends_the_run(study):
     path = study({CARS: [(EGO, EGO.replace('"100"', '"1900"'))], YAML: [("ego: ego", "ego: {id: ego, may_leave: true}")]})
     _, trace = simulated(path)
     assert (trace.ended, 0 < trace.time[-1] < 9.0) == ("left", True)
 
 
+@pytest.mark.sumo
 def test_new_writes_a_scenario_that_runs(study, tmp_path):
     path = study({CARS: [("${105 + gap}", "150"), ('maxSpeed="${v_lead}"', 'maxSpeed="20"'), ('departSpeed="${v_lead}"', 'departSpeed="20"'),
                          ('departSpeed="${v_lead}"', 'departSpeed="20"')]})  # fmt: skip
@@ -445,6 +461,7 @@ requirement: {metric: ttc_2d_min, critical: [-.inf, 1.0]}
     return folder / "scenario.yaml"
 
 
+@pytest.mark.sumo
 def test_a_city_with_traffic_lights(city):
     """Thousands of edges and signals; only who is near the ego is recorded, and exactly those."""
     scenario, trace = simulated(city, seed=2, flow=900)
@@ -463,6 +480,7 @@ def test_a_city_with_traffic_lights(city):
     assert trace.identical(scenario.simulate({"flow": 900.0}, 2))
 
 
+@pytest.mark.sumo
 def test_a_controller_sees_red_lights(tmp_path):
     """It comes to the stop line only once the light is green; without eyes for lights it drives on."""
     program = shutil.which("netgenerate")

@@ -104,7 +104,7 @@ def test_angles_sizes_and_accelerations(tmp_path):
     np.testing.assert_allclose(recording.acceleration, [0, 2, 0, 0, 0.25, 0.25])
 
 
-def test_a_gap_or_a_jump_begins_a_new_stretch(tmp_path):
+def test_a_gap_or_a_jump_begins_a_new_interval(tmp_path):
     times = np.arange(12.0)
     rows = [row(t, "a", 10.0 * t) for t in times]
     rows += [row(t, "b", 10.0 * t + 20 + (900 if t >= 8 else 0)) for t in times if t != 4]
@@ -131,7 +131,7 @@ def test_a_gap_or_a_jump_begins_a_new_stretch(tmp_path):
         ("a.xml.gz", as_xml(DRIVE), "must be whole"),
         ("a.csv", as_csv(DRIVE).replace("angle", "bearing"), "angle is missing"),
         ("a.csv", as_csv(DRIVE).replace("40.0", "forty", 1), "must be numbers"),
-        ("a.csv", as_csv([*DRIVE, DRIVE[0]]), "there once at a time"),
+        ("a.csv", as_csv([*DRIVE, DRIVE[0]]), "occur once per time step"),
         ("a.csv", "", "must be a table"),
         ("a.csv", as_csv([r | {"x": 13.4 + r["x"] * 1e-5} for r in DRIVE]), "fcd-output.geo"),
         ("a.txt", "", "must end in"),
@@ -145,14 +145,14 @@ def test_bad_files_are_an_input_error(tmp_path, name, text, words):
         read_fcd(path)
 
 
-def test_what_is_not_there(tmp_path):
+def test_missing_files_and_sizes_are_input_errors(tmp_path):
     with pytest.raises(InputError, match="readable"):
         read_fcd(tmp_path / "none.xml")
     with pytest.raises(InputError, match="length > 0"):
         read_fcd(written(tmp_path, "a.xml", as_xml(DRIVE)), length=-1.0)
 
 
-def test_the_verb(tmp_path):
+def test_the_metrics_verb(tmp_path):
     path, out = written(tmp_path, "a.xml", as_xml(DRIVE)), tmp_path / "m.csv"
     printed = CliRunner().invoke(app, ["metrics", str(path)])
     assert printed.exit_code == 0, printed.output

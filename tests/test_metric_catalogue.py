@@ -19,10 +19,10 @@ from sbt.errors import InputError
 from sbt.metrics.braking import btn, btn_max, drac, mdrac, mdrac_max, mttc_min
 from sbt.metrics.comfort import deceleration_max, jerk_max
 from sbt.metrics.exposure import tet, tit
-from sbt.metrics.geometry import corners, rectangle_distance, time_to_contact
+from sbt.metrics.geometry import corners, time_to_contact
 from sbt.metrics.longitudinal import HORIZON, drac_max, impact_speed, ttc_min
 from sbt.metrics.planar import distance_min, pet, severity, ttc_2d, ttc_2d_min
-from sbt.metrics.reference_line import deviation, heading_error_max, lateral_error_max
+from sbt.metrics.reference_line import Curve, deviation, heading_error_max, lateral_error_max
 from sbt.metrics.rss import Rss, rss_lateral_min, rss_longitudinal_min, rss_violation
 from sbt.metrics.signals import signal
 from sbt.problem.scenario import Metric
@@ -145,13 +145,6 @@ def test_2d_ttc_is_where_shapely_sees_the_contact():
         assert (far[~hit] > 0).all()
 
 
-def test_rectangle_distance_is_shapelys():
-    shapely = pytest.importorskip("shapely")
-    a, b = random_pairs(2000, 2)
-    expected = shapely.distance(boxes(shapely, a), boxes(shapely, b))
-    np.testing.assert_allclose(rectangle_distance(a, b), expected, atol=1e-12)
-
-
 def crossing(delay: float, v_ego=10.0, v_co=8.0, dt=0.05) -> Trace:
     """Ego along x reaches the conflict area at 2 s; co along y comes `delay` after ego has left it."""
     leaves = 2.0 + (L + W) / v_ego
@@ -268,6 +261,15 @@ def test_course_against_a_circle():
         deviation(trace.actor("ego"), np.zeros((2, 2)))
 
 
+def test_curve_projects_back_what_is_beside_it():
+    curve = Curve((3.0, -2.0, 0.4), ((10.0, 0.0), (10.0, 1 / 30), (20.0, 1 / 30), (15.0, -1 / 40)))
+    s = np.linspace(0.5, curve.length - 0.5, 40)
+    for left in (-3.0, 0.0, 2.0):
+        found = np.array([curve.project(x, y) for x, y in curve.offset_points(s, left)])
+        assert np.abs(found[:, 0] - s).max() < 5e-3
+        assert np.abs(found[:, 1] - left).max() < 2e-3
+
+
 # --- all of them -------------------------------------------------------------------------------------------------
 
 CATALOGUE: list[Metric] = [plugins.load("metrics", name) for name in plugins.names("metrics")]
@@ -287,7 +289,7 @@ def test_every_metric_is_finite_and_symmetric_ones_do_not_care_who_is_ego(one, t
             assert metric(swapped) == pytest.approx(value, abs=1e-6), metric.name
 
 
-def test_every_metric_says_what_it_is():
+def test_every_metric_is_described():
     far = record(path(speed=10.0), path(3000.0, 3000.0, 0.0, 10.0))
     for metric in CATALOGUE:
         assert metric.description

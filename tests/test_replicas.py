@@ -139,7 +139,7 @@ def same(one: Trace | Exception, two: Trace | Exception) -> bool:
 
 
 @pytest.mark.parametrize("kind", [1, 2, 6, 7, 8, 9], ids=["raises", "nan", "no scene", "not inserted", "gone", "by pose"])
-def test_a_run_that_cannot_share_costs_no_other_and_says_what_it_says_alone(kind: int, alone: list[int]):
+def test_a_run_that_cannot_share_costs_no_other_and_ends_as_it_does_alone(kind: int, alone: list[int]):
     work = awkward([0, 0, kind, 0, 0, kind, 0])
     found = AWKWARD.simulate_many(work)
     assert alone  # it was run again alone
@@ -209,7 +209,7 @@ def test_rows_do_not_depend_on_the_isolation():
     assert rows["auto"][:20] == rows["fresh"]
 
 
-def test_copies_share_no_id_and_lie_on_each_other(tmp_path: Path):
+def test_replicas_share_no_id_and_have_the_same_coordinates(tmp_path: Path):
     (tmp_path / "copies.net.xml").write_text(replicated_net(net_file("street"), 3))
     simulation = replace(AWKWARD, net=str(tmp_path / "copies.net.xml"))
     with session().run(simulation.setup(Scene(())), 0, "fresh"):

@@ -107,7 +107,8 @@ class Page(HTMLParser):
 
 
 def page_of(store, scenario, predictor=predict, conclusion=None):
-    return Page(write_report(store, scenario, predictor, conclusion).read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " "))
+    text = write_report(store, scenario, predictor, conclusion).read_text(encoding="utf-8")
+    return Page(text.replace("\N{NO-BREAK SPACE}", " "))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Testbeds: the same answers as the reference file where it is there, and the laws of their own truths anywhere."""
+"""Testbeds: agreement with the reference file where it is available, and consistency of their reference values."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_truths_equal_the_reference(oracle: ModuleType, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_laws_equal_the_reference(oracle: ModuleType, name: str) -> None:
+def test_distributions_equal_the_reference(oracle: ModuleType, name: str) -> None:
     reference, space = oracle.get(name), testbeds.find(name).scenario().space
     z = np.vstack([stream(3, name).standard_normal((500, space.dimension)), np.full((2, space.dimension), [[-5.0], [5.0]])])
     x = space.from_normal(z)
@@ -135,7 +135,7 @@ def test_truths_in_the_plane_by_integration_along_rays(name: str) -> None:
     assert mass == pytest.approx(testbeds.truth(name).probability, rel=0.02)
 
 
-def test_truths_in_ten_dimensions_are_the_laws_of_sum_and_length() -> None:
+def test_truths_in_ten_dimensions_are_those_of_sum_and_length() -> None:
     assert testbeds.truth("linear_d10").probability == pytest.approx(ndtr(-3.5), rel=1e-12)
     assert testbeds.values("linear_d10", np.full((1, 10), 3.5 / math.sqrt(10)))[0] == pytest.approx(0.0, abs=1e-12)
     assert testbeds.truth("chi2_d10").probability == pytest.approx(chi2(10).sf(6.2**2), rel=1e-12)
@@ -144,7 +144,7 @@ def test_truths_in_ten_dimensions_are_the_laws_of_sum_and_length() -> None:
 
 @pytest.mark.parametrize(("name", "cells"), [("himmelblau_partx", 500), ("goldstein_price_partx", 500), ("deceptive_d2", 400),
                                              ("needle_d2_1e-3", 400), ("wavy_level_d3", 80)])  # fmt: skip
-def test_modes_of_uniform_laws_are_the_connected_critical_regions(name: str, cells: int) -> None:
+def test_modes_of_uniform_inputs_are_the_connected_critical_regions(name: str, cells: int) -> None:
     problem = testbeds.find(name)
     d = len(problem.parameters)
     axis = (np.arange(cells) + 0.5) / cells
@@ -156,7 +156,7 @@ def test_modes_of_uniform_laws_are_the_connected_critical_regions(name: str, cel
 @pytest.mark.parametrize(
     ("name", "nearest"), [("four_branch_6", 4), ("four_branch_7", 4), ("metaball", 4), ("rp110", 2), ("gayton_hat", 1)]
 )
-def test_modes_of_normal_laws_are_the_nearest_critical_points(name: str, nearest: int) -> None:
+def test_modes_of_normal_inputs_are_the_nearest_critical_points(name: str, nearest: int) -> None:
     r = np.linspace(0.01, 12.0, 2400)
     inside = inside_along_rays(name, r, 720)
     distance = np.where(inside.any(axis=1), r[inside.argmax(axis=1)], 99.0)
@@ -283,7 +283,7 @@ def test_analytic_refuses_what_cannot_be(wrong: dict[str, Any], message: str) ->
         )
 
 
-def test_a_function_of_the_wrong_shape_is_told() -> None:
+def test_a_function_of_the_wrong_shape_is_an_error() -> None:
     scenario = testbeds.analytic(lambda x: x, inputs={"a": (0.0, 1.0)}, critical=(0.0, 1.0), name="wrong")
     with pytest.raises(ValueError, match=r"shape \(n,\)"):
         scenario.run({"a": 0.5}, seed=0)

@@ -15,9 +15,10 @@ from sbt.metrics import longitudinal
 from sbt.metrics.comfort import deceleration_max
 from sbt.metrics.longitudinal import FAR, HORIZON, collision, drac_max, ttc_min
 from sbt.metrics.pairwise import in_traffic, joint_intervals, worst_signal
-from sbt.metrics.planar import distance_min
+from sbt.metrics.paths import ttc_on_paths
+from sbt.metrics.planar import distance_min, post_encroachment_time, time_behind, ttc_2d
 from sbt.metrics.stl import stl
-from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, ttc_path_min
+from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.outcome import Job, Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
@@ -52,23 +53,23 @@ def test_the_worst_of_all_others_counts_in_either_direction():
         assert in_traffic(metric, "v", "fast")(trace) == single[1]
 
 
-def test_the_contact_of_a_pair_is_looked_for_once_per_trace_and_forgotten_with_it(monkeypatch: pytest.MonkeyPatch):
-    asked: list[None] = []
+def test_the_contact_of_a_pair_is_computed_once_per_trace_and_released_with_it(monkeypatch: pytest.MonkeyPatch):
+    calls: list[None] = []
     real = longitudinal.contact_index
-    monkeypatch.setattr(longitudinal, "contact_index", lambda a, b: (asked.append(None), real(a, b))[1])
+    monkeypatch.setattr(longitudinal, "contact_index", lambda a, b: (calls.append(None), real(a, b))[1])
     trace = traffic(**{f"car_{k}": (30.0 * k, 0.0, 10.0, ALL) for k in range(1, 20)})
     metrics = (nearest_distance("v"), any_collision("v"), any_impact_speed("v"), ttc_path_min("v"))
     first = [metric(trace) for metric in metrics]
-    assert len(asked) == 19
+    assert len(calls) == 19
     assert [metric(dataclasses.replace(trace)) for metric in metrics] == first
-    assert len(asked) == 5 * 19, "another trace is another trace, equal or not"
+    assert len(calls) == 5 * 19, "another trace is another trace, equal or not"
     kept = weakref.ref(trace)
     del trace
     gc.collect()
     assert kept() is None
 
 
-def test_who_comes_and_goes_is_measured_while_there():
+def test_road_users_are_measured_while_they_are_present():
     """Far away at first and at last; a car that jumps in from NaN sweeps over nobody."""
     trace = traffic(one=(45.0, 0.0, 10.0, slice(10, 20)), two=(200.0, 0.0, 20.0, slice(0, 5)))
     parts = joint_intervals(trace, "v", "one")
@@ -80,13 +81,13 @@ def test_who_comes_and_goes_is_measured_while_there():
     assert len(joint_intervals(traffic(one=(45.0, 0.0, 10.0, twice)), "v", "one")) == 2
 
 
-def test_without_anybody_the_metric_has_its_value_without():
+def test_without_others_a_metric_has_its_value_without():
     for metric in (ttc_min(), distance_min(), drac_max(), collision()):
         assert in_traffic(metric, "v")(traffic()) == metric.without
     assert in_traffic(deceleration_max(), "v")(traffic()) == 0.0
 
 
-def test_an_actor_that_never_is_there_is_told():
+def test_an_actor_that_is_never_present_is_an_error():
     with pytest.raises(RunError, match="no actor 'truck' in the trace, there are: v, one"):
         in_traffic(ttc_min(), "v", "truck")(traffic(one=(50.0, 0.0, 10.0, ALL)))
 
@@ -124,3 +125,61 @@ def test_absent_is_nan_in_every_state_and_the_ego_never_is():
     assert found == [Status.OK] + [Status.FAILED] * 4
     assert len(good.rows()) == N + 10
     assert good.identical(dataclasses.replace(good, x=good.x.copy()))
+
+
+# Among any number of road users
+
+
+def driven(*tracks: tuple[np.ndarray, np.ndarray], dt: float = 0.1) -> Trace:
+    """A trace of cars of 4 m x 2 m along (t,) x and y; speeds and headings follow from them."""
+    x, y = np.stack([t[0] for t in tracks], axis=1), np.stack([t[1] for t in tracks], axis=1)
+    dx, dy = np.gradient(x, dt, axis=0), np.gradient(y, dt, axis=0)
+    n, m = x.shape
+    names = ("ego", *(f"co_{k}" for k in range(m - 1)))
+    speed = np.hypot(dx, dy)
+    acceleration = np.gradient(speed, dt, axis=0)
+    size = np.full(m, 4.0), np.full(m, 2.0)
+    return Trace(np.arange(n) * dt, names, x, y, np.arctan2(dy, dx), speed, acceleration, *size)
+
+
+def test_time_behind_counts_only_who_comes_after_ego() -> None:
+    t = np.arange(0.0, 12.0, 0.1)
+    ego, co = (10.0 * t - 50.0, 0.0 * t), (0.0 * t, 10.0 * t - 80.0)
+    first, second = driven(ego, co), driven(co, ego)
+    expected = 3.0 - 0.6  # centres come 3 s apart; half a length and half a width off, of both
+    assert time_behind(first, "ego", "co_0") == pytest.approx(expected, abs=0.01)
+    assert time_behind(first, "ego", "co_0") == pytest.approx(post_encroachment_time(first, "ego", "co_0"), abs=0.01)
+    assert time_behind(second, "ego", "co_0") == 10.0
+    assert pet_ego_first(horizon=5.0)(second) == 5.0
+    assert time_behind(first, "ego", "co_0", zone=(0.0, 0.0, 8.0)) == pytest.approx(expected, abs=0.01)
+    assert time_behind(first, "ego", "co_0", 4.0, zone=(40.0, 0.0, 8.0)) == 4.0
+
+
+def test_ttc_on_paths_is_gap_by_closing_speed_and_knows_bends() -> None:
+    t = np.arange(0.0, 3.0, 0.1)
+    follow = driven((12.0 * t, 0.0 * t), (24.0 + 6.0 * t, 0.0 * t))
+    found = ttc_on_paths(follow, "ego", "co_0")
+    assert found[:20] == pytest.approx((20.0 - 6.0 * t[:20]) / 6.0, abs=1e-6)
+    assert ttc_path_min()(follow) == pytest.approx(found.min())
+    angle = np.arange(0.0, 6.0, 0.1) * 0.5
+    ring = driven(*((18.0 * np.cos(angle + p), 18.0 * np.sin(angle + p)) for p in (0.0, 1.2)))
+    inner = slice(1, len(angle) - 40)
+    assert ttc_2d(ring, "ego", "co_0").min() > 0
+    assert ttc_on_paths(ring, "ego", "co_0")[inner].min() == 5.0, "equal speeds on one ring never meet"
+    head_on = driven((10.0 * t, 0.0 * t), (100.0 - 10.0 * t, 3.0 + 0.0 * t))
+    assert ttc_path_min()(head_on) == 5.0
+
+
+def test_metrics_among_many_take_the_worst_of_all() -> None:
+    t = np.arange(0.0, 4.0, 0.1)
+    ego, far = (10.0 * t, 0.0 * t), (10.0 * t, 40.0 + 0.0 * t)
+    braking = (60.0 + 10.0 * t - 2.0 * t**2, 0.0 * t)
+    struck_one = (9.0 + 6.0 * t, 0.0 * t)
+    calm, worse, crash = driven(ego, far), driven(ego, far, braking), driven(ego, far, struck_one)
+    assert (nearest_distance()(calm), any_collision()(calm), any_impact_speed()(calm)) == (38.0, 0.0, 0.0)
+    assert others_braking_max()(calm) == pytest.approx(0.0, abs=1e-9)
+    assert others_braking_max()(worse) == pytest.approx(4.0)
+    worst = [metric(crash) for metric in (any_collision(), nearest_distance(), ttc_path_min(), pet_ego_first())]
+    assert worst == [1.0, 0.0, 0.0, 0.0]
+    assert any_impact_speed()(crash) == pytest.approx(4.0)
+    assert any_collision()(driven(far)) == 0.0

@@ -87,7 +87,8 @@ class EstimationConclusion:
         confidence = percent(self.confidence)
         if self.exact_bound is not None:
             bound = number(self.exact_bound)
-            return [f"No critical run was drawn: with {confidence} confidence, the probability of one is at most {bound}.", *verdict]
+            found = f"No critical run was drawn: with {confidence} confidence, the probability of one is at most {bound}."
+            return [found, *verdict]
         if self.probability is None:
             return verdict
         found = [
@@ -165,7 +166,9 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         warnings.append(_NOTHING)
     elif not seen.safe:
         limits = Limits(lambda c: 1.0 - few_hits_bound(seen.failed_draws, counted, c), lambda _: 1.0)
-        warnings.append("everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution")
+        warnings.append(
+            "everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution"
+        )
     elif hits < FEWEST_HITS:
         limits = Limits(lambda _: 0.0, lambda c: few_hits_bound(_hits(critical), counted, c))
         warnings.append(f"only {hits} counted draws were critical, fewer than {FEWEST_HITS}: only an upper bound is given")

@@ -22,7 +22,9 @@ from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
 from sbt.store.records import Validation, to_json
 
-__all__ = ["CONFIRM", "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs"]
+__all__ = [
+    "CONFIRM", "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs",
+]  # fmt: skip
 
 CONFIRM = "confirm"
 """Stage of the runs that repeat a failure mode's representative with fresh seeds; they come beside the budget."""

@@ -218,7 +218,9 @@ class SequentialStage:
         proposal = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted)
         return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), proposal)
 
-    def _pooled(self, log_probability: LogProbability | None, known: _Known, shares: tuple[float, ...], rng: np.random.Generator) -> _Pool:
+    def _pooled(
+        self, log_probability: LogProbability | None, known: _Known, shares: tuple[float, ...], rng: np.random.Generator
+    ) -> _Pool:
         """Return a fresh pool and how a batch would be drawn from it with this metamodel."""
         space = self.settings.scenario.space
         mixture = self._mixture(log_probability, known, rng)

@@ -102,7 +102,7 @@ class CampaignKind:
         target_aware: the metamodel may be told where the critical edge is; otherwise all of y counts.
         most_initial: the most runs that the default of `initial` takes.
         batch: default runs per iteration; None: as many as initial.
-        takes_gate: it takes the keys `gate` and `from`.
+        takes_gate: it takes the keys `gate` and `warm_start`.
     """
 
     description: str
@@ -152,8 +152,9 @@ class CampaignKind:
             raise InputError(f"campaign '{name}' is known by its description only: its code must be at hand to run it")
 
         known = {f.name for f in fields(cls)}
-        given = {key: tuple(v) if isinstance(v, list) else v for key, v in described.items() if key in known}
-        return cls(**{**given, "recipe": recipe})
+        given: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described.items() if key in known}
+        given["recipe"] = recipe
+        return cls(**given)
 
     def read(self, data: Mapping[str, Any]) -> Conclusion:
         """Return a conclusion from its JSON."""

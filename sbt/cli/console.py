@@ -23,7 +23,7 @@ from sbt.errors import InputError, SbtError
 from sbt.execution.streams import SteadyStream, open_missing
 
 if TYPE_CHECKING:
-    from sbt.loop.stages import Progress
+    from sbt import Progress
 
 __all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "print_json", "process", "resumable", "verb"]
 

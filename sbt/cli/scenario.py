@@ -37,15 +37,14 @@ def simulate(
 ) -> None:
     """Run one concrete scenario and print every metric and the verdict."""
     with clean_stdout():
-        from sbt.execution.spec import ScenarioSpec
         from sbt.workflows.front import simulate_scenario
 
         choices = _pairs("--ego", ego or []) or None
         _check_choices(choices, step, isolation)
         values = _pairs("input", inputs or [])
-        if trace is not None and (logical := ScenarioSpec(scenario, str(Path.cwd())).resolve()).simulate is None:
-            raise InputError(f"--trace needs a scenario that is simulated, but {logical.name} gives its metrics directly")
         run = simulate_scenario(scenario, values, seed=seed, ego=choices, step_length=step, isolation=isolation)
+        if trace is not None and run.scenario.simulate is None:
+            raise InputError(f"--trace needs a scenario that is simulated, but {run.scenario.name} gives its metrics directly")
         if trace is not None:
             _write_trace(trace, run)
     if as_json:

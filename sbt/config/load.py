@@ -30,8 +30,8 @@ from sbt.errors import did_you_mean
 from sbt.plugins import Scope
 
 __all__ = [
-    "ConfigError", "Loaded", "checked", "differences", "dump", "fingerprint", "from_mapping", "load", "located", "parse", "read_text",
-    "resolve", "resumed", "schema",
+    "ConfigError", "Loaded", "checked", "differences", "dump", "fingerprint", "from_mapping", "load", "located", "parse",
+    "read_text", "resolve", "resumed", "schema",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=BaseModel)

@@ -168,7 +168,7 @@ class InputChange(_Strict):
     min: float | None = Field(default=None, description="Lower end of the range, in the input's unit.")
     max: float | None = Field(default=None, description="Upper end of the range, in the input's unit.")
     distribution: Choice | None = Field(
-        default=None, description="Law, truncated to the range: {kind: normal, mean: 40, std: 15}, "
+        default=None, description="Distribution, truncated to the range: {kind: normal, mean: 40, std: 15}, "
         "or uniform, lognormal, exponential, gumbel, weibull, beta, triangular, scipy, empirical.",
     )  # fmt: skip
 

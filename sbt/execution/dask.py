@@ -1,9 +1,9 @@
 """Workers of a dask cluster, on this machine or elsewhere: each runs its jobs in a process of its own.
 
 A dask worker hands its jobs to a `LocalExecutor` of one process, so that libsumo has a process to
-itself, and a run that hangs or kills its process is treated exactly as on one machine. What is left to
-dask is the death of a whole worker (a lost node, the end of its time): its jobs are run elsewhere, and
-are tried alone where they seem to have caused several deaths.
+itself, and a run that hangs or kills its process is treated as on one machine. dask only handles the loss
+of a whole worker (a lost node, the end of its allocation): its jobs are run on another one, and are repeated alone
+if several workers died while running them.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Any, Self
 
 from sbt.errors import InputError, SbtError
 from sbt.execution.local import LocalExecutor
-from sbt.execution.pool import start_apart
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.starting import start_apart
 from sbt.execution.streams import open_missing
 from sbt.execution.worker import versions
 from sbt.problem.outcome import Job, Outcome, Status
@@ -29,13 +29,13 @@ from sbt.processes import SCRATCH, scratch
 __all__ = ["DaskExecutor"]
 
 _TARGET = 0.5
-"""Runs are handed out in chunks of about so many seconds: a task of dask costs milliseconds."""
+"""Target duration of a chunk of runs (s): a dask task costs milliseconds."""
 _GRACE = 5
-"""So many seconds the client may take to say goodbye."""
+"""Longest wait for the client to close (s)."""
 _PATIENCE = 60
-"""So many seconds a scheduler may take to answer and to have its first worker."""
+"""Longest wait for the scheduler and its first worker (s)."""
 _LARGE = 100_000
-"""A carried scenario of more bytes goes to each worker once, instead of with every chunk."""
+"""Size from which a carried scenario is sent to each worker once instead of with every chunk (bytes)."""
 
 
 class DaskExecutor:
@@ -110,14 +110,14 @@ class DaskExecutor:
             self._scratch.cleanup()
 
     def _free(self) -> None:
-        """Let every worker end its process, after what it is at."""
+        """Stop the process below every worker, after its current task."""
         from distributed import fire_and_forget
 
         for worker in self._client.nthreads():
             fire_and_forget(self._client.submit(_end, self._spec, self._timeout, workers=[worker], pure=False))
 
     def _prepare(self) -> None:
-        """Start each worker's process, all at once."""
+        """Start the processes below all workers at the same time."""
         own = _versions(self._spec)
         found = {w: self._client.submit(_begin, self._spec, self._timeout, workers=[w], pure=False) for w in self._workers()}
         for worker, future in found.items():
@@ -145,21 +145,21 @@ class DaskExecutor:
                 yield Outcome(job.index, Status.CRASHED, {}, reason)
 
     def _drain(self, queue: deque[Job]) -> Any:
-        """Run what is queued; return the jobs whose workers died."""
+        """Run the queued jobs; return those whose workers died."""
         from distributed import KilledWorker, as_completed
 
-        flying: dict[Any, list[Job]] = {}
+        submitted: dict[Any, list[Job]] = {}
         finished = as_completed(loop=self._client.loop)
         suspects: list[Job] = []
-        while queue or flying:
+        while queue or submitted:
             workers = max(len(self._workers()), 1)
-            while queue and len(flying) < 2 * workers:
+            while queue and len(submitted) < 2 * workers:
                 chunk = chunk_of(queue, _TARGET / self._seconds, workers)
                 future = self._client.submit(_run, self._sent, chunk, self._timeout, pure=False)
-                flying[future] = chunk
+                submitted[future] = chunk
                 finished.add(future)
             future = next(finished)
-            chunk = flying.pop(future)
+            chunk = submitted.pop(future)
             try:
                 outcomes = self._result(future)
             except KilledWorker:
@@ -184,11 +184,11 @@ class DaskExecutor:
 
 
 _held: list[tuple[ScenarioSpec, float | None, LocalExecutor]] = []
-"""In a worker: the one executor it keeps."""
+"""In a worker: its executor, at most one."""
 
 
 def _executor_of(spec: ScenarioSpec, timeout: float | None) -> LocalExecutor:
-    """Return this worker's executor; another campaign's is ended first."""
+    """Return this worker's executor; that of another campaign is stopped first."""
     if not (_held and _held[0][:2] == (spec, timeout)):
         _drop()
         multiprocessing.current_process().daemon = False  # dask's workers are daemons, which may have no children

@@ -1,11 +1,11 @@
 """Worker processes on this machine: spawned by loky, kept alive, one libsumo each, one thread each.
 
-A worker that dies breaks loky's whole pool, so the recovery is ours: every worker notes which runs it
-is at in a file of its own. After a death the runs that were at work are tried again alone; one that
-kills its worker again is `crashed`, all others go on as if nothing had happened. A run that hangs
-inside SUMO cannot be stopped from within (the step holds the interpreter's lock): the driver kills
-exactly that process. Runs that share a simulation are suspects together, and tried again one by one.
-The scenario reaches each worker once, through a file; a chunk of work is its jobs only.
+When a worker dies, loky gives up its whole pool, so recovery is implemented here. Every worker records the
+indices of its current runs in a file. After a death the pool is restarted and these runs are repeated alone; a
+run that kills its worker again is `crashed`, all others are unaffected. A run that hangs inside SUMO cannot be
+stopped from within (the step holds the interpreter's lock), so the driver kills that process. Runs that share a
+simulation are suspects together and are repeated one by one. The scenario is sent to each worker once, through
+a file; a task holds jobs only.
 """
 
 from __future__ import annotations
@@ -38,11 +38,13 @@ from sbt.processes import scratch
 __all__ = ["LocalExecutor", "settle"]
 
 _MARK = struct.Struct("<dq")
-"""The time of the note, and how many indices of runs follow."""
+"""Header of a worker's record: time stamp, number of run indices that follow."""
 _TARGET = 0.05
-"""Runs are handed out in chunks of about so many seconds."""
+"""Target duration of a chunk of runs (s)."""
 _TICK = 0.25
+"""Interval at which overdue runs are looked for (s)."""
 _GRACE = 2.0
+"""Time by which a run may exceed its limit before its worker is killed (s): most runs stop themselves."""
 _MARKS = "marks"
 _SCENARIO = "scenario.pickle"
 
@@ -123,50 +125,50 @@ class LocalExecutor:
         return Outcome(job.index, status, {}, "the worker process died, also when this run was tried again alone")
 
     def _drain(self, queue: deque[Job]) -> Any:
-        """Run what is queued; return the jobs that are missing after a death, and who was at work then."""
-        flying: dict[Future[Any], list[Job]] = {}
+        """Run the queued jobs; return those without an outcome after a worker died, and the runs that were in progress."""
+        submitted: dict[Future[Any], list[Job]] = {}
         overdue: dict[int, Status] = {}
         died = False
-        while (queue or flying) and not died:
-            while queue and len(flying) < 2 * self._workers and not died:
+        while (queue or submitted) and not died:
+            while queue and len(submitted) < 2 * self._workers and not died:
                 chunk = chunk_of(queue, _TARGET / max(self._seconds, 1e-4), self._workers)
                 try:
-                    flying[self._pool.submit(_run_chunk, self._folder, chunk)] = chunk
+                    submitted[self._pool.submit(_run_chunk, self._folder, chunk)] = chunk
                 except broken():
                     queue.extendleft(reversed(chunk))
                     died = True
-            done, _ = wait(flying, timeout=_TICK, return_when=FIRST_COMPLETED)
+            done, _ = wait(submitted, timeout=_TICK, return_when=FIRST_COMPLETED)
             for future in done:
                 if isinstance(future.exception(), broken()):
                     died = True
                     continue
-                del flying[future]
+                del submitted[future]
                 yield from self._measured(future.result())
             if not done:
                 overdue |= self._kill_overdue()
         if not died:
             return [], {}
-        yield from self._rescued(flying)
-        missing = [job for chunk in flying.values() for job in chunk] + list(queue)
+        yield from self._rescued(submitted)
+        missing = [job for chunk in submitted.values() for job in chunk] + list(queue)
         dead = {index: Status.CRASHED for runs, _, _ in self._at_work() for index in runs} | overdue
         self._restart()
         return missing, dead
 
-    def _rescued(self, flying: dict[Future[Any], list[Job]]) -> Iterator[Outcome]:
-        """Yield what had come back by the time the pool broke."""
-        wait(flying, timeout=5.0)
-        for future in [f for f in flying if f.done() and not f.cancelled() and f.exception() is None]:
-            del flying[future]
+    def _rescued(self, submitted: dict[Future[Any], list[Job]]) -> Iterator[Outcome]:
+        """Yield the outcomes that had arrived before the pool broke."""
+        wait(submitted, timeout=5.0)
+        for future in [f for f in submitted if f.done() and not f.cancelled() and f.exception() is None]:
+            del submitted[future]
             yield from self._measured(future.result())
 
     def _measured(self, outcomes: list[Outcome]) -> list[Outcome]:
-        """Note how long runs take, and pass them on."""
+        """Update the mean duration of a run; return the outcomes."""
         mean = sum(o.seconds for o in outcomes) / len(outcomes)
         self._seconds += 0.3 * (mean - self._seconds)
         return outcomes
 
     def _at_work(self) -> list[tuple[tuple[int, ...], int, float]]:
-        """Return (indices of the runs, process, time on the monotonic clock) of every worker with runs at work."""
+        """Return (run indices, process, time stamp on the monotonic clock) of every worker with runs in progress."""
         found = []
         for path in Path(self._folder, _MARKS).iterdir():
             data = path.read_bytes()
@@ -177,14 +179,14 @@ class LocalExecutor:
         return found
 
     def _kill_overdue(self) -> dict[int, Status]:
-        """Kill the processes that have shown no life for the time of a run, and say which runs were too long."""
+        """Kill the workers whose record is older than a run may take; return the runs that timed out."""
         if self._timeout is None:
             return {}
         late = [(runs, pid) for runs, pid, since in self._at_work() if time.monotonic() - since > self._timeout + _GRACE]
         for _, pid in late:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        return {runs[0]: Status.TIMEOUT for runs, _ in late if len(runs) == 1}  # which of several it was shows alone
+        return {runs[0]: Status.TIMEOUT for runs, _ in late if len(runs) == 1}  # of several, each is repeated alone
 
     def _restart(self) -> None:
         self._stop()
@@ -195,24 +197,24 @@ class LocalExecutor:
 
 @cache
 def _mark_file(folder: str) -> int:
-    """Open this worker's own note, once."""
+    """Open the record of this worker, once."""
     return os.open(Path(folder, _MARKS, str(os.getpid())), os.O_CREAT | os.O_WRONLY)
 
 
 def _mark(folder: str, runs: Sequence[int]) -> None:
-    """Note which runs this worker is at, and that it is alive."""
+    """Record the current runs of this worker and the time."""
     os.pwrite(_mark_file(folder), _MARK.pack(time.monotonic(), len(runs)) + struct.pack(f"<{len(runs)}q", *runs), 0)
 
 
 def settle() -> None:
-    """Let the garbage collector look seldom: what is loaded by now stays, and runs make next to no cycles."""
+    """Make garbage collection rare: what is loaded now is permanent, and runs create hardly any cycles."""
     gc.freeze()
     gc.set_threshold(20_000)
 
 
 @cache
 def _scenario(folder: str) -> LogicalScenario:
-    """Return the scenario that the driver has written down for its workers."""
+    """Return the scenario that the driver wrote for its workers."""
     spec, timeout = pickle.loads(Path(folder, _SCENARIO).read_bytes())
     scenario: LogicalScenario = spec.resolve()
     try:
@@ -235,5 +237,5 @@ def _prepare(folder: str, workers: int) -> None:
 
 
 def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:
-    """Run jobs in a worker, noting which are at work."""
+    """Run jobs in a worker and record which are in progress."""
     return run_jobs(_scenario(folder), jobs, partial(_mark, folder))

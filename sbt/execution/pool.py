@@ -17,27 +17,22 @@ from __future__ import annotations
 
 import ctypes
 import os
-import queue
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future
 from contextlib import suppress
-from functools import cache
-from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
+from sbt.execution.starting import TERMINAL_SIGNALS, start_apart
 from sbt.execution.streams import SteadyStream, open_missing
 from sbt.processes import SCRATCH, ProcessId
 
-__all__ = ["broken", "close_pool", "open_pool", "start_apart"]
+__all__ = ["broken", "close_pool", "open_pool"]
 
 T = TypeVar("T")
 
 _THREADS = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
-_TERMINAL = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _PR_SET_PDEATHSIG = 1
 
 
@@ -50,7 +45,7 @@ def open_pool(workers: int, folder: str) -> Any:
     """
     from joblib.externals.loky.process_executor import ProcessPoolExecutor
 
-    from sbt.execution.starting import Context
+    from sbt.execution.loky_context import Context
 
     return start_apart(
         lambda: ProcessPoolExecutor(
@@ -73,58 +68,6 @@ def broken() -> type[BaseException]:
     return error
 
 
-def start_apart(function: Callable[[], T], abandon: Callable[[T], None] = lambda _: None) -> T:
-    """Call a function that starts processes, in the thread that lives as long as this process; return what it returns.
-
-    What it starts, and the threads it starts, have the terminal's signals blocked.
-
-    Args:
-        function: to call.
-        abandon: is called with its result where the caller is interrupted meanwhile and does not get it.
-    """
-    starter = _starter(os.getpid())
-    if threading.current_thread() is starter.thread:
-        return function()
-    future = starter.submit(function)
-    try:
-        return future.result()
-    except KeyboardInterrupt:
-        if future.exception() is None:
-            abandon(future.result())
-        raise
-
-
-class _Starter:
-    """The thread that starts processes."""
-
-    def __init__(self) -> None:
-        self._tasks: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
-        self.thread = threading.Thread(target=self._work, name="sbt-starter", daemon=True)
-        self.thread.start()
-
-    def submit(self, function: Callable[[], T]) -> Future[T]:
-        future: Future[T] = Future()
-        self._tasks.put((function, future))
-        return future
-
-    def _work(self) -> None:
-        resource_tracker.ensure_running()  # to start it later would let the signals through again
-        signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL)
-        while True:
-            function, future = self._tasks.get()
-            try:
-                future.set_result(function())
-            except BaseException as error:
-                future.set_exception(error)
-            del function, future
-
-
-@cache
-def _starter(pid: int) -> _Starter:
-    """Return the thread of this process; a forked child has none of its parent's."""
-    return _Starter()
-
-
 def _begin(driver: ProcessId) -> None:
     """In a worker: end with the driver, leave the terminal's signals to it, and survive its closed terminal."""
     with suppress(OSError, AttributeError):  # another system than Linux
@@ -132,9 +75,9 @@ def _begin(driver: ProcessId) -> None:
     if not _has_driver(driver):
         os._exit(1)
     threading.Thread(target=_watch, args=(driver,), name="sbt-driver-watch", daemon=True).start()
-    for number in _TERMINAL:
+    for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _TERMINAL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
     open_missing()
     sys.stdout, sys.stderr = SteadyStream(sys.stdout, any_error=True), SteadyStream(sys.stderr, any_error=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from types import TracebackType
@@ -10,14 +11,16 @@ from typing import Protocol, Self
 from sbt import interruption
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.streams import open_missing
-from sbt.execution.worker import run_jobs
+from sbt.execution.worker import run_job, run_jobs
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.scenario import Batched
 
 __all__ = ["CHUNK", "Executor", "SerialExecutor", "chunk_of"]
 
 CHUNK = 64
-"""So many runs are begun, at most, before the outcome of the first is there."""
+"""Largest number of runs that are started before the outcome of the first is known."""
+_QUICK = 0.02
+"""Runs in this process are reported together if they take less time than this (s)."""
 
 
 class Executor(Protocol):
@@ -56,12 +59,23 @@ class SerialExecutor:
         Raises:
             KeyboardInterrupt: Ctrl-C, after the run that was at work at the latest.
         """
-        simulate = self._scenario.simulate
-        size = CHUNK if isinstance(simulate, Batched) and simulate.batched else 1
-        for first in range(0, len(jobs), size):
+        simulate, queue = self._scenario.simulate, deque(jobs)
+        together = isinstance(simulate, Batched) and simulate.batched
+        while queue:
             with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
-                outcomes = run_jobs(self._scenario, jobs[first : first + size], lambda _: None)
+                outcomes = self._together(queue) if together else self._alone(queue)
             yield from outcomes
+
+    def _together(self, queue: deque[Job]) -> list[Outcome]:
+        """Run the next jobs at once."""
+        return run_jobs(self._scenario, [queue.popleft() for _ in range(min(CHUNK, len(queue)))], lambda _: None)
+
+    def _alone(self, queue: deque[Job]) -> list[Outcome]:
+        """Run the next job, and more where that takes no time."""
+        start, outcomes = time.perf_counter(), [run_job(self._scenario, queue.popleft())]
+        while queue and time.perf_counter() - start < _QUICK:
+            outcomes.append(run_job(self._scenario, queue.popleft()))
+        return outcomes
 
 
 def chunk_of(queue: deque[Job], size: float, workers: int) -> list[Job]:

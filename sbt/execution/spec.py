@@ -28,7 +28,7 @@ Attempt = Callable[[tuple[str | int, ...], Callable[[], LogicalScenario]], Logic
 
 @dataclass(frozen=True)
 class ScenarioSpec:
-    """A scenario by name, with the choices that change how it runs (not what is asked about it).
+    """A scenario by name, with the choices that change how it runs (not what is evaluated).
 
     Args:
         name: an installed scenario, or `file.py:NAME`; where the scenario is carried only for people.

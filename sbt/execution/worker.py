@@ -63,10 +63,10 @@ def run_jobs(scenario: LogicalScenario, jobs: Sequence[Job], at_work: Callable[[
     Args:
         scenario: what to run.
         jobs: its inputs and seeds.
-        at_work: called again and again with the indices of the jobs that are being run, none in the end.
+        at_work: called repeatedly with the indices of the runs in progress, with none in the end.
 
     Returns:
-        The outcomes, which do not depend on what ran at once; of runs at once the mean time.
+        The outcomes, which do not depend on how jobs are grouped; `seconds` is the mean of jobs that ran at once.
 
     Raises:
         KeyboardInterrupt: a signal asked for it.
@@ -103,7 +103,7 @@ def _together(
 
 
 def _outcome(job: Job, measured: Callable[[], _Measured], seconds: float = 0.0) -> Outcome:
-    """Return what became of a job: the metrics, or the error that is raised instead."""
+    """Return the outcome of a job: its metrics, or the status and reason of what was raised."""
     start = time.perf_counter() - seconds
     try:
         metrics, reported = measured()

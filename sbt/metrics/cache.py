@@ -1,4 +1,4 @@
-"""Results kept as long as the trace they were computed from, for what several metrics of one run share."""
+"""A cache of intermediate results that several metrics of a trace share."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ R = TypeVar("R")
 def per_trace(function: Callable[Concatenate[Trace, P], R]) -> Callable[Concatenate[Trace, P], R]:
     """Decorate a function of a trace and hashable arguments so that it is computed once per trace.
 
-    Traces are told apart by identity and referenced weakly: the results go with the trace. The result
-    must therefore not refer to the trace itself, and must not be changed by the caller.
+    Traces are compared by identity and referenced weakly, so that the results are released together with the trace.
+    A result must therefore not refer to the trace itself, and callers must not modify it.
     """
     results: WeakKeyDictionary[Trace, dict[Any, R]] = WeakKeyDictionary()
 

@@ -124,7 +124,7 @@ def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: 
     if duplicates.size:
         k = int(duplicates[0])
         where = f"'{users[user[k]]}' at {time[step[k]]:g} s"
-        raise InputError(f"a road user of an FCD file must be there once at a time, but in '{path}' {where} is not")
+        raise InputError(f"a road user of an FCD file must occur once per time step, but in '{path}' {where} does not")
     start = np.searchsorted(user, np.arange(len(users) + 1))
     _check_metres(path, data, user)
     person = np.asarray(kinds)[order][start[:-1]] == 1

@@ -42,8 +42,8 @@ def _parameter(p: Parameter) -> dict[str, Any]:
     found = p.distribution
     distribution = None if found is None else {"kind": found.kind, "parameters": [list(pair) for pair in found.parameters]}
     return {
-        "name": p.name, "low": _ended(p.low), "high": _ended(p.high), "unit": p.unit, "kind": p.kind, "description": p.description,
-        "distribution": distribution,
+        "name": p.name, "low": _ended(p.low), "high": _ended(p.high), "unit": p.unit, "kind": p.kind,
+        "description": p.description, "distribution": distribution,
     }  # fmt: skip
 
 

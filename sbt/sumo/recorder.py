@@ -1,9 +1,9 @@
 """Records the ego of a user's own simulation and the road users around it, and ends the run.
 
-The recorder is called after every step of SUMO, whoever makes the step. The ego is a vehicle id; from the
-step of its departure on, vehicles and persons within a radius are recorded (by a context subscription, whose
-cost does not grow with the traffic elsewhere), and named ones wherever they are. The states of a road user
-that is not present are NaN in the trace.
+The recorder is called after every step of SUMO, made by the user's loop or by this package. The ego is a vehicle
+id; from the step of its departure on, vehicles and persons within a radius are recorded (by a context
+subscription, whose cost does not grow with the traffic elsewhere), and named ones at any distance. The states of a
+road user that is not present are NaN in the trace.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class RecordingSettings:
         ego: the vehicle under test, and its driver.
         duration: time recorded, from the departure of the ego on (s).
         within: radius around the ego in which other road users are recorded (m).
-        named: vehicles or persons that are recorded wherever they are.
+        named: vehicles or persons that are recorded at any distance.
         wait: longest simulated time until the ego departs (s).
 
     Raises:

@@ -97,7 +97,7 @@ def compare_egos(
         Study.from_file(path, changes={**common, "store": str(store / name)}) for path, name in ((first, "a"), (second, "b"))
     )
     if one.scenario.space != other.scenario.space:
-        raise InputError(f"compare-ego needs the same inputs with the same distributions, but {first} and {second} differ in them")
+        raise InputError(f"compare-ego needs the same inputs and distributions, but {first} and {second} differ in them")
     requirement = one.scenario.requirement
     if requirement != other.scenario.requirement:
         found = f"{requirement} in {first}, {other.scenario.requirement} in {second}"

@@ -4,24 +4,65 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import FittedMetamodel
+from sbt.loop.stages import Conclusion
 from sbt.problem.arrays import Mask, Vector
-from sbt.store.history import VALIDATION
+from sbt.problem.scenario import LogicalScenario
+from sbt.store.history import VALIDATION, History
+from sbt.workflows.study import Study
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from sbt.workflows.result import Result
 
 __all__ = ["Plots"]
 
 _SLICE_POINTS = 201
 """Points along a slice: below a pixel of the default figure."""
+
+
+class Plotted(Protocol):
+    """What the figures are of: a result."""
+
+    @property
+    def store(self) -> Path:
+        """Its folder."""
+        ...
+
+    @property
+    def study(self) -> Study:
+        """The campaign as it is configured."""
+        ...
+
+    @property
+    def scenario(self) -> LogicalScenario:
+        """With the campaign's inputs and requirement."""
+        ...
+
+    @property
+    def history(self) -> History:
+        """All finished runs."""
+        ...
+
+    @property
+    def fitted(self) -> FittedMetamodel | None:
+        """The metamodel that learned from all runs but the held-out ones."""
+        ...
+
+    @property
+    def finished(self) -> bool:
+        """Whether the campaign has concluded."""
+        ...
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """What it found."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,7 +73,7 @@ class Plots:
         result: the campaign.
     """
 
-    result: Result[Any]
+    result: Plotted
 
     def runs(self, ax: Axes | None = None, *, x: str | None = None, y: str | None = None) -> Axes:
         """Scatter the runs over two inputs; with one input, the safety metric over it.
@@ -46,8 +87,12 @@ class Plots:
 
         r, space = self.result, self.result.scenario.space
         if space.dimension == 1:
-            return figures.plot_metric(r.history, r.scenario.requirement, space, _axes(ax), unit=r.scenario.unit)
-        return figures.plot_runs(r.history, r.scenario.requirement, space, _axes(ax), pair=self._pair(x, y))
+            drawn = figures.plot_metric(r.history, r.scenario.requirement, space, _axes(ax), unit=r.scenario.unit)
+        else:
+            drawn = figures.plot_runs(r.history, r.scenario.requirement, space, _axes(ax), pair=self._pair(x, y))
+        if drawn.get_legend_handles_labels()[0]:
+            drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize="small", frameon=False)
+        return drawn
 
     def boundary(self, ax: Axes | None = None, *, x: str | None = None, y: str | None = None) -> Axes:
         """Draw P(critical) over two inputs, averaged over the others, with the runs that the metamodel learned from.

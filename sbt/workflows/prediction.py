@@ -20,6 +20,7 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor
+from sbt.metamodels.persistence import load, read_info, save
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
@@ -176,11 +177,10 @@ def _within(x: Points, space: ParameterSpace) -> Points:
 
 def _predictor(folder: Path, learner: Learner, training: History, settings: str, device: str | None) -> tuple[Predictor, str]:
     """Return the fitted metamodel, from the file beside the store where that has learned from the same runs."""
-    from sbt.metamodels.persistence import load, read_info, save  # knows all metamodels, and loads torch with them
-    from sbt.metamodels.torch_tools import device_of
-
     path, key = folder / MODEL, _key(learner, training, settings)
     if device is not None:
+        from sbt.metamodels.torch_tools import device_of
+
         device_of(device)  # refuses one that is not there
     if path.is_file():
         try:
