@@ -87,8 +87,8 @@ class EstimationConclusion:
         confidence = percent(self.confidence)
         if self.exact_bound is not None:
             bound = number(self.exact_bound)
-            found = f"No critical run was drawn: with {confidence} confidence, the probability of one is at most {bound}."
-            return [found, *verdict]
+            none = f"No critical run was drawn: with {confidence} confidence, the probability of one is at most {bound}."
+            return [none, *verdict]
         if self.probability is None:
             return verdict
         found = [
