@@ -19,10 +19,13 @@ from typing import Any, TypeVar
 from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
 
-__all__ = ["KINDS", "OBJECT", "Scope", "load", "names"]
+__all__ = ["KINDS", "OBJECT", "Objects", "Scope", "load", "names"]
 
 OBJECT = "object:"
 """Before the name of an object that was given in Python, where a name is asked for."""
+
+Objects = Mapping[tuple[str, str], Any]
+"""What was given in Python: (kind, name) -> object, such as ("scenarios", "object:disc")."""
 
 KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
@@ -40,7 +43,7 @@ class Scope:
     """
 
     folder: Path = field(default_factory=Path.cwd)
-    objects: Mapping[tuple[str, str], Any] = field(default_factory=dict)
+    objects: Objects = field(default_factory=dict)
 
     def load(self, kind: str, name: str) -> Any:
         """Return the object with this name; as `load`, and the objects of the scope.

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -20,6 +19,7 @@ from sbt.errors import InputError
 from sbt.execution.protocol import SerialExecutor
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Status
+from sbt.problem.plain import Json, JsonMapping
 from sbt.processes import scratch
 from sbt.samplers.search import DEFLATION
 from sbt.seeds import run_seed
@@ -97,13 +97,13 @@ def compare(
     return cells
 
 
-def _settings(loaded: Loaded) -> dict[str, Any]:
+def _settings(loaded: Loaded) -> Json:
     """Return the settings that a cell depends on, beside sampler and seed."""
     settings = loaded.config.model_dump(mode="json", exclude={"seed", "store", "executor", "acquisition"})
     return json.loads(json.dumps(settings))
 
 
-def _finished(path: Path, settings: Mapping[str, Any]) -> Iterator[tuple[tuple[str, int], Cell]]:
+def _finished(path: Path, settings: JsonMapping) -> Iterator[tuple[tuple[str, int], Cell]]:
     """Yield the finished cells with the same settings; an incomplete line, of a process that was killed, is skipped."""
     for line in path.read_text().splitlines() if path.is_file() else []:
         try:

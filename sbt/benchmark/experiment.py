@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 from sbt.benchmark.cell import is_done, run_cell
 from sbt.benchmark.reference import make_reference
@@ -14,6 +13,7 @@ from sbt.benchmark.table import write_table
 from sbt.config.benchmark import LoadedBenchmark
 from sbt.execution.tasks import each
 from sbt.loop.stages import Progress
+from sbt.problem.plain import Json
 
 __all__ = ["TABLE", "Listener", "run_benchmark"]
 
@@ -35,7 +35,7 @@ class Listener:
 
 def run_benchmark(
     loaded: LoadedBenchmark, listener: Listener, *, reference: bool = True, cells: bool = True, figures: bool = True
-) -> dict[str, Any]:
+) -> Json:
     """Run a benchmark, or resume it; finished cells are not run again.
 
     Args:
@@ -62,7 +62,7 @@ def run_benchmark(
             listener.message(f"{cell.name}: {reason or 'done'}")
             if reason is not None:
                 failed[cell.name] = reason
-    result: dict[str, Any] = {
+    result: Json = {
         "store": str(store), "references": [str(folder) for folder in made if folder is not None], "cells": len(all_cells),
         "done": sum(map(is_done, all_cells)), "failed": failed, "rows": 0, "table": None, "figures": [],
     }  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from sbt.acquisitions import is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
@@ -15,6 +14,7 @@ from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
 from sbt.problem.arrays import Points
+from sbt.problem.plain import Json
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
 from sbt.store.history import VALIDATION, History
@@ -45,9 +45,9 @@ class BoundaryConclusion:
     chosen_because: str | None = optional()
     held_out_fraction: CriticalShare | None = None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the JSON of the command line."""
-        found: dict[str, Any] = to_json(self)
+        found: Json = to_json(self)
         return found
 
     def sentences(self, facts: Facts) -> list[str]:

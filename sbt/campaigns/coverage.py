@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from sbt.campaigns.choices import evenly
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
+from sbt.problem.plain import Json
 from sbt.store.records import Validation, optional, to_json
 
 __all__ = ["COVERAGE", "CoverageConclusion", "recipe"]
@@ -35,9 +35,9 @@ class CoverageConclusion:
     counted: int = 0
     validation: Validation | None = optional()
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the JSON of the command line."""
-        found: dict[str, Any] = to_json(self)
+        found: Json = to_json(self)
         return found
 
     def sentences(self, facts: Facts) -> list[str]:

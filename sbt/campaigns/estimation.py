@@ -16,6 +16,7 @@ from sbt.errors import InputError
 from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates, few_hits_bound
 from sbt.estimators.subset import combine_repeats
 from sbt.loop.stages import Campaign, Facts, Log, Stage
+from sbt.problem.plain import Json
 from sbt.store.records import optional, to_json
 
 __all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "recipe"]
@@ -75,9 +76,9 @@ class EstimationConclusion:
     exact_bound: float | None = optional()
     gate: GateVerdict | None = optional()
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the JSON of the command line."""
-        found: dict[str, Any] = to_json(self)
+        found: Json = to_json(self)
         return found
 
     def sentences(self, facts: Facts) -> list[str]:
@@ -224,7 +225,7 @@ def _from_nominal(log: Log, settings: Settings) -> Concluded:
     """Return what crude Monte Carlo says; its interval is exact, with few hits too."""
     share = nominal_proportion(log, settings)
     limits = Limits(share.lower, share.upper)
-    rest: dict[str, Any] = {}
+    rest: Json = {}
     if share.hits == 0:
         rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": (_NOTHING,)}
     return _conclusion(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from sbt.errors import InputError
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Facts
 from sbt.problem.arrays import Mask, Vector
+from sbt.problem.plain import Json
 from sbt.samplers.search import Search, fit_warped
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
@@ -98,9 +98,9 @@ class FalsificationConclusion:
     statement: str
     validation: Validation | None = None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the JSON of the command line."""
-        found: dict[str, Any] = to_json(self)
+        found: Json = to_json(self)
         return found
 
     def sentences(self, facts: Facts) -> list[str]:

@@ -11,6 +11,7 @@ from sbt.loop.learner import Learner
 from sbt.loop.stages import Campaign, Conclusion, Facts
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Vector
+from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.history import History
@@ -67,14 +68,14 @@ class Settings:
 class PlainConclusion:
     """The conclusion of a campaign that declares no type of its own: values by name."""
 
-    values: Mapping[str, Any]
+    values: JsonMapping
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> PlainConclusion:
+    def from_dict(cls, data: JsonMapping) -> PlainConclusion:
         """Return the conclusion from its JSON."""
         return cls(dict(data))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the JSON of the command line."""
         return dict(self.values)
 
@@ -112,7 +113,7 @@ class CampaignKind:
     methods: tuple[str, ...] = ()
     stop: Mapping[str, float | int | None] = field(default_factory=dict)
     adaptive: bool = True
-    metamodel: Mapping[str, Any] = field(default_factory=lambda: {"kind": "gp", "nu": 2.5, "input_noise": False})
+    metamodel: JsonMapping = field(default_factory=lambda: {"kind": "gp", "nu": 2.5, "input_noise": False})
     metamodel_free: tuple[str, ...] = ()
     target_aware: bool = True
     most_initial: int | None = None
@@ -138,25 +139,25 @@ class CampaignKind:
         """Name of the recipe, by which a campaign goes that was given as an object."""
         return str(getattr(self.recipe, "__name__", type(self.recipe).__name__))
 
-    def described(self) -> dict[str, Any]:
+    def described(self) -> Json:
         """Return what it declares as JSON data, so that a store can be read where its code is not at hand."""
         code = ("recipe", "conclusion")
-        found: dict[str, Any] = to_json({f.name: getattr(self, f.name) for f in fields(self) if f.name not in code})
+        found: Json = to_json({f.name: getattr(self, f.name) for f in fields(self) if f.name not in code})
         return found
 
     @classmethod
-    def absent(cls, name: str, described: Mapping[str, Any]) -> CampaignKind:
+    def absent(cls, name: str, described: JsonMapping) -> CampaignKind:
         """Return a kind of this declaration that cannot be run, and whose conclusion is values by name."""
 
         def recipe(settings: Settings) -> Campaign:
             raise InputError(f"campaign '{name}' is known by its description only: its code must be at hand to run it")
 
         known = {f.name for f in fields(cls)}
-        given: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described.items() if key in known}
+        given: Json = {key: tuple(v) if isinstance(v, list) else v for key, v in described.items() if key in known}
         given["recipe"] = recipe
         return cls(**given)
 
-    def read(self, data: Mapping[str, Any]) -> Conclusion:
+    def read(self, data: JsonMapping) -> Conclusion:
         """Return a conclusion from its JSON."""
         read = getattr(self.conclusion, "from_dict", None)
         made: Conclusion = read(data) if read is not None else from_json(self.conclusion, dict(data))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from sbt.acquisitions import Acquisition, even
 from sbt.config.load import Loaded
@@ -22,6 +22,7 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.recalibrated import Recalibrated
 from sbt.plugins import OBJECT
+from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, metric_from
 
@@ -113,7 +114,7 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     )  # fmt: skip
 
 
-def _plain_ego(ego: Choice, folder: Path) -> dict[str, Any]:
+def _plain_ego(ego: Choice, folder: Path) -> Json:
     kind = str(folder.resolve() / Path(ego.kind).expanduser()) if ".py:" in ego.kind else ego.kind
     return {"kind": kind, **ego.settings}
 

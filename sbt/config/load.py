@@ -27,7 +27,8 @@ from sbt.config.kinds import kind_of, kinds, looked_up_in
 from sbt.config.model import Configuration
 from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
 from sbt.errors import did_you_mean
-from sbt.plugins import Scope
+from sbt.plugins import Objects, Scope
+from sbt.problem.plain import Json, JsonMapping
 
 __all__ = [
     "ConfigError", "Loaded", "checked", "differences", "dump", "fingerprint", "from_mapping", "load", "located", "parse",
@@ -72,8 +73,8 @@ class Loaded:
 
 
 def load(
-    path: str | Path, overrides: Sequence[str] = (), *, changes: Mapping[str, Any] | None = None,
-    objects: Mapping[tuple[str, str], Any] | None = None,
+    path: str | Path, overrides: Sequence[str] = (), *, changes: JsonMapping | None = None,
+    objects: Objects | None = None,
 ) -> Loaded:  # fmt: skip
     """Read and check a configuration file.
 
@@ -121,7 +122,7 @@ def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wr
 
 def parse(
     text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None,
-    changes: Mapping[str, Any] | None = None, objects: Mapping[tuple[str, str], Any] | None = None,
+    changes: JsonMapping | None = None, objects: Objects | None = None,
 ) -> Loaded:  # fmt: skip
     """Check a configuration given as text; like `load`.
 
@@ -139,7 +140,7 @@ def parse(
     return Loaded(config, source, scope)
 
 
-def from_mapping(data: Mapping[str, Any], *, name: str, scope: Scope) -> Loaded:
+def from_mapping(data: JsonMapping, *, name: str, scope: Scope) -> Loaded:
     """Check a configuration given as plain data.
 
     Args:
@@ -159,7 +160,7 @@ def from_mapping(data: Mapping[str, Any], *, name: str, scope: Scope) -> Loaded:
 
 
 def checked(
-    model: type[M], text: str, overrides: Sequence[str], name: str, changes: Mapping[str, Any] | None = None
+    model: type[M], text: str, overrides: Sequence[str], name: str, changes: JsonMapping | None = None
 ) -> tuple[M, SourceMap]:
     """Return YAML text as a checked model, and where its keys stand.
 
@@ -186,7 +187,7 @@ def checked(
     return config, source
 
 
-def resolve(config: Configuration) -> dict[str, Any]:
+def resolve(config: Configuration) -> Json:
     """Return the configuration as plain data, every default filled in."""
     return config.model_dump(mode="json", by_alias=True)
 
@@ -198,7 +199,7 @@ def dump(config: Configuration) -> str:
     return stream.getvalue()
 
 
-def fingerprint(config: Configuration) -> dict[str, Any]:
+def fingerprint(config: Configuration) -> Json:
     """Return what must stay the same when a campaign is resumed: all but executor, store and budget.
 
     Plain JSON data: infinite numbers are the texts "inf" and "-inf".
@@ -206,7 +207,7 @@ def fingerprint(config: Configuration) -> dict[str, Any]:
     return {key: _jsonable(value) for key, value in resolve(config).items() if key not in _NOT_IDENTITY}
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: Collection[str]) -> str:
+def differences(before: JsonMapping, now: JsonMapping, keys: Collection[str]) -> str:
     """Return in words where two fingerprints differ in these keys; "" where they agree.
 
     An unset key (None) and a missing one are the same, so that a later version may have more keys.
@@ -222,7 +223,7 @@ def _stated(value: Any) -> Any:
     return {k: _stated(v) for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
 
 
-def resumed(config: Configuration, stored: Mapping[str, Any]) -> Configuration:
+def resumed(config: Configuration, stored: JsonMapping) -> Configuration:
     """Return the configuration with `initial` and `batch` as stored, where the user does not state them.
 
     Their defaults follow the budget, which may grow when a campaign is resumed; they must not.
@@ -231,7 +232,7 @@ def resumed(config: Configuration, stored: Mapping[str, Any]) -> Configuration:
     return config.model_copy(update=kept)
 
 
-def schema() -> dict[str, Any]:
+def schema() -> Json:
     """Return the JSON schema of configurations, with what the installed campaigns declare."""
     found = {k: v for k, v in Configuration.model_json_schema().items() if k != "title"}
     campaigns, keys = kinds(), found["properties"]
@@ -245,7 +246,7 @@ def schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "sumo-sbt campaign", **found}
 
 
-def _overridden(data: dict[str, Any], source: SourceMap, overrides: Sequence[str]) -> tuple[dict[str, Any], SourceMap, list[str]]:
+def _overridden(data: Json, source: SourceMap, overrides: Sequence[str]) -> tuple[Json, SourceMap, list[str]]:
     """Return the data with the overrides in it, the source that knows them, and what is wrong with them."""
     wrong: list[str] = []
     given: set[Key] = set(source.overrides)
@@ -270,7 +271,7 @@ def _overridden(data: dict[str, Any], source: SourceMap, overrides: Sequence[str
     return data, replace(source, overrides=frozenset(given)), wrong
 
 
-def _with(data: Any, path: tuple[str, ...], value: Any) -> dict[str, Any]:
+def _with(data: Any, path: tuple[str, ...], value: Any) -> Json:
     """Return a copy of nested mappings with one value replaced or added; null counts as an empty mapping."""
     if data is not None and not isinstance(data, dict):
         raise TypeError(f"--set reaches into mappings only, but '{path[0]}' would be inside {_shown(data)}")
@@ -319,7 +320,7 @@ def _inner(kind: Any) -> Any:
     return kind
 
 
-def _flow(settings: Mapping[str, Any]) -> str:
+def _flow(settings: JsonMapping) -> str:
     """Return settings as YAML on one line."""
     return "{" + ", ".join(f"{key}: {json.dumps(value)}" for key, value in settings.items()).replace('"', "") + "}"
 

@@ -28,6 +28,7 @@ from sbt.config.kinds import kind_of
 from sbt.errors import did_you_mean
 from sbt.plugins import OBJECT
 from sbt.problem.expression import Expression
+from sbt.problem.plain import Json
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
@@ -140,7 +141,7 @@ class Choice(_Strict):
     kind: Name = Field(description="An installed name, or file.py:NAME (relative to the configuration file).")
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Json:
         """The keys beside the declared ones."""
         return dict(self.__pydantic_extra__)
 
@@ -246,16 +247,16 @@ class ExecutorChoice(_Strict):
         return value
 
 
-def _tenth(data: dict[str, Any]) -> int:
+def _tenth(data: Json) -> int:
     most = kind_of(data["campaign"]).most_initial or data["budget"]
     return int(min(max(10, data["budget"] // 10), data["budget"], most))
 
 
-def _batch(data: dict[str, Any]) -> int:
+def _batch(data: Json) -> int:
     return kind_of(data["campaign"]).batch or int(data["initial"])
 
 
-def _store(data: dict[str, Any]) -> str:
+def _store(data: Json) -> str:
     path = Path(data["scenario"].removesuffix(":SCENARIO").removeprefix(OBJECT))
     path = path.parent if path.name in ("scenario.yaml", "scenario.yml") and path.parent.name else path
     name = re.sub(r"[^\w-]+", "_", path.stem if path.suffix in (".py", ".yaml") else path.name)
@@ -263,12 +264,12 @@ def _store(data: dict[str, Any]) -> str:
     return f"runs/{campaign}_{name}"
 
 
-def _metamodel(data: dict[str, Any]) -> MetamodelChoice | None:
+def _metamodel(data: Json) -> MetamodelChoice | None:
     kind = kind_of(data["campaign"])
     return MetamodelChoice.model_validate(dict(kind.metamodel)) if kind.adaptive else None
 
 
-def _acquisition(data: dict[str, Any]) -> AcquisitionChoice:
+def _acquisition(data: Json) -> AcquisitionChoice:
     return AcquisitionChoice(kind=kind_of(data["campaign"]).acquisition)
 
 

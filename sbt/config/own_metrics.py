@@ -13,6 +13,7 @@ from sbt.errors import InputError
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.stl import stl
 from sbt.plugins import load
+from sbt.problem.plain import Json
 from sbt.problem.scenario import Metric
 
 __all__ = ["actors_of", "metric_of"]
@@ -42,7 +43,7 @@ def metric_of(entry: MetricEntry, folder: Path, ego: str) -> Metric:
     return in_traffic(metric, ego, entry.other, entry.name or "")
 
 
-def _made(found: Any, kind: str, settings: dict[str, Any]) -> Metric:
+def _made(found: Any, kind: str, settings: Json) -> Metric:
     """Return the metric that settings make of an installed one: by the function of its name in its module."""
     factory: Callable[..., Any] | None = found
     if isinstance(found, Metric):

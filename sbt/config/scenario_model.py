@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, ValidationInfo, field_validator
 
 from sbt.config.model import Choice, Condition, CorrelationEntry, Formula, Name, RequirementChange
+from sbt.problem.plain import Json
 
 __all__ = ["EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ScenarioModel", "SumoEntry", "schema"]
 
@@ -29,7 +30,7 @@ class _Open(_Strict):
     __pydantic_extra__: dict[str, JsonValue]
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Json:
         """The keys beside the declared ones."""
         return dict(self.__pydantic_extra__)
 
@@ -127,7 +128,7 @@ class ScenarioModel(_Strict):
         return value
 
 
-def schema() -> dict[str, Any]:
+def schema() -> Json:
     """Return the JSON schema of a `scenario.yaml`."""
     found = {k: v for k, v in ScenarioModel.model_json_schema().items() if k != "title"}
     for name in ("sumo", "ego"):  # a bare text stands for {config: text} and {id: text}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from sbt.errors import InputError
 from sbt.execution.protocol import Executor
 from sbt.loop.learner import FittedMetamodel
 from sbt.problem.outcome import Status
+from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.seeds import run_seed
 from sbt.store.database import PlannedRun, Store
@@ -73,7 +74,7 @@ class Log:
 class Conclusion(Protocol):
     """What a campaign found: a frozen dataclass with typed attributes."""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the JSON of the command line."""
         ...
 
@@ -215,7 +216,7 @@ class ShardConclusion:
     shard: str
     runs_of_the_campaign: int
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the JSON of the command line."""
         return {"shard": self.shard, "runs_of_the_campaign": self.runs_of_the_campaign}
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from sbt.errors import InputError
 from sbt.problem.distribution import Distribution
 from sbt.problem.expression import Expression
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.space import ParameterSpace
@@ -22,7 +22,7 @@ _TEXTS = ("description", "title")
 """Keys that may differ between a campaign and its resumption."""
 
 
-def describe_scenario(scenario: LogicalScenario) -> dict[str, Any]:
+def describe_scenario(scenario: LogicalScenario) -> Json:
     """Return a scenario as JSON data: inputs, requirement, metrics; what is Python code stands there by name only."""
     space, need = scenario.space, scenario.requirement
     return {
@@ -38,7 +38,7 @@ def describe_scenario(scenario: LogicalScenario) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _parameter(p: Parameter) -> dict[str, Any]:
+def _parameter(p: Parameter) -> Json:
     found = p.distribution
     distribution = None if found is None else {"kind": found.kind, "parameters": [list(pair) for pair in found.parameters]}
     return {
@@ -52,13 +52,13 @@ def _ended(value: float) -> float | str:
     return value if math.isfinite(value) else str(value)
 
 
-def is_complete(data: Mapping[str, Any]) -> bool:
+def is_complete(data: JsonMapping) -> bool:
     """Return whether the data say all of a scenario but how it runs: no constraint or feature in Python, no recorded rows."""
     formulas = all(written for _, written in data["constraints"]) and all(text is not None for _, text in data["features"])
     return formulas and not data["recorded"]
 
 
-def rebuild_scenario(data: Mapping[str, Any]) -> LogicalScenario:
+def rebuild_scenario(data: JsonMapping) -> LogicalScenario:
     """Return the scenario of these data; it can be asked about, not run.
 
     Raises:
@@ -101,7 +101,7 @@ class _Absent:
         raise InputError(f"scenario {self.name} is known by its description only: its code must be loaded to measure a run")
 
 
-def scenario_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def scenario_differences(before: JsonMapping, now: JsonMapping) -> str:
     """Return in words how two described scenarios differ in what is run and asked; "" where they agree."""
     if not before or not now:
         return ""

@@ -7,12 +7,12 @@ import shlex
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from sbt.campaigns.wording import NOTHING, number
 from sbt.files import write_atomically
 from sbt.loop.stages import Conclusion
 from sbt.plugins import OBJECT
+from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
 from sbt.report.modes import mode_table
@@ -70,7 +70,7 @@ def write_report(
     return write_atomically(target / REPORT, page)
 
 
-def _render(values: Mapping[str, Any]) -> str:
+def _render(values: JsonMapping) -> str:
     import jinja2
 
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -78,7 +78,7 @@ def _render(values: Mapping[str, Any]) -> str:
     return template.render(values)
 
 
-def _inline(drawing: Drawing) -> dict[str, Any]:
+def _inline(drawing: Drawing) -> Json:
     """Return a drawing for the template; its SVG, without the XML prologue, is the only text not escaped."""
     import markupsafe
 
@@ -152,7 +152,7 @@ def _commands(found: Findings, store: Store) -> dict[str, str]:
     }
 
 
-def _objects(configuration: Mapping[str, Any]) -> str:
+def _objects(configuration: JsonMapping) -> str:
     """Return the arguments that give again what was defined in Python; "" where nothing was."""
     choices = {key: configuration.get(key) for key in ("campaign", "scenario", "metamodel", "acquisition")}
     named = {key: str(choice.get("kind") if isinstance(choice, Mapping) else choice) for key, choice in choices.items()}

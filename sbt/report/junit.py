@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+
+from sbt.problem.plain import JsonMapping
 
 __all__ = ["write_junit"]
 
 
-def write_junit(path: Path, result: Mapping[str, Any], *, fail_on_critical: bool = False) -> None:
+def write_junit(path: Path, result: JsonMapping, *, fail_on_critical: bool = False) -> None:
     """Write one test suite with a case for each verdict: the runs, the gate, critical runs where they are to fail.
 
     A gate that is undecided is a failure of its own type: it did not pass.

@@ -13,6 +13,7 @@ from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
 from sbt.plugins import OBJECT
 from sbt.problem.arrays import Vector
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.words import SCORES, distribution_words
@@ -128,7 +129,7 @@ def iteration_table(
     return Table(columns, tuple(rows), "Scores are those of the metamodel that chose the batch." if scored else "")
 
 
-def _listed(proposal: Mapping[str, Any]) -> str:
+def _listed(proposal: JsonMapping) -> str:
     """Return the keys and values of how a batch was chosen on one line; arrays as their length."""
 
     def shown(value: Any) -> str:

@@ -13,6 +13,7 @@ from sbt.campaigns.wording import number, percent
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Conclusion, Facts
 from sbt.problem.distribution import Distribution
+from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
@@ -60,9 +61,9 @@ class Findings:
     history: History
     requirement: Requirement
     unit: str
-    configuration: Mapping[str, Any]
+    configuration: JsonMapping
     conclusion: Conclusion | None
-    ended: Mapping[str, Any]
+    ended: JsonMapping
     validation: Validation | None
     planned: int
     direction: str = "low"

@@ -24,6 +24,7 @@ import numpy as np
 
 from sbt.errors import StoreError
 from sbt.problem.outcome import Job, Outcome
+from sbt.problem.plain import Json, JsonMapping
 from sbt.store.history import PLANNED, History, Rows
 from sbt.store.records import FitRecord, Iteration, from_json, to_json
 
@@ -95,7 +96,7 @@ class Store:
         self._fits: list[FitRecord] = []
 
     @classmethod
-    def open(cls, folder: Path, configuration: Mapping[str, Any] | None = None, *, durable: bool = True) -> Store:
+    def open(cls, folder: Path, configuration: JsonMapping | None = None, *, durable: bool = True) -> Store:
         """Open for writing: a new store with this configuration, or the one that is there.
 
         Args:
@@ -122,7 +123,7 @@ class Store:
                 store.begin(configuration)
             return store
 
-    def begin(self, configuration: Mapping[str, Any]) -> None:
+    def begin(self, configuration: JsonMapping) -> None:
         """Make the tables of a new store, with the configuration of its campaign; a store that has them stays as it is."""
         if self._db.execute("PRAGMA user_version").fetchone()[0] != 0:
             return
@@ -205,22 +206,22 @@ class Store:
         return json.loads(row[0])
 
     @property
-    def configuration(self) -> dict[str, Any]:
+    def configuration(self) -> Json:
         """What the campaign was started with; empty where none was begun."""
         return dict(self._get_meta("configuration") or {})
 
-    def update_configuration(self, configuration: Mapping[str, Any]) -> None:
+    def update_configuration(self, configuration: JsonMapping) -> None:
         """Replace the configuration (a larger budget, another executor)."""
         with self._transaction():
             self._set_meta("configuration", dict(configuration))
 
     @property
-    def conclusion(self) -> dict[str, Any] | None:
+    def conclusion(self) -> Json | None:
         """The result of the campaign as `run --json` prints it; None while it is not finished."""
         found = self._get_meta("conclusion")
         return None if found is None else dict(found)
 
-    def conclude(self, conclusion: Mapping[str, Any]) -> None:
+    def conclude(self, conclusion: JsonMapping) -> None:
         """Keep the result of the campaign."""
         with self._transaction():
             self._set_meta("conclusion", dict(conclusion))

@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any, TypeVar
 
 from sbt.errors import StoreError
+from sbt.problem.plain import Json, JsonMapping
 
 __all__ = ["FitRecord", "Iteration", "Validation", "from_json", "optional", "to_json"]
 
@@ -90,7 +91,7 @@ class Validation:
     n: int = 0
     n_critical: int = 0
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return the scores by name."""
         return dataclasses.asdict(self)
 
@@ -142,7 +143,7 @@ class Iteration:
 
     number: int
     stage: str
-    proposal: Mapping[str, Any]
+    proposal: JsonMapping
 
     def read(self, kind: type[T]) -> T:
         """Return how it was chosen as the stage's own record."""

@@ -5,17 +5,17 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from sbt.errors import InputError, did_you_mean
 from sbt.files import write_atomically
+from sbt.plugins import Objects
 from sbt.store.database import Store
 from sbt.workflows.study import Study
 
 __all__ = ["FORMS", "export_store"]
 
 
-def export_store(folder: Path, form: str = "csv", *, objects: Mapping[tuple[str, str], Any] | None = None) -> Path:
+def export_store(folder: Path, form: str = "csv", *, objects: Objects | None = None) -> Path:
     """Write the runs of a store as a table into its folder `exports`.
 
     Args:

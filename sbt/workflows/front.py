@@ -19,9 +19,10 @@ from sbt.errors import InputError, PluginError, did_you_mean
 from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_traced
-from sbt.plugins import OBJECT, Scope
+from sbt.plugins import OBJECT, Objects, Scope
 from sbt.problem.description import describe_scenario, scenario_differences
 from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.plain import Json
 from sbt.problem.scenario import LogicalScenario, Metric, metric_from
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
@@ -123,7 +124,7 @@ def open_result(
     return Result(folder, objects)
 
 
-def _check_objects(study: Study, objects: Mapping[tuple[str, str], Any], folder: Path) -> None:
+def _check_objects(study: Study, objects: Objects, folder: Path) -> None:
     """Refuse objects that the store was not made with."""
     config = study.config
     expected = {
@@ -201,7 +202,7 @@ class Run:
             raise InputError(f"only a run with a trace can be shown, but this one has none: {reason}")
         return pd.DataFrame(self.states.rows())
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return what `simulate --json` prints."""
         return {
             "scenario": self.name, "seed": self.seed, "inputs": dict(self.inputs), "status": str(self.status),
@@ -282,7 +283,7 @@ class Checked:
         """Whether every rule holds."""
         return all(finding.ok for finding in self.findings)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return what `check --json` prints, but the target."""
         return {"ok": self.ok, "findings": [vars(finding) for finding in self.findings]}
 

@@ -12,37 +12,38 @@ from sbt.loop.stages import Progress
 from sbt.plugins import OBJECT
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, metric_from
 from sbt.problem.trace import Trace
 
 __all__ = ["CampaignKeys", "Setting", "as_data"]
 
-Setting = str | Mapping[str, Any]
+Setting = str | JsonMapping
 
 
 class CampaignKeys(TypedDict, total=False):
     """Keys of a configuration (but `campaign`), as `run` takes them; see docs/configuration.md."""
 
     scenario: LogicalScenario | str
-    requirement: Requirement | Mapping[str, Any]
-    inputs: Mapping[str, Any]
+    requirement: Requirement | JsonMapping
+    inputs: JsonMapping
     correlation: Sequence[Any]
     constraints: Sequence[str]
     features: Mapping[str, str]
     metrics: Sequence[Metric | str | Callable[[Trace], float]]
     ego: Setting | None
-    simulation: Mapping[str, Any]
+    simulation: JsonMapping
     seed: int
     budget: int
     initial: int
     batch: int
-    validation: Mapping[str, Any]
+    validation: JsonMapping
     metamodel: object
     acquisition: object
-    stop: Mapping[str, Any]
+    stop: JsonMapping
     gate: Mapping[str, float] | None
-    warm_start: Mapping[str, Any] | str | Path | None
+    warm_start: JsonMapping | str | Path | None
     executor: Setting
     store: str | Path
     workers: int
@@ -50,7 +51,7 @@ class CampaignKeys(TypedDict, total=False):
     progress: Callable[[Progress], None] | None
 
 
-def as_data(keys: Mapping[str, Any]) -> tuple[dict[str, Any], dict[tuple[str, str], Any]]:
+def as_data(keys: JsonMapping) -> tuple[Json, dict[tuple[str, str], Any]]:
     """Return keywords as a configuration's plain data, and the objects among them by kind and name."""
     objects: dict[tuple[str, str], Any] = {}
 
@@ -67,7 +68,7 @@ def as_data(keys: Mapping[str, Any]) -> tuple[dict[str, Any], dict[tuple[str, st
             return {k: named(kind, v) if k == "kind" and not isinstance(v, str) else _plain(v) for k, v in given.items()}
         return {"kind": str(given) if isinstance(given, str | Path) else named(kind, given)}
 
-    data: dict[str, Any] = {}
+    data: Json = {}
     for key, given in keys.items():
         if key in ("metamodel", "acquisition"):
             data[key] = choice(f"{key}s", given)
@@ -98,7 +99,7 @@ def _input(change: Any) -> Any:
     return _plain(change)
 
 
-def _law(given: Distribution) -> dict[str, Any]:
+def _law(given: Distribution) -> Json:
     return {"kind": given.kind, **dict(given.parameters)}
 
 

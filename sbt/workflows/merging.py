@@ -10,13 +10,14 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from sbt.errors import InputError
 from sbt.files import move_atomically
 from sbt.loop.stages import Shard, run_stages
 from sbt.problem.description import is_complete
 from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.plain import JsonMapping
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import Record
 from sbt.workflows.running import Summary, keep_configuration, rebuild_report, summarise
@@ -35,7 +36,7 @@ class _Part:
 
     folder: Path
     shard: Shard
-    configuration: Mapping[str, Any]
+    configuration: JsonMapping
     records: tuple[Record, ...]
     total: int
 

@@ -19,6 +19,7 @@ from sbt.estimators.binomial import interval
 from sbt.estimators.monte_carlo import Proportion
 from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask
+from sbt.problem.plain import Json
 from sbt.store.database import Store
 from sbt.store.history import History
 from sbt.workflows.running import run_study
@@ -69,7 +70,7 @@ class Pairs:
 
 def compare_egos(
     first: Path, second: Path, *, store: Path, runs: int | None = None, progress: Callable[[Progress], None] | None = None
-) -> dict[str, Any]:
+) -> Json:
     """Run both configurations on the same draws, or go on where the stores stopped, and compare them.
 
     Args:
@@ -113,7 +114,7 @@ def _history(folder: Path) -> History:
         return store.history()
 
 
-def _result(first: History, second: History, requirement: Any) -> dict[str, Any]:
+def _result(first: History, second: History, requirement: Any) -> Json:
     """Return the comparison of two histories of the same draws."""
     same = np.array_equal(first.x, second.x) and np.array_equal(first.seed, second.seed)
     if not same:
@@ -136,6 +137,6 @@ def _result(first: History, second: History, requirement: Any) -> dict[str, Any]
     }  # fmt: skip
 
 
-def _listed(history: History, mask: Mask) -> list[dict[str, Any]]:
+def _listed(history: History, mask: Mask) -> list[Json]:
     found = [history.record(int(k)) for k in np.flatnonzero(mask)]
     return [{"run": r.index, "inputs": dict(r.inputs), "seed": r.seed} for r in found]

@@ -21,8 +21,10 @@ from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.persistence import load, read_info, save
+from sbt.plugins import Objects
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Json
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import Store
 from sbt.store.history import History
@@ -80,7 +82,7 @@ def predict_rows(folder: Path, inputs: Path, device: str | None = None) -> Table
 
 def predict_inputs(
     folder: Path, read: Callable[[ParameterSpace], tuple[Points, tuple[str, ...]]], *, device: str | None = None,
-    objects: Mapping[tuple[str, str], Any] | None = None,
+    objects: Objects | None = None,
 ) -> Table:  # fmt: skip
     """Return what a campaign's metamodel predicts about concrete scenarios.
 
@@ -189,7 +191,7 @@ def _predictor(folder: Path, learner: Learner, training: History, settings: str,
         except InputError:  # damaged or of another version: it is only a copy, and is made again
             pass
     predictor = learner.train(training)
-    info: dict[str, Any] = {
+    info: Json = {
         "key": key, "inputs": list(training.names), "metric": learner.scenario.requirement.metric, "runs": len(training),
     }  # fmt: skip
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from sbt.errors import InputError, StoreError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Facts
-from sbt.plugins import OBJECT
+from sbt.plugins import OBJECT, Objects
+from sbt.problem.plain import Json
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
@@ -44,10 +44,10 @@ class Result(Generic[C]):
     """
 
     store: Path
-    objects: Mapping[tuple[str, str], Any] = field(default_factory=dict)
+    objects: Objects = field(default_factory=dict)
 
     @cached_property
-    def _read(self) -> tuple[Study, History, dict[str, Any], list[FitRecord]]:
+    def _read(self) -> tuple[Study, History, Json, list[FitRecord]]:
         with Store.read(self.store) as store:
             return Study.from_store(store, objects=self.objects), store.history(), store.conclusion or {}, store.fits()
 
@@ -77,7 +77,7 @@ class Result(Generic[C]):
         return bool(self._read[2])
 
     @property
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Json:
         """What `run --json` prints; empty while the campaign goes on."""
         return dict(self._read[2])
 

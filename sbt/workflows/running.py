@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,10 @@ from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Finished, Progress, Shard, check_shard, run_shard, run_stages
+from sbt.plugins import Objects
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Job, Outcome
+from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
@@ -54,7 +55,7 @@ class Summary:
     seconds: Mapping[str, float]
     conclusion: Conclusion
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Json:
         """Return what `run --json` prints."""
         return {**vars(self), "seconds": dict(self.seconds), "conclusion": self.conclusion.to_dict()}
 
@@ -88,7 +89,7 @@ def run_study(
         store.begin(snapshot)
         _check_same(store, snapshot)
         keep_configuration(store, study, snapshot)
-        common: dict[str, Any] = {
+        common: Json = {
             "seed": study.config.seed, "requirement": study.scenario.requirement, "versions": versions(),
             "listener": progress or (lambda _: None),
         }  # fmt: skip
@@ -104,7 +105,7 @@ def run_study(
     return summary
 
 
-def keep_configuration(store: Store, study: Study, snapshot: Mapping[str, Any]) -> None:
+def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> None:
     """Write what a store remembers of its configuration, and the YAML beside it."""
     store.update_configuration(snapshot)
     write_atomically(store.folder / RESOLVED, dump(study.config))
@@ -121,7 +122,7 @@ def summarise(store: Store, study: Study, finished: Finished) -> Summary:
     )  # fmt: skip
 
 
-def rebuild_report(folder: Path, *, objects: Mapping[tuple[str, str], Any] | None = None) -> Path:
+def rebuild_report(folder: Path, *, objects: Objects | None = None) -> Path:
     """Write the report of a store again, also while its campaign runs; without a metamodel whose code is not at hand.
 
     Raises:
@@ -161,7 +162,7 @@ class Replay:
         return str(self.outcome.status) == self.record.status and dict(self.outcome.metrics) == dict(self.record.metrics)
 
 
-def replay_run(folder: Path, index: int, *, objects: Mapping[tuple[str, str], Any] | None = None) -> Replay:
+def replay_run(folder: Path, index: int, *, objects: Objects | None = None) -> Replay:
     """Execute a stored run again, as the campaign did.
 
     Raises:
@@ -179,7 +180,7 @@ def replay_run(folder: Path, index: int, *, objects: Mapping[tuple[str, str], An
     return Replay(record, outcome, trace, scenario)
 
 
-def _check_same(store: Store, snapshot: Mapping[str, Any]) -> None:
+def _check_same(store: Store, snapshot: JsonMapping) -> None:
     """Refuse to go on with a store that another configuration or scenario made.
 
     Only the budget may change (a shard's must not: its share was planned with it), and where runs are executed.

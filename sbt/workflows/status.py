@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
+from sbt.problem.plain import Json
 from sbt.store.database import Store
 from sbt.store.records import FitRecord
 
 __all__ = ["read_status"]
 
 
-def read_status(folder: Path) -> dict[str, Any]:
+def read_status(folder: Path) -> Json:
     """Return what `status --json` prints: counts, iterations, last validation and conclusion.
 
     Raises:
@@ -29,7 +29,7 @@ def read_status(folder: Path) -> dict[str, Any]:
         }
 
 
-def _validation(fit: FitRecord) -> dict[str, Any]:
+def _validation(fit: FitRecord) -> Json:
     """Return the numbers of the last fit."""
     shares = {name: getattr(fit, name) for name in ("critical_fraction", "expected_misclassified", "ambiguous_volume")}
     scores = {} if fit.validation is None else fit.validation.to_dict()

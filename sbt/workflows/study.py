@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,8 +19,9 @@ from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
 from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.stages import Campaign, Conclusion, Shard
-from sbt.plugins import Scope
+from sbt.plugins import Objects, Scope
 from sbt.problem.description import describe_scenario, is_complete, rebuild_scenario
+from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History
@@ -43,7 +44,7 @@ class Study:
     """
 
     loaded: Loaded
-    kept: Mapping[str, Any] = field(default_factory=dict)
+    kept: JsonMapping = field(default_factory=dict)
     live: bool = True
 
     @classmethod
@@ -52,13 +53,13 @@ class Study:
         return cls(load(path, overrides, **more))
 
     @classmethod
-    def from_mapping(cls, data: Mapping[str, Any], *, name: str, scope: Scope) -> Study:
+    def from_mapping(cls, data: JsonMapping, *, name: str, scope: Scope) -> Study:
         """Return the study of a configuration given as plain data."""
         return cls(from_mapping(data, name=name, scope=scope))
 
     @classmethod
     def from_store(
-        cls, store: Store, *, objects: Mapping[tuple[str, str], Any] | None = None, live: bool = False
+        cls, store: Store, *, objects: Objects | None = None, live: bool = False
     ) -> Study:
         """Return the study that a store was made with.
 
@@ -193,7 +194,7 @@ class Study:
             return DaskExecutor(self.spec, choice.address, choice.workers, limit)
         return LocalExecutor(self.spec, choice.workers, limit)
 
-    def snapshot(self, shard: Shard | None = None) -> dict[str, Any]:
+    def snapshot(self, shard: Shard | None = None) -> Json:
         """Return what the store remembers of the configuration: plain JSON, and the YAML to read back."""
         config = self.config
         return {
@@ -203,7 +204,7 @@ class Study:
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
         }  # fmt: skip
 
-    def conclusion(self, data: Mapping[str, Any]) -> Conclusion:
+    def conclusion(self, data: JsonMapping) -> Conclusion:
         """Return a conclusion from the JSON in the store; values by name where the campaign's own type is not at hand."""
         return self.kind.read(data)
 
