@@ -274,7 +274,7 @@ def test_a_failed_run_is_told_and_ends_with_4(folder: Path, name: str, status: s
         (["--ego", "kind=acc"], "scenario plane offers no choice of ego or step length"),
         (["--step", "0"], "--step must be > 0 s, but got 0.0"),
         (["--isolation", "none"], "--isolation must be auto, fresh, reuse or replicas, but got 'none'"),
-        (["--trace", "t.csv"], "--trace needs a scenario that is simulated, but plane gives its metrics directly"),
+        (["--trace", "t.csv"], "a trace needs a scenario that is simulated, but plane gives its metrics directly"),
     ],
 )
 def test_wrong_input_of_simulate_ends_with_2(folder: Path, args: list[str], expected: str):

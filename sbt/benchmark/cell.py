@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from sbt.acquisitions import Acquisition, boundary
 from sbt.benchmark.reference import reference_rows
 from sbt.benchmark.stores import open_store
-from sbt.campaigns.settings import PlainConclusion
+from sbt.campaigns.settings import Acquisition, PlainConclusion
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
 from sbt.errors import SbtError
@@ -188,7 +187,7 @@ class _BenchmarkStage:
             start=0 if last is None else last.next_position, seed=self.seed, label=log.iteration,
             max_candidates=max(self.max_candidates, self.batch), accept_filter=admissible,
         )  # fmt: skip
-        screen = fitted.log_ambiguity_bound if fitted is not None and acquisition is boundary else None
+        screen = fitted.log_ambiguity_bound if fitted is not None and acquisition is not None else None  # a_BI, the only one
         draw = draws(bound=screen, fill=False)
         if draw.method == "short":
             draw = draws()  # the pool ranks what was rejected, so all of it has to be scored

@@ -42,9 +42,9 @@ def simulate(
         choices = _pairs("--ego", ego or []) or None
         _check_choices(choices, step, isolation)
         values = _pairs("input", inputs or [])
-        run = simulate_scenario(scenario, values, seed=seed, ego=choices, step_length=step, isolation=isolation)
-        if trace is not None and run.scenario.simulate is None:
-            raise InputError(f"--trace needs a scenario that is simulated, but {run.scenario.name} gives its metrics directly")
+        run = simulate_scenario(
+            scenario, values, seed=seed, ego=choices, step_length=step, isolation=isolation, traced=trace is not None
+        )
         if trace is not None:
             _write_trace(trace, run)
     if as_json:

@@ -219,7 +219,7 @@ class Run:
 def simulate_scenario(
     scenario: LogicalScenario | str | Path, inputs: Mapping[str, float] | None = None, *, seed: int = 0,
     ego: Setting | None = None, step_length: float | None = None, isolation: str = "auto",
-    metrics: Sequence[Metric | str | Callable[[Trace], float]] = (),
+    metrics: Sequence[Metric | str | Callable[[Trace], float]] = (), traced: bool = False,
 ) -> Run:  # fmt: skip
     """Run one concrete scenario.
 
@@ -231,6 +231,7 @@ def simulate_scenario(
         step_length: simulation step (s).
         isolation: how SUMO is kept between runs.
         metrics: further ones to measure.
+        traced: refuse a scenario that gives no trace, before it runs.
 
     Returns:
         The run; one that fails says why in `status` and `reason`.
@@ -250,6 +251,8 @@ def simulate_scenario(
     else:
         spec = _spec(scenario, isolation)
         found = replace(spec, ego=choice, step_length=step_length, metrics=named).resolve()
+    if traced and found.simulate is None:
+        raise InputError(f"a trace needs a scenario that is simulated, but {found.name} gives its metrics directly")
     if own:
         found = replace(found, metrics=(*found.metrics, *own))
     values = found.space.values({name: _number(name, value) for name, value in (inputs or {}).items()})
