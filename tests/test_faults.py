@@ -249,6 +249,7 @@ def test_a_signal_is_told_from_what_code_raises():
     assert found == [False]
 
 
+@pytest.mark.sumo
 def test_drivers_that_are_killed_leave_no_process_and_no_folder():
     """A few kills of those that `benchmarks/faults.py` makes."""
     done = subprocess.run(
@@ -319,6 +320,7 @@ def test_a_task_may_raise_anything():
     assert [reason and reason.partition(" (")[0] for _, reason in each(raising, [0, 1], 1)] == [None, "SystemExit: over"]
 
 
+@pytest.mark.sumo
 @pytest.mark.parametrize("kind", ["local", "serial"])
 def test_a_campaign_leaves_no_temporary_folder(kind: str, started: Any, configured: Callable[..., Path], temporary: Path):
     executor = {"kind": kind} | ({"workers": 2} if kind == "local" else {})

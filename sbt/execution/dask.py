@@ -118,10 +118,15 @@ class DaskExecutor:
 
     def _prepare(self) -> None:
         """Start the processes below all workers at the same time."""
+        from distributed import KilledWorker
+
         own = _versions(self._spec)
         found = {w: self._client.submit(_begin, self._spec, self._timeout, workers=[w], pure=False) for w in self._workers()}
         for worker, future in found.items():
-            of_worker = future.result()
+            try:
+                of_worker = self._result(future)
+            except KilledWorker:  # it has left since
+                continue
             if of_worker != own:
                 raise InputError(f"every worker must have the versions of this process ({own}), but {worker} has {of_worker}")
 
@@ -170,11 +175,11 @@ class DaskExecutor:
                 yield outcome
         return suspects
 
-    def _result(self, future: Any) -> list[Outcome]:
+    def _result(self, future: Any) -> Any:
         from concurrent.futures import CancelledError
 
         try:
-            return list(future.result())
+            return future.result()
         except CancelledError as error:
             raise self._lost() from error
 
