@@ -75,6 +75,7 @@ def traci_load(scenario: LogicalScenario, values: list[dict[str, float]], progra
         vehicle=traci.vehicle, route=traci.route, load=traci.load, isLoaded=traci.isLoaded,
         simulationStep=traci.simulationStep, TraCIException=traci.TraCIException, FatalTraCIError=traci.FatalTraCIError,
         start=lambda command: traci.start([program, *command[1:]]),
+        edge=traci.edge,
         simulation=SimpleNamespace(step=traci.simulationStep, getCollisions=traci.simulation.getCollisions,
                                    getCollidingVehiclesNumber=traci.simulation.getCollidingVehiclesNumber),
     )  # fmt: skip

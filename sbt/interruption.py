@@ -25,11 +25,13 @@ class _Handler:
 
     def __init__(self, before: Any, notify: Notify | None):
         self.before, self._notify = before, notify
+        self.active = True
 
     def __call__(self, number: int, frame: Any) -> None:
-        _received.append(number)
-        if self._notify is not None and not self._notify(number):
-            return
+        if self.active:  # other code may have kept the handler for later
+            _received.append(number)
+            if self._notify is not None and not self._notify(number):
+                return
         if number == signal.SIGINT and callable(self.before):
             self.before(number, frame)  # Python's own raises KeyboardInterrupt
         raise KeyboardInterrupt
@@ -62,6 +64,7 @@ def handled(*numbers: int, notify: Notify | None = None) -> Iterator[None]:
         yield
     finally:
         for number, own in installed.items():
+            own.active = False
             now: Any = signal.getsignal(number)
             if now is own:
                 signal.signal(number, own.before)

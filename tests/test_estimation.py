@@ -16,11 +16,13 @@ from typer.testing import CliRunner
 
 from sbt.campaigns.counting import counted_batches
 from sbt.campaigns.gate import Limits, gate_verdict
+from sbt.campaigns.settings import Gate
 from sbt.cli import app
 from sbt.config.load import ConfigError, load, parse
 from sbt.errors import InputError
 from sbt.loop.stages import Log
 from sbt.store.database import Store
+from sbt.store.history import History
 from sbt.testbeds import truth
 
 Run = Callable[..., dict[str, Any]]
@@ -162,9 +164,9 @@ def test_it_refuses_runs_of_unknown_density(campaign: Run, configured: Callable[
     loaded = load(configured(**QUICK))
     settings = settings_of(loaded)
     assert counted_batches(log, settings)
-    blank = tuple(replace(r, log_q=None) for r in log.history.records)
+    blank = History(log.history.names, {**log.history.columns, "log_q": np.full(len(log.history), np.nan)})
     with pytest.raises(InputError, match="known proposal density"):
-        counted_batches(replace(log, history=replace(log.history, records=blank)), settings)
+        counted_batches(replace(log, history=blank), settings)
 
 
 def test_incomplete_batches_do_not_count(campaign: Run, configured: Callable[..., Path]):
@@ -174,28 +176,28 @@ def test_incomplete_batches_do_not_count(campaign: Run, configured: Callable[...
         log = Log(store.history(), tuple(store.iterations()), ())
     loaded = load(configured(**QUICK))
     settings = settings_of(loaded)
-    cut = replace(log, history=replace(log.history, records=log.history.records[:-3]))
+    cut = replace(log, history=log.history.where(np.arange(len(log.history)) < len(log.history) - 3))
     assert len(counted_batches(cut, settings)) == len(counted_batches(log, settings)) - 1
 
 
-def test_an_earlier_campaign_teaches_and_is_not_counted(campaign: Run, configured: Callable[..., Path]):
+def test_a_warm_start_teaches_and_is_not_counted(campaign: Run, configured: Callable[..., Path]):
     before = campaign("before", campaign="boundary", budget=40)
-    result = campaign("after", **QUICK, **{"from": before["store"]})
+    result = campaign("after", **QUICK, warm_start={"store": before["store"]})
     assert result["runs"] == 60
     with Store.read(Path(result["store"])) as store:
-        assert store.iterations()[0]["method"] != "sobol"  # it has learned already
+        assert store.iterations()[0].proposal["method"] != "sobol"  # it has learned already
         assert all(r.stage != "boundary" for r in store.history().records)
     with pytest.raises(InputError, match="same scenario"):
-        campaign("other", "LINE", **QUICK, **{"from": before["store"]})
-    with pytest.raises(ConfigError, match="from: only an estimation campaign"):
-        load(configured("wrong", **{"from": before["store"]}))
+        campaign("other", "LINE", **QUICK, warm_start={"store": before["store"]})
+    with pytest.raises(ConfigError, match="warm_start: only an estimation campaign"):
+        load(configured("wrong", warm_start={"store": before["store"]}))
 
 
 def test_the_gate_decides_by_one_sided_limits():
     limits = Limits(lambda c: 0.01 * (1 - c), lambda c: 0.01 * (1 + c))
-    assert gate_verdict(limits, probability=0.02, confidence=0.95)["verdict"] == "pass"
-    assert gate_verdict(limits, probability=0.0001, confidence=0.95)["verdict"] == "fail"
-    assert gate_verdict(limits, probability=0.01, confidence=0.95)["verdict"] == "undecided"
+    assert gate_verdict(limits, Gate(0.02)).verdict == "pass"
+    assert gate_verdict(limits, Gate(0.0001)).verdict == "fail"
+    assert gate_verdict(limits, Gate(0.01)).verdict == "undecided"
 
 
 @pytest.mark.parametrize(("probability", "code", "verdict"), [(0.9, 0, "pass"), (0.05, 3, "fail"), (0.28, 3, "undecided")])

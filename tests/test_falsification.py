@@ -123,7 +123,7 @@ def test_both_holes_are_found_confirmed_and_told_apart(falsified: Run):
     assert found["critical_runs"] == sum(mode["size"] for mode in found["failure_modes"])
     kept = rows(result)
     first = next(k for k, row in enumerate(kept) if row[5]["y"] <= 0)
-    assert found["first_critical_run"] == first + 1
+    assert (found["first_critical_run"], found["runs_to_first"]) == (first, first + 1)
     centres = {(0.2, 0.25), (0.8, 0.7)}
     for mode in found["failure_modes"]:
         at = kept[mode["representative"]]
@@ -193,7 +193,7 @@ def test_where_nothing_is_found_only_the_space_filling_runs_bound(falsified: Run
 def test_everything_critical_is_one_mode_and_the_search_spreads(falsified: Run):
     result = falsified("EVERYTHING")
     found = result["conclusion"]
-    assert (found["first_critical_run"], found["critical_runs"], len(found["failure_modes"])) == (1, 50, 1)
+    assert (found["first_critical_run"], found["critical_runs"], len(found["failure_modes"])) == (0, 50, 1)
     assert found["failure_modes"][0]["nearest_safe"] is None
     assert "Every run that gave a metric was critical (50)" in found["statement"]
 
@@ -214,7 +214,7 @@ def test_plateaus_and_idle_inputs(falsified: Run):
     assert falsified("PLATEAU", budget=150, stop={"failures": 1})["conclusion"]["first_critical_run"] is not None
     idle = falsified("IDLE", "idle", budget=60)["conclusion"]
     assert 1 <= len(idle["failure_modes"]) <= 3  # one slab; idle inputs do not split it into many
-    assert idle["first_critical_run"] <= 40
+    assert idle["runs_to_first"] <= 40
 
 
 def test_recorded_rows_are_chosen_once_each_and_never_repeated(falsified: Run):
@@ -372,8 +372,8 @@ def test_compare_is_continued_and_tells_the_first_failure(tmp_path: Path):
     path.write_text(path.read_text() + "\n")
     whole = compare(loaded, names, 2, tmp_path, ran.append)
     assert (whole[:3], len(ran), len(whole)) == (half, 6, 6)
-    assert {c.sampler for c in whole if c.first} == set(names)  # 18 % of the box is critical
-    assert all(c.runs <= 40 and c.first <= c.runs for c in whole if c.first)
+    assert {c.sampler for c in whole if c.runs_to_first} == set(names)  # 18 % of the box is critical
+    assert all(c.runs <= 40 and c.runs_to_first <= c.runs for c in whole if c.runs_to_first)
     assert table(whole).count("\n") == 4
     (tmp_path / "c.yaml").write_text(text)
     done = CliRunner().invoke(app, ["compare", str(tmp_path / "c.yaml"), "--samplers", "rando", "--into", str(tmp_path)])

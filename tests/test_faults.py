@@ -235,6 +235,10 @@ def test_a_signal_is_told_from_what_code_raises():
             interruption.check()
         with interruption.handled():
             assert interruption.requested(), "an inner one forgets nothing"
+        kept = signal.getsignal(signal.SIGINT)
+    assert not interruption.requested()
+    with pytest.raises(KeyboardInterrupt):
+        kept(signal.SIGINT, None)  # by code that has found it and calls it later
     assert not interruption.requested()
     assert interruption.is_interruption(KeyboardInterrupt()), "nobody knows without a handler"
     interruption.check()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from sbt.errors import InputError
 from sbt.execution.protocol import SerialExecutor
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Status
+from sbt.processes import scratch
 from sbt.samplers.search import DEFLATION
 from sbt.seeds import run_seed
 from sbt.store.database import Store
@@ -127,7 +127,7 @@ def _run(loaded: Loaded, name: str, seed: int) -> Cell:
 
 def _own(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
     """Return points and margins of a campaign with one of its own methods, as `sumo-sbt run` runs it."""
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch("compare") as folder:
         store = str(Path(folder) / "store")
         acquisition = loaded.config.acquisition.model_copy(update={"kind": name})
         config = loaded.config.model_copy(update={"seed": seed, "store": store, "acquisition": acquisition})

@@ -10,7 +10,7 @@ from sbt.acquisitions import is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.settings import CampaignKind, Settings
-from sbt.campaigns.wording import mixture_shares, percent
+from sbt.campaigns.wording import percent
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
@@ -57,7 +57,7 @@ class BoundaryConclusion:
         if self.critical_fraction is not None:
             found.append(f"The metamodel takes {percent(self.critical_fraction)} of the parameter space to be critical.")
         if self.weights is not None:
-            found.append(f"The metamodel is {mixture_shares(self.weights)}: {self.chosen_because}.")
+            found.append(f"The metamodel chose among its members: {self.chosen_because}.")
         return found
 
 

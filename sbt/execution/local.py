@@ -186,7 +186,7 @@ class LocalExecutor:
         for _, pid in late:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        return {runs[0]: Status.TIMEOUT for runs, _ in late if len(runs) == 1}  # of several, each is repeated alone
+        return {runs[0]: Status.TIMEOUT for runs, _ in late if len(runs) == 1}  # of several: repeated alone
 
     def _restart(self) -> None:
         self._stop()
