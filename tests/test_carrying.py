@@ -22,7 +22,7 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.plugins import load
 from sbt.problem.outcome import Job
 from sbt.problem.parameter import Parameter
-from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 
@@ -50,7 +50,7 @@ class Model:
 
 def make(factor):
     model = Model(factor)
-    space, need = ParameterSpace((Parameter("a", 0.0, 1.0),)), Requirement("y", CriticalInterval(high=0.0))
+    space, need = ParameterSpace((Parameter("a", 0.0, 1.0),)), Requirement("y", high=0.0)
     evaluate = lambda values, seed: {"y": model(values["a"]) + float(table[seed % 10])}
     return LogicalScenario("mine", space, need, evaluate=evaluate, metric_names=("y",))
 
@@ -84,7 +84,7 @@ def test_a_script_carries_closures_lambdas_and_the_modules_beside_it(tmp_path: P
 
 
 def scenario(evaluate: Callable[..., Any]) -> LogicalScenario:
-    space, need = ParameterSpace((Parameter("a", 0.0, 1.0),)), Requirement("y", CriticalInterval(high=0.0))
+    space, need = ParameterSpace((Parameter("a", 0.0, 1.0),)), Requirement("y", high=0.0)
     return LogicalScenario("mine", space, need, evaluate=evaluate, metric_names=("y",))
 
 
@@ -199,7 +199,7 @@ def test_a_large_scenario_goes_to_each_worker_once(tmp_path: Path):
         "import numpy as np\nfrom sbt.problem.parameter import Parameter\nfrom sbt.problem.requirement import *\n"
         "from sbt.problem.scenario import LogicalScenario\nfrom sbt.problem.space import ParameterSpace\n\n\n"
         "def make():\n    table, space = np.arange(1e6), ParameterSpace((Parameter('a', 0.0, 1.0),))\n"
-        "    return LogicalScenario('large', space, Requirement('y', CriticalInterval(high=0.0)),\n"
+        "    return LogicalScenario('large', space, Requirement('y', high=0.0),\n"
         "        evaluate=lambda v, s: {'y': float(table[s])}, metric_names=('y',))\n"
     )
     (tmp_path / "script.py").write_text(text)

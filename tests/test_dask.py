@@ -93,7 +93,7 @@ def rude(values, seed):
         raise KeyboardInterrupt
     return {"y": values["a"]}
 
-SCENARIO = LogicalScenario("rude", SPACE, Requirement("y", CriticalInterval(high=0.0)), evaluate=rude, metric_names=("y",))
+SCENARIO = LogicalScenario("rude", SPACE, Requirement("y", high=0.0), evaluate=rude, metric_names=("y",))
 '''
 
 

@@ -99,7 +99,7 @@ RUDE = [
     lambda: throw(RunError("no status", "x")), lambda: {}, lambda: None, lambda: {"y": "much"}, lambda: {"y": 1.0, "z": 2.0},
 ]
 SPACE = ParameterSpace((Parameter("a", 0.0, 100.0), Parameter("b", 0.0, 1.0)))
-NEED = Requirement("y", CriticalInterval(high=0.0))
+NEED = Requirement("y", high=0.0)
 
 def rude(values, seed):
     return RUDE[int(values["a"])]() if values["a"] < 99 else {"y": 1.0}

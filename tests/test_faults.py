@@ -144,7 +144,7 @@ def printing(values, seed):
 
 SPACE = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
 DEAF, PRINTING = (
-    LogicalScenario(f.__name__, SPACE, Requirement("y", CriticalInterval(high=0.0)), evaluate=f, metric_names=("y",))
+    LogicalScenario(f.__name__, SPACE, Requirement("y", high=0.0), evaluate=f, metric_names=("y",))
     for f in (deaf, printing)
 )
 """
