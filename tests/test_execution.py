@@ -139,8 +139,8 @@ REASONS = [
     r"RecursionError: maximum recursion depth exceeded.*", r"RunError: x \(.*",
 ]  # fmt: skip
 WRONG = [
-    "a run must give the metrics y, but gave none", r"AttributeError: .*", "ValueError: could not convert string to float: .*",
-    "a run must give the metrics y, but gave y, z",
+    "a run must give the metrics y, but gave none", "a run must return its metrics by name, but got .*",
+    "metric y must be one number, but got .*", r"a run must give the metrics y, but gave y, z; declare all of them: metrics=.*",
 ]  # fmt: skip
 
 

@@ -58,7 +58,7 @@ def test_merged_shards_are_the_campaign_row_for_row(
     keys: dict[str, Any], n: int, configured: Configured, campaign: Run, rows: Rows, tmp_path: Path
 ):
     whole = campaign("whole", "SOME_FAIL", **keys)
-    merged = merge_shards(sharded(configured, n, "SOME_FAIL", **keys), tmp_path / "merged", report=False)
+    merged = merge_shards(sharded(configured, n, "SOME_FAIL", **keys), tmp_path / "merged", report=False).to_dict()
     assert rows(merged["store"]) == rows(whole["store"])
     assert timeless(merged) == timeless(whole)
     assert 0 < merged["failed"] < merged["runs"]
@@ -184,7 +184,7 @@ def test_a_killed_merge_leaves_no_store_and_can_be_repeated(
     assert killed.returncode == -signal.SIGKILL
     assert list(into.iterdir()) != []
     assert not Store.begun(into)
-    merged, whole = merge_shards(folders, into, report=False), campaign("whole", **COVERAGE)
+    merged, whole = merge_shards(folders, into, report=False).to_dict(), campaign("whole", **COVERAGE)
     assert rows(into) == rows(whole["store"])
     assert timeless(merged) == timeless(whole)
 
@@ -204,7 +204,7 @@ def test_a_killed_shard_goes_on_and_is_not_merged_before(configured: Configured,
         merge_shards([shard], into)
     for k in (1, 2):
         run_loaded(load(config, [f"store={into}/shard-{k}-of-2"]), shard=Shard(k, 2))
-    merged = merge_shards(sorted(into.glob("shard-*-of-2")), into, report=False)  # where one run would have put it
+    merged = merge_shards(sorted(into.glob("shard-*-of-2")), into, report=False).to_dict()  # where one run would have put it
     assert rows(merged["store"]) == rows(campaign("whole", "SLOW", **keys)["store"])
 
 

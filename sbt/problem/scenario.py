@@ -318,19 +318,21 @@ def _checked(returned: Any, names: tuple[str, ...]) -> dict[str, float]:
     """
     if not isinstance(returned, Mapping):
         raise RunError(Status.FAILED, f"a run must return its metrics by name, but got {type(returned).__name__}")
-    if missing := [name for name in names if name not in returned]:
-        raise RunError(Status.FAILED, f"a run must return the metrics {', '.join(names)}, but {', '.join(missing)} missing")
-    if surplus := [str(name) for name in returned if name not in names]:
-        raise RunError(
-            Status.FAILED, f"a run must return the metrics {', '.join(names)}, but got {', '.join(surplus)} too: declare them"
-        )
-    metrics = {}
-    for name in names:
-        value = returned[name]
-        try:
-            metrics[name] = math.nan if isinstance(value, str | bytes) else float(value)
-        except (TypeError, ValueError):
-            metrics[name] = math.nan
-        if not math.isfinite(metrics[name]):
-            raise RunError(Status.FAILED, f"metric {name} must be finite, but got {value!r}")
-    return metrics
+    if set(returned) != set(names):
+        given = [str(name) for name in returned]
+        hint = f"; declare all of them: metrics={given}" if set(names) < set(given) else ""
+        raise RunError(Status.FAILED, f"a run must give the metrics {', '.join(names)}, but gave {', '.join(given) or 'none'}{hint}")
+    return {name: _finite(name, returned[name]) for name in names}
+
+
+def _finite(name: str, value: Any) -> float:
+    """Return a metric's value as a number."""
+    try:
+        number = None if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = None
+    if number is None:
+        raise RunError(Status.FAILED, f"metric {name} must be one number, but got {value!r}")
+    if not math.isfinite(number):
+        raise RunError(Status.FAILED, f"metric {name} must be finite, but got {number}")
+    return number

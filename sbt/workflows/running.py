@@ -76,6 +76,7 @@ def run_study(
             campaign cannot be run in shards.
         StoreError: the store cannot be written.
     """
+    executor = study.executor()
     if not Store.begun(Path(study.config.store)):  # what can be wrong is found before there is a folder
         campaign = study.campaign
         if shard is not None:
@@ -85,7 +86,6 @@ def run_study(
         campaign, snapshot = study.campaign, study.snapshot(shard)
         if shard is not None:
             check_shard(campaign)
-        executor = study.executor()
         store.begin(snapshot)
         _check_same(store, snapshot)
         keep_configuration(store, study, snapshot)

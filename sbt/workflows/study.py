@@ -196,10 +196,12 @@ class Study:
 
     def snapshot(self, shard: Shard | None = None) -> Json:
         """Return what the store remembers of the configuration: plain JSON, and the YAML to read back."""
-        config = self.config
+        config, described = self.config, self.kept.get("described")
+        if self.live or described is None:  # otherwise the scenario itself may be made from its description
+            described = describe_scenario(self.scenario)
         return {
             **fingerprint(config), "budget": config.budget, "names": list(self.scenario.space.names),
-            "described": describe_scenario(self.scenario), "folder": str(Path(self.loaded.folder).resolve()),
+            "described": described, "folder": str(Path(self.loaded.folder).resolve()),
             "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
         }  # fmt: skip
