@@ -385,7 +385,7 @@ def test_export_writes_a_table(folder: Path):
 
 def test_other_forms_of_export_are_refused(folder: Path):
     done = call("export", str(store(folder / "s")), "--format", "xls")
-    assert (done.exit_code, done.stderr.strip()) == (2, "--format must be csv, parquet, dsiod, boundary, but got 'xls'")
+    assert (done.exit_code, done.stderr.strip()) == (2, "the format must be csv, parquet, dsiod, boundary, but got 'xls'")
 
 
 @pytest.mark.parametrize("verb", ["status", "report", "export"])

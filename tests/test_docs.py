@@ -91,7 +91,7 @@ def test_commands_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 LANGUAGES = {"bash", "console", "python", "text", "toml", "xml", "yaml"}
 RUN = {
-    "README.md": {"bash", "yaml"}, "docs/benchmark.md": {"bash"}, "docs/boundary.md": {"console"},
+    "README.md": {"bash", "python", "yaml"}, "docs/benchmark.md": {"bash"}, "docs/boundary.md": {"console"},
     "docs/clusters.md": {"bash", "yaml"}, "docs/configuration.md": {"yaml"}, "docs/estimation.md": {"yaml"},
     "docs/extending.md": {"python", "toml", "yaml"},
     "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
@@ -108,7 +108,7 @@ BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 def of(*languages: str) -> list[Any]:
     """Return the blocks in these languages that no tutorial writes to a file; those that run SUMO are marked."""
     return [
-        pytest.param(block, id=str(block), marks=[pytest.mark.sumo] if "sbt.sumo" in block.text else [])
+        pytest.param(block, id=str(block), marks=[pytest.mark.sumo] if "sbt.sumo" in block.text or '"cut_in"' in block.text else [])
         for block in BLOCKS if block.language in languages and not block.name
     ]  # fmt: skip
 

@@ -274,7 +274,7 @@ def test_runs_that_go_wrong_are_rows_with_reasons(tmp_path):
     assert wrong["critical"].isna().all()
     assert wrong["margin"].isna().all()
     reasons = " ".join(wrong["reason"])
-    for part in ("missing", "declare them", "SystemExit", "must be finite"):
+    for part in ("but gave none", "declare all of them", "SystemExit", "must be finite"):
         assert part in reasons
     assert frame.loc[frame["status"] == "ok", "critical"].notna().all()
     assert result.finished

@@ -248,7 +248,7 @@ def test_values_of_a_concrete_scenario_are_checked_and_filled():
     assert HALF.values({"a": 0.0, "b": 19.0}) == {"a": 0.0, "b": 19.0}
     with pytest.raises(InputError, match="must satisfy 'b > 10"):
         HALF.values({"a": 2.0, "b": 11.0})
-    with pytest.raises(InputError, match=r"input k must be a whole number in \[-3, 4\] , but got 1.5"):
+    with pytest.raises(InputError, match=r"input k must be a whole number in \[-3, 4\], but got 1.5"):
         one(INTEGERS["uniform"]).values({"k": 1.5})
     with pytest.raises(InputError, match="but got nan"):
         SQUARE.values({"a": math.nan})

@@ -100,7 +100,9 @@ class EstimationConclusion:
         found.append(f"Behind it: {', '.join(f'{k} {number(v, 3)}' for k, v in details.items() if v is not None)}.")
         if self.failed_as_critical is not None and self.failed_as_critical != self.probability:
             found.append(f"If every failed run were critical, it would be {number(self.failed_as_critical)}.")
-        found.append(f"A critical region that no run has met may hold up to {number(self.undetected_mass_bound, 3)} more.")
+        missed = min(self.undetected_mass_bound, 1.0 - self.probability)
+        holds = f"a critical region that no run has met holds at most {number(missed, 3)} more"
+        found.append(f"With {confidence} confidence, {holds}.")
         return [*found, *verdict]
 
 

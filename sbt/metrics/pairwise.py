@@ -72,11 +72,11 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
 
     def function(trace: Trace) -> float:
         if metric.alone:
-            return metric.function(_part(trace, slice(None), [trace.actors.index(ego)]))
+            return metric.value(_part(trace, slice(None), [trace.actors.index(ego)]))
         if other is not None:
             trace.actor(other)
         values = [
-            metric.function(part)
+            metric.value(part)
             for actor in trace.actors
             if actor != ego and other in (None, actor)
             for _, part in joint_intervals(trace, ego, actor)

@@ -46,6 +46,12 @@ class Parameter:
     description: str = ""
 
     def __post_init__(self) -> None:
+        for end in ("low", "high"):
+            value = getattr(self, end)
+            if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
+                raise InputError(f"input {self.name}: {end} must be a number, but got {value!r}")
+        if not isinstance(self.unit, str):
+            raise InputError(f"input {self.name}: a unit must be text (a distribution comes after it), but got {self.unit!r}")
         if not self.name.isidentifier():
             raise InputError(f"an input's name must be an identifier, but got '{self.name}'")
         if not self.low < self.high:
@@ -59,6 +65,11 @@ class Parameter:
             raise InputError(f"input {self.name}: an integer range needs whole ends, but got [{self.low}, {self.high}]")
         if self.distribution is not None:
             self.distribution.truncated(*self._support)
+
+    @property
+    def range(self) -> str:
+        """The range as printed, with its unit."""
+        return f"[{self.low:g}, {self.high:g}] {self.unit}".rstrip()
 
     @property
     def _support(self) -> tuple[float, float]:

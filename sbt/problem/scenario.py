@@ -80,7 +80,7 @@ class Metric:
 
     Args:
         name: as written in requirements and in the store (`y.<name>`).
-        function: trace to a finite number.
+        function: trace to a finite number; None: a scenario without traces gives it itself.
         unit: "" for a pure number or a flag.
         direction: "low" where small values are critical, "high" where large ones are.
         without: the value where there was no interaction to measure.
@@ -92,7 +92,7 @@ class Metric:
     """
 
     name: str
-    function: Callable[[Trace], float]
+    function: Callable[[Trace], float] | None = None
     unit: str = ""
     direction: str = "low"
     without: float = math.inf
@@ -107,10 +107,16 @@ class Metric:
         Raises:
             RunError: the value is not finite.
         """
-        value = float(self.function(trace))
+        value = self.value(trace)
         if not math.isfinite(value):
             raise RunError(Status.FAILED, f"metric {self.name} must be finite, but got {value}")
         return value
+
+    def value(self, trace: Trace) -> float:
+        """Return its value on a trace, finite or not."""
+        if self.function is None:
+            raise InputError(f"metric {self.name} is given by its scenario: it cannot be measured on a trace")
+        return float(self.function(trace))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +166,8 @@ class LogicalScenario:
         requirement: default requirement.
         simulate: values and seed to a trace; None where `evaluate` is given.
         metrics: with `simulate`, what is computed from the trace: metrics, names of installed ones, or functions of a
-            trace; with `evaluate`, the names of what it returns (default: the requirement's metric alone).
+            trace; with `evaluate`, what it returns: names, names with units (a mapping), or `Metric(name, unit=...)` (default:
+            the requirement's metric alone).
         description: for people; the first line is a title.
         evaluate: values and seed to metrics directly (analytic functions, recorded tables), instead
             of `simulate`: there is no trace to look at.
@@ -191,10 +198,13 @@ class LogicalScenario:
 
     def __init__(
         self, name: str, inputs: ParameterSpace | Sequence[Parameter] | None = None, requirement: Requirement | None = None,
-        simulate: Simulate | None = None, metrics: Sequence[Metric | str | Callable[[Trace], float]] = (), description: str = "",
+        simulate: Simulate | None = None, metrics: Sequence[Metric | str | Callable[[Trace], float]] | Mapping[str, str] = (),
+        description: str = "",
         evaluate: Evaluate | None = None, metric_names: Sequence[str] = (), pool: Pool | None = None, roles: Roles = Roles(), *,
         space: ParameterSpace | None = None,
     ):  # fmt: skip
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            raise InputError(f"a scenario's name must be text on one line, but got {name!r}")
         given = space if inputs is None else inputs
         if (inputs is None) == (space is None) or given is None:
             raise InputError(f"scenario {name}: give the inputs (or a space) once")
@@ -203,11 +213,8 @@ class LogicalScenario:
         if (simulate is None) == (evaluate is None):
             raise InputError(f"scenario {name}: give either simulate or evaluate")
         if evaluate is not None:
-            measured = tuple(m for m in metrics if isinstance(m, str))
-            if len(measured) < len(metrics):
-                rule = "with evaluate, metrics are the names of what it returns"
-                raise InputError(f"scenario {name}: {rule}, but got {metrics[0]!r}")
-            metric_names, metrics = tuple(metric_names) or measured or (requirement.metric,), ()
+            metrics = _returned(name, metrics, tuple(metric_names) or (requirement.metric,))
+            metric_names = [m.name for m in metrics]
         values = {
             "name": name, "space": given if isinstance(given, ParameterSpace) else ParameterSpace(tuple(given)),
             "requirement": requirement, "simulate": simulate, "metrics": tuple(metric_from(m) for m in metrics),
@@ -291,6 +298,20 @@ class LogicalScenario:
         return _checked(self.evaluate(values, seed), self.metric_names)
 
 
+def _returned(
+    scenario: str, metrics: Sequence[Metric | str | Callable[[Trace], float]] | Mapping[str, str], names: tuple[str, ...]
+) -> tuple[Metric, ...]:
+    """Return the metrics that `evaluate` gives, with their units where they are stated."""
+    if isinstance(metrics, Mapping):
+        return tuple(Metric(str(name), unit=str(unit)) for name, unit in metrics.items())
+    found = []
+    for given in metrics:
+        if not isinstance(given, str | Metric) or (isinstance(given, Metric) and given.function is not None):
+            raise InputError(f"scenario {scenario}: with evaluate, metrics are the names of what it returns, but got {given!r}")
+        found.append(Metric(given) if isinstance(given, str) else given)
+    return tuple(found) or tuple(Metric(name) for name in names)
+
+
 def metric_from(given: Metric | str | Callable[[Trace], float]) -> Metric:
     """Return a metric: itself, the installed one of this name, or a function of a trace under its own name.
 
@@ -321,7 +342,8 @@ def _checked(returned: Any, names: tuple[str, ...]) -> dict[str, float]:
     if set(returned) != set(names):
         given = [str(name) for name in returned]
         hint = f"; declare all of them: metrics={given}" if set(names) < set(given) else ""
-        raise RunError(Status.FAILED, f"a run must give the metrics {', '.join(names)}, but gave {', '.join(given) or 'none'}{hint}")
+        rule = f"a run must give the metrics {', '.join(names)}"
+        raise RunError(Status.FAILED, f"{rule}, but gave {', '.join(given) or 'none'}{hint}")
     return {name: _finite(name, returned[name]) for name in names}
 
 

@@ -203,7 +203,7 @@ class ParameterSpace:
         for p in self.parameters:
             if not bool(p.contains(np.array(full[p.name]))):
                 kind = "a whole number " if p.kind == "integer" else ""
-                raise InputError(f"input {p.name} must be {kind}in [{p.low:g}, {p.high:g}] {p.unit}, but got {full[p.name]:g}")
+                raise InputError(f"input {p.name} must be {kind}in {p.range}, but got {full[p.name]:g}")
         if self.constraints and not bool(self.feasible(np.array([list(full.values())]))[0]):
             rules = "; ".join(text for text, _ in self.constraints)
             raise InputError(f"inputs must satisfy '{rules}', but got {full}")

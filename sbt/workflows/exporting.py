@@ -29,9 +29,9 @@ def export_store(folder: Path, form: str = "csv", *, objects: Objects | None = N
         StoreError: the folder holds no campaign.
     """
     if form not in FORMS:
-        raise InputError(f"--format must be {', '.join(FORMS)}, but got '{form}'{did_you_mean(form, FORMS)}")
+        raise InputError(f"the format must be {', '.join(FORMS)}, but got '{form}'{did_you_mean(form, FORMS)}")
     if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise InputError("--format parquet needs pyarrow: pip install 'sumo-sbt[parquet]', or choose csv")
+        raise InputError("parquet needs pyarrow: pip install 'sumo-sbt[parquet]', or choose csv")
     with Store.read(folder) as store:
         return FORMS[form](store, Study.from_store(store, objects=objects))
 

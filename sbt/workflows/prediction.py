@@ -173,7 +173,7 @@ def _within(x: Points, space: ParameterSpace) -> Points:
     if wrong.any():
         row, k = (int(i) for i in np.argwhere(wrong)[0])
         p = space.parameters[k]
-        raise InputError(f"row {row}: {p.name} must be in [{p.low:g}, {p.high:g}] {p.unit}, but got {x[row, k]:g}")
+        raise InputError(f"row {row}: {p.name} must be in {p.range}, but got {x[row, k]:g}")
     return np.clip(x, low, high)
 
 
@@ -252,5 +252,5 @@ def _value(path: Path, number: int, line: list[str], column: int, parameter: Par
     low, high = parameter.low, parameter.high
     room = _TOLERANCE * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
     if not low - room <= value <= high + room:  # also NaN
-        raise InputError(f"{path}:{number}: {parameter.name} must be in [{low:g}, {high:g}] {parameter.unit}, but got {text}")
+        raise InputError(f"{path}:{number}: {parameter.name} must be in {parameter.range}, but got {text}")
     return min(max(value, low), high)

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from sbt.campaigns.wording import plural
 from sbt.errors import InputError, StoreError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Facts
@@ -182,13 +183,24 @@ class Result(Generic[C]):
         """Return what the campaign found in plain words."""
         if not self.finished:
             return [f"The campaign has not concluded: {len(self.history):,} runs are done."]
-        return self.conclusion.sentences(Facts(self.history, self.scenario.requirement, self.scenario.unit))
+        said = self.conclusion.sentences(Facts(self.history, self.scenario.requirement, self.scenario.unit))
+        return [*said, *map(str, getattr(self.conclusion, "warnings", ())), *self._failures()]
+
+    def _failures(self) -> list[str]:
+        """Return how many runs gave no metrics, and why the first did not."""
+        failed = [int(i) for i in (~self.history.ok).nonzero()[0]]
+        if not failed:
+            return []
+        first = self.history.record(failed[0])
+        return [f"{len(failed):,} of {plural(len(self.history), 'run')} failed; run {first.index}: {first.reason}"]
 
     def __repr__(self) -> str:
         """Return campaign, scenario and counts."""
         config, critical = self.study.config, int(self.scenario.requirement.critical_runs(self.history).sum())
         what = f"{config.campaign} of {config.scenario}".replace(OBJECT, "")
-        return f"<Result: {what}, {len(self.history)} runs, {critical} critical, in {self.store}>"
+        failed = len(self.history) - int(self.history.ok.sum())
+        counts = f"{plural(len(self.history), 'run')}, {critical:,} critical" + (f", {failed:,} failed" if failed else "")
+        return f"<Result: {what}, {counts}, in {self.store}>"
 
     def _repr_html_(self) -> str:
         """Return the summary that a notebook shows."""
