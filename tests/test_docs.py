@@ -108,7 +108,7 @@ BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 def of(*languages: str) -> list[Any]:
     """Return the blocks in these languages that no tutorial writes to a file; those that run SUMO are marked."""
     return [
-        pytest.param(block, id=str(block), marks=[pytest.mark.sumo] if "sbt.sumo" in block.text or '"cut_in"' in block.text else [])
+        pytest.param(block, id=str(block), marks=[pytest.mark.sumo] if re.search(r'sbt\.sumo|"cut_in"', block.text) else [])
         for block in BLOCKS if block.language in languages and not block.name
     ]  # fmt: skip
 

@@ -264,6 +264,33 @@ def awkward(values, seed):
     return gap(values, seed)
 
 
+def test_what_cannot_travel_runs_in_this_process(tmp_path):
+    lock = threading.Lock()
+
+    def guarded(values, seed):
+        with lock:
+            return gap(values, seed)
+
+    result = sbt.run(campaign="coverage", scenario=scenario_of(guarded), store=tmp_path / "s", **TINY)
+    assert result.frame["status"].eq("ok").all()
+    assert result.replay(0).identical
+
+
+def test_code_that_has_changed_does_not_go_on_with_a_store(tmp_path):
+    def run(evaluate, budget):
+        return sbt.run(campaign="coverage", scenario=scenario_of(evaluate), store=tmp_path / "s", **{**TINY, "budget": budget})
+
+    def shifted(values, seed):
+        return {"gap": gap(values, seed)["gap"] + 0.1}
+
+    before = run(gap, 12).frame
+    with pytest.raises(sbt.InputError, match=r"run 0 now gives .*choose another store for changed code"):
+        run(shifted, 24)
+    after = run(gap, 24).frame
+    assert len(after) == 24
+    assert after.iloc[:12]["y.gap"].equals(before["y.gap"])
+
+
 def test_runs_that_go_wrong_are_rows_with_reasons(tmp_path):
     keys = {**TINY, "budget": 40, "initial": 40, "report": True}
     result = sbt.run(campaign="coverage", scenario=scenario_of(awkward), store=tmp_path / "s", **keys)

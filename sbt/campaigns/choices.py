@@ -85,7 +85,7 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     """Return a batch of parts: exploration where critical runs are rare, representative, greedy and space-filling runs.
 
     Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
-    least doubt far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
+    least uncertainty far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
     nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
     the mean P(critical) is below 1 %, half of the batch explores first (see `explore`).
     """
@@ -99,7 +99,7 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     so_far = np.concatenate([so_far, typical])
     greedy, looked = _greedy(settings, fitted, boundary, log, n - len(so_far), so_far)
     so_far, last = np.concatenate([so_far, greedy]), second
-    if len(so_far) < n:  # nothing is in doubt
+    if len(so_far) < n:  # nothing is uncertain
         last, more = _draw(settings, fitted, even, log, n - len(so_far), taken=so_far, start=second.next_position)
         so_far = np.concatenate([so_far, more])
     proposal = BatchProposal(

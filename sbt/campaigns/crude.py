@@ -94,8 +94,8 @@ def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:
         for k, repeat in enumerate(repeats):
             if not repeat.finished:
                 z = repeat.ask(stream(settings.seed, "subset", k, batch.number))
-                told = _outcomes(margin[rows[start : start + len(z)]], z, space)
-                repeats[k], start = repeat.tell(z, told), start + len(z)
+                outcomes = _outcomes(margin[rows[start : start + len(z)]], z, space)
+                repeats[k], start = repeat.tell(z, outcomes), start + len(z)
     return repeats
 
 

@@ -218,5 +218,5 @@ def _statement(runs: History, hits: int, modes: list[FailureMode], bound: Search
     if hits == n - failed:
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
     unsure = [m for m in modes if m.confirmed is not None and m.confirmed < 1.0]
-    doubt = f" {len(unsure)} of them did not fail again with every fresh seed." if unsure else ""
-    return f"{hits} of {n} runs of the search were critical, in {plural(len(modes), 'failure mode')}.{doubt}{hidden}"
+    unconfirmed = f" {len(unsure)} of them did not fail again with every fresh seed." if unsure else ""
+    return f"{hits} of {n} runs of the search were critical, in {plural(len(modes), 'failure mode')}.{unconfirmed}{hidden}"

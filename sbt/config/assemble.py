@@ -17,7 +17,7 @@ from sbt.config.load import Loaded
 from sbt.config.model import Choice
 from sbt.config.source import Problems, must_be_one_of
 from sbt.config.space import configured_space
-from sbt.execution.carrying import carry
+from sbt.execution.carrying import carry, keep_here
 from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.recalibrated import Recalibrated
@@ -107,7 +107,8 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     if own or config.scenario.startswith(OBJECT):
         scenario: LogicalScenario = scope.load("scenarios", config.scenario)
         kept = tuple(m for m in scenario.metrics if m.name not in {metric.name for metric in own})
-        carried = carry(replace(scenario, metrics=(*kept, *own)) if own else scenario)
+        whole = replace(scenario, metrics=(*kept, *own)) if own else scenario
+        carried = keep_here(whole) if config.executor.kind == "serial" else carry(whole)
     return ScenarioSpec(
         config.scenario, str(loaded.folder.resolve()), ego, config.executor.isolation, config.simulation.step_length,
         config.requirement.stl, types, named, carried,

@@ -12,7 +12,7 @@ from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
-from sbt.config.space import SpaceChanges, configured_space, law_of
+from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load
 from sbt.problem.parameter import Parameter
@@ -91,10 +91,11 @@ class _Builder:
         """Return the inputs with their correlation, constraints and features."""
         parameters = []
         for name, entry in self._model.inputs.items():
-            law, choice = None, entry.distribution
+            distribution, choice = None, entry.distribution
             if choice is not None:
-                law = self._problems.attempt(("inputs", name, "distribution"), partial(law_of, choice, self._folder))
-            make = partial(Parameter, name, entry.min, entry.max, entry.unit, law, entry.kind, entry.description)
+                path = ("inputs", name, "distribution")
+                distribution = self._problems.attempt(path, partial(distribution_of, choice, self._folder))
+            make = partial(Parameter, name, entry.min, entry.max, entry.unit, distribution, entry.kind, entry.description)
             made = self._problems.attempt(("inputs", name), make)
             if made is not None:
                 parameters.append(made)

@@ -51,7 +51,7 @@ class SumoEntry(_Strict):
 
 
 class InputEntry(_Strict):
-    """One input: its range, unit and law."""
+    """One input: its range, unit and distribution."""
 
     min: float = Field(description="Lower end of the range.")
     max: float = Field(description="Upper end of the range.")

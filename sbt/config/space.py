@@ -18,7 +18,7 @@ from sbt.problem.expression import Expression
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["SpaceChanges", "configured_space", "law_of"]
+__all__ = ["SpaceChanges", "configured_space", "distribution_of"]
 
 
 @dataclass(frozen=True)
@@ -60,21 +60,21 @@ def configured_space(
 
 def _changed(space: ParameterSpace, step: Mapping[str, Any]) -> ParameterSpace:
     """Return the space with one change, after what it would otherwise check only when it is used."""
-    with np.errstate(all="ignore"):  # a formula that is not finite is told, not warned of
+    with np.errstate(all="ignore"):  # a formula that is not finite is reported, not warned of
         space = replace(space, **step)
         if space.constraints:
-            space.feasible_mass  # noqa: B018  (raises where the law gives the constraints no mass)
+            space.feasible_mass  # noqa: B018  (raises where the distributions give the constraints no mass)
         space.metamodel_inputs(np.full((1, space.dimension), 0.5))
     return space
 
 
 def _parameter(old: Parameter, change: InputChange, problems: Problems, folder: Path) -> Parameter:
-    """Return the input with another range or law."""
+    """Return the input with another range or distribution."""
     path: Key = ("inputs", old.name)
     distribution = old.distribution
     if change.distribution is not None:
-        law = change.distribution
-        distribution = problems.attempt((*path, "distribution"), lambda: law_of(law, folder))
+        wanted = change.distribution
+        distribution = problems.attempt((*path, "distribution"), lambda: distribution_of(wanted, folder))
         if distribution is None:
             return old
     low = old.low if change.min is None else change.min
@@ -82,11 +82,11 @@ def _parameter(old: Parameter, change: InputChange, problems: Problems, folder: 
     return problems.attempt(path, lambda: replace(old, low=low, high=high, distribution=distribution)) or old
 
 
-def law_of(choice: Choice, folder: Path | None = None) -> Distribution:
-    """Return the law that a configuration describes; a recorded sample's file is relative to the folder.
+def distribution_of(choice: Choice, folder: Path | None = None) -> Distribution:
+    """Return the distribution that a configuration describes; a recorded sample's file is relative to the folder.
 
     Raises:
-        InputError: there is no such law, or not with these parameters.
+        InputError: there is no such distribution, or not with these parameters.
     """
     given = choice.settings
     if choice.kind == "empirical" and isinstance(given.get("file"), str):

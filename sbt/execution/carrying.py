@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import io
 import json
+import os
 import subprocess
 import sys
 import sysconfig
@@ -23,7 +24,7 @@ from typing import Any
 from sbt.errors import InputError, described
 from sbt.problem.scenario import LogicalScenario
 
-__all__ = ["carry", "delivered"]
+__all__ = ["carry", "delivered", "keep_here"]
 
 _LOCK = threading.Lock()
 _ORIGINALS: dict[bytes, LogicalScenario] = {}
@@ -60,6 +61,13 @@ def carry(scenario: LogicalScenario) -> bytes:
                 f"a scenario must be made of plain data and code to reach its workers, but in scenario {scenario.name} "
                 f"{_culprit(scenario, error)}; make such an object inside the function that uses it"
             ) from None
+    _ORIGINALS[data] = scenario
+    return data
+
+
+def keep_here(scenario: LogicalScenario) -> bytes:
+    """Return what stands for a scenario that stays in this process; nothing of it need be able to travel."""
+    data = f"scenario {scenario.name} stays in process {os.getpid()}: {id(scenario)}".encode()
     _ORIGINALS[data] = scenario
     return data
 

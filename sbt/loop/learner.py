@@ -52,7 +52,7 @@ class Learner:
         scenario: with the campaign's space and requirement.
         metamodel: its settings.
         seed: of the campaign.
-        target_aware: the critical edge is what is looked for, and the metamodel is told where it is; otherwise all of y counts.
+        target_aware: the critical edge is what is looked for, and the metamodel knows where it is; otherwise all of y counts.
     """
 
     scenario: LogicalScenario
@@ -126,7 +126,7 @@ class Learner:
 
 
 def chunked(predict: Predictor, u: Points) -> Prediction:
-    """Return the belief at many points, a few thousand at a time."""
+    """Return the predictions at many points, a few thousand at a time."""
     parts = [predict(u[k : k + _CHUNK]) for k in range(0, len(u), _CHUNK)]
     if len(parts) == 1:
         return parts[0]

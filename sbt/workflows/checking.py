@@ -208,8 +208,8 @@ def _warned(spec: ScenarioSpec) -> list[Finding]:
     said = getattr(spec.resolve().simulate, "warnings", None)
     lines = () if said is None else said()
     more = f" (and {len(lines) - _WARNINGS} more)" if len(lines) > _WARNINGS else ""
-    told = "; ".join(line.removeprefix("Warning: ") for line in lines[:_WARNINGS]) + more
-    return [Finding("for information: SUMO warns", ok=True, detail=told)] if lines else []
+    detail = "; ".join(line.removeprefix("Warning: ") for line in lines[:_WARNINGS]) + more
+    return [Finding("for information: SUMO warns", ok=True, detail=detail)] if lines else []
 
 
 def _sides(runs: list[_Run], scenario: LogicalScenario) -> Finding:

@@ -90,16 +90,16 @@ def as_data(keys: JsonMapping) -> tuple[Json, dict[tuple[str, str], Any]]:
 def _input(change: Any) -> Any:
     """Return the change of an input as plain data: of a range, a distribution, or a whole parameter."""
     if isinstance(change, Parameter):
-        law = {} if change.distribution is None else {"distribution": change.distribution}
-        change = {"min": change.low, "max": change.high, **law}
+        distribution = {} if change.distribution is None else {"distribution": change.distribution}
+        change = {"min": change.low, "max": change.high, **distribution}
     if isinstance(change, Distribution):
         change = {"distribution": change}
     if isinstance(change, Mapping):
-        return {k: _law(v) if isinstance(v, Distribution) else _plain(v) for k, v in change.items()}
+        return {k: _distribution(v) if isinstance(v, Distribution) else _plain(v) for k, v in change.items()}
     return _plain(change)
 
 
-def _law(given: Distribution) -> Json:
+def _distribution(given: Distribution) -> Json:
     return {"kind": given.kind, **dict(given.parameters)}
 
 

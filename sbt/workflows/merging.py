@@ -102,12 +102,12 @@ def _check_same(parts: Sequence[_Part]) -> None:
         one, other = ({**p.configuration, "number of shards": p.shard.of} for p in (first, part))
         changed = sorted(key for key in {*one, *other} - _OWN if one.get(key) != other.get(key))
         if changed:
-            told = "; ".join(f"{key}: {one.get(key)} there, {other.get(key)} here" for key in changed)
-            raise InputError(f"shards must have one configuration, but {first.folder} and {part.folder} differ ({told})")
+            differing = "; ".join(f"{key}: {one.get(key)} there, {other.get(key)} here" for key in changed)
+            raise InputError(f"shards must have one configuration, but {first.folder} and {part.folder} differ ({differing})")
     found = {record.versions: part.folder for part in parts for record in part.records}
     if len(found) > 1:
-        told = "; ".join(f"{versions} in {folder}" for versions, folder in found.items())
-        raise InputError(f"shards must have been run with the same versions, but got {told}")
+        differing = "; ".join(f"{versions} in {folder}" for versions, folder in found.items())
+        raise InputError(f"shards must have been run with the same versions, but got {differing}")
 
 
 def _check_whole(parts: Sequence[_Part]) -> None:

@@ -10,11 +10,12 @@ import numpy as np
 
 from sbt.config.load import differences, dump
 from sbt.errors import InputError
+from sbt.execution.protocol import Executor
 from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Finished, Progress, Shard, check_shard, run_shard, run_stages
-from sbt.plugins import Objects
+from sbt.plugins import OBJECT, Objects
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.plain import Json, JsonMapping
@@ -94,6 +95,7 @@ def run_study(
             "listener": progress or (lambda _: None),
         }  # fmt: skip
         with executor:
+            _check_code(store, study, executor)
             if shard is None:
                 finished = run_stages(campaign, store, executor, budget=study.budget, **common)
             else:
@@ -103,6 +105,22 @@ def run_study(
         if report and shard is None:
             _report(store, study, finished.conclusion, finished.fitted)
     return summary
+
+
+def _check_code(store: Store, study: Study, executor: Executor) -> None:
+    """Refuse to go on with a store whose runs the user's code would not give again: the first and the last are tried."""
+    config, history = study.config, store.history()
+    code = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
+    if not any(name.startswith(OBJECT) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code):
+        return
+    ok = np.flatnonzero(history.ok)
+    records = [history.record(int(row)) for row in dict.fromkeys([*ok[:1], *ok[-1:]])]
+    for outcome in executor.run([Job(record.index, record.inputs, record.seed) for record in records]):
+        record = next(each for each in records if each.index == outcome.index)
+        if dict(outcome.metrics) != dict(record.metrics):
+            now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics)
+            rule = f"code must give the runs of {store.folder} again to go on there, but run {record.index} now gives {now}"
+            raise InputError(f"{rule}, not {stored}; choose another store for changed code")
 
 
 def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> None:
