@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -117,18 +117,18 @@ class FalsificationConclusion:
         return [*said, *share_among_held_out(facts).sentence()]
 
 
-@dataclass(frozen=True)
 class FailureSearch:
     """A search for failures as functions of its runs, shared by both stages and the conclusion.
 
+    It remembers its last answer: stages ask again and again, and finished rows never change.
+
     Args:
         settings: of the campaign.
-        found: failure modes by the indices of the runs they were found in; stages ask again and again, and rows
-            that are finished never change.
     """
 
-    settings: Settings
-    found: dict[tuple[int, ...], list[Mode]] = field(default_factory=dict, repr=False, compare=False)
+    def __init__(self, settings: Settings):
+        self.settings = settings
+        self._last: tuple[tuple[int, ...], list[Mode]] = ((), [])
 
     @cached_property
     def search(self) -> Search:
@@ -148,10 +148,9 @@ class FailureSearch:
     def modes(self, history: History) -> list[Mode]:
         """Return the failure modes among these runs."""
         runs = tuple(history.index.tolist())
-        if runs not in self.found:
-            self.found.clear()  # only the last answer is asked for again
-            self.found[runs] = self._modes(history)
-        return self.found[runs]
+        if runs != self._last[0]:
+            self._last = runs, self._modes(history)
+        return self._last[1]
 
     def _modes(self, history: History) -> list[Mode]:
         scenario = self.settings.scenario
