@@ -182,6 +182,7 @@ MISSPELT = pd.DataFrame({"x.aa": [0.1], "b": [0.2]})
 WRONG = {
     "keyword": (lambda s: sbt.run(campaign="boundary", scenario=scenario_of(), bugdet=3), r"'bugdet' \(did you mean 'budget'"),
     "campaign": (lambda s: sbt.run(campaign="boundry", scenario=scenario_of()), r"did you mean 'boundary'"),
+    "no scenario at all": (lambda s: unable(None, s.parent / "none"), r"a Scenario or the name of one, but got None"),
     "lock": (lambda s: unable(scenario_of(guarded()), s.parent / "lock"), r"variable 'lock' of guarded"),
     "other scenario": (lambda s: sbt.open(s, scenario=scenario_of(name="disk")), r"with scenario disc, but got disk"),
     "other inputs": (lambda s: sbt.open(s, scenario=scenario_of(inputs=STRETCHED)), r"of input a: .* there"),
@@ -265,13 +266,7 @@ def awkward(values, seed):
 
 
 def test_what_cannot_travel_runs_in_this_process(tmp_path):
-    lock = threading.Lock()
-
-    def guarded(values, seed):
-        with lock:
-            return gap(values, seed)
-
-    result = sbt.run(campaign="coverage", scenario=scenario_of(guarded), store=tmp_path / "s", **TINY)
+    result = sbt.run(campaign="coverage", scenario=scenario_of(guarded()), store=tmp_path / "s", **TINY)
     assert result.frame["status"].eq("ok").all()
     assert result.replay(0).identical
 

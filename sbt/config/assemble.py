@@ -17,6 +17,7 @@ from sbt.config.load import Loaded
 from sbt.config.model import Choice
 from sbt.config.source import Problems, must_be_one_of
 from sbt.config.space import configured_space
+from sbt.errors import InputError
 from sbt.execution.carrying import carry, keep_here
 from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
@@ -105,7 +106,9 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     own = tuple(metric_from(scope.load("metrics", name)) for name in config.metrics if name.startswith(OBJECT))
     carried = b""
     if own or config.scenario.startswith(OBJECT):
-        scenario: LogicalScenario = scope.load("scenarios", config.scenario)
+        scenario = scope.load("scenarios", config.scenario)
+        if not isinstance(scenario, LogicalScenario):
+            raise InputError(f"a scenario must be a Scenario or the name of one, but got {scenario!r}")
         kept = tuple(m for m in scenario.metrics if m.name not in {metric.name for metric in own})
         whole = replace(scenario, metrics=(*kept, *own)) if own else scenario
         carried = keep_here(whole) if config.executor.kind == "serial" else carry(whole)
