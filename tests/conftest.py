@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -28,7 +29,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Hide libsumo from this process and from every process that a test starts."""
+    """Let programs that tests start be interrupted, and hide libsumo from them and from this process where it is asked for."""
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):  # background jobs and nohup ignore them, and pass that on
+        if signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     if config.getoption("--no-sumo"):
         sys.path.insert(0, str(NO_SUMO))
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(NO_SUMO), os.environ.get("PYTHONPATH")]))
