@@ -179,7 +179,8 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         limits = Limits(lambda c: 1.0 - few_hits_bound(misses, counted, c), lambda _: 1.0)
         warnings.append(f"only {misses} counted draws were safe, fewer than {FEWEST_HITS}: only a lower bound is given")
     if len(safe) < FEWEST_BATCHES:
-        warnings.append(f"only {len(safe)} batches count, fewer than {FEWEST_BATCHES}: their spread says little")
+        counts = "1 batch counts" if len(safe) == 1 else f"{len(safe)} batches count"
+        warnings.append(f"only {counts}, fewer than {FEWEST_BATCHES}: their spread says little")
     if low.largest_share > _HEAVY and 0.0 < value < 1.0:
         warnings.append(f"one draw carries {low.largest_share:.0%} of the weight")
     if undetected > value:
