@@ -7,18 +7,18 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from studies import by_index
 
 from sbt.errors import InputError
 from sbt.execution.carrying import carry
 from sbt.execution.protocol import SerialExecutor
 from sbt.execution.spec import ScenarioSpec
 from sbt.plugins import load
-from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.outcome import Job, Status
 from sbt.seeds import run_seed
 
 distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed (pip install 'sumo-sbt[dask]')")
@@ -59,20 +59,14 @@ def jobs(n: int, kind: Callable[[int], float]) -> list[Job]:
     return [Job(k, {"a": kind(k), "b": k / n}, run_seed(0, k)) for k in range(n)]
 
 
-def found(outcomes: Iterator[Outcome]) -> dict[int, Outcome]:
-    rows = list(outcomes)
-    assert len({o.index for o in rows}) == len(rows), "a run was reported twice"
-    return {o.index: replace(o, seconds=0.0) for o in rows}
-
-
 def test_rows_are_those_of_the_serial_executor_and_bad_runs_have_the_same_fate(cluster: Any, analytic: Path):
     spec = ScenarioSpec("analytic.py:AWKWARD", str(analytic.parent))
     work = jobs(60, lambda k: {7: 0.01, 11: 0.02, 12: 0.03, 13: 0.04}.get(k, 0.5))
     with DaskExecutor(spec, cluster.scheduler_address, 1, timeout=1.0) as executor:
-        rows = found(executor.run(work))
-        assert found(executor.run(jobs(5, lambda k: 0.5))).keys() == set(range(5))
+        rows = by_index(executor.run(work))
+        assert by_index(executor.run(jobs(5, lambda k: 0.5))).keys() == set(range(5))
     assert sorted(rows) == list(range(60))
-    healthy = found(SerialExecutor(spec).run([job for job in work if job.index not in (7, 11)]))
+    healthy = by_index(SerialExecutor(spec).run([job for job in work if job.index not in (7, 11)]))
     assert {k: o for k, o in rows.items() if k not in (7, 11)} == healthy
     assert (rows[7].status, rows[7].reason) == (
         Status.CRASHED, "the worker process died, also when this run was tried again alone",
@@ -102,8 +96,8 @@ def test_a_run_may_raise_anything(cluster: Any, tmp_path: Path):
     spec = ScenarioSpec("rude.py:SCENARIO", str(tmp_path))
     work = [Job(k, {"a": k / 10 + 0.05}, k) for k in range(6)]
     with DaskExecutor(spec, cluster.scheduler_address, 1) as executor:
-        rows = found(executor.run(work))
-    assert rows == found(SerialExecutor(spec).run(work))
+        rows = by_index(executor.run(work))
+    assert rows == by_index(SerialExecutor(spec).run(work))
     assert [rows[k].status for k in range(3)] == ["failed", "failed", "ok"]
 
 
@@ -116,8 +110,8 @@ def test_a_scenario_is_carried_whatever_its_size(cluster: Any, tmp_path: Path, s
     spec = ScenarioSpec("deadly", carried=data)
     work = [Job(k, {"a": k / 10}, k) for k in range(10)]
     with DaskExecutor(spec, cluster.scheduler_address, 1) as executor:
-        rows = found(executor.run(work))
-    assert rows == found(SerialExecutor(spec).run(work))
+        rows = by_index(executor.run(work))
+    assert rows == by_index(SerialExecutor(spec).run(work))
     assert rows[0].metrics == {"y": float(size)}
 
 
@@ -138,7 +132,7 @@ def test_a_worker_that_is_killed_costs_nothing(cluster: Any, analytic: Path):
         outcomes = executor.run(jobs(40, lambda k: 0.05))
         first = next(outcomes)
         os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
-        rows = found(iter([first, *outcomes]))
+        rows = by_index(iter([first, *outcomes]))
     assert sorted(rows) == list(range(40))
     assert {o.status for o in rows.values()} == {Status.OK}
 
@@ -146,7 +140,7 @@ def test_a_worker_that_is_killed_costs_nothing(cluster: Any, analytic: Path):
 def test_a_run_that_kills_dask_workers_is_crashed_and_its_neighbours_are_not(cluster: Any, tmp_path: Path):
     (tmp_path / "deadly.py").write_text(DEADLY)
     with DaskExecutor(ScenarioSpec("deadly.py:SCENARIO", str(tmp_path)), cluster.scheduler_address, 1) as executor:
-        rows = found(executor.run([Job(k, {"a": 0.05 if k == 3 else 0.5}, k) for k in range(16)]))
+        rows = by_index(executor.run([Job(k, {"a": 0.05 if k == 3 else 0.5}, k) for k in range(16)]))
     assert [k for k, o in sorted(rows.items()) if o.status != Status.OK] == [3]
     assert (rows[3].status, rows[3].reason) == (Status.CRASHED, "the dask worker died, also when this run was tried again alone")
     assert len(rows) == 16
@@ -161,7 +155,7 @@ def test_a_campaign_on_dask_is_the_serial_one(cluster: Any, rows: Callable[..., 
     cut_in = ScenarioSpec("cut_in")
     work = [Job(k, {"d_v": 10.0 * k, "d_t": 1.0}, run_seed(1, k)) for k in range(8)]
     with DaskExecutor(cut_in, cluster.scheduler_address, 1) as executor:
-        assert found(executor.run(work)) == found(SerialExecutor(cut_in).run(work))
+        assert by_index(executor.run(work)) == by_index(SerialExecutor(cut_in).run(work))
 
 
 def test_workers_with_threads_are_refused(analytic: Path):

@@ -10,11 +10,12 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from studies import by_index
 
 from sbt.errors import InputError, PluginError
 from sbt.execution.local import LocalExecutor
@@ -31,12 +32,6 @@ def jobs(n: int, kind: Callable[[int], float] = lambda k: 0.5) -> list[Job]:
 
 def spec(file: Path, name: str = "AWKWARD") -> ScenarioSpec:
     return ScenarioSpec(f"{file.name}:{name}", str(file.parent))
-
-
-def by_index(outcomes: Iterator[Outcome]) -> dict[int, Outcome]:
-    found = list(outcomes)
-    assert len({o.index for o in found}) == len(found), "a run was reported twice"
-    return {o.index: replace(o, seconds=0.0) for o in found}
 
 
 def run(executor: Executor, work: list[Job]) -> dict[int, Outcome]:
