@@ -79,7 +79,8 @@ def plot_precision_recall(p: Vector, critical: Mask, ax: Axes) -> Axes:
     base = float(np.mean(critical))
     end = int(np.argmax(recall >= 1.0 - 1e-12)) + 1  # beyond full recall, more flags are only more false alarms
     full = float(precision[end - 1])
-    ax.plot(recall[:end], precision[:end], drawstyle="steps-pre", color=MODEL)
+    steps = np.concatenate([[0.0], recall[:end]]), np.concatenate([precision[:1], precision[:end]])
+    ax.plot(*steps, drawstyle="steps-pre", color=MODEL, clip_on=False)
     ax.axhline(base, color="#777777", linestyle="--", linewidth=1.0, label=f"base rate {base:.3g}")
     ax.plot(
         [1.0],
@@ -89,14 +90,14 @@ def plot_precision_recall(p: Vector, critical: Mask, ax: Axes) -> Axes:
         markersize=13,
         clip_on=False,
         zorder=5,
-        label=f"all critical runs found: precision {full:.2f}",
+        label=f"all critical found: precision {full:.2f}",
     )
     ax.set(
         xlabel="recall (share of the critical runs found)",
         ylabel="precision (share critical of those flagged)",
     )
     ax.set(xlim=(0.0, 1.03), ylim=(0.0, 1.03))
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize="small", frameon=False)
     return ax
 
 

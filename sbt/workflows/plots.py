@@ -139,6 +139,7 @@ class Plots:
         parameter = space.parameters[k]
         drawn.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(r.scenario.requirement.metric, r.scenario.unit))
         drawn.set(ylim=padded(*ends))
+        drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
         return drawn
 
     def convergence(self, ax: Axes | None = None) -> Axes:
