@@ -42,9 +42,10 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     """Return the ego in the middle lane, d_v faster than co, and co in the right lane, a time gap d_t ahead."""
     speed = CO_SPEED + values["d_v"] / 3.6
     gap = values["d_t"] * speed
+    kind, changes = ego.vehicle_type(CAR, speed), ego.changes_lanes(usual=False)
     return Scene(
         (
-            Actor("ego", ("road",), 1, START, speed, ego.driver(rng, speed), ego.vehicle_type(CAR, speed)),
+            Actor("ego", ("road",), 1, START, speed, ego.driver(rng, speed), kind, lane_changes=changes),
             Actor("co", ("road",), 0, START + gap + CAR.length, CO_SPEED, LaneChange(lane=1), CAR),
         ),
         end_condition(),

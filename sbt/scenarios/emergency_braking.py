@@ -22,6 +22,8 @@ from sbt.sumo.simulation import SumoSimulation
 
 __all__ = ["SCENARIO"]
 
+LANE_CHANGE = 3.0
+"""Duration of a lane change of an ego with `lane_change: true` (s)."""
 DURATION = 20.0
 """Longest simulated time (s)."""
 START = 20.0
@@ -34,9 +36,10 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     v_ego, v_co = values["v_ego"] / 3.6, values["v_co"] / 3.6
     gap = values["d_t"] * v_ego
     final = values["v_co_min_frac"] * v_co
+    kind, changes = ego.vehicle_type(CAR, v_ego), ego.changes_lanes(usual=False)
     return Scene(
         (
-            Actor("ego", ("road",), 1, START, v_ego, ego.driver(rng, v_ego), ego.vehicle_type(CAR, v_ego)),
+            Actor("ego", ("road",), 1, START, v_ego, ego.driver(rng, v_ego), kind, lane_changes=changes),
             Actor("co", ("road",), 1, START + gap + CAR.length, v_co, Braking(-values["a_co"], final), CAR),
         ),
         end_condition(final),
@@ -71,7 +74,9 @@ SCENARIO = LogicalScenario(
             Parameter("v_ego", 80.0, 150.0, "km/h", description="speed of ego at the start, also its set speed"),
         )
     ),
-    simulate=SumoSimulation("straight", scene, DURATION, isolations=("fresh", "reuse", "replicas")),
+    simulate=SumoSimulation(
+        "straight", scene, DURATION, lane_change_duration=LANE_CHANGE, isolations=("fresh", "reuse", "replicas")
+    ),
     metrics=longitudinal_metrics(),
     requirement=Requirement("ttc_min", high=0.1),
 )

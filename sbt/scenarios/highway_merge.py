@@ -49,7 +49,8 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
         for lane, factor in zip(LANES, (1.0, 1.1), strict=True)
     )
     kind = ego_type(ego, DESIRED, LIMIT)
-    car = Actor("ego", ("ramp", "merge", "after"), 0, RAMP - DISTANCE, speed, driver, kind, lane_changes=True)
+    changes = ego.changes_lanes(usual=True)
+    car = Actor("ego", ("ramp", "merge", "after"), 0, RAMP - DISTANCE, speed, driver, kind, lane_changes=changes)
     return Scene((car, *right, *left), end_condition)
 
 

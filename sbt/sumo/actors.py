@@ -121,7 +121,8 @@ class Actor:
             return a pose at every step; `lane` and `position` only tell SUMO where to insert the actor.
         person: a SUMO person, a circle of diameter `type.width`. With a pose its controller moves it; without
             one it walks along `route` at `speed` by SUMO's pedestrian model, on pavements and crossings.
-        lane_changes: let SUMO change lanes (strategically and safely) although a controller sets the speed.
+        lane_changes: let SUMO's lane-change model change lanes, also where a controller sets the speed; otherwise the actor
+            stays in its lane, except where its controller asks for another.
 
     Raises:
         InputError: a number is not finite, a pose is given without a controller, or a person has a

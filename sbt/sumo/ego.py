@@ -15,7 +15,7 @@ from sbt.problem.parameter import Parameter
 from sbt.seeds import stream
 from sbt.sumo.actors import Controller, VehicleType
 from sbt.sumo.formatting import format_number, plain
-from sbt.sumo.models import unit_of, vtype_attributes
+from sbt.sumo.models import DEFAULT_LANE_CHANGE, unit_of, vtype_attributes
 
 __all__ = ["SUMO", "Ego"]
 
@@ -63,8 +63,24 @@ class Ego:
     @property
     def lane_change(self) -> str:
         """The lane-change model of SUMO that the settings select; "" for a controller."""
+        given = self._lane_change
+        return "" if self.kind != SUMO else given if isinstance(given, str) else DEFAULT_LANE_CHANGE
+
+    @property
+    def _lane_change(self) -> str | bool | None:
         settings = dict(self.settings)
-        return str(settings.get("lane_change", settings.get("laneChangeModel", "LC2013"))) if self.kind == SUMO else ""
+        given = settings.get("lane_change", settings.get("laneChangeModel"))
+        return given if given is None or isinstance(given, bool) else str(given)
+
+    def changes_lanes(self, *, usual: bool) -> bool:
+        """Return whether SUMO may change lanes for this ego.
+
+        Args:
+            usual: whether it may in this scenario without a setting. `lane_change: true`, `false` or the name of a model decides.
+        """
+        if self.kind != SUMO or self._lane_change is None:
+            return usual
+        return self._lane_change is not False
 
     @property
     def inputs(self) -> tuple[Parameter, ...]:

@@ -59,10 +59,10 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
             route = registry.route(tuple([prefix + edge for edge in actor.route]))
             add(name, route, type_name(actor), "now", str(actor.lane), repr(position), repr(speed))
             registry.inserted(name)
+            if not actor.lane_changes:
+                sumo.vehicle.setLaneChangeMode(name, 0)
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(name, SPEED_MODE)
-                if not actor.lane_changes:
-                    sumo.vehicle.setLaneChangeMode(name, 0)
                 set_speed(name, speed)  # SUMO would accelerate until the first command of the controller
         if actor.pose is not None:
             pose_setter(sumo, actor, prefix)(actor.pose)

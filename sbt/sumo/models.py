@@ -15,8 +15,9 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean
 from sbt.sumo.formatting import format_number
 
-__all__ = ["CAR_FOLLOWING", "LANE_CHANGE", "SUBLANE", "known_attributes", "unit_of", "vtype_attributes"]
+__all__ = ["CAR_FOLLOWING", "DEFAULT_LANE_CHANGE", "LANE_CHANGE", "SUBLANE", "known_attributes", "unit_of", "vtype_attributes"]
 
+DEFAULT_LANE_CHANGE = "LC2013"
 SUBLANE = "SL2015"
 """The sublane model; it changes lanes only with SUMO's option --lateral-resolution."""
 _COMMON = {
@@ -83,7 +84,8 @@ def unit_of(name: str) -> str:
 def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the vType attributes for the settings of an ego of kind `sumo`.
 
-    `model` and `lane_change` (SUMO's `carFollowModel` and `laneChangeModel`) select the models, by default Krauss and LC2013.
+    `model` and `lane_change` (SUMO's `carFollowModel` and `laneChangeModel`) select the models, by default Krauss and LC2013;
+    `lane_change` may also be true or false.
 
     Raises:
         InputError: a model is unknown, the models do not have an attribute, or its value is not a finite number.
@@ -93,7 +95,8 @@ def vtype_attributes(settings: Mapping[str, Any]) -> dict[str, str]:
     """
     aliases = {"carFollowModel": "model", "laneChangeModel": "lane_change"}
     given = {aliases.get(name, name): value for name, value in settings.items()}
-    model, lane_change = str(given.pop("model", "Krauss")), str(given.pop("lane_change", "LC2013"))
+    model, lane_change = str(given.pop("model", "Krauss")), given.pop("lane_change", DEFAULT_LANE_CHANGE)
+    lane_change = DEFAULT_LANE_CHANGE if isinstance(lane_change, bool) else str(lane_change)  # true, false: whether, not how
     known = known_attributes(model, lane_change)
     for name, value in given.items():
         if name not in known:

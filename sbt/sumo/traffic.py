@@ -96,6 +96,7 @@ class TrafficStream:
             factor = 1.0 + self.spread * float(np.clip(rng.standard_normal(), -2.0, 2.0))
             attributes = dict(self.type.attributes) | {"speedFactor": format_number(speed * factor / self.limit)}
             kind = VehicleType(self.type.length, self.type.width, tuple(attributes.items()))
-            cars.append(Actor(f"{self.name}_{len(cars)}", self.route, self.lane, position, pace * factor, type=kind))
+            name = f"{self.name}_{len(cars)}"
+            cars.append(Actor(name, self.route, self.lane, position, pace * factor, type=kind, lane_changes=True))
             position -= pace * (shortest + (mean - shortest) * rng.standard_exponential())
         return tuple(cars)
