@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Film,
         Gumbel,
         InputError,
+        KnotProfile,
         Log,
         LogNormal,
         Metric,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
         PluginError,
         Prediction,
         Progress,
+        RecordedProfile,
         Requirement,
         Result,
         Roles,
@@ -72,6 +74,7 @@ _FROM = {
         "Weibull",
     ),
     "sbt.problem.parameter": ("Parameter",),
+    "sbt.problem.profile": ("KnotProfile", "RecordedProfile"),
     "sbt.problem.requirement": ("CriticalInterval", "Requirement"),
     "sbt.problem.scenario": ("LogicalScenario Scenario", "Metric", "Roles"),
     "sbt.problem.space": ("ParameterSpace",),
@@ -90,9 +93,9 @@ _NAMES = {name.split()[-1]: (module, name.split()[0]) for module, names in _FROM
 __all__ = [  # noqa: RUF022  (by use)
     "run", "open", "simulate", "list", "check", "Scenario", "Parameter", "ParameterSpace", "Requirement", "CriticalInterval",
     "Metric", "Roles", "Trace", "Distribution", "Uniform", "Normal", "LogNormal", "Exponential", "Gumbel", "Weibull", "Beta",
-    "Triangular", "SciPy", "Empirical", "Prediction", "Result", "Run", "Film", "Progress", "CampaignKind", "Campaign", "Batch",
-    "Log", "PlannedRun", "SbtError", "InputError", "PluginError", "RunError", "StoreError", "acquisitions", "campaigns",
-    "metamodels", "metrics", "testing", "__version__",
+    "Triangular", "SciPy", "Empirical", "KnotProfile", "RecordedProfile", "Prediction", "Result", "Run", "Film", "Progress",
+    "CampaignKind", "Campaign", "Batch", "Log", "PlannedRun", "SbtError", "InputError", "PluginError", "RunError", "StoreError",
+    "acquisitions", "campaigns", "metamodels", "metrics", "testing", "__version__",
 ]  # fmt: skip
 
 

@@ -10,12 +10,14 @@ from pydantic import ValidationError
 
 from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of
+from sbt.config.profiles import guided_vehicles, profile_of
 from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load
 from sbt.problem.parameter import Parameter
+from sbt.problem.profile import KnotProfile, Profile
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
@@ -61,6 +63,7 @@ class _Builder:
 
     def __init__(self, model: ScenarioModel, folder: Path, problems: Problems):
         self._model, self._folder, self._problems = model, folder, problems
+        self._profiles: dict[str, Profile] = {}
 
     def scenario(self, path: Path) -> LogicalScenario:
         model, problems = self._model, self._problems
@@ -69,6 +72,7 @@ class _Builder:
         ego = self._ego(model.ego, files)
         metrics = self._metrics()
         requirement = self._requirement(metrics)
+        guided = guided_vehicles(model.actors, self._profiles, files, model.ego.id, problems)
         if files is not None:
             self._check_inputs(files)
         if model.sumo is None and model.simulate is None:
@@ -78,7 +82,7 @@ class _Builder:
         named = tuple(n for n in named if n != model.ego.id)
         simulation = problems.attempt(("step_length",), lambda: UserSimulation(
             RecordingSettings(ego or EgoVehicle(model.ego.id), model.duration, model.others.within, named, model.wait),
-            files, loop, self._folder, model.step_length,
+            files, loop, self._folder, model.step_length, profiles=tuple(self._profiles.values()), participants=guided,
         ))  # fmt: skip
         problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
@@ -89,8 +93,18 @@ class _Builder:
 
     def _space(self) -> ParameterSpace | None:
         """Return the inputs with their correlation, constraints and features."""
-        parameters = []
+        parameters: list[Parameter] = []
+        before = len(self._problems.found)
         for name, entry in self._model.inputs.items():
+            if entry.profile is not None:
+                profile = profile_of(name, entry, self._folder, self._problems)
+                if profile is not None:
+                    self._profiles[name] = profile
+                    parameters.extend(profile.parameters)
+                continue
+            if entry.min is None or entry.max is None:
+                self._problems.add(("inputs", name), "an input must have min and max, or a profile")
+                continue
             distribution, choice = None, entry.distribution
             if choice is not None:
                 path = ("inputs", name, "distribution")
@@ -99,11 +113,13 @@ class _Builder:
             made = self._problems.attempt(("inputs", name), make)
             if made is not None:
                 parameters.append(made)
-        if len(parameters) < len(self._model.inputs):
+        if len(self._problems.found) > before:
             return None
         model = self._model
-        changes = SpaceChanges({}, model.correlation, model.constraints, model.features)
-        return configured_space(changes, ParameterSpace(tuple(parameters)), self._problems)
+        limits = (rule for p in self._profiles.values() if isinstance(p, KnotProfile) for rule in p.constraints)
+        changes = SpaceChanges({}, model.correlation, (*model.constraints, *limits), model.features)
+        space = self._problems.attempt(("inputs",), lambda: ParameterSpace(tuple(parameters)))
+        return None if space is None else configured_space(changes, space, self._problems)
 
     def _files(self) -> SumoFiles | None:
         if self._model.sumo is None:
@@ -181,7 +197,13 @@ class _Builder:
 
     def _check_inputs(self, files: SumoFiles) -> None:
         """Compare placeholders and inputs."""
-        known, used = list(self._model.inputs), set()
+        shaped = {name for name, entry in self._model.inputs.items() if entry.profile is not None}
+        if len(self._profiles) < len(shaped):  # their inputs are not known
+            return
+        of_profile = {p.name: name for name, profile in self._profiles.items() for p in profile.parameters}
+        known = [*(name for name in self._model.inputs if name not in shaped), *of_profile]
+        followed = {name for entry in self._model.actors.values() for name in (entry.speed, entry.acceleration)}
+        used = {name for name, profile in of_profile.items() if profile in followed}
         try:
             holes = list(files.placeholders())
         except InputError as error:
@@ -197,4 +219,6 @@ class _Builder:
             if name not in used and self._model.simulate is None:
                 read_files = ", ".join(t.path.name for t in files.templates)
                 rule = f"an input must stand as a placeholder ${{{name}}} in the files ({read_files}), but does not"
-                self._problems.add(("inputs", name), rule, at_key=True)
+                if name in of_profile:
+                    rule += f"; a profile may be followed instead: actors: {{ID: {{speed: {of_profile[name]}}}}}"
+                self._problems.add(("inputs", of_profile.get(name, name)), rule, at_key=True)

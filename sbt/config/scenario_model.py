@@ -6,10 +6,12 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, ValidationInfo, field_validator
 
-from sbt.config.model import Choice, Condition, CorrelationEntry, Formula, Name, RequirementChange
+from sbt.config.model import Choice, Condition, CorrelationEntry, Formula, Interval, Name, RequirementChange
 from sbt.problem.plain import Json
 
-__all__ = ["EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ScenarioModel", "SumoEntry", "schema"]
+__all__ = [
+    "ActorEntry", "EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ProfileEntry", "ScenarioModel", "SumoEntry", "schema",
+]  # fmt: skip
 
 
 def _under(key: str) -> BeforeValidator:
@@ -50,15 +52,48 @@ class SumoEntry(_Strict):
     options: dict[str, str | float | int | bool] = Field(default={}, description="Further SUMO options, name: value.")
 
 
-class InputEntry(_Strict):
-    """One input: its range, unit and distribution."""
+class DeformationEntry(_Strict):
+    """An input that deforms a recorded profile."""
 
     min: float = Field(description="Lower end of the range.")
     max: float = Field(description="Upper end of the range.")
+    distribution: Choice | None = Field(default=None, description="Law on the range.")
+
+
+class ProfileEntry(_Strict):
+    """A curve over time that several inputs shape: by its values at knots, or a recorded one that is deformed."""
+
+    knots: Annotated[tuple[float, ...], Field(strict=False)] | None = Field(
+        default=None, description="Times (s); the values there are the inputs NAME_0, NAME_1, ... (range beside the profile)."
+    )
+    interpolate: Literal["linear", "pchip"] = Field(default="linear", description="Between knots; pchip: smooth, no overshoot.")
+    rate: Interval | None = Field(default=None, description="Lowest and highest mean change between two knots (unit/s).")
+    file: Name | None = Field(default=None, description="A recorded curve instead: a CSV file with a header.")
+    time: Name = Field(default="t", description="Its column of times (s), counted from the first.")
+    value: Name = Field(default="v", description="Its column of values.")
+    scale: DeformationEntry | None = Field(default=None, description="Input NAME_scale: factor of the values.")
+    offset: DeformationEntry | None = Field(default=None, description="Input NAME_offset: added to the values.")
+    shift: DeformationEntry | None = Field(default=None, description="Input NAME_shift: the curve begins so much later (s).")
+    stretch: DeformationEntry | None = Field(default=None, description="Input NAME_stretch: factor of the times.")
+
+
+class ActorEntry(_Strict):
+    """A vehicle of the files, not the ego, that follows a profile from the ego's departure on."""
+
+    speed: Name | None = Field(default=None, description="The input, a profile, that is its speed (m/s).")
+    acceleration: Name | None = Field(default=None, description="The input, a profile, that is its acceleration (m/s^2).")
+
+
+class InputEntry(_Strict):
+    """One input: its range, unit and distribution; or a profile, which is several."""
+
+    min: float | None = Field(default=None, description="Lower end of the range.")
+    max: float | None = Field(default=None, description="Upper end of the range.")
     unit: str = Field(default="", description="As printed.")
     distribution: Choice | None = Field(default=None, description="Law on the range, such as {kind: normal, mean: 4, std: 1}.")
     kind: Literal["continuous", "integer"] = Field(default="continuous", description="integer: whole numbers only.")
     description: str = Field(default="", description="One line for reports.")
+    profile: ProfileEntry | None = Field(default=None, description="The input is a curve over time.")
 
 
 class EgoEntry(_Open):
@@ -109,6 +144,7 @@ class ScenarioModel(_Strict):
     constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = Field(default=(), description="Conditions on inputs.")
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel.")
     ego: Annotated[EgoEntry, _under("id")] = Field(description="The vehicle under test, or just its id.")
+    actors: dict[str, ActorEntry] = Field(default={}, description="By id: who follows a profile.")
     others: OthersEntry = Field(default=OthersEntry(), description="Who is recorded.")
     duration: float = Field(gt=0, allow_inf_nan=False, description="From the ego's departure on (s).")
     wait: float = Field(default=3600.0, gt=0, allow_inf_nan=False, description="Longest time until the ego departs (s).")

@@ -8,11 +8,12 @@ from functools import partial
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.problem.profile import Curve
 from sbt.sumo.actors import KEEP, Action, Pose, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, Gust
 from sbt.sumo.sensors import PERIOD, RangeSensor, Target
 
-__all__ = ["AccAeb", "ArcExit", "Braking", "LaneChange", "SpeedProfile", "Stationary", "Walk"]
+__all__ = ["AccAeb", "ArcExit", "Braking", "GivenSpeed", "LaneChange", "SpeedProfile", "Stationary", "Walk"]
 
 _as_action = partial(tuple.__new__, Action)
 """Makes an `Action` from a tuple of its four fields; faster than the constructor, which handles defaults."""
@@ -155,6 +156,21 @@ class Braking:
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the deceleration with the final speed as its limit."""
         return self._action
+
+
+class GivenSpeed:
+    """Drives the speed of a curve over time, such as that of a profile; below 0 it stands.
+
+    Args:
+        curve: speed (m/s) over the time of the scenario (s).
+    """
+
+    def __init__(self, curve: Curve):
+        self._curve = curve
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        """Return the speed at the end of the step."""
+        return Action(speed=max(self._curve(t + own.step), 0.0))
 
 
 class SpeedProfile:

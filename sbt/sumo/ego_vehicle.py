@@ -15,6 +15,7 @@ from sbt.sumo.actors import State
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.ego import SUMO, Ego
 from sbt.sumo.formatting import plain
+from sbt.sumo.guided import STRATEGIC_LANE_CHANGES
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, SPEED_MODE
 from sbt.sumo.models import vtype_attributes
 
@@ -31,8 +32,6 @@ _COMFORTABLE_DECELERATION = 3.0
 """Deceleration up to which the ego stops at a yellow light (m/s^2), about the 10 ft/s^2 behind ITE's yellow times."""
 _STOP_LINE_LENGTH, _STOP_LINE_WIDTH = 0.1, 3.0
 """Size of the obstacle that stands for a red light (m)."""
-_LANE_CHANGE_MODE = 513
-"""SUMO's lane-change mode with strategic changes only, respecting other vehicles."""
 
 ControlStep = Callable[[float, State, tuple[State, ...]], None]
 """Called before every step with the time (s), the state of the ego, and the states of the others."""
@@ -84,7 +83,7 @@ class EgoVehicle:
         if controller is None:
             raise InputError(f"ego.kind must name a controller, but got '{self.driver.kind}'")
         sumo.vehicle.setSpeedMode(self.id, SPEED_MODE)
-        sumo.vehicle.setLaneChangeMode(self.id, _LANE_CHANGE_MODE)
+        sumo.vehicle.setLaneChangeMode(self.id, STRATEGIC_LANE_CHANGES)
         act = controller.act
 
         def control(t: float, own: State, others: tuple[State, ...]) -> None:

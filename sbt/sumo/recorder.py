@@ -105,6 +105,7 @@ class Recorder:
         self._control: ControlStep | None = None
         self._named_present: set[str] = set()
         self._collisions: list[str] = []
+        self._given_speeds: Mapping[str, float] = {}
         self._ended: RunEnded | None = None
         self._steps = 0
         self._timeout = timeout
@@ -114,6 +115,15 @@ class Recorder:
     def ended(self) -> str:
         """Why the run is over; "" while it goes on."""
         return "" if self._ended is None else self._ended.reason
+
+    @property
+    def scenario_time(self) -> float | None:
+        """Time since the departure of the ego (s); None before it."""
+        return self._t if self._departed else None
+
+    def give_speeds(self, speeds: Mapping[str, float]) -> None:
+        """Record these speeds (m/s) in the next step instead of SUMO's, of road users that are moved by position."""
+        self._given_speeds = speeds
 
     def expect_departure(self, name: str, requested: RequestedDeparture) -> None:
         """Compare the departure of a vehicle that the loop adds with what it requests."""
@@ -237,7 +247,7 @@ class Recorder:
             self._centre_offsets[name] = 0.0 if _VEHICLE in variables else 0.5 * state.length
         if variables[_ANGLE] != state.angle:
             state.turn(variables[_ANGLE])
-        half, speed = self._centre_offsets[name], float(variables[_SPEED])
+        half, speed = self._centre_offsets[name], float(self._given_speeds.get(name, variables[_SPEED]))
         before = self._rows[-1].get(name) if self._rows else None
         state.acceleration = 0.0 if before is None else (speed - before[3]) / self._dt
         state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed

@@ -28,24 +28,26 @@ import numpy as np
 from sbt import interruption
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
+from sbt.problem.profile import Profile
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
 from sbt.sumo.departures import RequestedDeparture, number_or_none, requested_departures
 from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
 from sbt.sumo.formatting import plain, plain_values
+from sbt.sumo.guided import Motion, Participant
 from sbt.sumo.recorder import Recorder, RecordingSettings, RunEnded
 from sbt.sumo.session import scratch_folder, session
 
 __all__ = ["Loop", "TraciProxy", "UserSimulation", "step_until_over"]
 
-Loop = Callable[[Any, Mapping[str, float], np.random.Generator], object]
+Loop = Callable[[Any, Mapping[str, Any], np.random.Generator], object]
 """The user's `simulate(sumo, values, rng)`."""
 Connect = Callable[[Launch], AbstractContextManager[Any]]
 """Starts SUMO and provides its client module: libsumo or traci."""
 
 
-def step_until_over(sumo: Any, values: Mapping[str, float], rng: np.random.Generator) -> None:
+def step_until_over(sumo: Any, values: Mapping[str, Any], rng: np.random.Generator) -> None:
     """Step until the run is over: the loop of a scenario without one."""
     while True:
         sumo.simulationStep()
@@ -62,6 +64,8 @@ class UserSimulation:
         folder: working directory of the loop, to which relative file names refer.
         step: SUMO's step (s); None: that of the files, or 0.1.
         timeout: wall-clock limit of a run (s); None: none.
+        profiles: curves that inputs shape; the loop finds them among its values by name, as functions of time (s).
+        participants: road users that this package moves.
 
     Raises:
         InputError: a step is not a whole number of milliseconds, or neither files nor a loop are given.
@@ -74,6 +78,8 @@ class UserSimulation:
     step: float | None = None
     timeout: float | None = None
     isolations: tuple[str, ...] = ("fresh",)
+    profiles: tuple[Profile, ...] = ()
+    participants: tuple[Participant, ...] = ()
 
     def __post_init__(self) -> None:
         if self.files is None and self.loop is step_until_over:
@@ -172,6 +178,7 @@ class TraciProxy:
         self._user_simulation, self._values, self._seed, self._connect = simulation, values, seed, connect
         self._module: Any = None
         self._recorder: Recorder | None = None
+        self._motions: tuple[Motion, ...] = ()
         self.simulation = _SimulationProxy(self)
         self.vehicle, self.person = _CommandProxy(self, "vehicle"), _CommandProxy(self, "person")
         self.error_place = ""
@@ -213,13 +220,19 @@ class TraciProxy:
         self._module = self._connect(files.launch(self._values, folder, simulation.step))
         rng = stream(self._seed, "ego")
         self._recorder = Recorder(self._module, simulation.recording, rng, requested, simulation.timeout)
+        self._motions = tuple(p.begin(self._module, self._values) for p in simulation.participants)
 
     def simulationStep(self, until: float = 0.0) -> None:  # noqa: N802  (SUMO's name)
         """Make one step, or all steps until a time (s), and record each."""
         while True:
-            self.recorder.before_step()
+            recorder = self.recorder
+            recorder.before_step()
+            for motion in self._motions:
+                motion.before_step(recorder.scenario_time)
             self._module.simulationStep()
-            self.recorder.after_step()
+            if self._motions:
+                recorder.give_speeds({name: v for motion in self._motions for name, v in motion.after_step().items()})
+            recorder.after_step()
             if self._module.simulation.getTime() >= until - 1e-9:
                 return
 
@@ -234,7 +247,8 @@ class TraciProxy:
         """
         loop = self._user_simulation.loop
         try:
-            loop(self, dict(self._values), stream(self._seed, "loop"))
+            curves = {p.name: p.curve(self._values) for p in self._user_simulation.profiles}
+            loop(self, {**self._values, **curves}, stream(self._seed, "loop"))
         except RunEnded as end:
             return end.reason
         except BaseException as error:  # SystemExit too

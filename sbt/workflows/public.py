@@ -22,6 +22,7 @@ from sbt.problem.distribution import (
     Weibull,
 )
 from sbt.problem.parameter import Parameter
+from sbt.problem.profile import KnotProfile, RecordedProfile
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario as Scenario
 from sbt.problem.scenario import Metric, Roles
@@ -48,6 +49,7 @@ __all__ = [
     "Film",
     "Gumbel",
     "InputError",
+    "KnotProfile",
     "Log",
     "LogNormal",
     "Metric",
@@ -58,6 +60,7 @@ __all__ = [
     "PluginError",
     "Prediction",
     "Progress",
+    "RecordedProfile",
     "Requirement",
     "Result",
     "Roles",
