@@ -18,7 +18,7 @@ from sbt.metrics.fcd import read_fcd
 from sbt.plugins import load, names
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
-from sbt.report.film import metric_so_far
+from sbt.report.worst import metric_so_far
 from sbt.sumo import gui
 from sbt.sumo.nets import lanes
 from sbt.sumo.session import libsumo, session

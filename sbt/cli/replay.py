@@ -10,7 +10,6 @@ import typer
 
 from sbt.cli.campaign import Folder
 from sbt.cli.console import Exit, clean_stdout, fail, print_json
-from sbt.errors import InputError
 
 __all__ = ["replay"]
 
@@ -34,11 +33,9 @@ def replay(
 
         again = replay_run(folder, run)
         record, outcome, states = again.record, again.outcome, again.trace
-        if gui or gif or export or trace:
-            if states is None:
-                raise InputError(f"only a run with a trace can be shown or written out, but run {run} has none: {outcome.reason}")
-            if not show_replay(again, gui=gui, gif=gif, folder=export, csv=trace):
-                print("what sumo-gui showed differs from the run in the last digits", file=sys.stderr)
+        shown = gui or gif or export or trace
+        if shown and not show_replay(again, gui=gui, gif=gif, folder=export, csv=trace):
+            print("what sumo-gui showed differs from the run in the last digits", file=sys.stderr)
     same = again.identical
     if as_json:
         print_json({

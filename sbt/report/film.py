@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbt.errors import RunError
-from sbt.problem.arrays import Vector
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
-from sbt.report.scene import EGO, OTHER, ROAD, STANDING, Scenery, draw_lanes, window
+from sbt.report.contacts import Contacts
+from sbt.report.scene import BICYCLE, EGO, FEW, OTHER, PERSON, ROAD, STANDING, Scenery, View, draw_lanes, view_of
 from sbt.report.style import CRITICAL, MODEL, REGION, figure_style, label
+from sbt.report.worst import metric_so_far, worst_moment
 
 if TYPE_CHECKING:
     from sbt.sumo.nets import Lane
 
-__all__ = ["metric_so_far", "write_film"]
+__all__ = ["write_film"]
 
 _FRAMES = 90
 """Largest number of frames; a long run has fewer frames a second, at the same speed."""
@@ -27,42 +27,10 @@ _FASTEST = 0.08
 """Shortest time of a frame (s)."""
 _HOLD = 1.2
 """Time for which the last frame is shown (s)."""
-_SIZE = (5.6, 3.6)
+_WIDE, _TALL = (5.6, 3.6), (5.6, 5.2)
+"""Width and height of a picture (inch): of a scene along the x axis, and of any other."""
 _DPI = 96
 _COLORS = 48
-
-
-def metric_so_far(trace: Trace, metric: Metric, instants: Sequence[int]) -> Vector:
-    """Return the metric of the run up to each of these instants, NaN where it has no value yet.
-
-    A metric over the paths that were driven uses the whole paths at every instant.
-
-    >>> import numpy as np
-    >>> from sbt.problem.trace import Trace
-    >>> x = np.array([[0.0], [3.0], [1.0]])
-    >>> run = Trace(np.arange(3.0), ("ego",), x, x, x, x, x, np.ones(1), np.ones(1))
-    >>> metric_so_far(run, Metric("furthest", lambda t: float(t.x.max())), [0, 1, 2]).tolist()
-    [0.0, 3.0, 3.0]
-    """
-    if metric.over_time is not None:
-        worst = np.minimum if metric.direction == "low" else np.maximum
-        return np.asarray(worst.accumulate(metric.over_time(trace))[list(instants)])
-    values = []
-    for k in instants:
-        try:
-            values.append(metric(_until(trace, k)))
-        except RunError:
-            values.append(float("nan"))
-    return np.array(values)
-
-
-def _until(trace: Trace, k: int) -> Trace:
-    """Return the trace up to instant k."""
-    end = slice(0, k + 1)
-    return Trace(
-        trace.time[end], trace.actors, trace.x[end], trace.y[end], trace.heading[end], trace.speed[end], trace.acceleration[end],
-        trace.length, trace.width, trace.ended, trace.reported, {name: v[end] for name, v in trace.signals.items()},
-    )  # fmt: skip
 
 
 def write_film(
@@ -98,45 +66,92 @@ def _every(trace: Trace) -> int:
 def _frames(trace: Trace, metric: Metric, requirement: Requirement, lanes: Sequence[Lane], title: str) -> list[Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patheffects import withStroke
 
     last = len(trace.time) - 1
     instants = [*range(0, last, _every(trace)), last]
-    figure = Figure(figsize=_SIZE, dpi=_DPI)
+    moment, opponent = worst_moment(trace, metric)
+    size = _WIDE if _is_wide(trace, opponent, moment) else _TALL
+    figure = Figure(figsize=size, dpi=_DPI)
     canvas: Any = FigureCanvasAgg(figure)
-    above, below = figure.add_axes((0.02, 0.36, 0.96, 0.57)), figure.add_axes((0.08, 0.12, 0.89, 0.17))
-    width, height = 0.96 * _SIZE[0], 0.57 * _SIZE[1]
-    middle, (half_x, half_y) = window(trace, width / height)
-    above.grid(visible=False)
-    for side in above.spines.values():
-        side.set_visible(False)
-    above.set_xticks([])
-    above.set_yticks([])
+    above, below = _two_axes(figure, size)
+    box = above.get_position()
+    view = view_of(trace, opponent, moment, box.width * size[0] / (box.height * size[1]))
     above.set_title(title, loc="left", fontsize=9)
-    draw_lanes(above, lanes)
-    scenery = Scenery(above, trace)
-    clock = above.text(0.99, 0.96, "", transform=above.transAxes, ha="right", va="top", fontsize=9, zorder=9)
-    far = above.text(0.01, 0.05, "", transform=above.transAxes, ha="left", va="bottom", fontsize=8, color="#555555", zorder=9)
+    draw_lanes(above, _near(lanes, view))
+    scenery = Scenery(above, trace, opponent)
+    contacts = Contacts(above, trace)
+    halo = [withStroke(linewidth=2.0, foreground="white")]
+    clock = above.text(0.99, 0.97, "", transform=above.transAxes, ha="right", va="top", fontsize=9, zorder=9, path_effects=halo)
+    far = above.text(0.01, 0.03, "", transform=above.transAxes, ha="left", va="bottom", fontsize=8, zorder=9, path_effects=halo)
     now = _draw_metric(below, trace, metric, requirement, instants)
+    above.set_visible(False)  # what does not change is drawn once
+    now.set_visible(False)
+    canvas.draw()
+    still = canvas.copy_from_bbox(figure.bbox)
+    above.set_visible(True)
+    now.set_visible(True)
     drawn = []
     for k in instants:
         scenery.show(k)
-        above.set_xlim(middle[k, 0] - half_x, middle[k, 0] + half_x)
-        above.set_ylim(middle[k, 1] - half_y, middle[k, 1] + half_y)
+        words = contacts.show(k)
+        x, y = view.middle[k]
+        above.set_xlim(x - view.half_x, x + view.half_x)
+        above.set_ylim(y - view.half_y, y + view.half_y)
         clock.set_text(f"{trace.time[k]:.1f} s   {3.6 * trace.speed[k, 0]:.0f} km/h")
-        far.set_text(_out_of_view(trace, k, middle[k], half_x, half_y))
+        far.set_text(words or _out_of_view(trace, k, view, opponent))
+        far.set_color(CRITICAL if words else "#555555")
         now.set_xdata([trace.time[k]] * 2)
-        canvas.draw()
+        canvas.restore_region(still)
+        for artist in (above, now):
+            figure.draw_artist(artist)
         drawn.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return _with_one_palette(drawn)
 
 
-def _out_of_view(trace: Trace, k: int, middle: np.ndarray, half_x: float, half_y: float) -> str:
-    """Return who moves outside the view, and how far from ego."""
+def _two_axes(figure: Any, size: tuple[float, float]) -> tuple[Any, Any]:
+    """Return the axes of the scene and, below it, those of the metric; both keep their margins in inches."""
+    height = size[1]
+    above = figure.add_axes((0.02, 1.3 / height, 0.96, (height - 1.55) / height))
+    below = figure.add_axes((0.08, 0.43 / height, 0.89, 0.61 / height))
+    above.grid(visible=False)
+    for side in above.spines.values():
+        side.set_visible(False)
+    above.xaxis.set_visible(False)
+    above.yaxis.set_visible(False)
+    return above, below
+
+
+def _is_wide(trace: Trace, opponent: int | None, moment: int) -> bool:
+    """Return whether all that matters happens along the x axis, so that a wide view suits it."""
+    y = trace.y[:, [0] if opponent is None else [0, opponent]]
+    x = trace.x[:, [0] if opponent is None else [0, opponent]]
+    everybody = float(np.nanmax(trace.y) - np.nanmin(trace.y)), float(np.nanmax(trace.x) - np.nanmin(trace.x))
+    span = (float(np.nanmax(y) - np.nanmin(y)), float(np.nanmax(x) - np.nanmin(x)))
+    small = everybody[0] <= 50.0 and everybody[0] <= max(everybody[1], 30.0)
+    return small or span[0] <= 0.2 * span[1]
+
+
+def _near(lanes: Sequence[Lane], view: View) -> list[Lane]:
+    """Return the lanes that can be seen at any instant."""
+    half = np.array([view.half_x, view.half_y])
+    low, high = view.middle.min(axis=0) - half, view.middle.max(axis=0) + half
+    found = []
+    for lane in lanes:
+        points = np.array(lane.shape)
+        if (points.max(axis=0) + lane.width >= low).all() and (points.min(axis=0) - lane.width <= high).all():
+            found.append(lane)
+    return found
+
+
+def _out_of_view(trace: Trace, k: int, view: View, opponent: int | None) -> str:
+    """Return who moves outside the view, and how far from ego; of many road users only the opponent."""
     hidden = []
-    for j, name in enumerate(trace.actors[1:], start=1):
-        outside = abs(trace.x[k, j] - middle[0]) > half_x or abs(trace.y[k, j] - middle[1]) > half_y
-        if outside and trace.speed[:, j].max() > 0.0:
-            hidden.append(f"{name} {float(np.hypot(trace.x[k, j] - trace.x[k, 0], trace.y[k, j] - trace.y[k, 0])):.0f} m away")
+    for j in range(1, len(trace.actors)) if len(trace.actors) <= FEW else [opponent or 0]:
+        dx, dy = abs(trace.x[k, j] - view.middle[k, 0]), abs(trace.y[k, j] - view.middle[k, 1])
+        if (dx > view.half_x or dy > view.half_y) and np.nanmax(trace.speed[:, j]) > 0.0:  # NaN is neither
+            away = float(np.hypot(trace.x[k, j] - trace.x[k, 0], trace.y[k, j] - trace.y[k, 0]))
+            hidden.append(f"{trace.actors[j]} {away:.0f} m away")
     return ", ".join(hidden[:3]) + (" ..." if len(hidden) > 3 else "")
 
 
@@ -145,6 +160,7 @@ def _draw_metric(axes: Any, trace: Trace, metric: Metric, requirement: Requireme
     values = metric_so_far(trace, metric, instants)
     time = trace.time[instants]
     finite = values[np.isfinite(values)]
+    finite = finite[finite != metric.without] if (finite != metric.without).any() else finite  # 1,000 m would hide the rest
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     both = (requirement.critical.low, requirement.critical.high)
     ends = sorted((e for e in both if np.isfinite(e)), key=lambda e: abs(e - low))
@@ -168,7 +184,7 @@ def _with_one_palette(frames: list[np.ndarray]) -> list[Any]:
 
     some = np.concatenate([frames[k] for k in sorted({0, len(frames) // 2, len(frames) - 1})])
     width = some.shape[1]
-    for color in (EGO, OTHER, STANDING, ROAD, MODEL, CRITICAL, REGION):  # each counts, however small it is drawn
+    for color in (EGO, OTHER, PERSON, BICYCLE, STANDING, ROAD, MODEL, CRITICAL, REGION):  # each counts, however small it is drawn
         some = np.concatenate([some, np.full((30, width, 3), [int(color[i : i + 2], 16) for i in (1, 3, 5)], dtype=np.uint8)])
     palette = Image.fromarray(some).quantize(_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     return [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]

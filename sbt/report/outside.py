@@ -10,14 +10,13 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from sbt.metrics.geometry import corners
+from sbt.metrics.geometry import corners, select_instants
 from sbt.problem.trace import Trace
+from sbt.report.scene import is_person
 
 __all__ = ["write_csv", "write_fcd", "write_folder"]
 
 _COLORS = ("31,111,180", "217,130,43", "77,146,33", "148,103,189", "140,86,75")
-_PERSON = 1.0
-"""Largest width of a person (m); people are round."""
 
 
 def write_folder(folder: Path, trace: Trace, net: Path | None) -> list[Path]:
@@ -56,13 +55,16 @@ def write_csv(file: Path, trace: Trace) -> None:
 
 def write_fcd(file: Path, trace: Trace) -> None:
     """Write floating-car data as SUMO does: front bumpers (people: middles), degrees clockwise from north."""
+    present = trace.present
     with file.open("w") as out:
         out.write("<fcd-export>\n")
         for k, time in enumerate(trace.time.tolist()):
             out.write(f'  <timestep time="{time:.3f}">\n')
             for j, name in enumerate(trace.actors):
+                if not present[k, j]:
+                    continue
                 heading, length = float(trace.heading[k, j]), float(trace.length[j])
-                person = _is_person(trace, j)
+                person = is_person(trace, j)
                 front = 0.0 if person else 0.5 * length
                 x, y = float(trace.x[k, j]) + front * math.cos(heading), float(trace.y[k, j]) + front * math.sin(heading)
                 angle = (90.0 - math.degrees(heading)) % 360.0
@@ -75,19 +77,18 @@ def write_fcd(file: Path, trace: Trace) -> None:
         out.write("</fcd-export>\n")
 
 
-def _is_person(trace: Trace, j: int) -> bool:
-    return bool(trace.length[j] == trace.width[j] <= _PERSON)
-
-
 def _shapes(trace: Trace) -> str:
-    """Return paths and rectangles as polygons of an additional file."""
-    lines = []
+    """Return paths, and the rectangles at the first and last instant at which somebody is there, as polygons."""
+    lines, present = [], trace.present
     for j, name in enumerate(trace.actors):
         color = _COLORS[min(j, len(_COLORS) - 1)]
-        boxes = corners(trace.actor(name))  # (t, 4, 2)
+        there = np.flatnonzero(present[:, j])
+        if there.size == 0:
+            continue
+        boxes = corners(select_instants(trace.actor(name), there))  # (n, 4, 2)
         for where, k in (("start", 0), ("end", -1)):
             lines.append(_polygon(f"{name} {where}", color, boxes[k], "1"))
-        path = np.stack([trace.x[:, j], trace.y[:, j]], axis=1)
+        path = np.stack([trace.x[there, j], trace.y[there, j]], axis=1)
         if len(path) > 1 and float(np.ptp(path, axis=0).max()) > 0.0:
             lines.append(_polygon(f"{name} path", color, path, "0"))
     return "<additional>\n" + "\n".join(lines) + "\n</additional>\n"

@@ -47,7 +47,9 @@ class _Override:
         return getattr(self._original, name)
 
 
-def run_in_gui(simulate: Any, values: Any, seed: int, program: str, linger: float = 2.0) -> Any:
+def run_in_gui(
+    simulate: Any, values: Any, seed: int, program: str, *, ego: str = "ego", linger: float = 2.0, pace: float = 1.0
+) -> Any:
     """Run one concrete scenario in a separate SUMO process and return its trace.
 
     Args:
@@ -55,7 +57,9 @@ def run_in_gui(simulate: Any, values: Any, seed: int, program: str, linger: floa
         values: its inputs.
         seed: of the run.
         program: sumo-gui, or sumo.
-        linger: how long the window shows the first and the last state (s); in between it runs in real time.
+        ego: name of the road user under test, which the window follows.
+        linger: how long the window shows the first and the last state (s).
+        pace: simulated seconds in a second in between; 1: real time; infinite: as fast as it can.
 
     Raises:
         RunError: the program exits, or the run fails.
@@ -72,12 +76,15 @@ def run_in_gui(simulate: Any, values: Any, seed: int, program: str, linger: floa
     def step(*_: Any) -> None:
         if next_step:  # SUMO's own delay has no effect on steps made through TraCI
             time.sleep(max(0.0, next_step[0] - time.monotonic()))
-            next_step[0] += simulate.step_length
+            next_step[0] += traci.simulation.getDeltaT() / pace
         traci.simulationStep()
-        if has_window and not next_step and "ego" in traci.vehicle.getIDList():
-            traci.vehicle.setColor("ego", _EGO_COLOR)
+        if not has_window or next_step:
+            return
+        domain = next((d for d in (traci.vehicle, traci.person) if ego in d.getIDList()), None)
+        if domain is not None:
+            domain.setColor(ego, _EGO_COLOR)
             traci.gui.setSchema(traci.gui.DEFAULT_VIEW, "real world")
-            traci.gui.trackVehicle(traci.gui.DEFAULT_VIEW, "ego")
+            traci.gui.trackVehicle(traci.gui.DEFAULT_VIEW, ego)
             traci.gui.setZoom(traci.gui.DEFAULT_VIEW, _ZOOM)
             next_step.append(time.monotonic() + linger)
 

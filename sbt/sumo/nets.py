@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 import xml.parsers.expat
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sbt.errors import InputError
 
@@ -15,10 +15,19 @@ __all__ = ["Lane", "lanes", "net_file", "nets_folder"]
 
 
 class Lane(NamedTuple):
-    """The geometry of a lane: its centre line, (n, 2) points, and its width (m)."""
+    """The geometry of a lane, or of an area such as a junction.
+
+    Attributes:
+        shape: (n, 2) points of its centre line; of an area, its outline.
+        width: of a lane (m).
+        kind: `road`, `walk`, `bike`, `crossing` (of people), or `area` and `walking_area` where the shape is an outline.
+        height: mean of the points (m); 0 in a network without heights.
+    """
 
     shape: tuple[tuple[float, float], ...]
     width: float
+    kind: str = "road"
+    height: float = 0.0
 
 
 @cache
@@ -51,19 +60,47 @@ def net_file(net: str) -> Path:
 
 
 def lanes(net: str) -> tuple[Lane, ...]:
-    """Return all lanes of a network, including internal lanes of junctions.
+    """Return all lanes of a network, including internal lanes of junctions, and the areas of junctions.
 
     Raises:
         InputError: there is no such network.
     """
     path = net_file(net)
-    found = []
-    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-        for _, element in ET.iterparse(file):
-            if element.tag == "lane":
-                points = [tuple(map(float, pair.split(",")[:2])) for pair in element.get("shape", "").split()]
-                found.append(Lane(tuple((x, y) for x, y in points), float(element.get("width", "3.2"))))
+    found: list[Lane] = []
+    function = ""
+    with _opened(path) as file:
+        for event, element in ET.iterparse(file, events=("start", "end")):
+            if event == "start":
+                function = element.get("function", "") if element.tag == "edge" else function
+                continue
+            if element.tag in ("lane", "junction"):
+                found += _lane(element, function)
+            if element.tag != "lane":
+                element.clear()  # networks are large
     return tuple(found)
+
+
+def _lane(element: ET.Element, function: str) -> list[Lane]:
+    """Return a lane or the area of a junction; nothing where it has no shape."""
+    points = [tuple(map(float, point.split(","))) for point in element.get("shape", "").split()]
+    if len(points) < (3 if element.tag == "junction" else 2):  # a dead end has no area
+        return []
+    height = sum(p[2] for p in points) / len(points) if len(points[0]) > 2 else 0.0
+    allowed = set(element.get("allow", "").split())
+    if element.tag == "junction":
+        kind = "area"
+    elif function in ("crossing", "walkingarea"):
+        kind = "crossing" if function == "crossing" else "walking_area"
+    else:
+        kind = "walk" if allowed == {"pedestrian"} else "bike" if allowed and allowed <= {"pedestrian", "bicycle"} else "road"
+    return [Lane(tuple((p[0], p[1]) for p in points), float(element.get("width", "3.2")), kind, height)]
+
+
+def _opened(path: Path) -> Any:
+    """Open a file, which may be gzipped whatever its name is."""
+    with path.open("rb") as file:
+        zipped = file.read(2) == b"\x1f\x8b"
+    return gzip.open(path) if zipped else path.open("rb")
 
 
 def _check_well_formed(path: Path) -> None:
@@ -77,7 +114,7 @@ def _check_well_formed(path: Path) -> None:
     parser = xml.parsers.expat.ParserCreate()
     parser.StartElementHandler = start
     try:
-        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        with _opened(path) as file:
             parser.ParseFile(file)
     except (xml.parsers.expat.ExpatError, OSError, EOFError) as error:
         raise InputError(f"a network must be well-formed XML, but {path} is not: {error}") from None

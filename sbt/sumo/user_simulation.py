@@ -147,12 +147,38 @@ class UserSimulation:
         """
         return self._run(values, seed, lambda launch: _traci_connection(traci, [*program, *launch.command(seed)]))
 
+    def files_of_run(self, values: Mapping[str, float], seed: int) -> SumoFiles:
+        """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.
+
+        Raises:
+            RunError: the loop fails before.
+        """
+        found: list[SumoFiles] = []
+
+        def stop(files: SumoFiles) -> Any:
+            found.append(files)
+            raise RunEnded("start")
+
+        proxy = TraciProxy(self, plain_values(values), seed, stop)
+        with contextlib.chdir(self.folder), contextlib.suppress(RunEnded):
+            if self.files is not None:
+                proxy.start_files(self.files)
+            proxy.run_loop()
+        if not found:
+            raise RunError(Status.FAILED, "a loop must call sumo.start([...]), but it did not")
+        return found[0]
+
     def _run(self, values: Mapping[str, float], seed: int, connect: Connect) -> Trace:
         proxy: TraciProxy | None = None
+        given = plain_values(values)
         try:
             with ExitStack() as stack:
                 stack.enter_context(contextlib.chdir(self.folder))
-                proxy = TraciProxy(self, plain_values(values), seed, lambda launch: stack.enter_context(connect(launch)))
+
+                def start(files: SumoFiles) -> Any:
+                    return stack.enter_context(connect(files.launch(given, scratch_folder(), self.step)))
+
+                proxy = TraciProxy(self, given, seed, start)
                 if self.files is not None:
                     proxy.start_files(self.files)
                 ended = proxy.run_loop()
@@ -168,13 +194,13 @@ class TraciProxy:
         simulation: what runs.
         values: inputs of the run.
         seed: of the run.
-        connect: starts SUMO and returns its client module.
+        connect: starts SUMO with files and returns its client module.
 
     Attributes:
         error_place: ` (file:line)` of the user's code where an error was raised, "" without one.
     """
 
-    def __init__(self, simulation: UserSimulation, values: Mapping[str, float], seed: int, connect: Callable[[Launch], Any]):
+    def __init__(self, simulation: UserSimulation, values: Mapping[str, float], seed: int, connect: Callable[[SumoFiles], Any]):
         self._user_simulation, self._values, self._seed, self._connect = simulation, values, seed, connect
         self._module: Any = None
         self._recorder: Recorder | None = None
@@ -210,14 +236,14 @@ class TraciProxy:
     def start_files(self, files: SumoFiles) -> None:
         """Fill the placeholders of the files, start SUMO with them, and begin to record."""
         simulation = self._user_simulation
-        ego, folder = simulation.recording.ego, scratch_folder()
+        ego = simulation.recording.ego
         vehicle_type = ego.vehicle_type()
         if vehicle_type is not None:
-            path = folder / "ego.add.xml"
+            path = scratch_folder() / "ego.add.xml"
             path.write_text(f"<additional>{vehicle_type}</additional>")
             files = replace(files, additional=(*files.additional, path))
         requested = requested_departures(files, self._values, ego.id)
-        self._module = self._connect(files.launch(self._values, folder, simulation.step))
+        self._module = self._connect(files)
         rng = stream(self._seed, "ego")
         self._recorder = Recorder(self._module, simulation.recording, rng, requested, simulation.timeout)
         self._motions = tuple(p.begin(self._module, self._values) for p in simulation.participants)

@@ -25,6 +25,7 @@ from sbt.workflows.exporting import export_store
 from sbt.workflows.plots import Plots
 from sbt.workflows.prediction import inputs_from, predict_inputs
 from sbt.workflows.running import Replay, rebuild_report, replay_run
+from sbt.workflows.showing import net_of_run, save_film, shown_trace
 from sbt.workflows.study import Study
 
 if TYPE_CHECKING:
@@ -158,18 +159,12 @@ class Result(Generic[C]):
         """
         import pandas as pd
 
-        return pd.DataFrame(self._trace(self.replay(run)).rows())
+        return pd.DataFrame(shown_trace(self.replay(run)).rows())
 
     def film(self, run: int) -> Film:
         """Return a run as a film from above, with its metric over time; by executing it again, verified."""
         again = self.replay(run)
-        return Film(self._trace(again), again.scenario, f"{again.scenario.name}, run {run}")
-
-    def _trace(self, again: Replay) -> Trace:
-        if again.trace is None:
-            reason = again.outcome.reason or f"scenario {again.scenario.name} gives its metrics directly"
-            raise InputError(f"only a run with a trace can be shown, but run {again.record.index} has none: {reason}")
-        return again.trace
+        return Film(shown_trace(again), again.scenario, f"{again.scenario.name}, run {run}", net_of_run(again))
 
     def report(self) -> Path:
         """Write `report.html` in the store's folder, and return its path."""
@@ -223,13 +218,15 @@ class Film:
 
     Args:
         states: the run.
-        scenario: names metric, requirement and network.
+        scenario: names metric and requirement.
         title: above the scene.
+        net: network file whose lanes are drawn, None: none.
     """
 
     states: Trace
     scenario: LogicalScenario
     title: str = ""
+    net: Path | None = None
 
     def save(self, path: str | Path) -> Path:
         """Write the film as an animated GIF in real time, and return its path.
@@ -237,15 +234,10 @@ class Film:
         Raises:
             InputError: the name does not end in .gif.
         """
-        from sbt.report.film import write_film
-        from sbt.sumo.nets import lanes
-
         file = Path(path)
         if file.suffix.lower() != ".gif":
             raise InputError(f"a film must be saved as .gif, but got '{path}'")
-        need, net = self.scenario.requirement, getattr(self.scenario.simulate, "net", None)
-        metric = next(m for m in self.scenario.metrics if m.name == need.metric)
-        write_film(file, self.states, metric, need, lanes=() if net is None else lanes(net), title=self.title)
+        save_film(file, self.states, self.scenario, self.title, self.net)
         return file
 
     def _repr_html_(self) -> str:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from sbt.errors import InputError
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.trace import Trace
 from sbt.workflows.running import Replay
 
-__all__ = ["show_replay"]
+__all__ = ["net_of_run", "save_film", "show_replay", "shown_trace"]
 
 
 def show_replay(
@@ -26,24 +29,61 @@ def show_replay(
         Whether sumo-gui, where it was opened, showed the run to the last bit.
 
     Raises:
-        InputError: the run has no trace.
+        InputError: the run has no trace, or sumo-gui cannot be opened.
     """
-    from sbt.report.film import write_film
     from sbt.report.outside import write_csv, write_folder
     from sbt.sumo.gui import gui_program, run_in_gui
-    from sbt.sumo.nets import lanes, net_file
 
-    scenario, record, states = again.scenario, again.record, again.trace
-    if states is None:
-        raise InputError(f"only a run with a trace can be shown, but run {record.index} has none: {again.outcome.reason}")
-    net = getattr(scenario.simulate, "net", None)
+    scenario, record, states = again.scenario, again.record, shown_trace(again)
+    program = gui_program() if gui else ""
     if csv is not None:
         write_csv(csv, states)
     if folder is not None:
-        write_folder(folder, states, None if net is None else net_file(net))
+        write_folder(folder, states, net_of_run(again))
     if gif is not None:
-        need = scenario.requirement
-        metric = next(m for m in scenario.metrics if m.name == need.metric)
-        title = f"{scenario.name}, run {record.index}: {metric.name} = {record.metrics[metric.name]:.3g} {metric.unit}"
-        write_film(gif, states, metric, need, lanes=() if net is None else lanes(net), title=title)
-    return not gui or run_in_gui(scenario.simulate, record.inputs, record.seed, gui_program()).identical(states)
+        save_film(gif, states, scenario, f"{scenario.name}, run {record.index}: {_result(again)}", net_of_run(again))
+    return not gui or run_in_gui(scenario.simulate, record.inputs, record.seed, program, ego=states.actors[0]).identical(states)
+
+
+def _result(again: Replay) -> str:
+    """Return the metric of a run in words, or why it has none."""
+    need = again.scenario.requirement.metric
+    unit = next(m.unit for m in again.scenario.metrics if m.name == need)
+    value = again.outcome.metrics.get(need)
+    return f"{again.outcome.status}, {again.outcome.reason}" if value is None else f"{need} = {value:.3g} {unit}"
+
+
+def shown_trace(again: Replay) -> Trace:
+    """Return the trace of a run.
+
+    Raises:
+        InputError: it has none, as it failed or its scenario gives metrics directly.
+    """
+    if again.trace is None:
+        reason = again.outcome.reason or f"scenario {again.scenario.name} gives its metrics directly"
+        raise InputError(f"only a run with a trace can be shown, but run {again.record.index} has none: {reason}")
+    return again.trace
+
+
+def net_of_run(again: Replay) -> Path | None:
+    """Return the network in which a run took place, with its placeholders filled; None where its scenario names none."""
+    from sbt.sumo.nets import net_file
+    from sbt.sumo.session import scratch_folder
+    from sbt.sumo.template import template
+
+    simulate: Any = again.scenario.simulate
+    if hasattr(simulate, "files_of_run"):
+        files = simulate.files_of_run(again.record.inputs, again.record.seed)
+        return template(files.net).write(again.record.inputs, scratch_folder())
+    net = getattr(simulate, "net", None)
+    return None if net is None else net_file(net)
+
+
+def save_film(file: Path, states: Trace, scenario: LogicalScenario, title: str, net: Path | None) -> None:
+    """Write a run as an animated GIF, with the lanes of its network and the metric of its requirement."""
+    from sbt.report.film import write_film
+    from sbt.sumo.nets import lanes
+
+    need = scenario.requirement
+    metric = next(m for m in scenario.metrics if m.name == need.metric)
+    write_film(file, states, metric, need, lanes=() if net is None else lanes(str(net)), title=title)
