@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -12,7 +13,7 @@ from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.profiles import guided_vehicles, profile_of
 from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
-from sbt.config.source import ConfigError, Problems, must_be_one_of, read_yaml
+from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load
@@ -50,12 +51,32 @@ def from_file(name: str, folder: Path) -> LogicalScenario:
     data, source, wrong = read_yaml(read_text(path), name)
     problems = Problems(source)
     try:
-        model = ScenarioModel.model_validate(data)
+        model = ScenarioModel.model_validate(_with_ids(data, source))
     except ValidationError as error:
         raise located(source, error, ScenarioModel, wrong) from None
     if wrong:
         raise ConfigError(wrong)
     return _Builder(model, path.parent, problems).scenario(path)
+
+
+def _with_ids(data: Any, source: SourceMap) -> Any:
+    """Return the data with every id of SUMO as it is written: randomTrips counts 0, 1, ..., which YAML reads as numbers."""
+
+    def walk(value: Any, path: Key) -> Any:
+        if isinstance(value, dict):
+            return {key: walk(entry, (*path, key)) for key, entry in value.items()}
+        if isinstance(value, list):
+            return [walk(entry, (*path, k)) for k, entry in enumerate(value)]
+        return source.texts.get(path, value) if value is not None and _is_id(path) else value
+
+    return walk(data, ())
+
+
+def _is_id(path: Key) -> bool:
+    match path:
+        case ("ego",) | ("ego", "id") | ("others", "named") | ("others", "named", int()) | ("metrics", int(), "other"):
+            return True
+    return False
 
 
 class _Builder:

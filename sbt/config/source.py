@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from sbt.errors import InputError, did_you_mean
 
@@ -62,11 +62,13 @@ class SourceMap:
         name: the file, as the user wrote it.
         places: by path of keys.
         overrides: paths that `--set` gave.
+        texts: unquoted values as they are written, by path: `007` where YAML reads the number 7.
     """
 
     name: str
     places: Mapping[Key, Place] = field(default_factory=dict)
     overrides: frozenset[Key] = frozenset()
+    texts: Mapping[Key, str] = field(default_factory=dict)
 
     def located(self, key: str | Key, message: str, *, at_key: bool = False) -> str:
         """Return `file:line:column: key.path: message`, or `--set key.path: message`.
@@ -167,29 +169,32 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
         raise ConfigError([f"{name}:{where}:1: the file must be YAML, but {reason}"]) from None
     places: dict[Key, Place] = {}
     doubled: list[tuple[Key, str, bool]] = []
-    for path, place in _walk(node, ()):
+    texts: dict[Key, str] = {}
+    for path, place, value_node in _walk(node, ()):
         if path in places:
             line = places[path].key[0]
             message = f"a key must stand once in its mapping, but '{path[-1]}' stands already in line {line}"
             doubled.append((path, message, True))
         places[path] = place
-    source = SourceMap(name, places)
+        if isinstance(value_node, ScalarNode) and value_node.style is None:
+            texts[path] = value_node.value
+    source = SourceMap(name, places, texts=texts)
     return value, source, source.sorted(doubled)
 
 
-def _walk(node: Node | None, path: Key) -> Iterator[tuple[Key, Place]]:
-    """Yield the place of every key and list entry below a node, and of the node itself if it is the root."""
+def _walk(node: Node | None, path: Key) -> Iterator[tuple[Key, Place, Node]]:
+    """Yield the place and value of every key and list entry below a node, and of the node itself if it is the root."""
     if node is None or len(path) > _DEPTH:
         return
     if not path:
-        yield (), Place(_mark(node), _mark(node))
+        yield (), Place(_mark(node), _mark(node)), node
     entries: list[tuple[str | int, Node, Node]] = []
     if isinstance(node, MappingNode):
         entries = [(key.value, key, value) for key, value in node.value if isinstance(key.value, str)]
     elif isinstance(node, SequenceNode):
         entries = [(k, item, item) for k, item in enumerate(node.value)]
     for name, key, value in entries:
-        yield (*path, name), Place(_mark(key), _mark(value))
+        yield (*path, name), Place(_mark(key), _mark(value)), value
         yield from _walk(value, (*path, name))
 
 

@@ -219,20 +219,24 @@ def _absolute(option: str, value: str, folder: Path) -> str:
 
 
 def _check_net(net: Template) -> None:
-    """Check that a file is a network of a supported version.
+    """Check that a file is a network of a version that this SUMO reads: any up to its own, also those before 1.0.
 
     Raises:
         InputError: it is not.
     """
     tag, attributes = net.root
     if tag != "net":
-        raise InputError(f"{net.path}: a network must have the root <net>, but has <{tag}>; make it with netconvert")
+        source = "--opendrive" if tag == "OpenDRIVE" else "--osm" if tag == "osm" else "..."
+        raise InputError(
+            f"{net.path}: a network must have the root <net>, but has <{tag}>; "
+            f"make it with netconvert {source} {net.path.name} -o {net.path.name.partition('.')[0]}.net.xml"
+        )
     version = attributes.get("version", "")
     match = re.fullmatch(r"(\d+)\.(\d+)", version)
     numbers = (int(match.group(1)), int(match.group(2))) if match is not None else (0, 0)
-    if not (1, 0) <= numbers <= _NEWEST_NET_VERSION:
+    if not (0, 0) < numbers <= _NEWEST_NET_VERSION:
         newest = ".".join(map(str, _NEWEST_NET_VERSION))
         raise InputError(
-            f"{net.path}: a network must be of a version from 1.0 to {newest}, but is of '{version}', made by another SUMO; "
+            f"{net.path}: a network must be of a version up to {newest}, but is of '{version}', made by another SUMO; "
             f"convert it: netconvert -s {net.path.name} -o new.net.xml"
         )
