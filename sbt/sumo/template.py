@@ -9,6 +9,7 @@ files that the user does not know of.
 from __future__ import annotations
 
 import gzip
+import io
 import math
 import re
 import xml.parsers.expat
@@ -16,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from sbt.errors import InputError, RunError
 from sbt.problem.expression import Expression
@@ -25,6 +26,8 @@ from sbt.problem.outcome import Status
 __all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
 
 _PLACEHOLDER = re.compile(r"\$\{([^{}]*)\}")
+_ALONE = re.compile(rb"([\w.:-]+)\s*=\s*[\"']\s*$")
+"""What stands before a placeholder that begins the value of an attribute."""
 _START_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
 _REFERRING = ("include", "variableSpeedSign", "rerouter")
@@ -34,10 +37,11 @@ _VEHICLES = ("vehicle", "trip", "flow")
 
 @dataclass(frozen=True)
 class Placeholder:
-    """A placeholder: its formula, and its place as `file:line:column`."""
+    """A placeholder: its formula, its place as `file:line:column`, and the attribute (or option) that it alone is the value of, or ""."""
 
     formula: Expression
     place: str
+    attribute: str = ""
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,10 @@ class Template:
     def varying(self) -> tuple[str, ...]:
         """Ids of the vehicles with placeholders."""
         return tuple(name for name, vehicle in self.vehicles.items() if vehicle.varies)
+
+    def opened(self) -> BinaryIO:
+        """Open the file for reading, unpacked."""
+        return io.BytesIO(_read(self.path))
 
     @cached_property
     def includes(self) -> tuple[Template, ...]:
@@ -143,7 +151,9 @@ def placeholders(text: str, place: str) -> tuple[Placeholder, ...]:
     Raises:
         InputError: one of them is not a formula; the message begins with the place.
     """
-    return tuple(_placeholder(match.group(1), place) for match in _PLACEHOLDER.finditer(text))
+    alone = _PLACEHOLDER.fullmatch(text.strip()) is not None
+    attribute = place.rpartition(": ")[2] if alone else ""
+    return tuple(_placeholder(match.group(1), place, attribute) for match in _PLACEHOLDER.finditer(text))
 
 
 def fill(text: str, values: Mapping[str, float], place: str = "") -> str:
@@ -163,14 +173,14 @@ def number(placeholder: Placeholder, values: Mapping[str, float]) -> str:
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 
-def _placeholder(text: str, place: str) -> Placeholder:
+def _placeholder(text: str, place: str, attribute: str = "") -> Placeholder:
     try:
         formula = Expression(text)
     except InputError as error:
         raise InputError(f"{place}: ${{{text}}} must be a formula over inputs, but {error}") from None
     if not formula.names():
         raise InputError(f"{place}: ${{{text}}} must use at least one input, but it uses none")
-    return Placeholder(formula, place)
+    return Placeholder(formula, place, attribute)
 
 
 def _read(path: Path) -> bytes:
@@ -244,5 +254,9 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_
             if target.is_file():
                 parts.append(_Part(at + match.start(2), at + match.end(2), target=target))
     for match in re.finditer(_PLACEHOLDER.pattern.encode(), text):
-        parts.append(_Part(at + match.start(), at + match.end(), placeholder=_placeholder(match.group(1).decode(), place)))
+        before = _ALONE.search(text, 0, match.start())
+        alone = before is not None and text[match.end() : match.end() + 1] in (b'"', b"'")
+        attribute = before.group(1).decode() if before is not None and alone else ""
+        hole = _placeholder(match.group(1).decode(), place, attribute)
+        parts.append(_Part(at + match.start(), at + match.end(), placeholder=hole))
     yield from sorted(parts, key=lambda part: part.start)

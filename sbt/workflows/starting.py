@@ -1,0 +1,237 @@
+"""What `sumo-sbt new` writes: a scenario.yaml and a campaign.yaml for a user's own SUMO files, tried out before they are handed over."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sbt.config.scenario_file import from_file
+from sbt.errors import InputError, RunError, SbtError, did_you_mean
+from sbt.files import write_atomically
+from sbt.problem.scenario import LogicalScenario
+from sbt.sumo.departures import number_or_none
+from sbt.sumo.files import SumoFiles, options_of_config
+from sbt.sumo.observing import Observed, Traffic, candidates, observe
+from sbt.sumo.own_ego import OwnEgo, Suggestion, own_ego
+from sbt.sumo.suggesting import suggested
+from sbt.sumo.template import template
+
+__all__ = ["Written", "write_scenario"]
+
+_TRIED = 4
+"""Vehicles that are tried at most, until one departs as asked at every end of the inputs."""
+_STEP = 0.1
+"""Step of the simulation where the files set none (s); SUMO's own default is 1 s."""
+_DURATION, _SHORTEST = 30.0, 10.0
+"""Time that is recorded, and at least recorded of a vehicle that leaves earlier (s)."""
+
+_SCENARIO = """\
+# A logical scenario of your own SUMO files, which stay as they are. Try it: sumo-sbt check {folder}/scenario.yaml
+# A placeholder such as ${{{first}}}, or a formula such as ${{2 * {first}}}, may stand in every attribute of the files
+# below and in every option; every input must stand in one.
+
+sumo:                       # or just: sumo: my.sumocfg
+  config: {config}
+{files}  options: {{}}               # further SUMO options, such as {{scale: 1.2, insertion-checks: none}}
+
+inputs:                     # min, max, and if you like: unit, distribution, kind: integer, description
+{inputs}
+# The vehicle under test: {why}
+ego:
+  id: {ego}
+  may_leave: true           # arriving early is no failure
+  # kind: acc_aeb           # drive it by a controller, file.py:NAME for your own; or {{kind: sumo, model: IDM, tau: 1.2}}
+
+others: {{within: 100}}       # record everybody who comes this near (m); named: [lead] records lead wherever it is
+duration: {duration:g}                # from the ego's departure on (s)
+wait: {wait:g}                    # longest time until it departs (s)
+{step}
+metrics:                    # of ego and each of the others, the worst counts; other: lead asks for that one
+  - ttc_path_min            # time to collision along the paths driven: right in bends and at crossings, too
+  - distance_min
+  - collision
+  - deceleration_max
+  - {{stl: "G(distance > 0.5)", name: keeps_clear}}
+
+requirement: {{metric: ttc_path_min, critical: [-.inf, 1.0]}}   # less than 1 s to a collision
+"""
+_CAMPAIGN = """\
+# Run it: sumo-sbt run {folder}/campaign.yaml
+campaign: falsification     # find critical runs; or coverage (spread evenly), boundary, estimation
+scenario: scenario.yaml
+seed: 1
+budget: {budget}                  # runs
+initial: {initial}                 # spread evenly at first; the others where failures are likely
+stop: {{failures: null}}      # failures: 1 ends with the first one
+"""
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written.
+
+    Args:
+        paths: of the files.
+        notes: what was chosen and tried, a line each.
+    """
+
+    paths: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Draft:
+    """A scenario before it is written: the texts of its files, and why it has this ego."""
+
+    texts: Mapping[Path, str | bytes]
+    scenario: str
+    why: str
+
+
+def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Written:
+    """Write scenario.yaml, campaign.yaml and what they need into a folder.
+
+    Where the files have no placeholders yet, the traffic is watched once, a vehicle is chosen from its midst (`ego` names
+    another), and it gets a type of its own with inputs in it; the first of some choices that runs at every end of every
+    input is taken. Where they have placeholders, those are the inputs.
+
+    Raises:
+        InputError: the configuration cannot be read or run, has no such vehicle, or there is a scenario already.
+    """
+    if (folder / "scenario.yaml").exists():
+        raise InputError(f"FOLDER must not have a scenario.yaml yet, but '{folder}' has")
+    files = SumoFiles.of(options_of_config(config), config.resolve().parent, str(config))
+    if ego is not None and files.vehicle(ego) is None:
+        names = files.names()
+        known = ", ".join(names[:8]) or "none"
+        raise InputError(f"--ego must be a vehicle of the files ({known}), but got '{ego}'{did_you_mean(ego, names)}")
+    best: tuple[int, _Draft, list[str]] | None = None
+    made: set[Path] = set()
+    for draft in _drafts(files, config, folder, ego):
+        _write(draft, folder, made)
+        problems = _tried(folder / "scenario.yaml")
+        if best is None or len(problems) < best[0]:
+            best = (len(problems), draft, problems)
+        if not problems:
+            break
+    if best is None:
+        raise InputError(f"{config}: the traffic must have a road vehicle, but none departed while it was watched; name one: --ego ID")
+    _write(best[1], folder, made)
+    campaign = _CAMPAIGN.format(folder=folder, budget=40, initial=20)
+    made.add(write_atomically(folder / "campaign.yaml", campaign))
+    return Written(tuple(sorted(made)), (f"the vehicle under test: {best[1].why}", *best[2]))
+
+
+def _drafts(files: SumoFiles, config: Path, folder: Path, ego: str | None) -> Iterator[_Draft]:
+    """Yield scenarios that could be written, the best ones first."""
+    step = files.step_length() or _STEP
+    holes = list(files.placeholders())
+    inputs = suggested(files)
+    if holes:
+        yield _with_placeholders(files, config, folder, ego, inputs)
+        return
+    traffic = observe(files, {}, ego)
+    if ego is not None:
+        chosen = traffic.get(ego) or next((v for v in traffic.vehicles if v.id.rpartition(".")[0] == ego), None)
+        if chosen is None:
+            raise InputError(f"--ego must depart, but '{ego}' did not while the traffic was watched")
+        choice = [chosen]
+    else:
+        choice = candidates(traffic)[:_TRIED]
+    for one in choice:
+        yield _draft(files, config, folder, traffic, one, step)
+
+
+def _draft(files: SumoFiles, config: Path, folder: Path, traffic: Traffic, chosen: Observed, step: float) -> _Draft:
+    own = own_ego(files, traffic, chosen, folder.resolve(), step)
+    new = folder / "ego.rou.xml"
+    copies = {path: folder / f"without_ego.{path.name}" for path in own.copies}
+    routes = [*(copies.get(path, path) for path in files.routes), new]
+    named = f"  routes: [{', '.join(_shown(p, folder) for p in routes)}]\n"
+    if any(path in own.copies for path in files.additional):
+        named += f"  additional: [{', '.join(_shown(copies.get(p, p), folder) for p in files.additional)}]\n"
+    why = (
+        f"{own.how}.\n# It departs at {chosen.depart:g} s, when {chosen.running} of at most {traffic.most} vehicles are on the road, and has"
+        f" {chosen.neighbours:.1f} others within 50 m on average"
+    )
+    scenario = _scenario(files, config, folder, own.id, own.inputs, why, named, chosen)
+    texts: dict[Path, str | bytes] = {new: own.xml, **{copies[path]: data for path, data in own.copies.items()}}
+    return _Draft(texts, scenario, why.replace("\n#", ""))
+
+
+def _with_placeholders(
+    files: SumoFiles, config: Path, folder: Path, ego: str | None, inputs: tuple[Suggestion, ...]
+) -> _Draft:
+    """Return a scenario of files whose inputs are there already."""
+    vehicles = [name for t in files.templates for name, v in t.vehicles.items() if v.tag != "flow"]
+    varying = [name for t in files.templates for name in t.varying if name in vehicles]
+    named = [name for name in vehicles if name.lower() == "ego"]
+    ego = ego or next(iter([*named, *varying, *vehicles, *(f"{name}.0" for name in files.names())]), None)
+    if ego is None:
+        raise InputError(f"{config}: the files must have a vehicle, trip or flow, but have none")
+    scenario = _scenario(files, config, folder, ego, inputs, "choose another one here, where it is not yours", "", None)
+    return _Draft({}, scenario, f"'{ego}'; the inputs are the placeholders of the files")
+
+
+def _scenario(
+    files: SumoFiles, config: Path, folder: Path, ego: str, inputs: tuple[Suggestion, ...], why: str, named: str,
+    chosen: Observed | None,
+) -> str:  # fmt: skip
+    found = files.vehicle(ego)
+    depart = chosen.depart if chosen is not None else None if found is None else number_or_none(found[0].depart)
+    duration = _DURATION if chosen is None else max(_SHORTEST, min(_DURATION, chosen.stay))
+    return _SCENARIO.format(
+        folder=folder, config=_shown(config, folder), files=named, ego=json.dumps(ego, ensure_ascii=False), why=why,
+        duration=duration, wait=3600.0 if depart is None else depart + 60.0, first=inputs[0].name if inputs else "name",
+        step="" if files.step_length() is not None else f"step_length: {_STEP}            # SUMO's own default is 1 s\n",
+        inputs="".join(f"  {s.name}: {_entry(s)}\n" for s in inputs),
+    )  # fmt: skip
+
+
+def _entry(s: Suggestion) -> str:
+    unit = f", unit: {json.dumps(s.unit)}" if s.unit else ""
+    kind = ", kind: integer" if s.integer else ""
+    return f"{{min: {s.low:g}, max: {s.high:g}{unit}{kind}, description: {json.dumps(s.description, ensure_ascii=False)}}}"
+
+
+def _shown(path: Path, folder: Path) -> str:
+    return json.dumps(os.path.relpath(path.resolve(), folder.resolve()), ensure_ascii=False)
+
+
+def _write(draft: _Draft, folder: Path, made: set[Path]) -> None:
+    """Write the files of a draft; none of an earlier draft is left, and none of the user's is overwritten.
+
+    Raises:
+        InputError: a file of that name is there already.
+    """
+    wanted = {**draft.texts, folder / "scenario.yaml": draft.scenario}
+    for path in made - set(wanted):
+        path.unlink()
+    made.intersection_update(wanted)
+    for path, text in wanted.items():
+        if path not in made and path.exists():
+            raise InputError(f"FOLDER must not have a {path.name} yet, but '{folder}' has: choose another folder")
+        made.add(write_atomically(path, text))
+    template.cache_clear()
+
+
+def _tried(path: Path) -> list[str]:
+    """Return what goes wrong in the runs at the centre and at both ends of every input, a line each."""
+    scenario = from_file(str(path), Path.cwd())
+    space = scenario.space
+    centre = {p.name: p.centre for p in space.parameters}
+    points = [centre, *({**centre, p.name: end} for p in space.parameters for end in p.bounds)]
+    return [line for seed, values in enumerate(points) if (line := _problem(scenario, values, seed))]
+
+
+def _problem(scenario: LogicalScenario, values: Mapping[str, float], seed: int) -> str:
+    if scenario.simulate is None:
+        return ""
+    try:
+        scenario.measure(scenario.simulate(values, seed))
+    except (RunError, SbtError) as error:
+        return f"at {', '.join(f'{k}={v:g}' for k, v in values.items())}: {error}"
+    return ""
