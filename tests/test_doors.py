@@ -446,9 +446,9 @@ def test_new_writes_a_scenario_that_runs(study, tmp_path):
     done = CliRunner().invoke(app, ["new", str(tmp_path / "s"), "--from", str(path.parent / "my.sumocfg"), "--ego", "ego"])
     assert done.exit_code == 0, done.output
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == before, "the user's files stay as they are"
-    scenario, trace = simulated(tmp_path / "s" / "scenario.yaml", speed_factor=0.9)
-    assert scenario.space.names == ("speed_factor",)
-    assert trace.actors[0] == "ego"
+    scenario, trace = simulated(tmp_path / "s" / "scenario.yaml", depart_speed=20.0, speed_factor=0.9, tau=1.0, decel=4.0)
+    assert scenario.space.names == ("depart_speed", "speed_factor", "tau", "decel")
+    assert (trace.actors[0], trace.actor("ego").speed[0]) == ("ego", 20.0)
     again = CliRunner().invoke(app, ["new", str(tmp_path / "s"), "--from", str(path.parent / "my.sumocfg")])
     assert (again.exit_code, "must not have a scenario.yaml yet" in again.output) == (2, True)
 

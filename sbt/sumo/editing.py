@@ -47,7 +47,8 @@ def changed_copy(template: Template, changes: Changes, folder: Path) -> bytes:
     """
     with template.opened() as file:
         data = file.read()
-    edits = [(p.start, p.end, quoteattr(os.path.relpath(p.target, folder)).encode()) for p in template.parts if p.target is not None]
+    named = [(p, os.path.relpath(p.target, folder)) for p in template.parts if p.target is not None]
+    edits = [(part.start, part.end, quoteattr(name).encode()) for part, name in named]
     attributes = changes.attributes or {}
     wanted = {name for name in (changes.without, *attributes) if name}
     for name, tag, start, end in _spans(data):

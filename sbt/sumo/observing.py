@@ -31,7 +31,9 @@ _LONG_ENOUGH = 30.0
 """A vehicle that drives this long (s) is long enough in the traffic to meet others."""
 _NO_ROAD = ("rail", "tram", "ship", "pedestrian", "wheelchair", "aircraft", "drone", "subway", "cable", "container")
 """Beginnings of vehicle classes that are no candidates."""
-_SECOND_CHOICE = ("bicycle", "moped", "motorcycle", "scooter", "bus", "coach", "emergency", "authority", "army")
+_SECOND_CHOICE = (
+    "bicycle", "moped", "motorcycle", "scooter", "bus", "coach", "truck", "trailer", "emergency", "authority", "army", "vip",
+)  # fmt: skip
 """Vehicle classes that are taken only where there is nothing else."""
 
 

@@ -197,7 +197,8 @@ def _crossing_flows(
         for e in definitions(t, "flow")
     }  # fmt: skip
     for name in sorted(busy, key=lambda n: -busy[n]):
-        if name in elements and taken < _MOST_FLOWS and not (own is not None and own[0].tag == "flow" and chosen.id.startswith(f"{name}.")):
+        its_own = own is not None and own[0].tag == "flow" and chosen.id.startswith(f"{name}.")
+        if name in elements and taken < _MOST_FLOWS and not its_own:
             template, element = elements[name]
             suggested = _flow_input(element)
             if suggested is not None:

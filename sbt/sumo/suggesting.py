@@ -25,6 +25,6 @@ def suggested(files: SumoFiles) -> tuple[Suggestion, ...]:
         for name in hole.formula.names():
             usual = _BY_ATTRIBUTE.get(hole.attribute) if hole.formula.text.strip() == name else None
             if usual is not None and (name not in found or found[name].description.startswith("your range")):
-                found[name] = Suggestion(name, *usual, f"{hole.attribute} in {hole.place.partition(':')[0].rpartition('/')[2]}: adapt the range")
+                found[name] = Suggestion(name, *usual, f"{hole.attribute}; a usual range, adapt it")
             found.setdefault(name, Suggestion(name, 0.0, 1.0, "", "your range, unit and description"))
     return tuple(found.values())

@@ -37,7 +37,7 @@ _VEHICLES = ("vehicle", "trip", "flow")
 
 @dataclass(frozen=True)
 class Placeholder:
-    """A placeholder: its formula, its place as `file:line:column`, and the attribute (or option) that it alone is the value of, or ""."""
+    """A placeholder: its formula, its place as `file:line:column`, and the attribute or option whose whole value it is, or ""."""
 
     formula: Expression
     place: str

@@ -1,4 +1,4 @@
-"""What `sumo-sbt new` writes: a scenario.yaml and a campaign.yaml for a user's own SUMO files, tried out before they are handed over."""
+"""What `sumo-sbt new` writes: a scenario.yaml and a campaign.yaml for a user's own SUMO files, tried out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.sumo.departures import number_or_none
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.observing import Observed, Traffic, candidates, observe
-from sbt.sumo.own_ego import OwnEgo, Suggestion, own_ego
+from sbt.sumo.own_ego import Suggestion, own_ego
 from sbt.sumo.suggesting import suggested
 from sbt.sumo.template import template
 
@@ -118,7 +118,7 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Writte
         if not problems:
             break
     if best is None:
-        raise InputError(f"{config}: the traffic must have a road vehicle, but none departed while it was watched; name one: --ego ID")
+        raise InputError(f"{config}: a road vehicle must depart, but none did while the traffic was watched; name one: --ego ID")
     _write(best[1], folder, made)
     campaign = _CAMPAIGN.format(folder=folder, budget=40, initial=20)
     made.add(write_atomically(folder / "campaign.yaml", campaign))
@@ -154,8 +154,8 @@ def _draft(files: SumoFiles, config: Path, folder: Path, traffic: Traffic, chose
     if any(path in own.copies for path in files.additional):
         named += f"  additional: [{', '.join(_shown(copies.get(p, p), folder) for p in files.additional)}]\n"
     why = (
-        f"{own.how}.\n# It departs at {chosen.depart:g} s, when {chosen.running} of at most {traffic.most} vehicles are on the road, and has"
-        f" {chosen.neighbours:.1f} others within 50 m on average"
+        f"{own.how}.\n# It departs at {chosen.depart:g} s, when {chosen.running} of at most {traffic.most} vehicles are on the"
+        f" road, and has {chosen.neighbours:.1f} others within 50 m on average"
     )
     scenario = _scenario(files, config, folder, own.id, own.inputs, why, named, chosen)
     texts: dict[Path, str | bytes] = {new: own.xml, **{copies[path]: data for path, data in own.copies.items()}}
