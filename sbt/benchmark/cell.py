@@ -228,7 +228,7 @@ def _known_runs(cell: Cell) -> dict[tuple[int, tuple[float, ...]], Outcome]:
         if folder != cell.folder and Store.begun(folder):
             with Store.read(folder) as store:
                 for r in store.history().training.records:
-                    outcome = Outcome(r.index, Status(r.status), r.metrics, r.reason, r.seconds, r.collisions)
+                    outcome = Outcome(r.index, Status(r.status), r.metrics, r.reason, r.seconds, r.collisions, r.unconfirmed)
                     known[r.seed, tuple(r.inputs.values())] = outcome
     return known
 

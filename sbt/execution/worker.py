@@ -20,8 +20,8 @@ from sbt.problem.trace import Trace
 
 __all__ = ["run_job", "run_jobs", "run_traced", "versions"]
 
-_Measured = tuple[dict[str, float], str]
-"""Metrics, and SUMO's own collision list."""
+_Measured = tuple[dict[str, float], str, str]
+"""Metrics, SUMO's own collision list, and what differs between it and the contacts."""
 
 
 def run_job(scenario: LogicalScenario, job: Job) -> Outcome:
@@ -45,7 +45,7 @@ def run_traced(scenario: LogicalScenario, job: Job) -> tuple[Outcome, Trace | No
     """
     simulate = scenario.simulate
     if simulate is None:
-        return _outcome(job, lambda: (scenario.run(job.inputs, job.seed), "")), None
+        return _outcome(job, lambda: (scenario.run(job.inputs, job.seed), "", "")), None
     traces: list[Trace] = []
 
     def measured() -> _Measured:
@@ -106,9 +106,9 @@ def _outcome(job: Job, measured: Callable[[], _Measured], seconds: float = 0.0) 
     """Return the outcome of a job: its metrics, or the status and reason of what was raised."""
     start = time.perf_counter() - seconds
     try:
-        metrics, reported = measured()
+        metrics, reported, unconfirmed = measured()
         interruption.check()  # the code of the run may have caught the KeyboardInterrupt of a signal
-        return Outcome(job.index, Status.OK, metrics, "", time.perf_counter() - start, reported)
+        return Outcome(job.index, Status.OK, metrics, "", time.perf_counter() - start, reported, unconfirmed)
     except BaseException as error:  # a user's scenario may raise anything, SystemExit too; the campaign goes on
         if interruption.is_interruption(error):
             raise KeyboardInterrupt from None
@@ -128,13 +128,13 @@ def _verdict(error: BaseException) -> tuple[Status, str]:
 
 
 def _measured(scenario: LogicalScenario, trace: Trace | BaseException) -> _Measured:
-    """Return the metrics of a run and SUMO's own collision list, or raise its error."""
+    """Return the metrics of a run, SUMO's own collision list and what differs, or raise its error."""
     if isinstance(trace, BaseException):
         raise trace
     if not isinstance(trace, Trace):
         raise RunError(Status.FAILED, f"simulate must return a Trace, but returned a {type(trace).__name__}")
     _check_trace(trace)
-    return scenario.measure(trace), " ".join(trace.reported)
+    return scenario.measure(trace), " ".join(trace.reported), " | ".join(trace.unconfirmed)
 
 
 def _check_trace(trace: Trace) -> None:

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from sbt.metrics.geometry import rectangle_distance
+from sbt.metrics.geometry import part_pairs, rectangle_distance
 from sbt.metrics.longitudinal import FAR
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
@@ -36,16 +36,17 @@ def conflict_type(ego: str = "ego") -> Metric:
     def function(trace: Trace) -> float:
         column = trace.actors.index(ego) if ego in trace.actors else 0
         own = trace.actor(trace.actors[column])
-        reach = 0.5 * np.hypot(trace.length, trace.width)
+        bent = np.array([name in trace.parts for name in trace.actors])
+        reach = np.where(bent, 1.5, 0.5) * np.hypot(trace.length, trace.width)
         centres = np.hypot(trace.x - own.x[:, None], trace.y - own.y[:, None])  # (t, m)
         least = np.where(np.isfinite(centres), centres, np.inf).min(axis=0) - reach - reach[column]
         best, code = FAR, _NOBODY
         for k in np.argsort(least, kind="stable").tolist():  # the nearest ones first
             if k != column and least[k] < best:
-                other = trace.actor(trace.actors[k])
-                distance, at = _nearest(own, other)
-                if distance < best:
-                    best, code = distance, _code(own, other, at)
+                for part, other in part_pairs(own, trace.actor(trace.actors[k])):
+                    distance, at = _nearest(part, other)
+                    if distance < best:
+                        best, code = distance, _code(part, other, at)
         return float(code)
 
     return Metric(

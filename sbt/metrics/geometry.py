@@ -1,23 +1,53 @@
-"""Oriented rectangles: contact while moving, and distance; vectorised over time."""
+"""Oriented rectangles: contact while moving, and distance; vectorised over time.
+
+The shape of a long vehicle is several rectangles (`ActorTrace.parts`): `contact_index`, `time_to_contact` and
+`rectangle_distance` compare all of them, the other functions single rectangles.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from sbt.problem.arrays import Vector
-from sbt.problem.trace import ActorTrace
+from sbt.problem.trace import ActorTrace, select_parts
 
 __all__ = [
     "contact_index",
+    "contact_part",
     "contact_share",
     "corners",
+    "overlap_depth",
+    "part_pairs",
     "rectangle_distance",
+    "rectangles",
     "select_instants",
     "swept_contact",
     "time_to_contact",
 ]  # fmt: skip
+
+
+def rectangles(actor: ActorTrace) -> tuple[ActorTrace, ...]:
+    """Return the rectangles that are the shape of an actor, the front one first."""
+    return actor.parts or (actor,)
+
+
+def part_pairs(a: ActorTrace, b: ActorTrace) -> Iterator[tuple[ActorTrace, ActorTrace]]:
+    """Yield every pair of rectangles of two actors."""
+    return itertools.product(rectangles(a), rectangles(b))
+
+
+def overlap_depth(a: ActorTrace, b: ActorTrace) -> Vector:
+    """Return (t,) how far two rectangles would have to move so as not to overlap (m); negative where they are apart.
+
+    The least overlap on the four axes; where they are apart, minus a lower bound of their distance.
+    """
+    cos, sin = _axes(a, b)
+    apart: Vector = np.abs((b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin)
+    return (_reach(a, cos, sin) + _reach(b, cos, sin) - apart).min(axis=1)
 
 
 def corners(actor: ActorTrace) -> np.ndarray:
@@ -100,6 +130,8 @@ def time_to_contact(a: ActorTrace, b: ActorTrace) -> Vector:
     Source:
         Separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
     """
+    if a.parts or b.parts:
+        return np.minimum.reduce([time_to_contact(p, q) for p, q in part_pairs(a, b)])
     cos, sin = _axes(a, b)
     reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)
     start = (b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin
@@ -111,6 +143,17 @@ def time_to_contact(a: ActorTrace, b: ActorTrace) -> Vector:
 
 def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
     """Return the index of the first instant at which, or in the step before which, the rectangles touch; None if never."""
+    found = contact_part(a, b)
+    return None if found is None else found[0]
+
+
+def contact_part(a: ActorTrace, b: ActorTrace) -> tuple[int, ActorTrace, ActorTrace] | None:
+    """Return the index of the first contact (as `contact_index`) and the rectangles that touch; None if there is none."""
+    found = [(k, p, q) for p, q in part_pairs(a, b) if (k := _rectangle_contact(p, q)) is not None]
+    return min(found, key=lambda one: one[0], default=None)
+
+
+def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
     dx, dy = b.x - a.x, b.y - a.y
     reach = 0.5 * (math.hypot(a.length, a.width) + math.hypot(b.length, b.width))
     moved = max(float(np.abs(d[1:] - d[:-1]).max(initial=0.0)) for d in (dx, dy))
@@ -125,11 +168,13 @@ def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
 
 def select_instants(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:
     """Return an actor at some instants only."""
-    return ActorTrace(actor.x[i], actor.y[i], actor.heading[i], actor.speed[i], actor.acceleration[i], actor.length, actor.width)
+    return select_parts((actor,), i)[0]
 
 
 def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:
     """Return the (t,) smallest distance between the rectangles (m), 0 where they overlap."""
+    if a.parts or b.parts:
+        return np.minimum.reduce([rectangle_distance(p, q) for p, q in part_pairs(a, b)])
     cos, sin = _axes(a, b)
     reach = _reach(a, cos, sin) + _reach(b, cos, sin)
     along = np.abs((b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin)

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.metrics.cache import per_trace
-from sbt.metrics.geometry import contact_index
+from sbt.metrics.geometry import contact_index, rectangles
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.scenario import Metric
-from sbt.problem.trace import Trace
+from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = [
     "BESIDE", "DRAC_LIMIT", "FAR", "HORIZON", "OVERTAKEN", "Encounter", "collision", "d_min", "drac_max", "encounter",
@@ -81,13 +81,8 @@ def first_contact(trace: Trace, ego: str, other: str) -> int | None:
 def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Encounter:
     """Return the relative position and motion of two actors."""
     a, b = trace.actor(ego), trace.actor(other)
-    cos, sin = np.cos(a.heading), np.sin(a.heading)
-    dx, dy = b.x - a.x, b.y - a.y
-    turn = np.cos(b.heading - a.heading)
-    gap = dx * cos + dy * sin - 0.5 * (a.length + b.length)
-    offset = np.abs(-dx * sin + dy * cos)
-    in_path = offset < 0.5 * (a.width + b.width) + margin
-    behind = gap <= -(a.length + b.length)
+    seen = [_sighting(rectangles(a)[0], part, a.length, margin) for part in rectangles(b)]
+    gap, turn, in_path, behind = seen[0] if len(seen) == 1 else _nearest_in_path(seen)
     contact = first_contact(trace, ego, other)
     if contact is not None:  # nothing counts after the first contact
         in_path[contact + 1 :] = False
@@ -98,6 +93,30 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
         gap, a.speed - b.speed * turn, in_path, ahead, in_path & (gap < 0) & ~behind, a.speed,
         contact, rear_end, bool(behind[-1]),
     )  # fmt: skip
+
+
+_Sighting = tuple[Vector, Vector, Mask, Mask]
+"""Gap (m), cosine of the relative heading, whether in the path, and whether behind the ego, (t,) each."""
+
+
+def _sighting(a: ActorTrace, b: ActorTrace, length: float, margin: float) -> _Sighting:
+    """Return the relation of a rectangle b to the ego's front rectangle a, the ego being of this length (m)."""
+    cos, sin = np.cos(a.heading), np.sin(a.heading)
+    dx, dy = b.x - a.x, b.y - a.y
+    turn = np.cos(b.heading - a.heading)
+    gap = dx * cos + dy * sin - 0.5 * (a.length + b.length)
+    offset = np.abs(-dx * sin + dy * cos)
+    return gap, turn, offset < 0.5 * (a.width + b.width) + margin, gap <= -(length + b.length)
+
+
+def _nearest_in_path(seen: list[_Sighting]) -> _Sighting:
+    """Return, at every instant, the relation to the part of a long vehicle that the ego would reach first."""
+    gap, turn, in_path, behind = (np.stack(columns) for columns in zip(*seen, strict=True))  # (parts, t)
+    last = np.where(behind, np.abs(gap), np.inf)  # parts behind the ego come last, the nearest of them first
+    rank = np.where(behind, 1e6 + last, gap) + np.where(in_path, 0.0, 1e9)
+    nearest = rank.argmin(axis=0)[None]
+    first_gap, first_turn = (np.take_along_axis(values, nearest, 0)[0] for values in (gap, turn))
+    return first_gap, first_turn, np.logical_or.reduce(in_path), np.logical_and.reduce(behind)
 
 
 def time_to_collision(e: Encounter) -> Vector:

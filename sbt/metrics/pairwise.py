@@ -50,10 +50,7 @@ def _joint_intervals(trace: Trace, ego: str, other: str) -> Iterator[tuple[slice
 
 def _part(trace: Trace, i: slice, at: list[int]) -> Trace:
     """Return some instants of one or two actors, named ego and co."""
-    return Trace(
-        trace.time[i], ("ego", "co")[: len(at)], trace.x[i][:, at], trace.y[i][:, at], trace.heading[i][:, at],
-        trace.speed[i][:, at], trace.acceleration[i][:, at], trace.length[at], trace.width[at], trace.ended,
-    )  # fmt: skip
+    return trace.select(i, dict(zip([trace.actors[k] for k in at], ("ego", "co"), strict=False)))
 
 
 def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "") -> Metric:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.metrics.geometry import contact_share
+from sbt.metrics.geometry import contact_share, part_pairs
 from sbt.metrics.longitudinal import first_contact
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, Trace
@@ -37,9 +37,18 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str = "co") -> Vector:
 
     At most 5 s, and 0 from the first contact on. Beyond the end of its path an actor goes straight ahead.
     """
-    a, b = trace.actor(ego), trace.actor(other)
-    after = np.arange(0.0, HORIZON + 0.5 * _STEP, _STEP)
     times = np.full(len(trace.time), HORIZON)
+    for a, b in part_pairs(trace.actor(ego), trace.actor(other)):
+        _predict_contacts(a, b, times)
+    contact = first_contact(trace, ego, other)
+    if contact is not None:
+        times[contact:] = 0.0
+    return np.minimum(times, HORIZON)
+
+
+def _predict_contacts(a: ActorTrace, b: ActorTrace, times: Vector) -> None:
+    """Lower the (t,) times to those until two rectangles touch."""
+    after = np.arange(0.0, HORIZON + 0.5 * _STEP, _STEP)
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width))
     farthest = HORIZON * (np.abs(a.speed) + np.abs(b.speed)) + reach
     near = np.flatnonzero(np.hypot(b.x - a.x, b.y - a.y) <= farthest)
@@ -50,10 +59,6 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str = "co") -> Vector:
         rows, steps = np.nonzero(np.hypot(dx[:, 1:], dy[:, 1:]) <= reach + moved)  # circumscribed circles first
         share = contact_share(_states(a, p, rows, steps + 1), _states(b, q, rows, steps + 1), dx[rows, steps], dy[rows, steps])
         np.minimum.at(times, near[rows], _STEP * (steps + share))
-    contact = first_contact(trace, ego, other)
-    if contact is not None:
-        times[contact:] = 0.0
-    return np.minimum(times, HORIZON)
 
 
 def _predict(actor: ActorTrace, rows: np.ndarray, after: Vector) -> _Prediction:

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from sbt.metrics.geometry import contact_index, contact_share, rectangle_distance, select_instants, time_to_contact
+from sbt.metrics.geometry import contact_index, contact_share, part_pairs, rectangle_distance, select_instants, time_to_contact
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
@@ -148,6 +148,8 @@ def _smallest_shift(a: ActorTrace, b: ActorTrace, limit: int) -> int | None:
 
     Circles around the rectangles, enlarged by the motion in a step, select the pairs of instants to be tested.
     """
+    if a.parts or b.parts:
+        return min((k for p, q in part_pairs(a, b) if (k := _smallest_shift(p, q, limit)) is not None), default=None)
     moved = sum(float(np.hypot(np.diff(c.x), np.diff(c.y)).max(initial=0.0)) for c in (a, b))
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + moved
     near = (b.x[None, :] - a.x[:, None]) ** 2 + (b.y[None, :] - a.y[:, None]) ** 2 <= reach**2  # (t, t)
@@ -186,18 +188,25 @@ def _shifted(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, Ac
     own, other = select_instants(a, slice(n)), select_instants(b, slice(whole, whole + n))
     if share == 0:
         return own, other
-    after = select_instants(b, slice(whole + 1, whole + 1 + n))
-    turn = after.heading - other.heading
-    return own, replace(
-        other,
-        x=other.x + share * (after.x - other.x),
-        y=other.y + share * (after.y - other.y),
-        heading=other.heading + share * np.arctan2(np.sin(turn), np.cos(turn)),
+    return own, _between(other, select_instants(b, slice(whole + 1, whole + 1 + n)), share)
+
+
+def _between(actor: ActorTrace, after: ActorTrace, share: float) -> ActorTrace:
+    """Return an actor between two states of each instant, at a share of the way."""
+    turn = after.heading - actor.heading
+    return replace(
+        actor,
+        x=actor.x + share * (after.x - actor.x),
+        y=actor.y + share * (after.y - actor.y),
+        heading=actor.heading + share * np.arctan2(np.sin(turn), np.cos(turn)),
+        parts=tuple(_between(p, q, share) for p, q in zip(actor.parts, after.parts, strict=True)),
     )
 
 
 def _paths_near(a: ActorTrace, b: ActorTrace) -> bool:
     """Return whether the bounding boxes of the two paths overlap."""
+    if a.parts or b.parts:
+        return any(_paths_near(p, q) for p, q in part_pairs(a, b))
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width))
     return all(u.min() - reach <= v.max() and v.min() - reach <= u.max() for u, v in ((a.x, b.x), (a.y, b.y)))
 

@@ -18,10 +18,11 @@ import numpy as np
 
 from sbt.errors import InputError
 from sbt.metrics.exposure import integral
+from sbt.metrics.geometry import part_pairs
 from sbt.metrics.longitudinal import FAR
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.scenario import Metric
-from sbt.problem.trace import Trace
+from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["Rss", "lateral_margin", "longitudinal_margin", "rss_lateral_min", "rss_longitudinal_min", "rss_violation"]
 
@@ -110,7 +111,17 @@ class _Relation:
 
 
 def _relation(trace: Trace, ego: str, other: str) -> _Relation:
-    a, b = trace.actor(ego), trace.actor(other)
+    found = [_relation_of(a, b) for a, b in part_pairs(trace.actor(ego), trace.actor(other))]
+    if len(found) == 1:
+        return found[0]
+    apart = np.stack([np.maximum(r.gap, r.clearance) for r in found])  # (pairs, t)
+    nearest = np.where(np.isnan(apart), np.inf, apart).argmin(axis=0)
+    rows = np.arange(len(nearest))
+    fields = ("gap", "clearance", "ahead", "left", "turn")
+    return _Relation(*(np.stack([getattr(r, name) for r in found])[nearest, rows] for name in fields))
+
+
+def _relation_of(a: ActorTrace, b: ActorTrace) -> _Relation:
     cos, sin = np.cos(a.heading), np.sin(a.heading)
     dx, dy, turn = b.x - a.x, b.y - a.y, b.heading - a.heading
     along, across = dx * cos + dy * sin, dy * cos - dx * sin

@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-__all__ = ["Job", "Outcome", "Status"]
+__all__ = ["LISTED_ONLY", "UNCONFIRMED", "Job", "Outcome", "Status"]
+
+UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
+"""How the text begins of a contact that SUMO's own list does not have, and of an entry of that list without a contact."""
 
 
 class Status(StrEnum):
@@ -46,4 +49,4 @@ class Outcome:
     collisions: str = ""
     """SUMO's own collision list, as a cross-check of the geometric verdict"""
     unconfirmed: str = ""
-    """contacts that SUMO's own list does not confirm, and what differs"""
+    """contacts that SUMO's own list does not confirm, entries of it without a contact, and what differs"""

@@ -8,7 +8,8 @@ where the trace is recorded.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +18,19 @@ from sbt.errors import RunError
 from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 
-__all__ = ["ActorTrace", "Trace"]
+__all__ = ["ActorTrace", "Trace", "select_parts"]
 
 States = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class ActorTrace:
-    """One actor of a trace: (t,) arrays and the size of its rectangle."""
+    """One actor of a trace: (t,) arrays and the size of its rectangle.
+
+    Attributes:
+        parts: rectangles that follow each other, the front one first, where the body bends: a long vehicle in a bend.
+            Their shape is that of the actor; its own rectangle is straight. Empty: the rectangle is the shape.
+    """
 
     x: Vector
     y: Vector
@@ -33,6 +39,15 @@ class ActorTrace:
     acceleration: Vector
     length: float
     width: float
+    parts: tuple[ActorTrace, ...] = ()
+
+
+def select_parts(parts: tuple[ActorTrace, ...], i: slice | NDArray[Any]) -> tuple[ActorTrace, ...]:
+    """Return the parts of an actor at some instants only."""
+    return tuple(
+        ActorTrace(p.x[i], p.y[i], p.heading[i], p.speed[i], p.acceleration[i], p.length, p.width, select_parts(p.parts, i))
+        for p in parts
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +65,8 @@ class Trace:
         ended: why the run ended, such as "collision" or "duration".
         reported: SUMO's own collision list ("collider>victim@time"), a cross-check only.
         signals: name to (t,) numbers recorded beside the states, such as what the ego perceived.
+        parts: name to the parts of a long vehicle (`ActorTrace.parts`), NaN where it is not there.
+        unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`).
 
     In traffic road users come and go: where one is not there, all its states are NaN (`present`).
 
@@ -71,6 +88,8 @@ class Trace:
     ended: str = ""
     reported: tuple[str, ...] = field(default=())
     signals: Mapping[str, Vector] = field(default_factory=dict)
+    parts: Mapping[str, tuple[ActorTrace, ...]] = field(default_factory=dict)
+    unconfirmed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.actors))
@@ -99,8 +118,28 @@ class Trace:
         k = self.actors.index(name)
         return ActorTrace(
             self.x[:, k], self.y[:, k], self.heading[:, k], self.speed[:, k], self.acceleration[:, k],
-            float(self.length[k]), float(self.width[k]),
+            float(self.length[k]), float(self.width[k]), self.parts.get(name, ()),
         )  # fmt: skip
+
+    def select(self, i: slice, actors: Mapping[str, str] | None = None) -> Trace:
+        """Return some instants, of all actors or of some under new names.
+
+        Args:
+            i: the instants.
+            actors: name in this trace to name in the result, in its order; None: all. Signals are those of all actors.
+        """
+        names = self.actors if actors is None else tuple(actors)
+        at: slice | list[int] = slice(None) if actors is None else [self.actors.index(name) for name in names]
+        new = dict(zip(names, names, strict=True)) if actors is None else actors
+        parts = {new[name]: select_parts(self.parts[name], i) for name in names if name in self.parts}
+        some = Trace(
+            self.time[i], tuple(new.values()), self.x[i][:, at], self.y[i][:, at], self.heading[i][:, at], self.speed[i][:, at],
+            self.acceleration[i][:, at], self.length[at], self.width[at], self.ended, parts=parts,
+        )  # fmt: skip
+        if actors is not None:
+            return some
+        signals = {name: v[i] for name, v in self.signals.items()}
+        return replace(some, reported=self.reported, signals=signals, unconfirmed=self.unconfirmed)
 
     def signal(self, name: str) -> Vector:
         """Return the (t,) values of one signal.
@@ -119,7 +158,13 @@ class Trace:
         same = all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in arrays)
         same = same and list(self.signals) == list(other.signals)
         same = same and all(np.array_equal(values, other.signals[name]) for name, values in self.signals.items())
-        return same and (self.actors, self.ended, self.reported) == (other.actors, other.ended, other.reported)
+        texts = ("actors", "ended", "reported", "unconfirmed")
+        same = same and all(getattr(self, name) == getattr(other, name) for name in texts)
+        return same and self.parts.keys() == other.parts.keys() and self._part_states() == other._part_states()
+
+    def _part_states(self) -> list[bytes]:
+        """Return the states of all parts, for comparison."""
+        return [getattr(p, s).tobytes() for parts in self.parts.values() for p in parts for s in ("x", "y", "heading")]
 
     def rows(self) -> list[dict[str, float | str]]:
         """Return one dictionary a time and actor that is there, for a CSV file."""

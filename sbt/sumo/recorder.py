@@ -1,9 +1,9 @@
 """Records the ego of a user's own simulation and the road users around it, and ends the run.
 
 The recorder is called after every step of SUMO, made by the user's loop or by this package. The ego is a vehicle
-id; from the step of its departure on, vehicles and persons within a radius are recorded (by a context
-subscription, whose cost does not grow with the traffic elsewhere), and named ones at any distance. The states of a
-road user that is not present are NaN in the trace.
+id; from the step of its departure on, the road users around it are recorded (`sbt.sumo.surroundings`). The states of a
+road user that is not present are NaN in the trace. A contact of the ego ends the run, and is compared with SUMO's own
+list of collisions (`sbt.sumo.contacts`).
 """
 
 from __future__ import annotations
@@ -17,22 +17,15 @@ from typing import Any, NoReturn
 import numpy as np
 
 from sbt.errors import InputError, RunError
-from sbt.metrics.geometry import contact_index
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
-from sbt.sumo.actors import State
+from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, listed_only, unconfirmed_contact
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture
 from sbt.sumo.ego_vehicle import ControlStep, EgoVehicle
-from sbt.sumo.session import INVALID_DOUBLE
+from sbt.sumo.surroundings import Surroundings
 
 __all__ = ["Recorder", "RecordingSettings", "RunEnded"]
 
-_POSITION, _ANGLE, _SPEED, _VEHICLE = 0x39, 0x43, 0x40, 0xC3
-"""TraCI variables: VAR_POSITION3D, VAR_ANGLE, VAR_SPEED, VAR_VEHICLE (the vehicle a person rides in)."""
-_VEHICLES, _PERSONS = 0xA4, 0xAE
-"""TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
-_LEVEL_HEIGHT = 3.0
-"""Difference in height above which two road users are on different levels, such as on and under a bridge (m)."""
 _CLOCK_STEPS = 64
 """Steps between two looks at the wall clock."""
 
@@ -98,14 +91,11 @@ class Recorder:
         self._departed = False
         self._start = sumo.simulation.getTime()
         self._dt = float(sumo.simulation.getDeltaT())
-        self._states: dict[str, State] = {}
-        self._centre_offsets: dict[str, float] = {}
-        self._present: list[str] = []
-        self._rows: list[dict[str, tuple[float, ...]]] = []
+        self._surroundings = Surroundings(sumo, self._ego, settings.within, settings.named, self._dt)
         self._control: ControlStep | None = None
-        self._named_present: set[str] = set()
         self._collisions: list[str] = []
-        self._given_speeds: Mapping[str, float] = {}
+        self._listed: dict[str, float] = {}
+        self._differing: dict[str, str] = {}
         self._ended: RunEnded | None = None
         self._steps = 0
         self._timeout = timeout
@@ -123,7 +113,7 @@ class Recorder:
 
     def give_speeds(self, speeds: Mapping[str, float]) -> None:
         """Record these speeds (m/s) in the next step instead of SUMO's, of road users that are moved by position."""
-        self._given_speeds = speeds
+        self._surroundings.given_speeds = speeds
 
     def expect_departure(self, name: str, requested: RequestedDeparture) -> None:
         """Compare the departure of a vehicle that the loop adds with what it requests."""
@@ -132,6 +122,15 @@ class Recorder:
     def ignore_departure(self, name: str) -> None:
         """Do not compare the departure of a vehicle that the loop moves or removes."""
         self._departures.ignore(name)
+
+    def take_as_rigid(self, name: str) -> None:
+        """Take the body of a vehicle that the loop moves by poses as a rectangle, however long it is."""
+        self._surroundings.rigid.add(name)
+
+    @property
+    def warning(self) -> str:
+        """What the user is told about the network, "" for nothing."""
+        return self._surroundings.levels.warning
 
     def before_step(self) -> None:
         """Let the controller of the ego act.
@@ -142,9 +141,9 @@ class Recorder:
         if self._ended is not None:
             raise self._ended
         if self._control is not None and self._departed:
-            t = (len(self._rows) - 1) * self._dt
-            others = tuple(self._states[name] for name in self._present if name != self._ego)
-            self._control(t, self._states[self._ego], others)
+            near = self._surroundings
+            others = tuple(near.states[name] for name in near.present if name != self._ego)
+            self._control(self._t, near.states[self._ego], others)
 
     def after_step(self) -> None:
         """Record the step.
@@ -157,7 +156,7 @@ class Recorder:
         simulation = self._sumo.simulation
         departed, arrived = frozenset(simulation.getDepartedIDList()), frozenset(simulation.getArrivedIDList())
         self._departures.after_step(departed)
-        self._named_present = (self._named_present | departed.intersection(self._settings.named)) - arrived
+        self._surroundings.follow(departed, arrived)
         if not self._departed:
             if self._ego not in departed:
                 self._check_waiting()
@@ -168,12 +167,6 @@ class Recorder:
         if self._ego in simulation.getStartingTeleportIDList():
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but SUMO teleported it at {self._now()}")
         self._record_step()
-        if simulation.getCollidingVehiclesNumber():
-            self._collisions += [f"{c.collider}>{c.victim}@{self._t:.3f}" for c in simulation.getCollisions()]
-        if self._ego_in_contact():
-            self._end("collision")
-        if self._t >= self._settings.duration - 0.5 * self._dt:
-            self._end("duration")
 
     def _end(self, reason: str) -> NoReturn:
         self._ended = RunEnded(reason)
@@ -186,7 +179,7 @@ class Recorder:
 
     @property
     def _t(self) -> float:
-        return (len(self._rows) - 1) * self._dt
+        return (len(self._surroundings) - 1) * self._dt
 
     def _now(self) -> str:
         return f"t = {self._sumo.simulation.getTime():g} s"
@@ -202,10 +195,8 @@ class Recorder:
 
     def _start_recording(self) -> None:
         """Subscribe to the surroundings of the ego, and give it its controller."""
-        vehicle, radius = self._sumo.vehicle, self._settings.within
         self._departed = True
-        vehicle.subscribeContext(self._ego, _VEHICLES, radius, [_POSITION, _ANGLE, _SPEED])
-        vehicle.subscribeContext(self._ego, _PERSONS, radius, [_POSITION, _ANGLE, _SPEED, _VEHICLE])
+        self._surroundings.subscribe()
         self._control = self._settings.ego.take_over(self._sumo, self._rng)
 
     def _handle_arrival(self) -> None:
@@ -216,55 +207,49 @@ class Recorder:
         raise RunError(Status.FAILED, f"{rule}, but it left after {self._t + self._dt:g} s, at the end of its route: {remedy}")
 
     def _record_step(self) -> None:
-        """Append the states of all road users that are present."""
-        near = self._sumo.vehicle.getContextSubscriptionResults(self._ego)
-        if self._ego not in near:
-            raise RunError(Status.FAILED, f"the ego '{self._ego}' must stay on the road, but it was gone at {self._now()}")
-        height = near[self._ego][_POSITION][2]
-        row: dict[str, tuple[float, ...]] = {}
-        self._record(row, self._ego, near[self._ego])
-        for name in sorted(near):
-            variables = near[name]
-            if name != self._ego and not variables.get(_VEHICLE) and abs(variables[_POSITION][2] - height) < _LEVEL_HEIGHT:
-                self._record(row, name, variables)
-        for name in sorted(self._named_present - set(near)):
-            vehicle = self._sumo.vehicle
-            state = vehicle.getPosition3D(name), vehicle.getAngle(name), vehicle.getSpeed(name)
-            self._record(row, name, dict(zip((_POSITION, _ANGLE, _SPEED), state, strict=True)))
-        self._present = list(row)
-        self._rows.append(row)
+        """Record the states, SUMO's list of collisions, and contacts; end the run at a contact of the ego."""
+        near = self._surroundings
+        near.record()
+        touched = near.touching()
+        if self._sumo.simulation.getCollidingVehiclesNumber():
+            self._record_collisions({name for name, *_ in touched})
+        if touched:
+            self._judge(touched)
+            self._end("collision")
+        if self._t >= self._settings.duration - 0.5 * self._dt:
+            self._end("duration")
 
-    def _record(self, row: dict[str, tuple[float, ...]], name: str, variables: Mapping[int, Any]) -> None:
-        """Record one state; SUMO's position is the front of a vehicle and the centre of a person, ours is the centre."""
-        x, y = variables[_POSITION][:2]
-        if x == INVALID_DOUBLE:
-            return
-        state = self._states.get(name)
-        if state is None:
-            domain = self._sumo.person if _VEHICLE in variables else self._sumo.vehicle
-            state = State(name, float(domain.getLength(name)), float(domain.getWidth(name)), self._dt)
-            self._states[name] = state
-            self._centre_offsets[name] = 0.0 if _VEHICLE in variables else 0.5 * state.length
-        if variables[_ANGLE] != state.angle:
-            state.turn(variables[_ANGLE])
-        half, speed = self._centre_offsets[name], float(self._given_speeds.get(name, variables[_SPEED]))
-        before = self._rows[-1].get(name) if self._rows else None
-        state.acceleration = 0.0 if before is None else (speed - before[3]) / self._dt
-        state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed
-        row[name] = (state.x, state.y, state.heading, speed, state.acceleration)
+    def _record_collisions(self, touched: set[str]) -> None:
+        """Record what SUMO lists in this step, and what differs where the bodies of a listed pair do not touch."""
+        listed = [(c.collider, c.victim) for c in self._sumo.simulation.getCollisions()]
+        self._collisions += [f"{collider}>{victim}@{self._t:.3f}" for collider, victim in listed]
+        for other in {b if a == self._ego else a for a, b in listed if self._ego in (a, b)} - touched:
+            if self._t - self._listed.get(other, -math.inf) > CONFIRMED_WITHIN:
+                persons = [name for name in (self._ego, other) if self._surroundings.is_person(name)]
+                apart = self._surroundings.distance(other)
+                self._differing[other] = listed_only(self._sumo, self._ego, other, self._t, apart, persons=persons)
+            self._listed[other] = self._t
 
-    def _ego_in_contact(self) -> bool:
-        """Return whether the ego has touched another road user since the last step."""
-        ego, rows = self._states[self._ego], self._rows[-2:]
-        for name in self._present:
-            other = self._states[name]
-            reach = ego.length + other.length + (ego.speed + other.speed) * self._dt
-            if name == self._ego or abs(other.x - ego.x) > reach or abs(other.y - ego.y) > reach:
-                continue
-            both = [row for row in rows if name in row]
-            if contact_index(_columns(both, ego), _columns(both, other)) is not None:
-                return True
-        return False
+    def _judge(self, touched: list[tuple[str, ActorTrace, ActorTrace]]) -> None:
+        """Tell apart the contacts that SUMO's list does not confirm; it may list them some steps later."""
+        sumo, near = self._sumo, self._surroundings
+        texts = {}
+        for name, *rectangles in touched:
+            persons = [one for one in (self._ego, name) if near.is_person(one)]
+            texts[name] = unconfirmed_contact(
+                sumo, self._ego, name, self._t, (rectangles[0], rectangles[1]), persons=persons, moved=near.rigid
+            )
+        listed = {name for name, t in self._listed.items() if self._t - t <= CONFIRMED_WITHIN} | collisions_of(sumo, self._ego)
+        for k in range(1, math.ceil(CONFIRMED_WITHIN / self._dt) + 1):
+            if texts.keys() <= listed or self._ego not in sumo.vehicle.getIDList():
+                break
+            sumo.simulationStep()
+            found = collisions_of(sumo, self._ego) & texts.keys() - listed
+            self._collisions += [f"{self._ego}>{name}@{self._t + k * self._dt:.3f}" for name in sorted(found)]
+            listed |= found
+        for name in listed:
+            self._differing.pop(name, None)
+        self._differing |= {name: text for name, text in texts.items() if name not in listed}
 
     def trace(self, ended: str) -> Trace:
         """Return the recorded trace; states of absent road users are NaN.
@@ -272,25 +257,6 @@ class Recorder:
         Raises:
             RunError: the ego never departed.
         """
-        if not self._rows:
-            raise RunError(
-                Status.INVALID, f"the ego '{self._ego}' must depart, but had not when the loop ended at {self._now()}"
-            )
-        names = tuple(self._states)
-        column = {name: k for k, name in enumerate(names)}
-        table = np.full((len(self._rows), len(names), 5), np.nan)
-        for i, row in enumerate(self._rows):
-            for name, state in row.items():
-                table[i, column[name]] = state
-        x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
-        return Trace(
-            np.arange(len(table), dtype=np.float64) * self._dt, names, x, y, heading, speed, acceleration,
-            np.array([self._states[n].length for n in names]), np.array([self._states[n].width for n in names]),
-            ended, tuple(self._collisions),
-        )  # fmt: skip
-
-
-def _columns(rows: list[dict[str, tuple[float, ...]]], state: State) -> ActorTrace:
-    """Return the (t,) columns of one actor, which is present in all rows."""
-    x, y, heading, speed, acceleration = np.array([row[state.name] for row in rows]).T
-    return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width)
+        if not len(self._surroundings):
+            raise RunError(Status.INVALID, f"the ego '{self._ego}' must depart, but had not when the loop ended at {self._now()}")
+        return self._surroundings.trace(ended, self._collisions, list(self._differing.values()))

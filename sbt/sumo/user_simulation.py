@@ -334,6 +334,8 @@ class _CommandProxy:
             self._expect(*args, **kwargs)
         elif self._domain == "vehicle" and name.startswith(("moveTo", "remove")) and args:
             self._proxy.recorder.ignore_departure(str(args[0]))
+            if name == "moveToXY":
+                self._proxy.recorder.take_as_rigid(str(args[0]))
         return result
 
     def _expect(

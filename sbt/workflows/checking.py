@@ -138,8 +138,9 @@ def _digest(trace: Trace) -> str:
         trace.acceleration,
         trace.length,
         trace.width,
+        *(getattr(part, name) for parts in trace.parts.values() for part in parts for name in ("x", "y", "heading")),
     )
-    digest = hashlib.blake2b("/".join(trace.actors).encode(), digest_size=16)
+    digest = hashlib.blake2b("/".join((*trace.actors, *trace.unconfirmed)).encode(), digest_size=16)
     for column in columns:
         digest.update(np.ascontiguousarray(column, dtype=np.float64).tobytes())
     return digest.hexdigest()

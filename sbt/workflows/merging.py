@@ -170,4 +170,4 @@ class _Recalled:
                     f"run {job.index} must be the one that the configuration plans, {dict(job.inputs)} with seed {job.seed}, "
                     f"but the shard has {dict(r.inputs)} with seed {r.seed}: it was made by another version"
                 )
-            yield Outcome(r.index, Status(r.status), r.metrics, r.reason, r.seconds, r.collisions)
+            yield Outcome(r.index, Status(r.status), r.metrics, r.reason, r.seconds, r.collisions, r.unconfirmed)

@@ -1,0 +1,171 @@
+"""What SUMO's own list of collisions says of a contact, and why it says less or more than geometry.
+
+A contact is that of the bodies' rectangles. It is confirmed where SUMO lists the pair within one second. SUMO looks
+along lanes, and in junctions at lanes that it knows to conflict; it never compares bodies side by side across the
+border of lanes, nor a vehicle with a pedestrian on a normal edge (measured: libsumo 1.28). So a contact that it does
+not list is told apart, with what differs, and so is a collision that it lists where no bodies touch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from sbt.metrics.geometry import overlap_depth
+from sbt.problem.outcome import LISTED_ONLY, UNCONFIRMED
+from sbt.problem.trace import ActorTrace
+
+__all__ = ["CONFIRMED_WITHIN", "collisions_of", "listed_only", "unconfirmed_contact"]
+
+CONFIRMED_WITHIN = 1.0
+"""Time between a contact and its entry in SUMO's list, before or after (s)."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a road user is: its lane, the edges under its body, and the junctions at which they begin or end."""
+
+    name: str
+    lane: str
+    person: bool
+    edges: frozenset[str]
+    nodes: frozenset[str]
+
+    @property
+    def edge(self) -> str:
+        return self.lane.rpartition("_")[0]
+
+    @property
+    def junction(self) -> str:
+        """The junction that it is in; "" on a normal edge."""
+        return self.edge[1:].rpartition("_")[0] if self.lane.startswith(":") else ""
+
+
+def collisions_of(sumo: Any, name: str) -> set[str]:
+    """Return who collides with a road user now, by SUMO's list."""
+    pairs = [(c.collider, c.victim) for c in sumo.simulation.getCollisions()]
+    return {b if a == name else a for a, b in pairs if name in (a, b)}
+
+
+def unconfirmed_contact(
+    sumo: Any, ego: str, other: str, t: float, rectangles: tuple[ActorTrace, ActorTrace], *,
+    persons: Iterable[str] = (), moved: Iterable[str] = (), prefix: str = "",
+) -> str:  # fmt: skip
+    """Return what differs where SUMO does not list a contact.
+
+    Args:
+        sumo: libsumo or traci, at the step of the contact.
+        ego: the road user under test.
+        other: whom it touched.
+        t: time of the contact in the trace (s).
+        rectangles: of the ego and of the other that touch, at the last one or two instants.
+        persons: which of the two are persons.
+        moved: which of the two are moved by poses and not by SUMO.
+        prefix: of all ids in SUMO, left out in the text.
+    """
+    a, b = (_place(sumo, prefix + name, person=name in set(persons)) for name in (ego, other))
+    depth = float(overlap_depth(*rectangles)[-1])
+    size = f"bodies overlap by {depth:.2f} m" if depth > 0 else "bodies touch within the step and are apart at its end"
+    return f"{UNCONFIRMED}'{other}' at {t:.3f} s: {_why(sumo, a, b, set(moved), prefix)}; {size}".replace(prefix or "\0", "")
+
+
+def listed_only(sumo: Any, ego: str, other: str, t: float, apart: float | None, *, persons: Iterable[str] = ()) -> str:
+    """Return what differs where SUMO lists a collision, but the bodies do not touch.
+
+    Args:
+        sumo: libsumo or traci, at the step of the entry.
+        ego: the road user under test.
+        other: the one that SUMO names with it.
+        t: time of the entry in the trace (s).
+        apart: distance of their bodies (m); None where the other is not recorded.
+        persons: which of the two are persons.
+    """
+    a, b = (_place(sumo, name, person=name in set(persons)) for name in (ego, other))
+    gap = "the other is not recorded" if apart is None else f"bodies are {apart:.2f} m apart"
+    if a.lane == b.lane != "" and not a.junction:
+        why = f"on lane '{a.lane}' SUMO compares positions along the lane, not sideways"
+    elif a.junction or b.junction:
+        why = f"at junction '{a.junction or b.junction}' SUMO's shapes differ (rears as its lanes have them)"
+    else:
+        why = f"SUMO sees both on the lane of one ('{a.lane}', '{b.lane}'), such as during a change of lanes"
+    return f"{LISTED_ONLY}'{other}' at {t:.3f} s: {gap}; {why}"
+
+
+def _place(sumo: Any, name: str, *, person: bool) -> _Place:
+    domain = sumo.person if person else sumo.vehicle
+    lane = domain.getLaneID(name)
+    edges = {lane.rpartition("_")[0]} - {""}
+    if edges and not person and domain.getLanePosition(name) < domain.getLength(name):  # its rear is further back
+        route, k = domain.getRoute(name), max(domain.getRouteIndex(name), 0)
+        left, back = domain.getLength(name) - domain.getLanePosition(name), k if lane.startswith(":") else k - 1
+        while back >= 0 and left > 0:
+            edges.add(route[back])
+            left, back = left - sumo.lane.getLength(f"{route[back]}_0"), back - 1
+    ends = (node for edge in edges for node in (sumo.edge.getFromJunction(edge), sumo.edge.getToJunction(edge)))
+    return _Place(name, lane, person, frozenset(edges), frozenset(ends))
+
+
+def _why(sumo: Any, a: _Place, b: _Place, moved: set[str], prefix: str) -> str:
+    """Return why SUMO does not list this pair."""
+    for one in (a, b):
+        if one.name.removeprefix(prefix) in moved:
+            return f"'{one.name}' is moved by poses, and SUMO compares only what it moves along lanes"
+        if not one.lane:
+            return f"'{one.name}' is on no lane, and SUMO compares only what is on lanes"
+    if a.person or b.person:
+        return _why_person(*((a, b) if a.person else (b, a)))
+    if a.lane == b.lane:
+        return _why_lane(sumo, a, b)
+    if a.edge == b.edge and not a.junction:
+        return f"side by side on lanes '{a.lane}' and '{b.lane}', and SUMO compares along one lane only{_sublane(sumo)}"
+    if not a.nodes & b.nodes:
+        return f"'{a.edge}' and '{b.edge}' overlap in the plane but share no junction, and SUMO never compares them"
+    if a.junction and a.junction == b.junction:
+        foes = b.lane in sumo.lane.getInternalFoes(a.lane) or a.lane in sumo.lane.getInternalFoes(b.lane)
+        if foes:
+            return f"in junction '{a.junction}' SUMO's shapes (cars with corners cut off, rears on their lanes) do not overlap"
+        return f"in junction '{a.junction}' lanes '{a.lane}' and '{b.lane}' do not conflict, and SUMO never compares them"
+    if a.junction or b.junction:
+        inside, outside = (a, b) if a.junction else (b, a)
+        return (
+            f"'{inside.name}' is in junction '{inside.junction}' and '{outside.name}' on lane '{outside.lane}' beside it,"
+            " and SUMO compares a junction's own lanes only"
+        )
+    if a.edges & b.edges:
+        return (
+            f"the rear of one reaches back beside the other (lanes '{a.lane}' and '{b.lane}'), and SUMO compares along one lane"
+        )
+    opposite = sumo.edge.getFromJunction(a.edge) == sumo.edge.getToJunction(b.edge) and a.nodes == b.nodes
+    how = "oncoming, across the middle of the road" if opposite else "on different roads at a junction"
+    return f"{how} (lanes '{a.lane}' and '{b.lane}'), and SUMO compares along one lane only"
+
+
+def _why_person(person: _Place, vehicle: _Place) -> str:
+    if not person.junction:
+        return f"'{person.name}' walks on edge '{person.edge}', and SUMO compares pedestrians with vehicles only on crossings"
+    if vehicle.person:
+        return "SUMO does not compare pedestrians with each other"
+    return (
+        f"'{person.name}' is on '{person.edge}' and '{vehicle.name}' on lane '{vehicle.lane}': SUMO compares a crossing with the"
+        " vehicles of lanes that cross it, by shapes with corners cut off"
+    )
+
+
+def _why_lane(sumo: Any, a: _Place, b: _Place) -> str:
+    """Return how far apart SUMO sees two vehicles of one lane."""
+    at = {one.name: sumo.vehicle.getLanePosition(one.name) for one in (a, b)}
+    front = a if at[a.name] >= at[b.name] else b
+    rear = b if front is a else a
+    gap = at[front.name] - sumo.vehicle.getLength(front.name) - at[rear.name]
+    if gap >= 0:
+        return f"along lane '{a.lane}' SUMO sees a gap of {gap:.2f} m"
+    sideways = abs(sumo.vehicle.getLateralLanePosition(a.name) - sumo.vehicle.getLateralLanePosition(b.name))
+    return f"on lane '{a.lane}' SUMO sees them {-gap:.2f} m into each other and {sideways:.2f} m sideways{_sublane(sumo)}"
+
+
+def _sublane(sumo: Any) -> str:
+    """Return a hint where SUMO does not look sideways."""
+    resolution = float(sumo.simulation.getOption("lateral-resolution") or 0.0)
+    return "" if resolution > 0 and math.isfinite(resolution) else " (no sublane model: lateral-resolution is not set)"

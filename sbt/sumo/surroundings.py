@@ -1,0 +1,293 @@
+"""The road users around the ego of a user's own simulation: their states at every step, and whether they touch it.
+
+Vehicles and persons within a radius are read by a context subscription, whose cost does not grow with the traffic
+elsewhere; named ones at any distance. Those on another level than the ego (a bridge) are left out. A long vehicle is
+recorded with the parts that follow its front (`sbt.sumo.trailing`); a very long one, such as a train, also while only
+its rear is within the radius.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sbt.errors import RunError
+from sbt.metrics.geometry import contact_part, rectangle_distance
+from sbt.problem.outcome import Status
+from sbt.problem.trace import ActorTrace, Trace
+from sbt.sumo.actors import State
+from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
+from sbt.sumo.session import INVALID_DOUBLE
+from sbt.sumo.trailing import LONGEST_RIGID, Pose, TrailingBody, path_behind
+
+__all__ = ["Surroundings"]
+
+_POSITION, _ANGLE, _SPEED, _VEHICLE = 0x39, 0x43, 0x40, 0xC3
+"""TraCI variables: VAR_POSITION3D, VAR_ANGLE, VAR_SPEED, VAR_VEHICLE (the vehicle a person rides in)."""
+_VEHICLES, _PERSONS = 0xA4, 0xAE
+"""TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
+_VERY_LONG = 20.0
+"""Length from which on a vehicle may be near although its front is not within the radius (m)."""
+_SLACK = 1e-6
+"""Below this distance (m) of two rectangles the quick separation test does not decide, but the exact one."""
+
+_Row = tuple[float, ...]
+_Rectangle = tuple[float, float, float, float, float]
+"""x, y (m), heading (rad), length and width (m)."""
+
+
+class Surroundings:
+    """The ego and the road users around it, step by step.
+
+    Args:
+        sumo: libsumo or traci, started.
+        ego: id of the vehicle under test.
+        within: radius (m).
+        named: vehicles or persons that are recorded at any distance.
+        dt: step (s).
+
+    Attributes:
+        states: the last state of every road user seen so far; the ego first.
+        present: names of those that are there now, the ego first.
+        rigid: vehicles that are moved by poses; their bodies are rectangles, however long.
+        given_speeds: recorded in the next step instead of SUMO's, of road users that are moved by position (m/s).
+    """
+
+    def __init__(self, sumo: Any, ego: str, within: float, named: Iterable[str], dt: float):
+        self._sumo, self._ego, self._within, self._dt = sumo, ego, within, dt
+        self._named = frozenset(named)
+        self._named_present: set[str] = set()
+        self._very_long: dict[str, float] = {}
+        self._centre_offsets: dict[str, float] = {}
+        self._bodies: dict[str, TrailingBody] = {}
+        self._rows: list[dict[str, _Row]] = []
+        self._parts: list[dict[str, tuple[Pose, ...]]] = []
+        self.states: dict[str, State] = {}
+        self.present: list[str] = []
+        self.rigid: set[str] = set()
+        self.given_speeds: Mapping[str, float] = {}
+        self.levels = levels_of(sumo)
+        self.follow(sumo.vehicle.getIDList())
+
+    def __len__(self) -> int:
+        """Return the number of recorded instants."""
+        return len(self._rows)
+
+    def is_person(self, name: str) -> bool:
+        """Return whether a recorded road user is a person."""
+        return self._centre_offsets.get(name) == 0.0
+
+    def follow(self, departed: Iterable[str], arrived: Iterable[str] = ()) -> None:
+        """Note who came and who left, near or far."""
+        for name in arrived:
+            self._very_long.pop(name, None)
+            self._named_present.discard(name)
+        length = self._sumo.vehicle.getLength
+        for name in departed:
+            if (extent := length(name)) > _VERY_LONG:
+                self._very_long[name] = extent
+            if name in self._named:
+                self._named_present.add(name)
+
+    def subscribe(self) -> None:
+        """Subscribe to the surroundings of the ego, which has just departed."""
+        vehicle = self._sumo.vehicle
+        vehicle.subscribeContext(self._ego, _VEHICLES, self._within, [_POSITION, _ANGLE, _SPEED])
+        vehicle.subscribeContext(self._ego, _PERSONS, self._within, [_POSITION, _ANGLE, _SPEED, _VEHICLE])
+
+    def record(self) -> None:
+        """Append the states of all road users that are present.
+
+        Raises:
+            RunError: the ego is not on the road.
+        """
+        ego, near = self._ego, self._sumo.vehicle.getContextSubscriptionResults(self._ego)
+        if ego not in near:
+            now = self._sumo.simulation.getTime()
+            raise RunError(Status.FAILED, f"the ego '{ego}' must stay on the road, but it was gone at t = {now:g} s")
+        row: dict[str, _Row] = {}
+        parts: dict[str, tuple[Pose, ...]] = {}
+        before = self._rows[-1] if self._rows else {}
+        self._record(row, parts, before, ego, near[ego])
+        height = near[ego][_POSITION][2]
+        apart = self.levels.apart.get(self._sumo.vehicle.getRoadID(ego)) if self.levels.apart else None
+        for name in sorted([*near, *self._far(near)] if self._very_long else near):
+            variables = near[name] if name in near else self._read(name)
+            if name == ego or variables.get(_VEHICLE) or abs(variables[_POSITION][2] - height) >= LEVEL_HEIGHT:
+                continue
+            if apart is None or self._road(name, variables) not in apart:
+                self._record(row, parts, before, name, variables)
+        for name in sorted(self._named_present - set(near) - set(row)):
+            self._record(row, parts, before, name, self._read(name))
+        self.present = list(row)
+        self._rows.append(row)
+        self._parts.append(parts)
+
+    def _far(self, near: Mapping[str, Any]) -> list[str]:
+        """Return the very long vehicles whose rear may be within the radius although their front is not."""
+        x, y = near[self._ego][_POSITION][:2]
+        found = []
+        for name, length in self._very_long.items():
+            if name not in near:
+                u, v = self._sumo.vehicle.getPosition(name)
+                if math.hypot(u - x, v - y) <= self._within + length:
+                    found.append(name)
+        return found
+
+    def _read(self, name: str) -> dict[int, Any]:
+        vehicle = self._sumo.vehicle
+        return {_POSITION: vehicle.getPosition3D(name), _ANGLE: vehicle.getAngle(name), _SPEED: vehicle.getSpeed(name)}
+
+    def _road(self, name: str, variables: Mapping[int, Any]) -> str:
+        road: str = (self._sumo.person if _VEHICLE in variables else self._sumo.vehicle).getRoadID(name)
+        return road
+
+    def _record(
+        self, row: dict[str, _Row], parts: dict[str, tuple[Pose, ...]], before: Mapping[str, _Row], name: str,
+        variables: Mapping[int, Any],
+    ) -> None:  # fmt: skip
+        """Record one state; SUMO's position is the front of a vehicle and the centre of a person, ours is the centre."""
+        x, y = variables[_POSITION][:2]
+        if x == INVALID_DOUBLE:
+            return
+        state = self.states.get(name)
+        if state is None:
+            state = self._first_seen(name, (x, y), variables)
+        if variables[_ANGLE] != state.angle:
+            state.turn(variables[_ANGLE])
+        half, speed = self._centre_offsets[name], float(self.given_speeds.get(name, variables[_SPEED]))
+        last = before.get(name)
+        state.acceleration = 0.0 if last is None else (speed - last[3]) / self._dt
+        state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed
+        row[name] = (state.x, state.y, state.heading, speed, state.acceleration)
+        if name in self._bodies and name not in self.rigid:
+            lane = self._sumo.vehicle.getLaneID(name)
+            parts[name] = self._bodies[name].move((x, y), state.cos, state.sin, lane, speed * self._dt)
+
+    def _first_seen(self, name: str, front: tuple[float, float], variables: Mapping[int, Any]) -> State:
+        person = _VEHICLE in variables
+        domain = self._sumo.person if person else self._sumo.vehicle
+        state = self.states[name] = State(name, float(domain.getLength(name)), float(domain.getWidth(name)), self._dt)
+        self._centre_offsets[name] = 0.0 if person else 0.5 * state.length
+        if not person and state.length > LONGEST_RIGID:
+            self._bodies[name] = TrailingBody(state.length, path_behind(self._sumo, name, front, state.length))
+        return state
+
+    def touching(self) -> list[tuple[str, ActorTrace, ActorTrace]]:
+        """Return who has touched the ego since the last step, with the rectangles that touch: the ego's and the other's."""
+        ego, found = self.states[self._ego], []
+        x, y, reach_0 = ego.x, ego.y, 1.5 * ego.length
+        for name in self.present:
+            if name == self._ego:
+                continue
+            other = self.states[name]
+            reach = reach_0 + 1.5 * other.length + (ego.speed + other.speed) * self._dt
+            if abs(other.x - x) > reach or abs(other.y - y) > reach:
+                continue
+            if not self._near(name):
+                continue
+            touched = contact_part(self._step_of(self._ego, name), self._step_of(name, name))
+            if touched is not None:
+                found.append((name, *touched[1:]))
+        return found
+
+    def distance(self, name: str) -> float | None:
+        """Return the distance between the bodies of the ego and another road user now (m); None where it is not there."""
+        if name not in self.present:
+            return None
+        at = [len(self._rows) - 1]
+        own, other = (self._track(who, at, [self._rows[-1][who]]) for who in (self._ego, name))
+        return float(rectangle_distance(own, other)[0])
+
+    def _near(self, name: str) -> bool:
+        """Return whether no axis of a rectangle separates any of the ego's from the other's during the last step."""
+        now, before = len(self._rows) - 1, max(len(self._rows) - 2, 0)
+        before = before if name in self._rows[before] else now
+        own_0, own, other_0, other = (self._rectangles(who, k) for who in (self._ego, name) for k in (before, now))
+        return any(
+            not _separate(a, b, a_0, b_0)
+            for a, a_0 in zip(own, own_0, strict=True)
+            for b, b_0 in zip(other, other_0, strict=True)
+        )
+
+    def _rectangles(self, name: str, k: int) -> list[_Rectangle]:
+        """Return the rectangles of a road user at an instant."""
+        state, poses = self.states[name], self._parts[k].get(name)
+        if poses and name not in self.rigid:
+            length = self._bodies[name].part_length
+            return [(*pose, length, state.width) for pose in poses]
+        x, y, heading = self._rows[k][name][:3]
+        return [(x, y, heading, state.length, state.width)]
+
+    def _step_of(self, name: str, other: str) -> ActorTrace:
+        """Return the last two instants of a road user, or the last one if the other was not there before."""
+        at = [k for k in (len(self._rows) - 2, len(self._rows) - 1) if k >= 0 and other in self._rows[k]]
+        return self._track(name, at, [self._rows[k][name] for k in at])
+
+    def _track(self, name: str, at: Sequence[int], rows: Sequence[_Row]) -> ActorTrace:
+        """Return the columns of one road user at some instants, at which it is present."""
+        state = self.states[name]
+        x, y, heading, speed, acceleration = np.array(rows).T
+        parts: tuple[ActorTrace, ...] = ()
+        if name in self._bodies and name not in self.rigid:
+            poses = np.array([self._parts[k][name] for k in at])  # (t, parts, 3)
+            parts = _parts(poses, speed, acceleration, self._bodies[name].part_length, state.width)
+        return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width, parts)
+
+    def trace(self, ended: str, reported: Sequence[str], unconfirmed: Sequence[str]) -> Trace:
+        """Return the recorded trace; states of absent road users are NaN."""
+        names = tuple(self.states)
+        column = {name: k for k, name in enumerate(names)}
+        table = np.full((len(self._rows), len(names), 5), np.nan)
+        at = [(i, column[name]) for i, row in enumerate(self._rows) for name in row]
+        i, j = np.array(at).T
+        table[i, j] = np.array([state for row in self._rows for state in row.values()])
+        x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
+        return Trace(
+            np.arange(len(table), dtype=np.float64) * self._dt, names, x, y, heading, speed, acceleration,
+            np.array([self.states[n].length for n in names]), np.array([self.states[n].width for n in names]),
+            ended, tuple(reported), parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
+            unconfirmed=tuple(unconfirmed),
+        )  # fmt: skip
+
+    def _bent(self) -> list[str]:
+        """Return the long vehicles whose parts were recorded at every instant."""
+        return [n for n in self._bodies if n not in self.rigid and any(n in parts for parts in self._parts)]
+
+    def _parts_of(self, name: str, table: np.ndarray) -> tuple[ActorTrace, ...]:
+        """Return the parts of a long vehicle over all instants, NaN where it is not there."""
+        body, state = self._bodies[name], self.states[name]
+        poses = np.full((len(self._rows), body.count, 3), np.nan)
+        for k, parts in enumerate(self._parts):
+            if name in parts:
+                poses[k] = parts[name]
+        return _parts(poses, table[:, 3], table[:, 4], body.part_length, state.width)
+
+
+def _parts(poses: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, length: float, width: float) -> tuple[ActorTrace, ...]:
+    """Return the parts of a long vehicle from their (t, parts, 3) poses."""
+    return tuple(
+        ActorTrace(poses[:, j, 0], poses[:, j, 1], poses[:, j, 2], speed, acceleration, length, width)
+        for j in range(poses.shape[1])
+    )
+
+
+def _separate(a: _Rectangle, b: _Rectangle, a_0: _Rectangle, b_0: _Rectangle) -> bool:
+    """Return whether an axis of one rectangle separates both during a whole step, from the states _0 on."""
+    dx, dy, dx_0, dy_0 = b[0] - a[0], b[1] - a[1], b_0[0] - a_0[0], b_0[1] - a_0[1]
+    turn = b[2] - a[2]
+    c, s = abs(math.cos(turn)), abs(math.sin(turn))
+    for one, other in ((a, b), (b, a)):
+        cos, sin = math.cos(one[2]), math.sin(one[2])
+        reach = 0.5 * (one[3] + c * other[3] + s * other[4]) + _SLACK
+        along, along_0 = dx * cos + dy * sin, dx_0 * cos + dy_0 * sin
+        if (along > reach and along_0 > reach) or (along < -reach and along_0 < -reach):
+            return True
+        reach = 0.5 * (one[4] + s * other[3] + c * other[4]) + _SLACK
+        left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
+        if (left > reach and left_0 > reach) or (left < -reach and left_0 < -reach):
+            return True
+    return False
