@@ -25,22 +25,41 @@ CONFIRMED_WITHIN = 1.0
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a road user is: its lane, the edges under its body, and the junctions at which they begin or end."""
+    """Where a road user is: its lane, the edges under its body, and the junctions at which they begin or end.
 
-    name: str
-    lane: str
+    `prefix` begins all ids in SUMO; the properties for people leave it out.
+    """
+
+    id: str
+    raw_lane: str
     person: bool
     edges: frozenset[str]
     nodes: frozenset[str]
+    prefix: str = ""
+
+    def _plain(self, name: str) -> str:
+        return name.replace(self.prefix, "", 1) if self.prefix else name
+
+    @property
+    def name(self) -> str:
+        return self._plain(self.id)
+
+    @property
+    def lane(self) -> str:
+        return self._plain(self.raw_lane)
 
     @property
     def edge(self) -> str:
         return self.lane.rpartition("_")[0]
 
     @property
+    def raw_edge(self) -> str:
+        return self.raw_lane.rpartition("_")[0]
+
+    @property
     def junction(self) -> str:
         """The junction that it is in; "" on a normal edge."""
-        return self.edge[1:].rpartition("_")[0] if self.lane.startswith(":") else ""
+        return self.edge[1:].rpartition("_")[0] if self.raw_lane.startswith(":") else ""
 
 
 def collisions_of(sumo: Any, name: str) -> set[str]:
@@ -65,10 +84,10 @@ def unconfirmed_contact(
         moved: which of the two are moved by poses and not by SUMO.
         prefix: of all ids in SUMO, left out in the text.
     """
-    a, b = (_place(sumo, prefix + name, person=name in set(persons)) for name in (ego, other))
+    a, b = (_place(sumo, name, prefix, person=name in set(persons)) for name in (ego, other))
     depth = float(overlap_depth(*rectangles)[-1])
     size = f"bodies overlap by {depth:.2f} m" if depth > 0 else "bodies touch within the step and are apart at its end"
-    return f"{UNCONFIRMED}'{other}' at {t:.3f} s: {_why(sumo, a, b, set(moved), prefix)}; {size}".replace(prefix or "\0", "")
+    return f"{UNCONFIRMED}'{other}' at {t:.3f} s: {_why(sumo, a, b, set(moved))}; {size}"
 
 
 def listed_only(sumo: Any, ego: str, other: str, t: float, apart: float | None, *, persons: Iterable[str] = ()) -> str:
@@ -93,8 +112,8 @@ def listed_only(sumo: Any, ego: str, other: str, t: float, apart: float | None, 
     return f"{LISTED_ONLY}'{other}' at {t:.3f} s: {gap}; {why}"
 
 
-def _place(sumo: Any, name: str, *, person: bool) -> _Place:
-    domain = sumo.person if person else sumo.vehicle
+def _place(sumo: Any, name: str, prefix: str = "", *, person: bool) -> _Place:
+    domain, name = sumo.person if person else sumo.vehicle, prefix + name
     lane = domain.getLaneID(name)
     edges = {lane.rpartition("_")[0]} - {""}
     if edges and not person and domain.getLanePosition(name) < domain.getLength(name):  # its rear is further back
@@ -104,13 +123,13 @@ def _place(sumo: Any, name: str, *, person: bool) -> _Place:
             edges.add(route[back])
             left, back = left - sumo.lane.getLength(f"{route[back]}_0"), back - 1
     ends = (node for edge in edges for node in (sumo.edge.getFromJunction(edge), sumo.edge.getToJunction(edge)))
-    return _Place(name, lane, person, frozenset(edges), frozenset(ends))
+    return _Place(name, lane, person, frozenset(edges), frozenset(ends), prefix)
 
 
-def _why(sumo: Any, a: _Place, b: _Place, moved: set[str], prefix: str) -> str:
+def _why(sumo: Any, a: _Place, b: _Place, moved: set[str]) -> str:
     """Return why SUMO does not list this pair."""
     for one in (a, b):
-        if one.name.removeprefix(prefix) in moved:
+        if one.name in moved:
             return f"'{one.name}' is moved by poses, and SUMO compares only what it moves along lanes"
         if not one.lane:
             return f"'{one.name}' is on no lane, and SUMO compares only what is on lanes"
@@ -123,7 +142,8 @@ def _why(sumo: Any, a: _Place, b: _Place, moved: set[str], prefix: str) -> str:
     if not a.nodes & b.nodes:
         return f"'{a.edge}' and '{b.edge}' overlap in the plane but share no junction, and SUMO never compares them"
     if a.junction and a.junction == b.junction:
-        foes = b.lane in sumo.lane.getInternalFoes(a.lane) or a.lane in sumo.lane.getInternalFoes(b.lane)
+        pairs = ((a.raw_lane, b.raw_lane), (b.raw_lane, a.raw_lane))
+        foes = any(other in sumo.lane.getInternalFoes(lane) for lane, other in pairs)
         if foes:
             return f"in junction '{a.junction}' SUMO's shapes (cars with corners cut off, rears on their lanes) do not overlap"
         return f"in junction '{a.junction}' lanes '{a.lane}' and '{b.lane}' do not conflict, and SUMO never compares them"
@@ -137,7 +157,7 @@ def _why(sumo: Any, a: _Place, b: _Place, moved: set[str], prefix: str) -> str:
         return (
             f"the rear of one reaches back beside the other (lanes '{a.lane}' and '{b.lane}'), and SUMO compares along one lane"
         )
-    opposite = sumo.edge.getFromJunction(a.edge) == sumo.edge.getToJunction(b.edge) and a.nodes == b.nodes
+    opposite = sumo.edge.getFromJunction(a.raw_edge) == sumo.edge.getToJunction(b.raw_edge) and a.nodes == b.nodes
     how = "oncoming, across the middle of the road" if opposite else "on different roads at a junction"
     return f"{how} (lanes '{a.lane}' and '{b.lane}'), and SUMO compares along one lane only"
 
@@ -155,13 +175,13 @@ def _why_person(person: _Place, vehicle: _Place) -> str:
 
 def _why_lane(sumo: Any, a: _Place, b: _Place) -> str:
     """Return how far apart SUMO sees two vehicles of one lane."""
-    at = {one.name: sumo.vehicle.getLanePosition(one.name) for one in (a, b)}
-    front = a if at[a.name] >= at[b.name] else b
+    at = {one.id: sumo.vehicle.getLanePosition(one.id) for one in (a, b)}
+    front = a if at[a.id] >= at[b.id] else b
     rear = b if front is a else a
-    gap = at[front.name] - sumo.vehicle.getLength(front.name) - at[rear.name]
+    gap = at[front.id] - sumo.vehicle.getLength(front.id) - at[rear.id]
     if gap >= 0:
         return f"along lane '{a.lane}' SUMO sees a gap of {gap:.2f} m"
-    sideways = abs(sumo.vehicle.getLateralLanePosition(a.name) - sumo.vehicle.getLateralLanePosition(b.name))
+    sideways = abs(sumo.vehicle.getLateralLanePosition(a.id) - sumo.vehicle.getLateralLanePosition(b.id))
     return f"on lane '{a.lane}' SUMO sees them {-gap:.2f} m into each other and {sideways:.2f} m sideways{_sublane(sumo)}"
 
 

@@ -127,11 +127,6 @@ class Recorder:
         """Take the body of a vehicle that the loop moves by poses as a rectangle, however long it is."""
         self._surroundings.rigid.add(name)
 
-    @property
-    def warning(self) -> str:
-        """What the user is told about the network, "" for nothing."""
-        return self._surroundings.levels.warning
-
     def before_step(self) -> None:
         """Let the controller of the ego act.
 

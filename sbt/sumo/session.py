@@ -17,7 +17,7 @@ import io
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -225,6 +225,10 @@ class Session:
         finally:
             os.dup2(saved, 2)
             os.close(saved)
+
+    def ask(self, question: Callable[[Any], str]) -> str:
+        """Return the answer to a question about the network that is loaded; "" while none is."""
+        return question(self._sumo) if self._sumo.isLoaded() else ""
 
     def messages(self) -> tuple[str, ...]:
         """Return the lines that SUMO wrote to file descriptor 2 during the last run."""

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import RunError
-from sbt.metrics.geometry import contact_index
+from sbt.metrics.geometry import contact_part
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
+from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, unconfirmed_contact
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
 from sbt.sumo.session import INVALID_DOUBLE, unwrapped
@@ -48,6 +49,8 @@ class SumoRun:
         self._rows = bytearray((self._last + 1) * len(scene.actors) * _ROW.size)
         self._signals: list[tuple[float, ...]] = []
         self._collisions: list[str] = []
+        self._listed: dict[frozenset[str], float] = {}
+        self._unconfirmed: tuple[str, ...] = ()
         self._ended = ""
         self.advance, self.recorded = self._functions(sumo, prefix)
 
@@ -69,7 +72,10 @@ class SumoRun:
             k += 1
             t = k * dt
             observe(k)
-            ended = "collision" if touching(k) else until(t, by_name) if until is not None else None
+            touched = touching(k)
+            if touched is not None:
+                self._judge(sumo, prefix, t, touched)
+            ended = "collision" if touched is not None else until(t, by_name) if until is not None else None
             if not ended:
                 if k < last:
                     control(t)
@@ -86,7 +92,18 @@ class SumoRun:
 
     def record_collision(self, collider: str, victim: str) -> None:
         """Record a collision that SUMO reports for the state that `advance` will read next."""
-        self._collisions.append(f"{collider}>{victim}@{self.recorded() * self._dt:.3f}")
+        t = self.recorded() * self._dt
+        self._collisions.append(f"{collider}>{victim}@{t:.3f}")
+        self._listed[frozenset((collider, victim))] = t
+
+    def _judge(self, sumo: Any, prefix: str, t: float, touched: _Touch) -> None:
+        """Tell what differs where SUMO does not list the contact of the ego, with which the run ends."""
+        name, *rectangles = touched
+        ego, moved = self._scene.actors[0].name, [a.name for a in self._scene.actors if a.pose is not None]
+        listed = t - self._listed.get(frozenset((ego, name)), -np.inf) <= CONFIRMED_WITHIN
+        if not listed and prefix + name not in collisions_of(sumo, prefix + ego):
+            both = (rectangles[0], rectangles[1])
+            self._unconfirmed = (unconfirmed_contact(sumo, ego, name, t, both, moved=moved, prefix=prefix),)
 
     def trace(self) -> Trace:
         """Return the recorded trace, with the obstacles as standing actors."""
@@ -113,6 +130,7 @@ class SumoRun:
             self._ended,
             tuple(self._collisions),
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
+            unconfirmed=self._unconfirmed,
         )
 
 
@@ -219,8 +237,12 @@ def _table(rows: bytearray, first: int, last: int, actors: int) -> np.ndarray:
     return np.frombuffer(rows, np.float64, (last - first) * numbers, first * numbers * 8).reshape(-1, actors, _COLUMNS)
 
 
-def _contact_test(states: list[State], solid: list[int], rows: bytearray, dt: float) -> Callable[[int], bool]:
-    """Return the function that tells whether the first actor, the ego, touched another rectangle in the step to row k.
+_Touch = tuple[str, ActorTrace, ActorTrace]
+"""Who touched the ego, and the rectangles that touch: the ego's and the other's."""
+
+
+def _contact_test(states: list[State], solid: list[int], rows: bytearray, dt: float) -> Callable[[int], _Touch | None]:
+    """Return the function that tells which rectangle the first actor, the ego, touched in the step to row k; None for none.
 
     The exact test is left to pairs that are neither far apart nor separated by an axis of the ego's rectangle.
     """
@@ -229,7 +251,7 @@ def _contact_test(states: list[State], solid: list[int], rows: bytearray, dt: fl
     others = [(s, j, _ROW.size * j) for j, s in ((j, states[j]) for j in solid)]
     length, breadth = 0.5 * ego.length + _SLACK, 0.5 * ego.width + _SLACK
 
-    def touching(k: int) -> bool:
+    def touching(k: int) -> _Touch | None:
         x, y, speed = ego.x, ego.y, ego.speed
         for other, j, column in others:
             dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
@@ -246,9 +268,10 @@ def _contact_test(states: list[State], solid: list[int], rows: bytearray, dt: fl
                 if (left > across and left_0 > across) or (left < -across and left_0 < -across):
                     continue
                 step = _table(rows, max(k - 1, 0), k + 1, len(states))
-                if contact_index(_track(step, 0, ego), _track(step, j, other)) is not None:
-                    return True
-        return False
+                found = contact_part(_track(step, 0, ego), _track(step, j, other))
+                if found is not None:
+                    return other.name, found[1], found[2]
+        return None
 
     return touching
 

@@ -36,6 +36,7 @@ from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
 from sbt.sumo.formatting import plain, plain_values
 from sbt.sumo.guided import Motion, Participant
+from sbt.sumo.levels import levels_of
 from sbt.sumo.recorder import Recorder, RecordingSettings, RunEnded
 from sbt.sumo.session import scratch_folder, session
 
@@ -128,9 +129,10 @@ class UserSimulation:
         return self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"))
 
     def warnings(self) -> tuple[str, ...]:
-        """Return SUMO's warnings about the files in the last run of this process, each once."""
+        """Return SUMO's warnings about the files in the last run of this process, each once, and that on missing heights."""
         lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
-        return tuple(dict.fromkeys(line for line in lines if "time=" not in line))  # with a time it is about the traffic
+        found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
+        return (*filter(None, [session().ask(lambda sumo: levels_of(sumo).warning)]), *found)
 
     def run_with_traci(self, values: Mapping[str, float], seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
         """Run one concrete scenario in a separate SUMO process, such as sumo-gui, through traci.
