@@ -173,7 +173,8 @@ def test_a_collision_that_sumo_lists_is_confirmed_and_cars_are_one_rectangle(sim
 @pytest.mark.sumo
 def test_a_side_contact_across_lanes_stays_critical_and_says_why_sumo_does_not_list_it(simulate, tmp_path):
     network = net({"we": WEST_EAST}, lanes=2, width=2.2)
-    vehicles = vehicle("bus", "we", "bus", departPos=40, departSpeed=5) + vehicle("ego", "we", "wide", departLane=1, departPos=20.3)
+    vehicles = vehicle("bus", "we", "bus", departPos=40, departSpeed=5)
+    vehicles += vehicle("ego", "we", "wide", departLane=1, departPos=20.3)
     trace = simulate(network, vehicles, deaf("ego", "bus"))
     assert (trace.ended, len(trace.unconfirmed)) == ("collision", 1)
     assert "side by side on lanes 'we_1' and 'we_0'" in trace.unconfirmed[0]

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sbt.problem.trace import Trace
+from sbt.metrics.geometry import rectangles
+from sbt.problem.trace import ActorTrace, Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -209,10 +210,12 @@ class Scenery:
         """Draw everybody who is there at instant k; ego, and above it its opponent, on top."""
         others = [j for j in range(1, len(self._people)) if self._there[k, j] and j != self._opponent]
         shown = [j for j in (*others, 0, self._opponent) if j is not None and self._there[k, j]]
-        self._shapes.set_verts([self._outline(k, j) for j in shown])
-        self._shapes.set_facecolor([self._colors[j] for j in shown])
-        self._shapes.set_edgecolor([self._colors[j] if self._people[j] else "#333333" for j in shown])
-        self._shapes.set_linewidth([self._rim(j) for j in shown])
+        outlines = {j: self._outlines(k, j) for j in shown}
+        drawn = [j for j in shown for _ in outlines[j]]
+        self._shapes.set_verts([outline for j in shown for outline in outlines[j]])
+        self._shapes.set_facecolor([self._colors[j] for j in drawn])
+        self._shapes.set_edgecolor([self._colors[j] if self._people[j] else "#333333" for j in drawn])
+        self._shapes.set_linewidth([self._rim(j) for j in drawn])
         if self._opponent in shown and self._opponent is not None:
             x, y = (float(v[k, self._opponent]) for v in (self._trace.x, self._trace.y))
             self._name.set_text(self._trace.actors[self._opponent][:20])
@@ -239,16 +242,20 @@ class Scenery:
             return _RIM_OF_PERSON
         return (1.2 if j == self._opponent else 0.6) * (0.6 if self._colors[j] == BICYCLE else 1.0)
 
-    def _outline(self, k: int, j: int) -> np.ndarray:
-        """Return the outline of an actor: people are round, the nose of a vehicle that moves is pointed a little."""
-        t = self._trace
-        x, y, heading = float(t.x[k, j]), float(t.y[k, j]), float(t.heading[k, j])
-        a, b = 0.5 * float(t.length[j]), 0.5 * float(t.width[j])
+    def _outlines(self, k: int, j: int) -> list[np.ndarray]:
+        """Return the outlines of an actor: of its rectangle, or of the parts of a long vehicle, the front one on top."""
+        actor = self._trace.actor(self._trace.actors[j])
+        return [self._outline(k, j, part, nose=n == 0) for n, part in enumerate(rectangles(actor))][::-1]
+
+    def _outline(self, k: int, j: int, t: ActorTrace, *, nose: bool) -> np.ndarray:
+        """Return the outline of a rectangle: people are round, the nose of a vehicle that moves is pointed a little."""
+        x, y, heading = float(t.x[k]), float(t.y[k]), float(t.heading[k])
+        a, b = 0.5 * t.length, 0.5 * t.width
         if self._people[j] or a == b:
             around = np.linspace(0.0, 2.0 * math.pi, 13)
             local = np.stack([a * np.cos(around), b * np.sin(around)], axis=1)
         else:
-            nose = a if self._stands[j] else a - min(0.14 * a, 0.6)
-            local = np.array([[a, 0.5 * b], [nose, b], [-a, b], [-a, -b], [nose, -b], [a, -0.5 * b]])
+            sides = a - min(0.14 * a, 0.6) if nose and not self._stands[j] else a
+            local = np.array([[a, 0.5 * b], [sides, b], [-a, b], [-a, -b], [sides, -b], [a, -0.5 * b]])
         cos, sin = math.cos(heading), math.sin(heading)
         return np.asarray(local @ np.array([[cos, sin], [-sin, cos]]) + (x, y))

@@ -49,10 +49,8 @@ def metric_so_far(trace: Trace, metric: Metric, instants: Sequence[int]) -> Vect
 
 def _until(trace: Trace, metric: Metric, k: int) -> float:
     """Return the metric of the trace up to instant k, NaN if it has none."""
-    end = slice(0, k + 1)
-    states: dict[str, Any] = {name: getattr(trace, name)[end] for name in ("time", "x", "y", "heading", "speed", "acceleration")}
     try:
-        return metric(replace(trace, **states, signals={name: v[end] for name, v in trace.signals.items()}))
+        return metric(trace.select(slice(0, k + 1)))
     except RunError:
         return float("nan")
 
