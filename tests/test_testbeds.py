@@ -31,6 +31,8 @@ from sbt.workflows.study import Study
 
 ORACLE = Path(__file__).resolve().parents[2] / "shared" / "data" / "reference_problems.py"
 NAMES = testbeds.names()
+OWN = {"needle_half_fails", "hartmann6_third_fails", "wavy_half_fails"}
+REFERENCED = [name for name in NAMES if name not in OWN]
 SAMPLED = [name for name in NAMES if testbeds.truth(name).probability >= 8e-4]
 """probable enough for a short Monte Carlo"""
 
@@ -57,11 +59,11 @@ def cube(name: str, n: int, rng: np.random.Generator) -> Any:
 
 
 def test_names_are_those_of_the_reference(oracle: ModuleType) -> None:
-    assert set(NAMES) == set(oracle.names())
+    assert set(REFERENCED) == set(oracle.names())
     assert len(NAMES) == len(set(NAMES))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", REFERENCED)
 def test_values_and_verdicts_equal_the_reference(oracle: ModuleType, name: str) -> None:
     reference, mine = oracle.get(name), testbeds.find(name)
     for x in (reference.sample(2000, 1), reference.sample_box(2000, 2)):
@@ -72,7 +74,7 @@ def test_values_and_verdicts_equal_the_reference(oracle: ModuleType, name: str) 
     assert mine.noise == reference.noise_sd
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", REFERENCED)
 def test_truths_equal_the_reference(oracle: ModuleType, name: str) -> None:
     reference, truth = oracle.get(name), testbeds.truth(name)
     assert truth.probability == pytest.approx(reference.pf, rel=3e-8)
@@ -81,7 +83,7 @@ def test_truths_equal_the_reference(oracle: ModuleType, name: str) -> None:
         assert truth.box_fraction == pytest.approx(reference.box_fraction, rel=0.01)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", REFERENCED)
 def test_distributions_equal_the_reference(oracle: ModuleType, name: str) -> None:
     reference, space = oracle.get(name), testbeds.find(name).scenario().space
     z = np.vstack([stream(3, name).standard_normal((500, space.dimension)), np.full((2, space.dimension), [[-5.0], [5.0]])])

@@ -28,13 +28,14 @@ class BoundaryConclusion:
     """Shares of the input space as the metamodel sees them, and how much that is worth.
 
     Attributes:
-        critical_fraction: mean P(critical); None: there is no metamodel yet.
+        critical_fraction: mean P(critical) where a run gives a metric; None: there is no metamodel yet.
         expected_misclassified: mean of min(P, 1 - P).
         ambiguous_volume: share of the space with P between 0.05 and 0.95.
         validation: scores on held-out runs; None without such runs.
         weights: of a metamodel that mixes others, the share of each.
         chosen_because: and why.
         held_out_fraction: critical share of the held-out random runs, free of any model.
+        failing_fraction: mean P(a run gives no metric); None: all runs gave one.
     """
 
     critical_fraction: float | None
@@ -44,6 +45,7 @@ class BoundaryConclusion:
     weights: Mapping[str, float] | None = optional()
     chosen_because: str | None = optional()
     held_out_fraction: CriticalShare | None = None
+    failing_fraction: float | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -55,7 +57,10 @@ class BoundaryConclusion:
         measured = self.held_out_fraction if self.held_out_fraction is not None else share_among_held_out(facts)
         found = measured.sentence()
         if self.critical_fraction is not None:
-            found.append(f"The metamodel takes {percent(self.critical_fraction)} of the parameter space to be critical.")
+            where = "the parameter space" if self.failing_fraction is None else "what gives a metric"
+            found.append(f"The metamodel takes {percent(self.critical_fraction)} of {where} to be critical.")
+        if self.failing_fraction is not None:
+            found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
         if self.weights is not None:
             found.append(f"The metamodel chose among its members: {self.chosen_because}.")
         return found
@@ -84,8 +89,9 @@ def recipe(settings: Settings) -> Campaign:
             return BoundaryConclusion(None, None, None, None, held_out_fraction=held_out), None
         r = fitted.record
         return BoundaryConclusion(
-            r.critical_fraction, r.expected_misclassified, r.ambiguous_volume, r.validation, r.weights, r.chosen_because, held_out
-        ), fitted
+            r.critical_fraction, r.expected_misclassified, r.ambiguous_volume, r.validation, r.weights, r.chosen_because,
+            held_out, r.failing_fraction,
+        ), fitted  # fmt: skip
 
     return Campaign((BatchStage("boundary", settings, _rule(settings)),), conclude)
 

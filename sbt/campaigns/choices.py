@@ -143,7 +143,8 @@ def _score(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acqu
     def score(u: Points) -> Vector:
         if fitted is None or acquisition is even:
             return np.zeros(len(u))
-        return log_scores(acquisition, fitted.predict(u), critical, space.log_density(space.from_unit(u)))
+        found = log_scores(acquisition, fitted.predict(u), critical, space.log_density(space.from_unit(u)))
+        return found if fitted.log_success is None else found + fitted.log_success(u)  # a run that fails shows nothing
 
     return score
 
@@ -183,6 +184,8 @@ def _draw(
         draw = _particles(settings, score, bound, draw, label, n)
         if draw.method == "short":  # the score is -inf wherever one looks
             return _draw(settings, fitted, even, log, n, taken=taken, start=begin)
+    if len(draw.u) < n and fitted is not None and fitted.log_success is not None:  # too little of the space is worth a run
+        return _draw(settings, None, even, log, n, taken=taken, start=begin)
     if len(draw.u) < n:
         raise InputError(f"the constraints must admit {n} of {draw.candidates} candidates, but admitted {len(draw.u)}")
     return draw, scenario.space.from_unit(draw.u)

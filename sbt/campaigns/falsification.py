@@ -151,7 +151,8 @@ class SearchStage:
             if fitted is None:
                 return np.zeros(len(u))
             log_density = space.log_density(space.from_unit(u))
-            return log_scores(score, fitted.predict(u), s.scenario.requirement.critical, log_density)
+            found = log_scores(score, fitted.predict(u), s.scenario.requirement.critical, log_density)
+            return found if fitted.log_success is None else found + fitted.log_success(u)  # a run that fails shows nothing
 
         feasible = self.failure_search.search.feasible
         if fitted is not None and is_greedy(score):

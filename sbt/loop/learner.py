@@ -12,11 +12,12 @@ import numpy as np
 from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
+from sbt.metamodels.success import log_success
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
-from sbt.store.history import History
+from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord, Validation
 
 __all__ = ["FittedMetamodel", "Learner", "changed_share", "chunked"]
@@ -36,12 +37,14 @@ class FittedMetamodel:
         record: its scores, as the log keeps them.
         seconds: the fit took.
         log_ambiguity_bound: (n, d) points -> (n,) quick upper bounds of log a_BI; None: the metamodel has none.
+        log_success: (n, d) points -> (n,) log P(a run gives a metric); None: all runs so far did.
     """
 
     predict: Callable[[Points], Prediction]
     record: FitRecord
     seconds: float
     log_ambiguity_bound: Callable[[Points], Vector] | None = None
+    log_success: Callable[[Points], Vector] | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,18 @@ class Learner:
             def bound(points: Points) -> Vector:
                 return log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
 
-        return FittedMetamodel(predict, self._record(predict, predictor, history, len(training)), seconds, bound)
+        success = self.success(history)
+        record = self._record(predict, predictor, history, len(training), success)
+        return FittedMetamodel(predict, record, seconds, bound, success)
+
+    def success(self, history: History) -> Callable[[Points], Vector] | None:
+        """Return log P(a run gives a metric) at the inputs' (n, d) unit-cube points; None where all runs did, or none."""
+        space, runs = self.scenario.space, history.where(history.stage != VALIDATION)
+        if runs.ok.all():
+            return None
+        u = space.metamodel_inputs(space.to_unit(runs.x))
+        score = log_success(u, runs.ok, stream(self.seed, "success", len(runs)))
+        return None if score is None else lambda points: score(space.metamodel_inputs(points))
 
     def on_inputs(self, predictor: Predictor, learned: int) -> Predictor:
         """Return a predictor as a function of the inputs' (n, d) unit-cube points; derived features are added here."""
@@ -104,25 +118,30 @@ class Learner:
         left = ~pool.taken(history.x)
         return pool.x[left], pool.metrics[metric][left]
 
-    def _record(self, predict: Predictor, predictor: Predictor, history: History, learned: int) -> FitRecord:
+    def _record(
+        self, predict: Predictor, predictor: Predictor, history: History, learned: int,
+        success: Callable[[Points], Vector] | None,
+    ) -> FitRecord:  # fmt: skip
         """Return the scores of a fitted metamodel, and its classification of fixed points."""
         (x, y), critical = self.unseen(history), self.scenario.requirement.critical
         found: Any = scores(chunked(predict, self.scenario.space.to_unit(x)), y, critical) if len(y) else None
-        p = self._probe(predict)
+        u = self._probe()
+        p = predict(u).probability(critical)
+        ok = None if success is None else np.exp(success(u))
+        shares = [float(np.average(v, weights=ok)) for v in (p, np.minimum(p, 1.0 - p), (p > 0.05) & (p < 0.95))]
         comparison = getattr(getattr(predictor, "predictor", predictor), "comparison", None)  # also of a recalibrated one
         return FitRecord(
-            learned, float(p.mean()), float(np.minimum(p, 1.0 - p).mean()), float(((p > 0.05) & (p < 0.95)).mean()),
+            learned, shares[0], shares[1], shares[2],
             np.packbits(p > 0.5).tobytes().hex(), None if found is None else Validation(**found),
             None if comparison is None else dict(comparison.weights), None if comparison is None else comparison.reason,
+            failing_fraction=None if ok is None else float(1.0 - ok.mean()),
         )  # fmt: skip
 
-    def _probe(self, predict: Predictor) -> Points:
-        """Return P(critical) at 4,096 fixed points of the space."""
+    def _probe(self) -> Points:
+        """Return the feasible ones of 4,096 fixed points of the space."""
         space = self.scenario.space
         u = SobolSequence(space.dimension, self.seed).points(0, _PROBE)
-        if space.constraints:
-            u = u[space.feasible(space.from_unit(u))]
-        return predict(u).probability(self.scenario.requirement.critical)
+        return u[space.feasible(space.from_unit(u))] if space.constraints else u
 
 
 def chunked(predict: Predictor, u: Points) -> Prediction:

@@ -35,24 +35,25 @@ def probability_of_violation(model: WarpedModel, u: Points, best: float) -> Vect
 
 
 def lower_confidence_bound(model: WarpedModel, u: Points, best: float) -> Vector:
-    """Return (n,) minus the margin two standard deviations towards the critical interval.
+    """Return (n,) minus the margin two standard deviations, times P(a run gives a metric), towards the critical interval.
 
     Source:
         Cox and John (1992); kappa = 2.
     """
     del best
     p = model(u)
-    return _KAPPA * p.sigma - model.critical.margin(p.mu)
+    return _KAPPA * np.exp(model.log_success(u)) * p.sigma - model.critical.margin(p.mu)
 
 
 def log_expected_improvement(model: WarpedModel, u: Points, best: float) -> Vector:
-    """Return (n,) log E[max(best - margin, 0)], the margin measured from the end on which the mean lies.
+    """Return (n,) log E[max(best - margin, 0)], the margin measured from the end on which the mean lies; 0 if a run fails.
 
     Source:
         Ament et al. (2023), arXiv 2310.20708, eq. (9): stable far below the incumbent.
     """
     p = model(u)
-    return np.asarray(np.log(p.sigma) + _log_h((best - model.critical.margin(p.mu)) / p.sigma))
+    gain = np.log(p.sigma) + _log_h((best - model.critical.margin(p.mu)) / p.sigma)
+    return np.asarray(gain + model.log_success(u))
 
 
 def _log_h(z: Vector) -> Vector:
@@ -91,7 +92,7 @@ def propose_by(
     seen, d = search_data(search, u, y, batch, rng), u.shape[1]
     if len(seen.u) < 2:
         return Picks(fill_uniformly(seen.admissible, n, d, rng), (name,) * n)
-    model = fit_warped(search, seen.u, seen.y, rng)
+    model = fit_warped(search, seen.u, seen.y, rng, seen.success)
     margin = model.critical.margin(model.warp.values(seen.y))
     start = seen.u[np.argsort(margin, kind="stable")[:_STARTS]]
     best = float(margin.min())
@@ -109,7 +110,7 @@ def propose_by(
 
 def _thompson(model: WarpedModel, candidates: Points, n: int, rng: np.random.Generator) -> Points:
     """Return n points, each the best of a sample path over the candidates; no point twice."""
-    margin = model.critical.margin(model.sample_paths(candidates, n, rng))
+    margin = -model.expected(-model.critical.margin(model.sample_paths(candidates, n, rng)), candidates)
     picks = np.empty((n, candidates.shape[1]))
     for k in range(n):
         at = int(np.argmin(margin[k]))

@@ -53,9 +53,13 @@ def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generat
     seen, d = search_data(search, u, y, batch, rng), u.shape[1]
     if len(seen.u) < 2:
         return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n)
-    model = fit_warped(search, seen.u, seen.y, rng)
+    model = fit_warped(search, seen.u, seen.y, rng, seen.success)
     fresh = ~seen.flank
-    found = regions(seen.u[fresh], search.critical.margin(seen.y[fresh]), seen.batch[fresh])
+    found = regions(
+        np.vstack([seen.u[fresh], seen.failed]),
+        np.concatenate([search.critical.margin(seen.y[fresh]), np.full(len(seen.failed), np.inf)]),
+        np.concatenate([seen.batch[fresh], seen.failed_batch]),
+    )
     niches = _hopeful(model, found, seen.admissible, rng)
     drawn = _thompson(model, niches, round(_THOMPSON * n), d, rng)
     picks = _globally(model, drawn, n, u, niches, seen.admissible, rng)
@@ -96,11 +100,12 @@ def regions(u: Points, margin: Vector, batch: Vector) -> list[Region]:
 
     Args:
         u: (n, d) runs, none of them critical.
-        margin: (n,) distance of the metric to the critical interval.
+        margin: (n,) distance of the metric to the critical interval; inf where a run failed: it found no region, but tried.
         batch: (n,) number of the batch of each run, increasing.
     """
     found: list[Region] = []
-    left = margin < np.median(margin) if len(u) else np.zeros(0, dtype=bool)  # on a plateau no run is better than the others
+    finite = np.isfinite(margin)
+    left = margin < (np.median(margin[finite]) if finite.any() else -np.inf)  # on a plateau no run is better than the others
     while left.any() and len(found) < _MOST_REGIONS:
         best = int(np.flatnonzero(left)[np.argmin(margin[left])])
         near = np.abs(u - u[best]).max(axis=1) <= _APART
@@ -152,7 +157,9 @@ def _thompson(model: WarpedModel, niches: list[tuple[Region, Points]], n: int, d
     """
     if not niches:
         return np.empty((0, d))
-    drawn = [model.critical.margin(model.sample_paths(points, n, rng)) for _, points in niches]
+    drawn = [
+        -model.expected(-model.critical.margin(model.sample_paths(points, n, rng)), points) for _, points in niches
+    ]
     picks = np.empty((n, d))
     for k in range(n):
         which = (k // 2) % len(niches) if k % 2 else int(np.argmin([values[k].min() for values in drawn]))

@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sample_paths, with_target
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.success import LogSuccess, log_success
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -81,6 +82,7 @@ class WarpedModel:
         critical: M_c, warped.
         metamodel: what was fitted; errors name it.
         n: rows it learned from.
+        success: log P(a run gives a metric) at the metamodel's inputs; None: all runs did.
     """
 
     predictor: Predictor
@@ -89,6 +91,7 @@ class WarpedModel:
     critical: CriticalInterval
     metamodel: Metamodel
     n: int
+    success: LogSuccess | None = None
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction of the warped metric at u (n, d)."""
@@ -97,13 +100,24 @@ class WarpedModel:
             return check_prediction(self.predictor(inputs), len(u))
 
     def log_probability(self, u: Points, inflation: float = 1.0) -> Vector:
-        """Return (n,) log P(critical) at u, sigma multiplied by `inflation`."""
+        """Return (n,) log P(a run gives a metric and is critical) at u, sigma multiplied by `inflation`."""
         p = self(u)
         wide = Prediction(p.mean, inflation * p.std, p.weight, p.noise)
-        return wide.log_probability(self.critical)[0]
+        return wide.log_probability(self.critical)[0] + self.log_success(u)
+
+    def log_success(self, u: Points) -> Vector:
+        """Return (n,) log P(a run gives a metric) at u."""
+        return np.zeros(len(u)) if self.success is None else self.success(self.columns(u))
+
+    def expected(self, scores: Points, u: Points) -> Points:
+        """Return scores (..., n) at u, larger is better, in expectation: a run that fails counts as the worst of them."""
+        if self.success is None:
+            return scores
+        worst = scores.min(axis=-1, keepdims=True)
+        return np.asarray(worst + np.exp(self.log_success(u)) * (scores - worst))
 
     def probability(self, u: Points) -> Vector:
-        """Return (n,) P(critical) at u."""
+        """Return (n,) P(a run gives a metric and is critical) at u."""
         return np.exp(self.log_probability(u))
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
@@ -113,14 +127,16 @@ class WarpedModel:
             return sample_paths(self.predictor, inputs, n, rng)
 
 
-def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator) -> WarpedModel:
-    """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2."""
+def fit_warped(
+    search: Search, u: Points, y: Vector, rng: np.random.Generator, success: LogSuccess | None = None
+) -> WarpedModel:
+    """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2; `success` is passed on."""
     warp = Warp.around_edge(y, search.critical)
     critical = warp.interval(search.critical)
     inputs, warped = search.columns(u), warp.values(y)
     with named_errors(search.metamodel, len(y)):
         predictor = with_target(search.metamodel, critical).fit(inputs, warped, rng)
-    return WarpedModel(predictor, search.columns, warp, critical, search.metamodel, len(y))
+    return WarpedModel(predictor, search.columns, warp, critical, search.metamodel, len(y), success)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +188,9 @@ class SearchData:
     Args:
         u, y, batch: (m, d), (m,), (m,) runs that neither failed nor lie in a deflated basin.
         flank: (m,) the run lies just outside of a deflated basin: near-critical for what is known already.
-        admissible: (n, d) points to (n,) booleans: feasible and not deflated.
+        admissible: (n, d) points to (n,) booleans: feasible, not deflated, and a run there may well give a metric.
+        failed, failed_batch: (k, d), (k,) runs that gave no metric.
+        success: log P(a run gives a metric), as in `WarpedModel`.
     """
 
     u: Points
@@ -180,6 +198,9 @@ class SearchData:
     batch: Vector
     flank: Mask
     admissible: Callable[[Points], Mask]
+    failed: Points
+    failed_batch: Vector
+    success: LogSuccess | None = None
 
 
 def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.random.Generator) -> SearchData:
@@ -198,7 +219,13 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
     free = deflate(search, u[hit], rng, u.shape[1])
     left = ok & ~hit & free(u)
     flank = ~free(u[left], _FLANK)
-    return SearchData(u[left], y[left], number[left], flank, lambda points: search.feasible(points) & free(points))
+    success = log_success(search.columns(u), ok, rng)
+
+    def admissible(points: Points) -> Mask:
+        left = search.feasible(points) & free(points)
+        return left if success is None else left & np.isfinite(success(search.columns(points)))
+
+    return SearchData(u[left], y[left], number[left], flank, admissible, u[~ok], number[~ok], success)
 
 
 def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:

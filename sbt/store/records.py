@@ -102,7 +102,7 @@ class FitRecord:
 
     Attributes:
         learned: runs that it learned from.
-        critical_fraction: mean P(critical) over 4,096 fixed Sobol points of the space.
+        critical_fraction: mean P(critical) over 4,096 fixed Sobol points of the space, weighted by P(a run gives a metric).
         expected_misclassified: mean of min(P, 1 - P) there.
         ambiguous_volume: share of them with P between 0.05 and 0.95.
         sides: their classification, as hexadecimal bits.
@@ -110,6 +110,7 @@ class FitRecord:
         weights: of a metamodel that mixes others, the share of each.
         chosen_because: and why.
         fit_seconds, scoring_seconds: in benchmarks only.
+        failing_fraction: mean P(a run gives no metric) over the points; None: all runs gave one.
         runs, iteration: of the campaign when it was fitted.
     """
 
@@ -123,6 +124,7 @@ class FitRecord:
     chosen_because: str | None = optional()
     fit_seconds: float | None = optional()
     scoring_seconds: float | None = optional()
+    failing_fraction: float | None = optional()
     runs: int = 0
     iteration: int = 0
 

@@ -1,0 +1,53 @@
+"""Where runs succeed: P(a run gives a metric), learned from the runs that did and those that did not.
+
+A run that fails tells nothing about the metric, so that a metamodel of the metric alone stays uncertain where runs
+fail, and everything that looks for uncertainty goes there again and again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sbt.metamodels.base import Metamodel
+from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.problem.arrays import Mask, Points, Vector
+
+__all__ = ["LogSuccess", "log_success"]
+
+LogSuccess = Callable[[Points], Vector]
+"""(n, d) metamodel inputs -> (n,) log P(a run there gives a metric) <= 0, -inf where one is not worth the try."""
+
+_LEAST, _LEAST_OF_BASE = 0.1, 0.5
+"""Below the smaller of a tenth and half of the share of runs that succeed, a place is left to the space-filling runs."""
+_MOST_EXACT = 1000  # rows up to which a Gaussian process takes about a second; a forest is quicker from there on
+
+
+def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | None:
+    """Return log P(a run gives a metric) as a function of the metamodel's inputs; None where all runs did, or none.
+
+    A Gaussian process is fitted to the labels 0 and 1, and P is its mean: far from all runs that is the share of those that
+    succeed. Its log likelihood on new points was that of a Laplace-approximated classifier (docs/falsification.md). Where P is so
+    small that a run would most likely be lost, the log is -inf.
+
+    Args:
+        u: (n, d) metamodel inputs of all runs.
+        ok: (n,) the run gave a metric.
+        rng: of the fit.
+
+    Source:
+        Least-squares classification: Rasmussen and Williams (2006), Gaussian processes for machine learning, section 6.5.
+    """
+    if len(u) < 2 or ok.all() or not ok.any():
+        return None
+    metamodel: Metamodel = GaussianProcess() if len(u) <= _MOST_EXACT else ExtraTrees()
+    predictor, least = metamodel.fit(u, ok.astype(np.float64), rng), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
+
+    def score(points: Points) -> Vector:
+        p = np.clip(predictor(points).mu, 0.0, 1.0)
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(np.where(p < least, 0.0, p)))
+
+    return score

@@ -1,0 +1,92 @@
+"""Runs that fail: the campaigns learn where, and neither go there nor count it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt import testbeds
+from sbt.metamodels.success import log_success
+from sbt.seeds import stream
+
+AWAY = 0.25
+"""Largest share of the guided runs that may fail."""
+
+
+def campaign(kind: str, testbed: str, folder: Path, budget: int) -> sbt.Result:
+    return sbt.run(
+        campaign=kind, scenario=f"testbed:{testbed}", seed=1, budget=budget, executor="serial", store=folder / "s", report=False
+    )
+
+
+SHARES = {"needle_half_fails": 0.5, "hartmann6_third_fails": 0.379, "wavy_half_fails": 0.4987}
+
+
+@pytest.mark.parametrize(("name", "share"), SHARES.items())
+def test_the_testbeds_fail_where_they_say(name: str, share: float):
+    problem = testbeds.find(name)
+    y = problem.function(stream(1, name).random((100_000, len(problem.parameters))))
+    assert np.isnan(y).mean() == pytest.approx(share, abs=0.006)
+
+
+@pytest.mark.parametrize("testbed", ["needle_half_fails", "hartmann6_third_fails"])
+def test_a_search_stays_where_runs_give_a_metric(testbed: str, tmp_path: Path):
+    frame = campaign("falsification", testbed, tmp_path, 70).frame
+    guided = frame[frame.stage == "search"]
+    assert len(guided) > 50
+    assert (guided.status != "ok").mean() <= AWAY
+    assert frame.critical.fillna(False).any()
+
+
+def test_a_boundary_stays_there_and_states_shares_of_what_gives_a_metric(tmp_path: Path):
+    result = campaign("boundary", "wavy_half_fails", tmp_path, 150)
+    guided = result.frame[result.frame.stage == "boundary"]
+    assert len(guided) > 100
+    assert (guided.status != "ok").mean() <= AWAY
+    critical, failing = testbeds.truth("wavy_half_fails").probability, SHARES["wavy_half_fails"]
+    assert result.conclusion.failing_fraction == pytest.approx(failing, abs=0.06)
+    assert result.conclusion.critical_fraction == pytest.approx(critical / (1 - failing), rel=0.1)
+    assert "of the parameter space gives no metric" in result._repr_html_()
+
+
+@pytest.mark.parametrize("method", ["log_expected_improvement", "lower_confidence_bound", "thompson", "u"])
+def test_every_method_stays_there(method: str, tmp_path: Path):
+    result = sbt.run(
+        campaign="falsification", scenario="testbed:needle_half_fails", seed=2, budget=40, acquisition=method, executor="serial",
+        store=tmp_path / "s", report=False, stop={"failures": None},
+    )  # fmt: skip
+    guided = result.frame[result.frame.stage == "search"]
+    assert (guided.status != "ok").mean() <= AWAY
+
+
+def test_p_of_success_is_a_probability_and_never_learned_from_success_alone():
+    rng = stream(3, "success")
+    u = rng.random((60, 2))
+    assert log_success(u, np.ones(60, bool), rng) is None
+    assert log_success(u, np.zeros(60, bool), rng) is None
+    score = log_success(u, u[:, 0] < 0.5, rng)
+    assert score is not None
+    inside, outside = np.array([[0.1, 0.5]]), np.array([[0.9, 0.5]])
+    assert np.exp(score(inside)) > 0.9
+    assert score(outside) == -np.inf
+    at_random = log_success(u, rng.random(60) < 0.8, rng)  # failures that no input explains
+    assert at_random is not None
+    assert np.exp(at_random(rng.random((500, 2)))).mean() == pytest.approx(0.8, abs=0.12)
+
+
+def test_runs_that_fail_for_no_reason_do_not_stop_the_search(tmp_path: Path):
+    problem = testbeds.find("needle_d4_1e-3")
+
+    def flaky(values: dict[str, float], seed: int) -> dict[str, float]:
+        y = float(problem.function(np.array([list(values.values())]))[0])
+        return {"y": np.nan if stream(seed, "flaky").random() < 0.3 else y}
+
+    scenario = sbt.Scenario("flaky", inputs=problem.parameters, evaluate=flaky, requirement=sbt.Requirement("y", high=0.0))
+    result = sbt.run(
+        campaign="falsification", scenario=scenario, seed=1, budget=80, executor="serial", store=tmp_path / "s", report=False
+    )
+    assert result.frame.critical.fillna(False).any()
+    assert 0.15 < (result.frame.status != "ok").mean() < 0.45
