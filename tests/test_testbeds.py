@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from sbt import testbeds
 from sbt.config.load import parse
-from sbt.errors import InputError
+from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.plugins import load
 from sbt.problem.distribution import Distribution
@@ -174,7 +174,13 @@ def test_a_testbed_is_a_scenario_whose_runs_are_the_vectorised_values(name: str)
         problem = testbeds.find(written)
         assert scenario.name == f"testbed:{written}"
         assert "Source:" in scenario.description
-        x = scenario.space.sample(20, stream(4, written))
+        x = scenario.space.sample(40, stream(4, written))
+        fails = np.isnan(testbeds.values(written, x))
+        assert fails.any() == (name in OWN)
+        for row in x[fails]:
+            with pytest.raises(RunError, match="metric y must be finite"):
+                scenario.run(dict(zip(scenario.space.names, row.tolist(), strict=True)), seed=5)
+        x = x[~fails]
         y = [scenario.run(dict(zip(scenario.space.names, row.tolist(), strict=True)), seed=5)["y"] for row in x]
         if not problem.noise:
             np.testing.assert_allclose(y, testbeds.values(written, x), rtol=1e-12, atol=1e-12)
