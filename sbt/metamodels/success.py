@@ -11,8 +11,6 @@ from collections.abc import Callable
 import numpy as np
 
 from sbt.metamodels.base import Metamodel
-from sbt.metamodels.extra_trees import ExtraTrees
-from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.arrays import Mask, Points, Vector
 
 __all__ = ["LogSuccess", "log_success"]
@@ -42,6 +40,9 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
     """
     if len(u) < 2 or ok.all() or not ok.any():
         return None
+    from sbt.metamodels.extra_trees import ExtraTrees
+    from sbt.metamodels.gaussian_process import GaussianProcess
+
     metamodel: Metamodel = GaussianProcess() if len(u) <= _MOST_EXACT else ExtraTrees()
     predictor, least = metamodel.fit(u, ok.astype(np.float64), rng), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
 
