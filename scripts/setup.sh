@@ -1,5 +1,5 @@
 # Sourced by scripts/run and scripts/test: makes .venv beside this folder, once, from constraints.txt.
-# Usage: setup_venv EXTRAS, where EXTRAS is "" or a list such as "dev".
+# Usage: setup_venv EXTRAS, where EXTRAS is "" or a list such as "dev,tools".
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
@@ -20,7 +20,7 @@ find_python() {
 setup_venv() {
     local extras=$1 python wanted stamp
     wanted=$(cat "$root/pyproject.toml" "$root/constraints.txt" | cksum)
-    for stamp in "$root/.venv/.installed-$extras" "$root/.venv/.installed-dev"; do # dev holds all that the bare one does
+    for stamp in "$root/.venv/.installed-$extras" "$root/.venv/.installed-dev,tools"; do # which holds all that the bare one does
         if [ -x "$root/.venv/bin/sumo-sbt" ] && [ "$(cat "$stamp" 2>/dev/null)" = "$wanted" ]; then
             return 0
         fi
