@@ -69,7 +69,7 @@ def grid(folder: Path) -> Path:
     with gzip.open(folder / "traffic.rou.xml.gz", "wt") as file:
         file.write(f"<routes>\n{_cars(110, across, every=0.6, seed=2, kinds='truck bus')}</routes>\n")
     (folder / "more.add.xml").write_text(
-        f'<additional>\n  {_TYPES}\n  <inductionLoop id="loop" lane="A2B2_0" pos="50" period="10" file="loop.xml"/>\n'
+        f'<additional>\n  {_TYPES}\n  <inductionLoop id="loop" lane="A2B2_0" pos="50" period="10" file="loop_${{speed}}.xml"/>\n'
         '  <edgeData id="means" file="means.xml"/>\n</additional>\n'
     )
     return path

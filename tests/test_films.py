@@ -52,6 +52,7 @@ class Stored:
 def stored(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Stored:
     folder = tmp_path_factory.mktemp(request.param)
     path = FIVE[request.param](folder)
+    before = {p.name for p in folder.iterdir()}
     text = (
         f"campaign: coverage\nscenario: {path}\nbudget: 2\nbatch: 2\nvalidation: {{share: 0}}\n"
         f"executor: {{kind: serial}}\nstore: {folder}/store\n"
@@ -59,6 +60,7 @@ def stored(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     assert run_study(Study(parse(text)), report=False).ok == 2
     again = replay_run(folder / "store", 1)
     assert again.trace is not None
+    assert {p.name for p in folder.iterdir()} == before | {"store"}, "SUMO must not write beside the user's files"
     return Stored(folder, folder / "store", again.trace, again.scenario, again)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from sbt.errors import InputError
 from sbt.sumo.formatting import format_number
+from sbt.sumo.outputs import begin_outputs
 from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template
 
 __all__ = ["FIXED_OPTIONS", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
@@ -29,11 +30,17 @@ _DEFAULTS = {"step-length": "0.1", "time-to-teleport": "-1", "xml-validation.net
 """Where the user sets nothing else. SUMO's defaults are a step of 1 s, and teleporting after 300 s of waiting."""
 _ALIASES = {
     "n": "net-file", "net": "net-file", "r": "route-files", "a": "additional-files", "additional": "additional-files",
-    "w": "weight-files", "b": "begin", "e": "end", "c": "configuration-file",
+    "w": "weight-files", "b": "begin", "e": "end", "c": "configuration-file", "routes": "route-files", "weights": "weight-files",
+    "configuration": "configuration-file",
 }  # fmt: skip
 """Short names of options, as SUMO has them."""
 _FILES = ("net-file", "route-files", "additional-files")
-_OUTPUT = re.compile(r".*(-output|output-prefix|-log)$|save-state.*|save-configuration|save-template|log|l")
+_OUTPUT = re.compile(
+    r".*-output(\..*)?|output-prefix|output-suffix|(n|net)?(state-)?dump.*|netstate.*|(person-)?summary|(trip|person)info|person-fcd"
+    r"|(veh|person)routes(\..*)?|device\.(rerouting|taxi\..*)\.output|device\.(ssm|toc)\.file|pedestrian\.jupedsim\.(wkt|py)"
+    r"|save-.*|C|(.*-)?log(-file)?|l"
+)
+"""Options that make SUMO write files, their details, and their older names (of `sumo --save-template`)."""
 _GUI = ("gui-settings-file", "start", "quit-on-end", "delay", "window-size", "window-pos", "tracker-interval", "S", "Q", "d", "g")
 _NEWEST_NET_VERSION = (1, 20)
 """Version of the network files that SUMO 1.28 writes."""
@@ -83,7 +90,7 @@ class SumoFiles:
         named = {k: [_existing(k, name, folder, place) for name in _split(options.get(k, ""))] for k in _FILES}
         if len(named["net-file"]) != 1:
             raise InputError(f"{place}: a simulation needs one network (net-file), but got {len(named['net-file'])}")
-        others = {k: _absolute(k, v, folder) for k, v in options.items() if k not in _FILES}
+        others = {k: _absolute(k, v, folder) for k, v in options.items() if k not in _FILES and not _dropped(k)}
         net, routes, additional = (tuple(named[k]) for k in _FILES)
         return cls(others, net[0], routes, additional, dict.fromkeys(others, place))
 
@@ -105,7 +112,7 @@ class SumoFiles:
     def placeholders(self) -> Iterator[Placeholder]:
         """Yield all placeholders in files and options."""
         for one in self.templates:
-            yield from (p.placeholder for p in one.parts if p.placeholder is not None)
+            yield from (hole for part in one.parts for hole in part.holes)
         for name, value in self.options.items():
             yield from placeholders(value, f"{self.places.get(name, '')}: {name}")
 
@@ -128,6 +135,7 @@ class SumoFiles:
             RunError: a placeholder's value is not finite.
         """
         self.templates  # noqa: B018  (checks them before SUMO reads them)
+        outputs = begin_outputs(folder)
         written = {
             name: ",".join(str(template(path).write(values, folder)) for path in paths)
             for name, paths in zip(_FILES, ((self.net,), self.routes, self.additional), strict=True)
@@ -135,7 +143,7 @@ class SumoFiles:
         }
         given = {k: fill(v, values, self.places.get(k, "")) for k, v in self.options.items()}
         step = {} if step_length is None else {"step-length": format_number(step_length)}
-        options = {**_DEFAULTS, **given, **step, **FIXED_OPTIONS, **written}
+        options = {**_DEFAULTS, **given, **step, **FIXED_OPTIONS, **written, "device.ssm.file": str(outputs / "ssm.xml")}
         options.pop("seed", None)
         return Launch(tuple(part for name, value in options.items() for part in (f"--{name}", value)))
 

@@ -167,6 +167,13 @@ class Session:
                 self._flush()
                 raise
 
+    def close(self) -> None:
+        """End the simulation that is still loaded: only then the files that SUMO writes are complete."""
+        self._setup = None
+        if self._sumo.isLoaded():
+            with self._captured():
+                self._sumo.close()
+
     @contextlib.contextmanager
     def using(self, client: Any) -> Iterator[None]:
         """Use another client than libsumo for the runs in this context: traci, or an object with its interface."""

@@ -18,10 +18,12 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 from sbt.errors import InputError, RunError
 from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
+from sbt.sumo.outputs import MARKS, names_output, output_names, run_file
 
 __all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
 
@@ -46,12 +48,20 @@ class Placeholder:
 
 @dataclass(frozen=True)
 class _Part:
-    """Bytes of a file that are replaced in a copy: a placeholder, or the name of another file."""
+    """Bytes of a file that are replaced in a copy: a placeholder, or the name of another file or of one that SUMO writes."""
 
     start: int
     end: int
     placeholder: Placeholder | None = None
     target: Path | None = None
+    output: str | None = None
+    within: tuple[Placeholder, ...] = ()
+    """The placeholders in the name of an output."""
+
+    @property
+    def holes(self) -> tuple[Placeholder, ...]:
+        """Its placeholders."""
+        return self.within if self.placeholder is None else (self.placeholder,)
 
 
 class Vehicle(NamedTuple):
@@ -116,22 +126,27 @@ class Template:
     @cached_property
     def placeholders(self) -> tuple[Placeholder, ...]:
         """All placeholders, including those of included files."""
-        return tuple(p.placeholder for t in self.tree() for p in t.parts if p.placeholder is not None)
+        return tuple(hole for t in self.tree() for p in t.parts for hole in p.holes)
+
+    @cached_property
+    def copied(self) -> bool:
+        """Whether a run needs a copy: a placeholder is to be filled, or SUMO would write beside this file or an included one."""
+        return any(p.target is None for t in self.tree() for p in t.parts)
 
     def write(self, values: Mapping[str, float], folder: Path) -> Path:
-        """Return the file with its placeholders filled: a copy in `folder`, or the file itself if it has none.
+        """Return the file as a run in `folder` uses it: a copy with placeholders filled and outputs there, or the file itself.
 
         Raises:
             RunError: a formula is not finite for these values.
         """
-        if not self.placeholders:
+        if not self.copied:
             return self.path
         pieces, at = [], 0
         for part in self.parts:
             pieces += [self.data[at : part.start], self._replacement(part, values, folder)]
             at = part.end
-        name = self.path.name.removesuffix(".gz")
-        target = folder / f"{abs(hash(self.path)):x}-{name}"
+        target = folder / f"{abs(hash(self.path)):x}" / self.path.name.removesuffix(".gz")
+        target.parent.mkdir(exist_ok=True)
         target.unlink(missing_ok=True)  # the previous simulation may still have the old copy open
         target.write_bytes(b"".join([*pieces, self.data[at:]]))
         return target
@@ -139,6 +154,8 @@ class Template:
     def _replacement(self, part: _Part, values: Mapping[str, float], folder: Path) -> bytes:
         if part.placeholder is not None:
             return number(part.placeholder, values).encode()
+        if part.output is not None:
+            return quoteattr(str(run_file(folder, self.path, fill(part.output, values)))).encode()
         if part.target is None:
             raise InputError(f"a part of {self.path} must have a value or a file")
         target = template(part.target).write(values, folder)
@@ -207,7 +224,8 @@ def template(path: Path) -> Template:
     roots: list[tuple[str, Mapping[str, str]]] = []
     parts: list[_Part] = []
     vehicles: dict[str, Vehicle] = {}
-    has_parts = b"${" in data or any(b"<" + tag.encode() in data for tag in _REFERRING)
+    marks = (b"${", *(b"<" + tag.encode() for tag in _REFERRING), *MARKS)
+    has_parts = any(mark in data for mark in marks)
 
     def place() -> str:
         return f"{path}:{parser.CurrentLineNumber}:{parser.CurrentColumnNumber + 1}"
@@ -225,7 +243,7 @@ def template(path: Path) -> Template:
             varies = has_parts and any("${" in value for value in attributes.values())
             departure = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane"))
             vehicles[attributes["id"]] = Vehicle(tag, at, varies, *departure)
-        if has_parts and (tag in _REFERRING or any("${" in value for value in attributes.values())):
+        if has_parts and (tag in _REFERRING or names_output(tag) or any("${" in value for value in attributes.values())):
             parts.extend(_parts(path, data, parser.CurrentByteIndex, tag, place()))
 
     parser.StartDoctypeDeclHandler = refuse
@@ -253,7 +271,13 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_
                 raise InputError(f"{place}: an included file must exist, but got '{name}'")
             if target.is_file():
                 parts.append(_Part(at + match.start(2), at + match.end(2), target=target))
+    if names_output(tag):
+        for start, end, name in output_names(tag, text):
+            parts.append(_Part(at + start, at + end, output=name, within=placeholders(name, place)))
+    outputs = [range(part.start, part.end) for part in parts if part.output is not None]
     for match in re.finditer(_PLACEHOLDER.pattern.encode(), text):
+        if any(at + match.start() in span for span in outputs):
+            continue
         before = _ALONE.search(text, 0, match.start())
         alone = before is not None and text[match.end() : match.end() + 1] in (b'"', b"'")
         attribute = before.group(1).decode() if before is not None and alone else ""

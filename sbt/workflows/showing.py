@@ -22,7 +22,7 @@ def show_replay(
         again: the run; it has a trace.
         gui: in sumo-gui, in real time.
         gif: an animated GIF from above, with the metric over time.
-        folder: network, trajectories (FCD, CSV) and a scene for sumo-gui.
+        folder: network, trajectories (FCD, CSV), a scene for sumo-gui, and what the files' detectors measured.
         csv: the states over time.
 
     Returns:
@@ -33,6 +33,8 @@ def show_replay(
     """
     from sbt.report.outside import write_csv, write_folder
     from sbt.sumo.gui import gui_program, run_in_gui
+    from sbt.sumo.outputs import collect_outputs
+    from sbt.sumo.session import scratch_folder, session
 
     scenario, record, states = again.scenario, again.record, shown_trace(again)
     program = gui_program() if gui else ""
@@ -40,6 +42,9 @@ def show_replay(
         write_csv(csv, states)
     if folder is not None:
         write_folder(folder, states, net_of_run(again))
+        if hasattr(scenario.simulate, "files_of_run"):
+            session().close()
+            collect_outputs(scratch_folder(), folder / "outputs")
     if gif is not None:
         save_film(gif, states, scenario, f"{scenario.name}, run {record.index}: {_result(again)}", net_of_run(again))
     return not gui or run_in_gui(scenario.simulate, record.inputs, record.seed, program, ego=states.actors[0]).identical(states)
