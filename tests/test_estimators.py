@@ -11,9 +11,10 @@ from scipy.special import ndtr
 from scipy.stats import binomtest
 
 from sbt.estimators.binomial import interval, lower, upper
+from sbt.estimators.choices import log_normal
 from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch
 from sbt.estimators.intervals import CountedBatch, combine_estimates, few_hits_bound
-from sbt.estimators.mixture import Mixture, Normals, fit_mixture, log_normal, particles, wide_scales
+from sbt.estimators.mixture import Mixture, Normals, fit_mixture, particles, wide_scales
 from sbt.estimators.monte_carlo import Proportion
 from sbt.estimators.subset import SubsetRun, combine_repeats
 from sbt.seeds import stream

@@ -259,7 +259,7 @@ WRONG = {
     "order": (lambda: Parameter("a", 1.0, 1.0), "low < high must hold, but got low 1.0, high 1.0"),
     "nan end": (lambda: Parameter("a", 0.0, math.nan), "low < high must hold"),
     "infinite": (lambda: Parameter("a", 0.0, math.inf), "an infinite range needs a distribution"),
-    "kind": (lambda: Parameter("a", 0, 1, kind="real"), "continuous or integer, but got 'real'"),
+    "kind": (lambda: Parameter("a", 0, 1, kind="real"), "continuous, integer or categorical, but got 'real'"),
     "integer ends": (lambda: Parameter("a", 0, 1.5, kind="integer"), "whole ends, but got"),
     "no mass": (lambda: Parameter("a", 5.0, 6.0, distribution=Distribution.of("beta", a=1, b=1)), "must have mass in its range"),
     "law": (lambda: Distribution.of("gauss", mean=0, std=1), "one of uniform, normal"),

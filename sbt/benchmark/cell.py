@@ -24,6 +24,7 @@ from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.stages import Batch, Campaign, Log, Progress, run_stages
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Outcome, Status
+from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
@@ -158,8 +159,7 @@ class _BenchmarkStage:
         fitted = self.learner.fit(log.history) if log.iteration > 0 else None
         start = time.perf_counter()
         draw, x = self._draw(fitted, log)
-        names = self.scenario.space.names
-        runs = tuple(PlannedRun(self.name, dict(zip(names, map(float, row), strict=True))) for row in x)
+        runs = tuple(PlannedRun(self.name, self.scenario.space.named(row)) for row in x)
         seconds = time.perf_counter() - start
         proposal = CellProposal(draw.method, draw.next_position, draw.candidates, draw.acceptance, seconds)
         return Batch(runs, proposal, fitted)
@@ -197,7 +197,7 @@ class _BenchmarkStage:
 class _Recalling:
     """An executor that takes the outcomes of runs with the same inputs and seed from other cells of the scenario."""
 
-    def __init__(self, executor: SerialExecutor, known: Mapping[tuple[int, tuple[float, ...]], Outcome]):
+    def __init__(self, executor: SerialExecutor, known: Mapping[tuple[int, tuple[Value, ...]], Outcome]):
         self._executor, self._known = executor, known
 
     def __enter__(self) -> _Recalling:
@@ -221,7 +221,7 @@ class _Recalling:
         yield from self._executor.run(new)
 
 
-def _known_runs(cell: Cell) -> dict[tuple[int, tuple[float, ...]], Outcome]:
+def _known_runs(cell: Cell) -> dict[tuple[int, tuple[Value, ...]], Outcome]:
     """Return the runs that went well in the even cells of this scenario and seed."""
     known = {}
     for folder in sorted(cell.folder.parents[2].glob(f"*/even/{cell.seed}")):

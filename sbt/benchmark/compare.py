@@ -117,7 +117,7 @@ def _finished(path: Path, settings: JsonMapping) -> Iterator[tuple[tuple[str, in
 def _run(loaded: Loaded, name: str, seed: int) -> Cell:
     config, start = loaded.config, time.perf_counter()
     u, margin = (_outside if name in OUTSIDE else _own)(loaded, name, seed)
-    hits = np.flatnonzero(margin <= 0)
+    hits, u = np.flatnonzero(margin <= 0), scenario_of(loaded).space.cube.embedded(u)
     first = int(hits[0]) + 1 if len(hits) else None
     return Cell(
         config.scenario, name, seed, config.budget, len(margin), first, len(hits), _distinct(u[hits]),
@@ -150,10 +150,7 @@ def _outside(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
         while len(margins) < config.budget and (most is None or (margins <= 0).sum() < most):
             u = sampler.ask(min(config.batch, config.budget - len(margins)))
             x, start = space.from_unit(u), len(margins)
-            jobs = [
-                Job(start + k, dict(zip(space.names, map(float, row), strict=True)), run_seed(seed, start + k))
-                for k, row in enumerate(x)
-            ]
+            jobs = [Job(start + k, space.named(row), run_seed(seed, start + k)) for k, row in enumerate(x)]
             y = np.full(len(jobs), np.nan)
             for outcome in executor.run(jobs):
                 if outcome.status == Status.OK:

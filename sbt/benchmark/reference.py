@@ -54,7 +54,7 @@ class _RandomStage:
             points.append(u[:missing])
             missing -= len(points[-1])
         x = space.from_unit(np.concatenate(points))[start % _CHUNK :]
-        named = [dict(zip(space.names, map(float, row), strict=True)) for row in x]
+        named = [space.named(row) for row in x]
         return Batch(tuple(PlannedRun(VALIDATION, inputs) for inputs in named), {"method": "random"})
 
 

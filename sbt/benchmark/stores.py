@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sbt.config.load import Loaded, differences, dump, fingerprint
 from sbt.errors import InputError
+from sbt.problem.description import describe_scenario
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 
@@ -31,6 +32,7 @@ def open_store(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: 
     snapshot = {
         **fingerprint(loaded.config), "budget": loaded.config.budget, "names": list(scenario.space.names),
         "folder": str(loaded.folder.resolve()), "yaml": dump(loaded.config), **more,
+        **({"described": describe_scenario(scenario)} if scenario.space.choices else {}),
     }  # fmt: skip
     store = Store.open(folder, snapshot)
     if changes := differences(store.configuration, snapshot, (*_IDENTITY, *more)):

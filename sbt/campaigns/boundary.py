@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from sbt.acquisitions import is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
@@ -114,8 +116,13 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
     predictor = settings.learner.train(history.finished)
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
     u = SobolSequence(space.dimension, settings.seed).points(0, 8192)
-    found = crossings(lambda v: predictor(space.metamodel_inputs(v)).probability(critical), u, most)
-    x = space.from_unit(found)
+    group = np.unique(space.cube.cells(u), axis=0, return_inverse=True)[1].reshape(-1)  # there is nothing between choices
+    alike = space.cube.snapped(u)
+    found = np.concatenate([
+        crossings(lambda v: predictor(space.metamodel_inputs(v)).probability(critical), alike[group == g], most)
+        for g in range(group.max() + 1)
+    ])  # fmt: skip
+    x = space.from_unit(found[np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(np.intp))])
     return x[space.feasible(x)]
 
 

@@ -119,7 +119,8 @@ def _typical(
     u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.history.x, taken])))
     scale = influence_on_mean(fitted.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
     weight = np.exp(_score(settings, fitted, boundary)(u))  # a_BI once more: sharper than it was drawn
-    return draw, x[select_representative(u, weight, there, n, scale)]
+    at = space.cube.embedded
+    return draw, x[select_representative(at(u), weight, at(there), n, space.cube.spread(scale))]
 
 
 def _rounded(wanted: float, log: Log) -> int:
@@ -202,7 +203,10 @@ def _particles(
         value = score(u)
         return value if admissible is None else np.where(admissible(u), value, -np.inf)
 
-    found = smc(inside, settings.scenario.space.dimension, rng, particles=max(1024, 2 * n), start=max(4096, 2 * n), bound=bound)
+    found = smc(
+        inside, settings.scenario.space.dimension, rng, particles=max(1024, 2 * n), start=max(4096, 2 * n), bound=bound,
+        cube=settings.scenario.space.cube,
+    )  # fmt: skip
     if found is None:
         return draw
     distinct = np.unique(found.u, axis=0, return_index=True)[1]
@@ -236,11 +240,12 @@ def _greedy(
     if scenario.pool is not None:
         rows = _rows(settings, log, taken)
         u = rows.points(0, len(rows))
-        picks = select_diverse(u, score(u), there, n, scale)
+        at = space.cube.embedded
+        picks = select_diverse(at(u), score(u), at(there), n, space.cube.spread(scale))
         return scenario.pool.x[rows.rows[picks]], len(u)
 
     def snap(v: Points) -> Points:  # integers are what will be run
         return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
 
-    u, looked = propose_greedily(score, there, n, scale, rng, snap=snap, admissible=admissible)
+    u, looked = propose_greedily(score, there, n, scale, rng, snap=snap, admissible=admissible, cube=space.cube)
     return space.from_unit(u), looked

@@ -108,11 +108,7 @@ def _width(repeat: SubsetRun) -> int:
 
 
 def _runs(space: ParameterSpace, x: Points, stage: str, log_q: Vector | None) -> tuple[PlannedRun, ...]:
-    names = space.names
-    return tuple(
-        PlannedRun(stage, {n: float(v) for n, v in zip(names, row, strict=True)}, None if log_q is None else float(log_q[k]))
-        for k, row in enumerate(x)
-    )
+    return tuple(PlannedRun(stage, space.named(row), None if log_q is None else float(log_q[k])) for k, row in enumerate(x))
 
 
 def nominal_proportion(log: Log, settings: Settings, stage: str = _NOMINAL) -> Proportion:

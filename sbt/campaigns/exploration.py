@@ -47,7 +47,7 @@ def fruitless_runs(settings: Settings, log: Log) -> int:
     hit = scenario.requirement.critical_runs(history)
     if not hit.any():
         return 0
-    u, iteration, spent = scenario.space.to_unit(history.x), history.iteration, 0
+    u, iteration, spent = scenario.space.cube.embedded(scenario.space.to_unit(history.x)), history.iteration, 0
     for k, batch in enumerate(log.iterations):
         before = u[hit & (iteration < k)]
         if len(before) == 0:
@@ -73,7 +73,7 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
     seen = log.history.where(log.history.stage != VALIDATION)
     search = Search(
         scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
-        lambda u: space.feasible(space.from_unit(u)),
+        lambda u: space.feasible(space.from_unit(u)), cube=space.cube,
     )  # fmt: skip
     y = np.where(seen.ok, seen.y(scenario.requirement.metric), np.nan)
     u = np.clip(space.to_unit(seen.x), 0.0, 1.0)

@@ -16,7 +16,7 @@ from sbt.errors import InputError
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Facts
 from sbt.problem.arrays import Mask, Vector
-from sbt.problem.plain import Json
+from sbt.problem.plain import Json, Value
 from sbt.samplers.search import Search, fit_warped
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
@@ -69,7 +69,7 @@ class ClosestRun:
     """The uncritical run nearest to the critical interval, by the metric."""
 
     run: int
-    inputs: Mapping[str, float]
+    inputs: Mapping[str, Value]
     metric: float
     margin: float
 
@@ -138,8 +138,9 @@ class FailureSearch:
             raise InputError("campaign falsification needs a metamodel, but got none")
         space = scenario.space
         return Search(
-            scenario.requirement.critical, learner.metamodel, space.metamodel_inputs, lambda u: space.feasible(space.from_unit(u))
-        )
+            scenario.requirement.critical, learner.metamodel, space.metamodel_inputs,
+            lambda u: space.feasible(space.from_unit(u)), cube=space.cube,
+        )  # fmt: skip
 
     def margin(self, history: History) -> Vector:
         """Return (n,) distance to M_c in the metric's unit, NaN where a run failed."""

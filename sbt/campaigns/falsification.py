@@ -137,7 +137,7 @@ class SearchStage:
         generations = [
             margin[(runs.iteration == k) & (runs.stage == _SEARCH)] for k in np.unique(runs.iteration[runs.stage == _SEARCH])
         ]
-        return evolution.propose(u[int(np.argmin(begin))], generations, n, s.seed)
+        return evolution.propose(u[int(np.argmin(begin))], generations, n, s.seed, s.scenario.space.cube)
 
     def _scored(self, log: Log, n: int) -> Points:
         """Return n points by an acquisition function: drawn in proportion to exp(score), or greedily."""
@@ -171,7 +171,7 @@ class SearchStage:
         def snap(v: Points) -> Points:  # integers are what will be run
             return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
 
-        u, _ = propose_greedily(score, existing, n, scale, rng, snap=snap, admissible=feasible)
+        u, _ = propose_greedily(score, existing, n, scale, rng, snap=snap, admissible=feasible, cube=space.cube)
         return np.concatenate([u, fill_uniformly(feasible, n - len(u), space.dimension, rng)])
 
     def _snapped(self, parts: list[tuple[str, Points]], runs: History) -> list[PlannedRun]:
@@ -181,12 +181,13 @@ class SearchStage:
         if scenario.pool is None:
             return [PlannedRun(stage, named_inputs(scenario, scenario.space.from_unit(u[None])[0])) for stage, u in rows]
         left = np.flatnonzero(~scenario.pool.taken(runs.x))
-        recorded = np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0)
+        at = scenario.space.cube.embedded
+        recorded = at(np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0))
         planned = []
         for stage, u in rows[: len(left)]:
-            at = int(cdist(u[None], recorded[left])[0].argmin())
-            planned.append(PlannedRun(stage, named_inputs(scenario, scenario.pool.x[left[at]])))
-            left = np.delete(left, at)
+            row = int(cdist(at(u[None]), recorded[left])[0].argmin())
+            planned.append(PlannedRun(stage, named_inputs(scenario, scenario.pool.x[left[row]])))
+            left = np.delete(left, row)
         return planned
 
 

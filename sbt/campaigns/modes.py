@@ -1,4 +1,4 @@
-"""Failure modes: critical runs of one conflict type that the metamodel's critical region connects; what is said of each."""
+"""Failure modes: critical runs of one conflict type, and of the same choices, that the metamodel's critical region connects."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
@@ -48,18 +49,18 @@ class RunPoint:
     """A run, its inputs and its metric."""
 
     run: int
-    inputs: Mapping[str, float]
+    inputs: Mapping[str, Value]
     metric: float
 
 
 @dataclass(frozen=True)
 class NearestSafe:
-    """The uncritical run nearest to a failure, and the change of each input that differs."""
+    """The uncritical run nearest to a failure, and the change of each input that differs: a difference, or the other choice."""
 
     run: int
-    inputs: Mapping[str, float]
+    inputs: Mapping[str, Value]
     metric: float
-    change: Mapping[str, float]
+    change: Mapping[str, Value]
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class FailureMode:
     """
 
     representative: int
-    inputs: Mapping[str, float]
+    inputs: Mapping[str, Value]
     metric: float
     size: int
     conflict: str | None
@@ -134,13 +135,14 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -
     hits = np.flatnonzero(scenario.requirement.critical_runs(history))
     if len(hits) == 0:
         return []
-    u = scenario.space.to_unit(history.x)
+    u, cube = scenario.space.to_unit(history.x), scenario.space.cube
+    at = cube.embedded(u)
     depth = critical.margin(y)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
-    kind = _kind(history)
+    kind = _kind(history, cube.choices(u))
     group = connected(fitted, u[chosen], kind[chosen])
     apart = kind[hits][:, None] != kind[chosen][None, :]
-    label = group[(cdist(u[hits], u[chosen]) + _FAR * apart).argmin(axis=1)]
+    label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]
     log_p = scenario.space.log_density(history.x[hits])
     uncritical = np.flatnonzero(np.isfinite(y) & ~critical.contains(y))
     found = []
@@ -148,14 +150,15 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -
         rows = hits[label == name]
         representative = int(rows[np.argmin(depth[rows])])
         likely = int(rows[np.argmax(log_p[label == name])])
-        safe = int(uncritical[cdist(u[[representative]], u[uncritical])[0].argmin()]) if len(uncritical) else None
+        safe = int(uncritical[cdist(at[[representative]], at[uncritical])[0].argmin()]) if len(uncritical) else None
         found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
     return sorted(found, key=lambda mode: (depth[mode.representative], mode.representative))
 
 
-def _kind(history: History) -> Vector:
-    """Return (n,) the type of conflict of every run; all the same where it is not measured."""
-    return np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED)
+def _kind(history: History, choices: Points) -> Vector:
+    """Return (n,) numbers, the same for runs of one type of conflict (where it is measured) and of the same choices (n, c)."""
+    told = np.column_stack([np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED), choices])
+    return np.unique(told, axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
 
 
 def describe(mode: Mode, history: History, scenario: LogicalScenario, confirmed: Vector) -> FailureMode:
@@ -181,8 +184,15 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, confirmed:
     )  # fmt: skip
 
 
-def _nearest_safe(row: int, inputs: Mapping[str, float], history: History, y: Vector) -> NearestSafe:
+def _nearest_safe(row: int, inputs: Mapping[str, Value], history: History, y: Vector) -> NearestSafe:
     """Return an uncritical run, and how it differs from these inputs."""
     safe = history.inputs(row)
-    change = {k: safe[k] - v for k, v in inputs.items() if abs(safe[k] - v) > _NOT_WITHIN * abs(v)}
-    return NearestSafe(int(history.index[row]), safe, float(y[row]), change)
+    change = {name: _change(value, safe[name]) for name, value in inputs.items()}
+    return NearestSafe(int(history.index[row]), safe, float(y[row]), {k: v for k, v in change.items() if v is not None})
+
+
+def _change(value: Value, other: Value) -> Value | None:
+    """Return the other choice, or how much the other number is larger; None where there is no difference."""
+    if isinstance(value, str) or isinstance(other, str):
+        return None if other == value else other
+    return other - value if abs(other - value) > _NOT_WITHIN * abs(value) else None

@@ -15,6 +15,7 @@ from sbt.estimators.binomial import interval
 from sbt.loop.learner import changed_share
 from sbt.loop.stages import Batch, Facts, Log
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
@@ -131,13 +132,13 @@ def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[P
     if space.constraints:
         return np.vstack(kept), None
     ends = [p.bounds for p in space.parameters]
-    whole = [p.kind == "integer" for p in space.parameters]
+    whole = [p.discrete for p in space.parameters]
     return np.vstack(kept), -float(sum(math.log(b - a + w) for (a, b), w in zip(ends, whole, strict=True)))
 
 
-def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, float]:
-    """Return the (d,) values of a concrete scenario by name."""
-    return {name: float(value) for name, value in zip(scenario.space.names, row, strict=True)}
+def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, Value]:
+    """Return the (d,) values of a concrete scenario by name, choices as text."""
+    return scenario.space.named(row)
 
 
 def critical_share(history: History, scenario: LogicalScenario) -> CriticalShare:

@@ -14,20 +14,21 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.special import ndtr, ndtri
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN, counted_batches
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, PoolSummary
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
+from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, log_normal, log_wide, to_cube
 from sbt.estimators.importance import BLIND, SHARES, Plan, draw_systematic, plan_batch
 from sbt.estimators.intervals import combine_estimates
-from sbt.estimators.mixture import Mixture, fit_mixture, log_normal, particles, wide_scales
+from sbt.estimators.mixture import Mixture, fit_mixture, particles, wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability, fit_log_probability
 from sbt.loop.stages import Batch, Log
 from sbt.metamodels.base import Metamodel
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.cube import Cube
 from sbt.samplers import portfolio
 from sbt.samplers.search import Search
 from sbt.samplers.sobol import SobolSequence
@@ -96,6 +97,10 @@ class SequentialStage:
         return Coordinates(self.settings.scenario.space)
 
     @cached_property
+    def _choices(self) -> tuple[ChoiceScore, ...]:
+        return choice_scores(self.settings.scenario.space)
+
+    @cached_property
     def _wide(self) -> Vector:
         return wide_scales(self._coordinates.bounded)
 
@@ -134,7 +139,7 @@ class SequentialStage:
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""
         sobol = SobolSequence(self.settings.scenario.space.dimension, self.settings.seed)
-        z = ndtri(sobol.points(0, n)) * self._wide
+        z = self._scores(sobol.points(0, n))
         return Batch(self._runs(self._feasible(z, 0), "initial"), EstimationProposal("initial", "sobol"))
 
     def _feasible(self, z: Points, iteration: int) -> Points:
@@ -150,10 +155,7 @@ class SequentialStage:
         space = self.settings.scenario.space
         rows = space.from_normal(z)
         densities = [None] * len(rows) if log_q is None else [float(q) for q in log_q]
-        return tuple(
-            PlannedRun(stage, {name: float(v) for name, v in zip(space.names, row, strict=True)}, density)
-            for row, density in zip(rows, densities, strict=True)
-        )
+        return tuple(PlannedRun(stage, space.named(row), density) for row, density in zip(rows, densities, strict=True))
 
     def _modes_while_searching(self, log: Log, known: _Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
@@ -182,15 +184,15 @@ class SequentialStage:
         if n > even:
             search = Search(
                 s.scenario.requirement.critical, metamodel_of(s), lambda v: self._coordinates(self._scores(v)),
-                lambda v: space.feasible(space.from_normal(self._scores(v))),
+                lambda v: space.feasible(space.from_normal(self._scores(v))), cube=Cube(nominal=space.cube.nominal),
             )  # fmt: skip
-            picks = portfolio.propose(search, known.cube(self._wide), known.y, n - even, rng, known.batch)
+            picks = portfolio.propose(search, to_cube(known.z, self._wide, self._choices), known.y, n - even, rng, known.batch)
             spread = np.vstack([picks.u, spread])
         return self._feasible(self._scores(spread), iteration)
 
     def _scores(self, v: Points) -> Points:
         """Return normal scores of points of the cube in which the wide distribution is uniform."""
-        return ndtri(np.clip(v, 1e-9, 1.0 - 1e-9)) * self._wide
+        return from_cube(v, self._wide, self._choices)
 
     def _drawn(self, log: Log, known: _Known, log_probability: LogProbability | None, size: int) -> Batch:
         """Return draws from a fresh pool, and search picks."""
@@ -229,10 +231,10 @@ class SequentialStage:
         log_w = log_normal(z) - mixture.log_density(z)
         if space.constraints:
             log_w = np.where(space.feasible(x), log_w - np.log(space.feasible_mass), -np.inf)
-        log_wide = log_normal(z, self._wide) - mixture.log_density(z)
+        over_wide = log_wide(z, self._wide, self._choices) - mixture.log_density(z)
         unsure = np.full(len(z), np.log(0.5))
         log_pi, log_not = (unsure, unsure) if log_probability is None else log_probability(z)
-        plan = plan_batch(log_pi, log_not, log_w, log_wide, stratum, shares)
+        plan = plan_batch(log_pi, log_not, log_w, over_wide, stratum, shares)
         return _Pool(mixture, z, x, plan, log_pi, log_not)
 
     def _fallback(self, log: Log, known: _Known, error: float) -> LogProbability | None:
@@ -260,8 +262,8 @@ class SequentialStage:
     def _mixture(self, log_probability: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
         """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
         if log_probability is None or not known.critical.any():
-            return Mixture(self._wide)
-        z, log_q = Mixture(self._wide).sample_near(_CANDIDATES, known.z[known.critical], rng)
+            return Mixture(self._wide, choices=self._choices)
+        z, log_q = Mixture(self._wide, choices=self._choices).sample_near(_CANDIDATES, known.z[known.critical], rng)
 
         at_start = log_probability(z)  # both clouds begin there
 
@@ -274,7 +276,7 @@ class SequentialStage:
             return log_normal(points) + 0.5 * (log_pi + log_not)
 
         clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, boundary))
-        return fit_mixture(clouds, self._wide, rng)
+        return fit_mixture(clouds, self._wide, rng, choices=self._choices)
 
     def _counts(self, log: Log, size: int) -> bool:
         """Return whether this batch counts: from the stopping time on.
@@ -363,16 +365,17 @@ class _Known:
         if log_probability is None or len(hits) < 2:
             return len(hits)
         i, j = np.triu_indices(len(hits), 1)
+        for choice in choice_scores(self.settings.scenario.space):  # there is nothing between choices
+            alike = choice.cells(hits)[i] == choice.cells(hits)[j]
+            i, j = i[alike], j[alike]
+        if len(i) == 0:
+            return len(hits)
         along = np.linspace(0.1, 0.9, _PROBES)[:, None, None]
         probes = hits[i] * along + hits[j] * (1.0 - along)  # (probes, pairs, d)
         inside = log_probability(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
         joined = inside.all(axis=0)
         graph = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(hits), len(hits)))
         return int(connected_components(graph, directed=False)[0])
-
-    def cube(self, wide: Vector) -> Points:
-        """Return the runs in the cube in which the wide distribution is uniform."""
-        return np.asarray(ndtr(self.z / wide))
 
     def learn(self, rng: np.random.Generator) -> LogProbability | None:
         """Return the log_probability; None with too few runs."""

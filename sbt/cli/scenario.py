@@ -41,10 +41,11 @@ def simulate(
 
         choices = _pairs("--ego", ego or []) or None
         _check_choices(choices, step, isolation)
-        values = _pairs("input", inputs or [])
+        values = _texts("input", inputs or [])
         run = simulate_scenario(
-            scenario, values, seed=seed, ego=choices, step_length=step, isolation=isolation, traced=trace is not None
-        )
+            scenario, values, seed=seed, ego=choices, step_length=step, isolation=isolation, traced=trace is not None,
+            as_text=True,
+        )  # fmt: skip
         if trace is not None:
             _write_trace(trace, run)
     if as_json:
@@ -56,7 +57,7 @@ def simulate(
 
 
 def _print_run(run: Run) -> None:
-    print(f"{run.name}, seed {run.seed}: " + ", ".join(f"{k}={v:g}" for k, v in run.inputs.items()))
+    print(f"{run.name}, seed {run.seed}: " + run.concrete)
     if run.critical is None:
         print(f"  {run.status}: {run.reason}")
         return
@@ -109,14 +110,19 @@ def _pairs(what: str, texts: list[str]) -> dict[str, Any]:
     """Return name=value texts by name, values read as YAML."""
     from sbt.config.source import read_yaml
 
-    pairs: dict[str, Any] = {}
+    return {name: read_yaml(value, f"{what} {name}")[0] for name, value in _texts(what, texts).items()}
+
+
+def _texts(what: str, texts: list[str]) -> dict[str, str]:
+    """Return name=value texts by name."""
+    pairs: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:
             raise InputError(f"{what} must be name=value, but got '{text}'")
         if name in pairs:
             raise InputError(f"{what} {name} must be given once, but got it twice")
-        pairs[name] = read_yaml(value, f"{what} {name}")[0]
+        pairs[name] = value
     return pairs
 
 

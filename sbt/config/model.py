@@ -21,6 +21,7 @@ from pydantic import (
     Field,
     JsonValue,
     ValidationInfo,
+    WithJsonSchema,
     field_validator,
 )
 
@@ -32,7 +33,7 @@ from sbt.problem.plain import Json
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "EXECUTORS", "AcquisitionChoice", "Choice", "Configuration",
+    "EXECUTORS", "AcquisitionChoice", "Choice", "ChoicesGiven", "Configuration",
     "CorrelationEntry", "ExecutorChoice", "GateChoice", "InputChange", "MetamodelChoice", "RequirementChange",
     "SimulationChoice", "StopRules", "ValidationChoice", "WarmStart",
 ]  # fmt: skip
@@ -66,7 +67,7 @@ def _formula(*, condition: bool) -> Callable[[str], str]:
         try:
             with np.errstate(all="ignore"):
                 rule = Expression(text)
-                value = np.asarray(rule(dict.fromkeys(rule.names(), np.ones(1))))
+                value = np.asarray(rule(rule.example()))
         except (ArithmeticError, TypeError) as error:
             raise ValueError(f"must be a formula that can be computed, but got '{text}' ({error})") from None
         if not rule.names():
@@ -158,9 +159,17 @@ class MetamodelChoice(Choice):
 class AcquisitionChoice(_Strict):
     """How runs are chosen: an acquisition function, or a method of the campaign."""
 
-    kind: Name = Field(
-        description="An installed acquisition function, file.py:NAME, or a method of the campaign."
-    )
+    kind: Name = Field(description="An installed acquisition function, file.py:NAME, or a method of the campaign.")
+
+
+ChoicesGiven = Annotated[
+    JsonValue,  # checked by `Parameter`, which knows the input
+    WithJsonSchema({"anyOf": [
+        {"type": "array", "items": {"type": "string"}, "minItems": 2},
+        {"type": "object", "additionalProperties": {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1}},
+        {"type": "null"},
+    ]}),
+]  # fmt: skip
 
 
 class InputChange(_Strict):
@@ -171,6 +180,10 @@ class InputChange(_Strict):
     distribution: Choice | None = Field(
         default=None, description="Distribution, truncated to the range: {kind: normal, mean: 40, std: 15}, "
         "or uniform, lognormal, exponential, gumbel, weibull, beta, triangular, scipy, empirical.",
+    )  # fmt: skip
+    choices: ChoicesGiven = Field(
+        default=None, description="Of an input with choices, those of the scenario's that the campaign uses: [car, truck], or "
+        "{car: 0.7, truck: 0.3} with probabilities.",
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.profiles import guided_vehicles, profile_of
-from sbt.config.scenario_model import EgoEntry, MetricEntry, ScenarioModel, SumoEntry
+from sbt.config.scenario_model import EgoEntry, InputEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
@@ -95,7 +95,7 @@ class _Builder:
         requirement = self._requirement(metrics)
         guided = guided_vehicles(model.actors, self._profiles, files, model.ego.id, problems)
         if files is not None:
-            self._check_inputs(files)
+            self._check_inputs(files, space)
         if model.sumo is None and model.simulate is None:
             problems.add(("inputs",), "a scenario needs files (sumo) or a loop (simulate), but has neither")
         problems.check()
@@ -117,21 +117,13 @@ class _Builder:
         parameters: list[Parameter] = []
         before = len(self._problems.found)
         for name, entry in self._model.inputs.items():
-            if entry.profile is not None:
+            if entry.profile is not None and entry.choices is None:
                 profile = profile_of(name, entry, self._folder, self._problems)
                 if profile is not None:
                     self._profiles[name] = profile
                     parameters.extend(profile.parameters)
                 continue
-            if entry.min is None or entry.max is None:
-                self._problems.add(("inputs", name), "an input must have min and max, or a profile")
-                continue
-            distribution, choice = None, entry.distribution
-            if choice is not None:
-                path = ("inputs", name, "distribution")
-                distribution = self._problems.attempt(path, partial(distribution_of, choice, self._folder))
-            make = partial(Parameter, name, entry.min, entry.max, entry.unit, distribution, entry.kind, entry.description)
-            made = self._problems.attempt(("inputs", name), make)
+            made = self._parameter(name, entry)
             if made is not None:
                 parameters.append(made)
         if len(self._problems.found) > before:
@@ -141,6 +133,25 @@ class _Builder:
         changes = SpaceChanges({}, model.correlation, (*model.constraints, *limits), model.features)
         space = self._problems.attempt(("inputs",), lambda: ParameterSpace(tuple(parameters)))
         return None if space is None else configured_space(changes, space, self._problems)
+
+    def _parameter(self, name: str, entry: InputEntry) -> Parameter | None:
+        """Return the input of an entry with a range or choices."""
+        path, choice, given = ("inputs", name), entry.distribution, entry.choices
+        there = [k for k in ("min", "max", "distribution", "kind", "profile") if getattr(entry, k) is not None]
+        if given is not None and there:
+            rule = "an input must have a range, choices, or a profile"
+            self._problems.add(path, f"{rule}, one of them, but got choices and {', '.join(there)}")
+            return None
+        if given is None and (entry.min is None or entry.max is None):
+            self._problems.add(path, "an input must have min and max, choices, or a profile")
+            return None
+        distribution = None
+        if choice is not None:
+            distribution = self._problems.attempt((*path, "distribution"), partial(distribution_of, choice, self._folder))
+        choices: Any = () if given is None else given
+        return self._problems.attempt(path, partial(
+            Parameter, name, entry.min, entry.max, entry.unit, distribution, entry.kind, entry.description, choices
+        ))  # fmt: skip
 
     def _files(self) -> SumoFiles | None:
         if self._model.sumo is None:
@@ -216,7 +227,7 @@ class _Builder:
             problems.add(("requirement", "metric"), must_be_one_of("a metric", wanted.metric, names))
         return Requirement(wanted.metric, *wanted.critical)
 
-    def _check_inputs(self, files: SumoFiles) -> None:
+    def _check_inputs(self, files: SumoFiles, space: ParameterSpace | None) -> None:
         """Compare placeholders and inputs."""
         shaped = {name for name, entry in self._model.inputs.items() if entry.profile is not None}
         if len(self._profiles) < len(shaped):  # their inputs are not known
@@ -236,6 +247,11 @@ class _Builder:
                 if name not in known:
                     rule = must_be_one_of(f"${{{hole.formula.text}}}: a placeholder", name, known)
                     self._problems.add(("inputs",), f"{hole.place}: {rule}")
+            if space is not None and not hole.formula.is_name:
+                try:
+                    space.check_formula(hole.formula)
+                except InputError as error:
+                    self._problems.add(("inputs",), f"{hole.place}: {error}")
         for name in known:
             if name not in used and self._model.simulate is None:
                 read_files = ", ".join(t.path.name for t in files.templates)

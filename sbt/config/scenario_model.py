@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, ValidationInfo, field_validator
 
-from sbt.config.model import Choice, Condition, CorrelationEntry, Formula, Interval, Name, RequirementChange
+from sbt.config.model import Choice, ChoicesGiven, Condition, CorrelationEntry, Formula, Interval, Name, RequirementChange
 from sbt.problem.plain import Json
 
 __all__ = [
@@ -85,13 +85,16 @@ class ActorEntry(_Strict):
 
 
 class InputEntry(_Strict):
-    """One input: its range, unit and distribution; or a profile, which is several."""
+    """One input: its range, unit and distribution; or its choices; or a profile, which is several."""
 
     min: float | None = Field(default=None, description="Lower end of the range.")
     max: float | None = Field(default=None, description="Upper end of the range.")
+    choices: ChoicesGiven = Field(
+        default=None, description="Instead of a range: [car, truck], equally likely, or {car: 0.7, truck: 0.3}."
+    )
     unit: str = Field(default="", description="As printed.")
     distribution: Choice | None = Field(default=None, description="Law on the range, such as {kind: normal, mean: 4, std: 1}.")
-    kind: Literal["continuous", "integer"] = Field(default="continuous", description="integer: whole numbers only.")
+    kind: Literal["continuous", "integer"] | None = Field(default=None, description="integer: whole numbers only.")
     description: str = Field(default="", description="One line for reports.")
     profile: ProfileEntry | None = Field(default=None, description="The input is a curve over time.")
 

@@ -69,8 +69,10 @@ def _changed(space: ParameterSpace, step: Mapping[str, Any]) -> ParameterSpace:
 
 
 def _parameter(old: Parameter, change: InputChange, problems: Problems, folder: Path) -> Parameter:
-    """Return the input with another range or distribution."""
+    """Return the input with another range or distribution, or fewer or otherwise likely choices."""
     path: Key = ("inputs", old.name)
+    if old.choices or change.choices is not None:
+        return problems.attempt(path, lambda: _with_choices(old, change)) or old
     distribution = old.distribution
     if change.distribution is not None:
         wanted = change.distribution
@@ -80,6 +82,26 @@ def _parameter(old: Parameter, change: InputChange, problems: Problems, folder: 
     low = old.low if change.min is None else change.min
     high = old.high if change.max is None else change.max
     return problems.attempt(path, lambda: replace(old, low=low, high=high, distribution=distribution)) or old
+
+
+def _with_choices(old: Parameter, change: InputChange) -> Parameter:
+    """Return the input with the configured ones of its choices.
+
+    Raises:
+        InputError: it has no choices, they are not among its own, or a range or distribution is given.
+    """
+    given: Any = change.choices
+    surplus = [key for key in ("min", "max", "distribution") if getattr(change, key) is not None]
+    if not old.choices:
+        raise InputError(f"input {old.name} has the range {old.range}, but got choices")
+    if surplus:
+        raise InputError(f"input {old.name} has choices ({', '.join(old.choices)}), but got {', '.join(surplus)}")
+    if given is None:
+        return old
+    made = Parameter(old.name, unit=old.unit, description=old.description, kind="categorical", choices=given)
+    for choice in made.choices:
+        old.number(choice)
+    return made
 
 
 def distribution_of(choice: Choice, folder: Path | None = None) -> Distribution:
@@ -131,6 +153,7 @@ def _expressions(key: str, texts: Mapping[Any, str], space: ParameterSpace, prob
         for used in rule.names():
             if used not in space.names:
                 problems.add((key, name), must_be_one_of("a formula's name", used, space.names))
+        problems.attempt((key, name), partial(space.check_formula, rule))
         if name in space.names:
             problems.add((key, name), f"a feature must not have the name of an input, but got '{name}'", at_key=True)
     return found

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammainccinv, logsumexp
 
+from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
 from sbt.problem.arrays import Points, Vector
 
 __all__ = ["Mixture", "Normals", "fit_mixture", "log_normal", "particles", "wide_scales"]
@@ -29,14 +30,6 @@ _STEPS = 25  # most of the expectation maximisation, which ends earlier where th
 _NEAR, _NEAR_SHARE = 0.3, 0.25  # standard deviation of candidates around known critical points, and their share
 _MOVES = 8  # Metropolis steps of a particle: resampled duplicates have moved apart
 _STEP, _LONGER, _SHORTER, _ACCEPTANCE = 0.6, 1.3, 0.7, 0.3  # of a Metropolis step: first length, factors, acceptance to reach
-
-
-def log_normal(z: Points, scale: Vector | float = 1.0) -> Vector:
-    """Return (n,) log density of independent centred normals with standard deviations `scale`, at z (n, d)."""
-    d = z.shape[1]
-    scales = np.broadcast_to(np.asarray(scale, dtype=np.float64), (d,))
-    squares: Vector = ((z / scales) ** 2).sum(axis=1)
-    return -0.5 * squares - float(np.log(scales).sum()) - 0.5 * d * math.log(2.0 * math.pi)
 
 
 def wide_scales(bounded: Vector) -> Vector:
@@ -55,14 +48,19 @@ def wide_scales(bounded: Vector) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class Normals:
-    """k normal components: weight (k,), mean (k, d), lower Cholesky factors (k, d, d)."""
+    """k normal components: weight (k,), mean (k, d), lower Cholesky factors (k, d, d).
+
+    With c inputs that have choices, d counts the others, and `masses` has (k, number of choices) for each: the components
+    are products of a normal and of masses of the choices.
+    """
 
     weight: Vector
     mean: Points
     factor: Points
+    masses: tuple[Points, ...] = ()
 
     def log_terms(self, z: Points) -> Points:
-        """Return (k, n) log density of each component at z (n, d), weights included."""
+        """Return (k, n) log density of each component at z (n, d), weights included, choices left out."""
         d, terms = z.shape[1], []
         for weight, mean, factor in zip(self.weight, self.mean, self.factor, strict=True):
             white = solve_triangular(factor, (z - mean).T, lower=True, check_finite=False)  # (d, n)
@@ -80,11 +78,13 @@ class Mixture:
         normals: fitted components; None: there was nothing to fit.
         defence: shares of the nominal and of the wide component where there are fitted ones (defensive mixture:
             Hesterberg 1995); they bound the weights p/h by 10.
+        choices: the scores of inputs with choices; the wide component takes them for equally likely.
     """
 
     wide: Vector
     normals: Normals | None = None
     defence: tuple[float, float] = (0.1, 0.1)
+    choices: tuple[ChoiceScore, ...] = ()
 
     @property
     def shares(self) -> Vector:
@@ -97,9 +97,12 @@ class Mixture:
     def log_density(self, z: Points) -> Vector:
         """Return (n,) log h(z), exact."""
         shares = self.shares
-        terms = [math.log(shares[0]) + log_normal(z), math.log(shares[1]) + log_normal(z, self.wide)]
+        terms = [math.log(shares[0]) + log_normal(z), math.log(shares[1]) + log_wide(z, self.wide, self.choices)]
         if self.normals is not None:
-            terms += list(math.log(1.0 - sum(self.defence)) + self.normals.log_terms(z))
+            fitted = self.normals.log_terms(_ordered(z, self.choices))
+            for choice, masses in zip(self.choices, self.normals.masses, strict=True):
+                fitted = fitted + choice.log_ratio(masses, z) + log_normal(z[:, [choice.column]])
+            terms += list(math.log(1.0 - sum(self.defence)) + fitted)
         return np.asarray(logsumexp(np.array(terms), axis=0))
 
     def sample(self, n: int, rng: np.random.Generator) -> tuple[Points, Vector]:
@@ -113,10 +116,25 @@ class Mixture:
         counts = np.diff(edges).astype(int)
         d = len(self.wide)
         parts = [rng.standard_normal((counts[0], d)), rng.standard_normal((counts[1], d)) * self.wide]
+        for choice in self.choices:
+            parts[1][:, choice.column] = choice.scores(rng.integers(len(choice.shares), size=counts[1]), rng.random(counts[1]))
         if self.normals is not None:
-            for count, mean, factor in zip(counts[2:], self.normals.mean, self.normals.factor, strict=True):
-                parts.append(mean + rng.standard_normal((count, d)) @ factor.T)
+            for k, (count, mean, factor) in enumerate(zip(counts[2:], self.normals.mean, self.normals.factor, strict=True)):
+                ordered = mean + rng.standard_normal((count, len(mean))) @ factor.T
+                parts.append(self._with_choices(ordered, k, rng))
         return np.concatenate(parts), np.repeat(np.arange(len(counts)), counts).astype(np.float64)
+
+    def _with_choices(self, ordered: Points, component: int, rng: np.random.Generator) -> Points:
+        """Return points (n, d) of their coordinates without choices, the choices drawn by a component's masses."""
+        if self.normals is None or not self.choices:
+            return ordered
+        n, d = len(ordered), len(self.wide)
+        z = np.empty((n, d))
+        z[:, _columns(d, self.choices)] = ordered
+        for choice, masses in zip(self.choices, self.normals.masses, strict=True):
+            cells = rng.choice(len(choice.shares), size=n, p=masses[component])
+            z[:, choice.column] = choice.scores(cells, rng.random(n))
+        return z
 
     def sample_near(self, n: int, centres: Points, rng: np.random.Generator) -> tuple[Points, Vector]:
         """Return n candidates from this mixture and from around `centres` (k, d), with (n,) log density."""
@@ -164,7 +182,10 @@ def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: 
     return z
 
 
-def fit_mixture(clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generator, inflate: float = 1.25) -> Mixture:
+def fit_mixture(
+    clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generator, inflate: float = 1.25,
+    choices: tuple[ChoiceScore, ...] = (),
+) -> Mixture:  # fmt: skip
     """Return the mixture whose normals are fitted to each cloud of particles, equal shares, by EM and BIC.
 
     Args:
@@ -172,33 +193,56 @@ def fit_mixture(clouds: tuple[Points, ...], wide: Vector, rng: np.random.Generat
         wide: (d,) standard deviations of the wide component.
         rng: the only source of randomness.
         inflate: factor on the covariances: the tails of h must not be thinner than the target's.
+        choices: the scores of inputs with choices.
     """
-    parts = [_em(cloud, rng) for cloud in clouds if len(cloud) >= _FEWEST * cloud.shape[1]]
+    parts = [
+        _em(_ordered(cloud, choices), tuple(_taken(cloud, c) for c in choices), rng)
+        for cloud in clouds if len(cloud) >= _FEWEST * cloud.shape[1]
+    ]  # fmt: skip
     if not parts:
-        return Mixture(wide)
+        return Mixture(wide, choices=choices)
     return Mixture(wide, Normals(
         np.concatenate([p.weight for p in parts]) / len(parts), np.concatenate([p.mean for p in parts]),
         math.sqrt(inflate) * np.concatenate([p.factor for p in parts]),
-    ))  # fmt: skip
+        tuple(np.concatenate(masses) for masses in zip(*(p.masses for p in parts), strict=True)),
+    ), choices=choices)  # fmt: skip
 
 
-def _em(z: Points, rng: np.random.Generator) -> Normals:
-    """Return the normals of best BIC among a few numbers of components."""
+def _columns(d: int, choices: tuple[ChoiceScore, ...]) -> list[int]:
+    """Return the columns of the inputs without choices, of d."""
+    nominal = {choice.column for choice in choices}
+    return [k for k in range(d) if k not in nominal]
+
+
+def _ordered(z: Points, choices: tuple[ChoiceScore, ...]) -> Points:
+    """Return the scores (n, d - c) of the inputs without choices."""
+    return np.ascontiguousarray(z[:, _columns(z.shape[1], choices)]) if choices else z
+
+
+def _taken(z: Points, choice: ChoiceScore) -> Points:
+    """Return (n, k) ones where a point takes a choice."""
+    return np.eye(len(choice.shares))[choice.cells(z)]
+
+
+def _em(z: Points, taken: tuple[Points, ...], rng: np.random.Generator) -> Normals:
+    """Return the normals (and masses of choices) of best BIC among a few numbers of components."""
     n, d = z.shape
-    found = [_em_of(z, k, rng) for k in _COMPONENTS if k == 1 or n >= _ROWS * k * d]
+    free = 1 + d + d * (d + 1) / 2 + sum(t.shape[1] - 1 for t in taken)
+    found = [_em_of(z, taken, k, rng) for k in _COMPONENTS if k == 1 or n >= _ROWS * k * (d + len(taken))]
 
     def bic(fit: tuple[Normals, float]) -> float:
         normals, log_likelihood = fit
-        return -2.0 * log_likelihood + len(normals.weight) * (1 + d + d * (d + 1) / 2) * math.log(n)
+        return -2.0 * log_likelihood + len(normals.weight) * free * math.log(n)
 
     return min(found, key=bic)[0]
 
 
-def _em_of(z: Points, k: int, rng: np.random.Generator) -> tuple[Normals, float]:
+def _em_of(z: Points, taken: tuple[Points, ...], k: int, rng: np.random.Generator) -> tuple[Normals, float]:
     """Return k normals by expectation maximisation, started from far-apart particles, and their log likelihood."""
     n, d = z.shape
-    total = np.cov(z.T).reshape(d, d) + 1e-6 * np.eye(d)
-    white = solve_triangular(np.linalg.cholesky(total), z.T, lower=True).T
+    total = np.cov(z.T).reshape(d, d) + 1e-6 * np.eye(d) if d else np.empty((0, 0))
+    white = solve_triangular(np.linalg.cholesky(total), z.T, lower=True).T if d else z
+    white = np.hstack([white, *taken])
     centres = [int(rng.integers(n))]
     nearest = np.full(n, np.inf)
     for _ in range(k - 1):
@@ -208,8 +252,10 @@ def _em_of(z: Points, k: int, rng: np.random.Generator) -> tuple[Normals, float]
     belonging = np.eye(k)[label].T * _LABELLED + _ELSEWHERE / k  # (k, n)
     value = -math.inf
     for _ in range(_STEPS):
-        model = _maximise(z, belonging, total)
+        model = _maximise(z, taken, belonging, total)
         terms = model.log_terms(z)
+        for masses, one in zip(model.masses, taken, strict=True):
+            terms = terms + np.log(masses) @ one.T
         log_total = logsumexp(terms, axis=0)
         belonging = np.exp(terms - log_total)
         if float(log_total.sum()) < value + 1e-3 * n:
@@ -219,7 +265,7 @@ def _em_of(z: Points, k: int, rng: np.random.Generator) -> tuple[Normals, float]
     return model, value
 
 
-def _maximise(z: Points, belonging: Points, total: Points) -> Normals:
+def _maximise(z: Points, taken: tuple[Points, ...], belonging: Points, total: Points) -> Normals:
     """Return the normals of largest likelihood, given the probability (k, n) with which each particle belongs to them."""
     d = z.shape[1]
     mass = belonging.sum(axis=1)
@@ -233,4 +279,5 @@ def _maximise(z: Points, belonging: Points, total: Points) -> Normals:
         prior = d + 2.0
         covariance = (m * covariance + prior * _PRIOR_SHAPE * total) / (m + prior) + 1e-4 * np.eye(d)
         factors.append(np.linalg.cholesky(covariance))
-    return Normals(mass / mass.sum(), mean, np.array(factors).reshape(len(mass), d, d))
+    masses = tuple((belonging @ one + 1.0 / one.shape[1]) / (mass[:, None] + 1.0) for one in taken)
+    return Normals(mass / mass.sum(), mean, np.array(factors).reshape(len(mass), d, d), masses)

@@ -17,6 +17,7 @@ from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_er
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.cube import Cube
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
 
@@ -36,7 +37,7 @@ class Coordinates:
     """From points of the standard-normal space to the inputs of the metamodel.
 
     A uniform input is taken on its range, every other one as its normal score with -5 to 5 as the unit
-    interval; derived features of the space follow.
+    interval, whole numbers at the middle of their cell, choices on an axis for each; derived features of the space follow.
     """
 
     space: ParameterSpace
@@ -50,11 +51,19 @@ class Coordinates:
         """Return (n, d + f) coordinates of normal scores z (n, d)."""
         correlation = self.space.correlation
         scores = z if correlation is None else z @ np.linalg.cholesky(np.asarray(correlation)).T
+        for k, p in enumerate(self.space.parameters):
+            if p.kind == "integer":
+                scores = scores.copy() if scores is z else scores
+                scores[:, k] = p.to_normal(p.from_normal(scores[:, k]))
         own = np.where(self.bounded == 1, ndtr(scores), 0.5 + scores / (2.0 * _REACH))
+        for k, p in enumerate(self.space.parameters):
+            if p.choices:
+                own[:, k] = p.to_unit(p.from_normal(scores[:, k]))
+        own = Cube(nominal=self.space.cube.nominal).embedded(own)
         if not self.space.features:
             return np.ascontiguousarray(own)
         u = self.space.to_unit(self.space.from_normal(z))
-        return np.column_stack([own, self.space.metamodel_inputs(u)[:, self.space.dimension :]])
+        return np.column_stack([own, self.space.metamodel_inputs(u)[:, own.shape[1] :]])
 
 
 def fit_log_probability(

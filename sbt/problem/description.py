@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sbt.errors import InputError
 from sbt.problem.distribution import Distribution
 from sbt.problem.expression import Expression
 from sbt.problem.parameter import Parameter
-from sbt.problem.plain import Json, JsonMapping
+from sbt.problem.plain import Json, JsonMapping, Values
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
-__all__ = ["describe_scenario", "is_complete", "rebuild_scenario", "scenario_differences"]
+__all__ = ["describe_scenario", "described_choices", "is_complete", "rebuild_scenario", "scenario_differences"]
 
 _TEXTS = ("description", "title")
 """Keys that may differ between a campaign and its resumption."""
@@ -44,12 +43,18 @@ def _parameter(p: Parameter) -> Json:
     return {
         "name": p.name, "low": _ended(p.low), "high": _ended(p.high), "unit": p.unit, "kind": p.kind,
         "description": p.description, "distribution": distribution,
+        **({"choices": list(p.choices), "probabilities": list(p.probabilities)} if p.choices else {}),
     }  # fmt: skip
 
 
 def _ended(value: float) -> float | str:
     """Return an end of a range as JSON has it: infinite ends are texts."""
     return value if math.isfinite(value) else str(value)
+
+
+def described_choices(data: JsonMapping) -> dict[str, tuple[str, ...]]:
+    """Return the choices of a described scenario's inputs that have some, by name."""
+    return {p["name"]: tuple(p["choices"]) for p in data.get("inputs", ()) if p.get("choices")}
 
 
 def is_complete(data: JsonMapping) -> bool:
@@ -71,7 +76,7 @@ def rebuild_scenario(data: JsonMapping) -> LogicalScenario:
             p["name"], float(p["low"]), float(p["high"]), p["unit"],
             None if p["distribution"] is None
             else Distribution(p["distribution"]["kind"], tuple((k, v) for k, v in p["distribution"]["parameters"])),
-            p["kind"], p["description"],
+            p["kind"], p["description"], tuple(p.get("choices", ())), tuple(p.get("probabilities", ())),
         )
         for p in data["inputs"]
     )  # fmt: skip
@@ -92,7 +97,7 @@ class _Absent:
 
     name: str
 
-    def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
+    def __call__(self, values: Values, seed: int) -> Trace:
         """Refuse to run."""
         raise InputError(f"scenario {self.name} is known by its description only: its code must be loaded to run it")
 
@@ -109,9 +114,9 @@ def scenario_differences(before: JsonMapping, now: JsonMapping) -> str:
     if list(one) != list(other):
         return f"inputs {', '.join(one)} there, {', '.join(other)} now"
     for name, parameter in one.items():
-        for key, value in parameter.items():
-            if key not in _TEXTS and value != other[name][key]:
-                return f"{key} of input {name}: {value} there, {other[name][key]} now"
+        for key, value in (other[name] | parameter).items():
+            if key not in _TEXTS and value != other[name].get(key):
+                return f"{key} of input {name}: {parameter.get(key)} there, {other[name].get(key)} now"
     for key in ("name", "requirement", "correlation", "constraints", "features", "recorded", "traced"):
         if before[key] != now[key]:
             return f"{key}: {before[key]} there, {now[key]} now"

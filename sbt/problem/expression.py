@@ -33,6 +33,7 @@ _COMPARE: dict[type, Callable[[Any, Any], Any]] = {
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }
+_EQUALITY: dict[type, Callable[[Any, Any], Any]] = {ast.Eq: operator.eq, ast.NotEq: operator.ne}
 _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "abs": (1, np.abs), "sqrt": (1, np.sqrt), "exp": (1, np.exp), "log": (1, np.log), "sin": (1, np.sin),
     "cos": (1, np.cos), "min": (2, np.minimum), "max": (2, np.maximum),
@@ -44,6 +45,8 @@ _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
 class Expression:
     """A formula over inputs: + - * / **, comparisons, and, or, not, and a few functions.
 
+    An input with choices is compared with one of them in quotes, by == or !=: `kind == "truck"`.
+
     Raises:
         InputError: the text is not such a formula.
     """
@@ -51,9 +54,8 @@ class Expression:
     text: str
 
     def __post_init__(self) -> None:
-        names = self.names()
         with np.errstate(all="ignore"):
-            _evaluate(self._tree(), dict.fromkeys(names, np.ones(1)), self.text)
+            _evaluate(self._tree(), self.example(), self.text)
             for node in ast.walk(self._tree()):
                 if not isinstance(node, ast.BinOp) or any(isinstance(part, ast.Name) for part in ast.walk(node)):
                     continue
@@ -72,13 +74,55 @@ class Expression:
         found = [n.id for n in ast.walk(self._tree()) if isinstance(n, ast.Name) and n.id not in _FUNCTIONS]
         return tuple(dict.fromkeys(found))
 
+    @property
+    def is_name(self) -> bool:
+        """Whether it is an input alone, whose value may be a number or a choice."""
+        return isinstance(self._tree(), ast.Name)
+
+    def choices(self) -> tuple[tuple[str, str], ...]:
+        """Return the inputs that are compared with a text, each with the text."""
+        found = (_equality(node) for node in ast.walk(self._tree()))
+        return tuple(dict.fromkeys((name, choice) for name, _, choice in filter(None, found)))
+
+    def numbers(self) -> tuple[str, ...]:
+        """Return the inputs that the formula uses as numbers."""
+        tree = self._tree()
+        compared = {id(part) for node in ast.walk(tree) if _equality(node) is not None for part in ast.walk(node)}
+        used = [n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and n.id not in _FUNCTIONS and id(n) not in compared]
+        return tuple(dict.fromkeys(used))
+
+    def example(self) -> dict[str, Any]:
+        """Return (1,) values of the inputs that the formula can be tried with."""
+        return {**{name: np.array([""]) for name, _ in self.choices()}, **{name: np.ones(1) for name in self.numbers()}}
+
     def __call__(self, values: Mapping[str, Any]) -> Any:
         """Return the formula's value: (n,) for arrays of n values."""
         return _evaluate(self._tree(), values, self.text)
 
 
+def _equality(node: ast.AST) -> tuple[str, type, str] | None:
+    """Return input, operator and text of a comparison such as `kind == "truck"`; None for any other node."""
+    match node:
+        case ast.Compare(left=ast.Name(id=name), ops=[op], comparators=[ast.Constant(value=str(choice))]):
+            return (name, type(op), choice) if type(op) in _EQUALITY else None
+        case ast.Compare(left=ast.Constant(value=str(choice)), ops=[op], comparators=[ast.Name(id=name)]):
+            return (name, type(op), choice) if type(op) in _EQUALITY else None
+    return None
+
+
+def _compared(name: str, operation: type, choice: str, values: Mapping[str, Any], text: str) -> Any:
+    """Return whether an input is, or is not, this choice."""
+    found = np.asarray(_evaluate(ast.Name(id=name), values, text))
+    if found.dtype.kind not in "UO":
+        raise InputError(f"'{name}' in '{text}' must be an input with choices, as it is compared with '{choice}'")
+    return _EQUALITY[operation](found, choice)
+
+
 def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
     """Return the value of one node of the syntax tree."""
+    equality = _equality(node)
+    if equality is not None:
+        return _compared(*equality, values, text)
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return np.float64(value)
@@ -104,5 +148,5 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
             if len(args) != count:
                 raise InputError(f"{name}() in '{text}' takes {count} argument{'s' * (count > 1)}, but got {len(args)}")
             return function(*(_evaluate(arg, values, text) for arg in args))
-    allowed = "numbers, inputs, + - * / **, comparisons, and, or, not, " + ", ".join(_FUNCTIONS)
+    allowed = "numbers, inputs, + - * / **, comparisons, == 'choice', and, or, not, " + ", ".join(_FUNCTIONS)
     raise InputError(f"an expression may use {allowed}, but got '{text}'")

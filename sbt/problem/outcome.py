@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from sbt.problem.plain import Values
+
 __all__ = ["LISTED_ONLY", "UNCONFIRMED", "Job", "Outcome", "Status"]
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
@@ -32,7 +34,7 @@ class Job:
     """One concrete scenario to run: plain data, the same in every process."""
 
     index: int
-    inputs: Mapping[str, float]
+    inputs: Values
     seed: int
 
 

@@ -1,8 +1,9 @@
-"""One input of a logical scenario: its range, unit and distribution."""
+"""One input of a logical scenario: its range, unit and distribution, or its choices and their probabilities."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -10,31 +11,45 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.distribution import Distribution, TruncatedDistribution
+from sbt.problem.plain import Value
 
-__all__ = ["TAIL", "Parameter"]
+__all__ = ["TAIL", "Choices", "Kind", "Parameter"]
 
 TAIL = 1e-6
 """An infinite range is searched between these quantiles of its distribution."""
+_SUM = 1e-6  # by which probabilities that were written with six digits may miss 1
+
+Kind = Literal["continuous", "integer", "categorical"]
+Choices = Sequence[str] | Mapping[str, float]
+"""Equally likely choices, or choices with their probabilities."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Parameter:
-    """One input: a range with a unit, and the distribution of the values in it (None: uniform).
+    """One input: a range with a unit and the distribution of the values in it (None: uniform), or named choices.
+
+    In arrays a choice stands as its position (0.0, 1.0, ...); wherever an input has its name beside it, a run, a formula, a
+    store, a table, it is the choice itself, as text. Choices have no order: none is nearer to one than to another.
 
     Args:
         name: an identifier.
         low, high: ends of the range in `unit`, both included; infinite only with a distribution.
         unit: as printed, "" for a pure number.
         distribution: distribution of the input, truncated to the range.
-        kind: "integer" inputs take the whole numbers of the range.
+        kind: "integer" inputs take the whole numbers of the range; inputs with choices are "categorical".
         description: one line for reports.
+        choices: at least two different texts, or a mapping of such texts to their probabilities; () for an input with a range.
+        probabilities: of the choices, in their order; () where they are equally likely, or stand in `choices`.
 
     Raises:
-        InputError: not low < high, a NaN, an infinite range without a distribution, or an integer range
-            whose ends are not whole numbers.
+        InputError: not low < high, a NaN, an infinite range without a distribution, an integer range whose ends are not
+            whole numbers, or choices that are no such texts, stand beside a range, or have probabilities that do not sum to 1.
+
+    >>> Parameter("kind", choices={"car": 0.7, "truck": 0.3}).range
+    '{car, truck}'
     """
 
     name: str
@@ -42,10 +57,40 @@ class Parameter:
     high: float
     unit: str = ""
     distribution: Distribution | None = None
-    kind: Literal["continuous", "integer"] = "continuous"
+    kind: Kind = "continuous"
     description: str = ""
+    choices: tuple[str, ...] = ()
+    probabilities: tuple[float, ...] = ()
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self, name: str, low: float | None = None, high: float | None = None, unit: str = "",
+        distribution: Distribution | None = None, kind: Kind | None = None, description: str = "", choices: Choices = (),
+        probabilities: Sequence[float] = (),
+    ):  # fmt: skip
+        if isinstance(choices, Mapping):
+            probabilities = tuple(choices.values())
+            choices = tuple(choices)
+        if not isinstance(choices, list | tuple):
+            raise InputError(f"input {name}: choices must be a list of texts, or texts with probabilities, but got {choices!r}")
+        if len(choices) or kind == "categorical":
+            given = {"low": low not in (None, 0.0), "high": high not in (None, len(choices) - 1.0),
+                     "distribution": distribution is not None}  # fmt: skip
+            if any(given.values()):
+                surplus = ", ".join(key for key, there in given.items() if there)
+                raise InputError(f"input {name}: an input has a range or choices, not both, but got choices and {surplus}")
+            low, high, kind = 0.0, len(choices) - 1.0, "categorical" if kind is None else kind
+        if low is None or high is None:
+            raise InputError(f"input {name}: a range (low, high) or choices are needed")
+        values = {
+            "name": name, "low": low, "high": high, "unit": unit, "distribution": distribution,
+            "kind": "continuous" if kind is None else kind, "description": description, "choices": tuple(choices),
+            "probabilities": tuple(probabilities),
+        }  # fmt: skip
+        for key, value in values.items():
+            object.__setattr__(self, key, value)
+        self._check()
+
+    def _check(self) -> None:
         for end in ("low", "high"):
             value = getattr(self, end)
             if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
@@ -54,10 +99,13 @@ class Parameter:
             raise InputError(f"input {self.name}: a unit must be text (a distribution comes after it), but got {self.unit!r}")
         if not self.name.isidentifier():
             raise InputError(f"an input's name must be an identifier, but got '{self.name}'")
+        if self.kind not in ("continuous", "integer", "categorical"):
+            raise InputError(f"input {self.name}: kind must be continuous, integer or categorical, but got '{self.kind}'")
+        if self.kind == "categorical" or self.choices:
+            self._check_choices()
+            return
         if not self.low < self.high:
             raise InputError(f"input {self.name}: low < high must hold, but got low {self.low}, high {self.high}")
-        if self.kind not in ("continuous", "integer"):
-            raise InputError(f"input {self.name}: kind must be continuous or integer, but got '{self.kind}'")
         finite = math.isfinite(self.low) and math.isfinite(self.high)
         if not finite and (self.distribution is None or self.distribution.kind == "uniform"):
             raise InputError(f"input {self.name}: an infinite range needs a distribution, but got none")
@@ -66,20 +114,87 @@ class Parameter:
         if self.distribution is not None:
             self.distribution.truncated(*self._support)
 
+    def _check_choices(self) -> None:
+        """Refuse what are no choices with probabilities."""
+        name = self.name
+        if self.kind != "categorical":
+            raise InputError(f"input {name}: an input with choices is categorical, but got kind '{self.kind}'")
+        for choice in self.choices:
+            if not isinstance(choice, str):
+                raise InputError(f"input {name}: a choice must be text (write a number in quotes), but got {choice!r}")
+            if not choice.strip() or choice != choice.strip() or not choice.isprintable():
+                rule = "a choice must be text on one line without blanks around it"
+                raise InputError(f"input {name}: {rule}, but got {choice!r}")
+        doubled = next((c for k, c in enumerate(self.choices) if c in self.choices[:k]), None)
+        if doubled is not None:
+            raise InputError(f"input {name}: choices must differ, but '{doubled}' stands twice")
+        if len(self.choices) < 2:
+            raise InputError(f"input {name}: at least two choices are needed, but got {', '.join(self.choices) or 'none'}")
+        if not self.probabilities:
+            return
+        if len(self.probabilities) != len(self.choices):
+            counts = f"{len(self.choices)} choices and {len(self.probabilities)} probabilities"
+            raise InputError(f"input {name}: every choice needs its probability, but got {counts}")
+        for choice, p in zip(self.choices, self.probabilities, strict=True):
+            number = isinstance(p, int | float | np.integer | np.floating) and not isinstance(p, bool | np.bool_)
+            if not number or not 0.0 < p < 1.0:
+                raise InputError(f"input {name}: a probability must be a number between 0 and 1, but '{choice}' has {p!r}")
+        total = math.fsum(self.probabilities)
+        if abs(total - 1.0) > _SUM:
+            raise InputError(f"input {name}: the probabilities of the choices must sum to 1, but sum to {total:.6g}")
+
     @property
     def range(self) -> str:
-        """The range as printed, with its unit."""
+        """The range as printed, with its unit; the choices of a categorical input."""
+        if self.choices:
+            return f"{{{', '.join(self.choices)}}}"
         return f"[{self.low:g}, {self.high:g}] {self.unit}".rstrip()
+
+    @property
+    def discrete(self) -> bool:
+        """Whether single values are taken: whole numbers, or choices."""
+        return self.kind != "continuous"
+
+    @cached_property
+    def shares(self) -> Vector:
+        """(k,) probabilities of the choices, summing to 1; empty for an input with a range."""
+        given = np.asarray(self.probabilities or [1.0] * len(self.choices), dtype=np.float64)
+        return given / max(given.sum(), 1e-300)
+
+    @cached_property
+    def edges(self) -> Vector:
+        """(k - 1,) normal scores between the k choices: a choice owns as much of the normal distribution as it is likely."""
+        below, above = np.cumsum(self.shares)[:-1], np.cumsum(self.shares[::-1])[::-1][1:]
+        return np.where(below <= above, ndtri(below), -ndtri(above))
+
+    def value(self, x: float) -> Value:
+        """Return what stands for a number of an array where the input is named: the choice, or the number itself."""
+        return self.choices[int(x)] if self.choices else float(x)
+
+    def number(self, value: object) -> float:
+        """Return the number that stands for a value in arrays: the position of a choice, or the value itself.
+
+        Raises:
+            InputError: it is no choice, or no number.
+        """
+        if not self.choices:
+            if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
+                raise InputError(f"input {self.name} must be a number, but got {value!r}")
+            return float(value)
+        if value not in self.choices:
+            hint = did_you_mean(value, self.choices) if isinstance(value, str) else ""
+            raise InputError(f"input {self.name} must be one of {', '.join(self.choices)}, but got {value!r}{hint}")
+        return float(self.choices.index(str(value)))
 
     @property
     def _support(self) -> tuple[float, float]:
         """Return the range of the distribution; whole numbers own half a unit on each side."""
-        half = 0.5 if self.kind == "integer" else 0.0
+        half = 0.5 if self.discrete else 0.0
         return self.low - half, self.high + half
 
     @cached_property
     def truncated(self) -> TruncatedDistribution | None:
-        """The truncated distribution, None where the input is uniform on its range."""
+        """The truncated distribution, None where the input is uniform on its range, or has choices."""
         if self.distribution is None or self.distribution.kind == "uniform":
             return None
         return self.distribution.truncated(*self._support)
@@ -95,33 +210,37 @@ class Parameter:
 
     @property
     def centre(self) -> float:
-        """Middle of the bounds, a whole number for integer inputs."""
+        """Middle of the bounds, a whole number for integer inputs; the likeliest choice, of equally likely ones the first."""
         low, high = self.bounds
+        if self.choices:
+            return float(np.argmax(self.shares))
         return float(math.floor((low + high) / 2)) if self.kind == "integer" else (low + high) / 2
 
     def contains(self, x: Vector) -> Mask:
-        """Return (n,) booleans: the value is in the range (and whole, for integers)."""
+        """Return (n,) booleans: the value is in the range (and whole, for integers and choices)."""
         x = np.asarray(x, dtype=np.float64)
         inside = (x >= self.low) & (x <= self.high)
-        return inside & (x % 1 == 0) if self.kind == "integer" else inside
+        return inside & (x % 1 == 0) if self.discrete else inside
 
     def from_unit(self, u: Vector) -> Vector:
-        """Map [0, 1] onto the bounds: linearly, in equal cells for integers."""
+        """Map [0, 1] onto the bounds: linearly, in equal cells for integers and choices."""
         low, high = self.bounds
-        if self.kind == "integer":
+        if self.discrete:
             return np.clip(np.floor(low + u * (high - low + 1)), low, high)
         return np.clip(low + u * (high - low), low, high)
 
     def to_unit(self, x: Vector) -> Vector:
-        """Map the bounds onto [0, 1]; integers to the middle of their cell."""
+        """Map the bounds onto [0, 1]; integers and choices to the middle of their cell."""
         low, high = self.bounds
-        if self.kind == "integer":
+        if self.discrete:
             return (x - low + 0.5) / (high - low + 1)
         return (x - low) / (high - low)
 
     def from_normal(self, z: Vector) -> Vector:
         """Map a standard-normal score to the value of the same probability."""
         z = np.asarray(z, dtype=np.float64)
+        if self.choices:
+            return np.searchsorted(self.edges, z, side="right").astype(np.float64)
         low, high = self._support
         if self.truncated is None:
             x = np.where(z <= 0, low + (high - low) * ndtr(z), high - (high - low) * ndtr(-z))
@@ -132,19 +251,24 @@ class Parameter:
         return np.clip(x, self.low, self.high)
 
     def to_normal(self, x: Vector) -> Vector:
-        """Map a value to its standard-normal score (integers: of their cell's middle)."""
+        """Map a value to its standard-normal score (integers and choices: of their cell's middle)."""
         low, high = self._support
-        if self.truncated is None:
+        if self.choices:
+            k = np.clip(np.asarray(x), self.low, self.high).astype(np.intp)
+            middle = 0.5 * self.shares[k]
+            below = np.concatenate([[0.0], np.cumsum(self.shares)])[k] + middle
+            above = np.concatenate([np.cumsum(self.shares[::-1])[::-1], [0.0]])[k + 1] + middle
+        elif self.truncated is None:
             below, above = (x - low) / (high - low), (high - x) / (high - low)
         else:
             below, above = self.truncated.cdf(x), self.truncated.sf(x)
         return np.where(below <= above, ndtri(below), -ndtri(above))
 
     def log_density(self, x: Vector) -> Vector:
-        """Return (n,) log density of the value, log mass for integers, -inf outside the range."""
+        """Return (n,) log density of the value, log mass for integers and choices, -inf outside the range."""
         x = np.asarray(x, dtype=np.float64)
         with np.errstate(divide="ignore"):
-            if self.kind == "integer":
+            if self.discrete:
                 log_p = np.log(self._cell_mass(x))
             elif self.truncated is None:
                 log_p = np.full(x.shape, -math.log(self.high - self.low))
@@ -153,7 +277,9 @@ class Parameter:
         return np.where(self.contains(x), log_p, -np.inf)
 
     def _cell_mass(self, x: Vector) -> Vector:
-        """Return the probability of the whole number x."""
+        """Return the probability of the whole number or choice x."""
+        if self.choices:
+            return self.shares[np.clip(x, self.low, self.high).astype(np.intp)]
         if self.truncated is None:
             return np.full(x.shape, 1.0 / (self.high - self.low + 1))
         upper = self.truncated.sf(x - 0.5) - self.truncated.sf(x + 0.5)

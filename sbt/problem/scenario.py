@@ -15,20 +15,21 @@ from sbt.errors import InputError, RunError, did_you_mean
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Values
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
 __all__ = ["Batched", "Configurable", "Evaluate", "LogicalScenario", "Metric", "Pool", "Roles", "Simulate", "metric_from"]
 
-Evaluate = Callable[[Mapping[str, float], int], Mapping[str, float]]
-"""(values, seed) -> metrics by name."""
+Evaluate = Callable[[Values, int], Mapping[str, float]]
+"""(values, seed) -> metrics by name; inputs with choices have text as value."""
 
 
 class Simulate(Protocol):
     """Runs one concrete scenario; same values and seed, same trace, in any process."""
 
-    def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
+    def __call__(self, values: Values, seed: int) -> Trace:
         """Return the trace; raise `RunError` where the run cannot give one."""
         ...
 
@@ -43,7 +44,7 @@ class Batched(Protocol):
         ...
 
     def simulate_many(
-        self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = ...
+        self, work: Sequence[tuple[Values, int]], at_work: Callable[[Sequence[int]], None] = ...
     ) -> list[Trace | BaseException]:
         """Return the trace, or the error, of each of these values and seeds: the same as one by one.
 
@@ -284,13 +285,13 @@ class LogicalScenario:
         """Return every metric of a trace by name."""
         return {metric.name: metric(trace) for metric in self.metrics}
 
-    def run(self, values: Mapping[str, float], seed: int) -> dict[str, float]:
+    def run(self, values: Values, seed: int) -> dict[str, float]:
         """Run one concrete scenario and return its metrics.
 
         Raises:
             RunError: it gives none; the error says which `Status` the run has.
         """
-        values = {name: float(value) for name, value in values.items()}
+        values = {name: value if isinstance(value, str) else float(value) for name, value in values.items()}
         if self.simulate is not None:
             return self.measure(self.simulate(values, seed))
         if self.evaluate is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -12,11 +13,14 @@ from scipy.stats import qmc
 
 from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Mask, Points, Vector, as_points
+from sbt.problem.cube import Cube
+from sbt.problem.expression import Expression
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Value, Values, written
 
 __all__ = ["ParameterSpace"]
 
-Formula = Callable[[Mapping[str, Vector]], Vector]
+Formula = Callable[[Mapping[str, Any]], Any]
 _MASS_POINTS = 2**15
 _MIN_FEASIBLE = 1e-3
 _FARTHEST = 38.0
@@ -31,13 +35,14 @@ class ParameterSpace:
         parameters: the inputs, in the order of the columns of every (n, d) array.
         correlation: (d, d) correlation of the inputs' normal scores as nested tuples; None:
             independent. This is the copula's matrix, not the correlation of the values.
-        constraints: (text, predicate) pairs; a concrete scenario must satisfy all of them.
+        constraints: (text, predicate) pairs; a concrete scenario must satisfy all of them. Predicates and formulas get
+            the (n,) column of each input by name, choices as text.
         features: (name, formula) pairs, quantities derived from the inputs that metamodels see as
             further columns; they change no range and no density.
 
     Raises:
-        InputError: no or doubled names, a matrix that is no correlation matrix, or constraints that
-            less than 1 in 1,000 points of the box satisfy.
+        InputError: no or doubled names, a matrix that is no correlation matrix or correlates an input with choices, a formula
+            that takes choices for numbers, or constraints that less than 1 in 1,000 points of the box satisfy.
     """
 
     parameters: tuple[Parameter, ...]
@@ -52,6 +57,9 @@ class ParameterSpace:
             raise InputError(f"inputs must have different names, but got {', '.join(self.names)}")
         if self.correlation is not None:
             self._check_correlation()
+        for _, formula in (*self.constraints, *self.features):
+            if isinstance(formula, Expression):
+                self.check_formula(formula)
         if self.constraints and self._feasible_share < _MIN_FEASIBLE:
             rules = "; ".join(text for text, _ in self.constraints)
             raise InputError(f"constraints must leave at least {_MIN_FEASIBLE:g} of the box, but '{rules}' leave less")
@@ -63,6 +71,26 @@ class ParameterSpace:
             raise InputError(f"correlation must be a symmetric ({d}, {d}) matrix with ones on its diagonal")
         if not np.linalg.eigvalsh(matrix)[0] > 1e-10:
             raise InputError("correlation must be positive definite, but it is not")
+        for k, p in enumerate(self.parameters):
+            if p.choices and np.count_nonzero(matrix[k]) > 1:
+                raise InputError(f"an input with choices has no order to correlate by, but {p.name} is in a correlation")
+
+    def check_formula(self, formula: Expression) -> None:
+        """Refuse a formula that takes choices for numbers, numbers for choices, or compares with an unknown choice.
+
+        Raises:
+            InputError: it does.
+        """
+        known = {p.name: p for p in self.parameters}
+        for name in formula.numbers():
+            if name in known and known[name].choices:
+                rule = f"it can only be compared with one of them, such as {name} == '{known[name].choices[0]}'"
+                raise InputError(f"'{name}' in '{formula.text}' is an input with choices: {rule}")
+        for name, choice in formula.choices():
+            if name in known and not known[name].choices:
+                raise InputError(f"'{name}' in '{formula.text}' is a number, but is compared with the text '{choice}'")
+            if name in known:
+                known[name].number(choice)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -73,6 +101,29 @@ class ParameterSpace:
     def dimension(self) -> int:
         """Number of inputs d."""
         return len(self.parameters)
+
+    @cached_property
+    def cube(self) -> Cube:
+        """Where in the unit cube the values of whole-number inputs and choices lie."""
+        counts = [(k, len(p.choices), round(p.high - p.low) + 1) for k, p in enumerate(self.parameters) if p.discrete]
+        return Cube(tuple((k, n) for k, m, n in counts if not m), tuple((k, m) for k, m, _ in counts if m))
+
+    @property
+    def choices(self) -> dict[str, tuple[str, ...]]:
+        """The choices of the inputs that have some, by name."""
+        return {p.name: p.choices for p in self.parameters if p.choices}
+
+    def named(self, x: Vector) -> dict[str, Value]:
+        """Return the (d,) numbers of a point as values by name, choices as text."""
+        return {p.name: p.value(v) for p, v in zip(self.parameters, x, strict=True)}
+
+    def numbers(self, values: Values) -> Vector:
+        """Return the (d,) numbers of values by name, a choice as its position.
+
+        Raises:
+            InputError: one is no choice, or no number.
+        """
+        return np.array([p.number(values[p.name]) for p in self.parameters])
 
     @cached_property
     def _factor(self) -> Points | None:
@@ -97,9 +148,9 @@ class ParameterSpace:
             raise InputError("constraints must have mass under the inputs' distribution, but they have none")
         return mass
 
-    def columns(self, x: Points) -> dict[str, Vector]:
-        """Return the (n,) column of each input by name."""
-        return {name: x[:, k] for k, name in enumerate(self.names)}
+    def columns(self, x: Points) -> dict[str, Any]:
+        """Return the (n,) column of each input by name, choices as text."""
+        return {p.name: _column(p, x[:, k]) for k, p in enumerate(self.parameters)}
 
     def feasible(self, x: Points) -> Mask:
         """Return (n,) booleans: in the ranges and all constraints hold."""
@@ -140,8 +191,8 @@ class ParameterSpace:
     def log_density(self, x: Points) -> Vector:
         """Return (n,) log p(x): the marginals, the copula, the constraints.
 
-        -inf outside the ranges and constraints. With integer inputs it is a density in the
-        continuous and a mass in the integer ones; their copula term is that of the cell's middle.
+        -inf outside the ranges and constraints. With integer inputs and choices it is a density in the
+        continuous and a mass in the others; the copula term of integers is that of the cell's middle.
         """
         x = as_points(x, self.dimension)
         log_p = np.sum([p.log_density(x[:, k]) for k, p in enumerate(self.parameters)], axis=0)
@@ -166,16 +217,17 @@ class ParameterSpace:
         return np.vstack(kept) if kept else np.empty((0, self.dimension))
 
     def metamodel_inputs(self, u: Points) -> Points:
-        """Return (n, d + f) columns for a metamodel: u and the derived features, each scaled to [0, 1].
+        """Return (n, e + f) columns for a metamodel: the embedded point (see `Cube`) and the derived features in [0, 1].
 
         A feature is scaled by its range over 4,096 Sobol points of the box.
         """
+        own = self.cube.embedded(u)
         if not self.features:
-            return u
+            return own
         ranges = self._feature_ranges
         columns = self.columns(self.from_unit(u))
         derived = [(np.asarray(f(columns)) - lo) / (hi - lo) for (_, f), (lo, hi) in zip(self.features, ranges, strict=True)]
-        return np.column_stack([u, *derived])
+        return np.column_stack([own, *derived])
 
     @cached_property
     def _feature_ranges(self) -> tuple[tuple[float, float], ...]:
@@ -189,22 +241,30 @@ class ParameterSpace:
             ranges.append((float(values.min()), float(values.max())))
         return tuple(ranges)
 
-    def values(self, given: Mapping[str, float]) -> dict[str, float]:
+    def values(self, given: Values) -> dict[str, Value]:
         """Return all inputs by name: the given ones checked, the others at their centre.
 
         Raises:
-            InputError: an unknown name, or a value outside its range or the constraints.
+            InputError: an unknown name, or a value outside its range, choices or the constraints.
         """
         for name in given:
             if name not in self.names:
                 hint = did_you_mean(name, self.names)
                 raise InputError(f"an input must be one of {', '.join(self.names)}, but got '{name}'{hint}")
-        full = {p.name: float(given.get(p.name, p.centre)) for p in self.parameters}
-        for p in self.parameters:
-            if not bool(p.contains(np.array(full[p.name]))):
+        x = np.array([p.number(given[p.name]) if p.name in given else p.centre for p in self.parameters])
+        for p, value in zip(self.parameters, x, strict=True):
+            if not bool(p.contains(value)):
                 kind = "a whole number " if p.kind == "integer" else ""
-                raise InputError(f"input {p.name} must be {kind}in {p.range}, but got {full[p.name]:g}")
-        if self.constraints and not bool(self.feasible(np.array([list(full.values())]))[0]):
+                raise InputError(f"input {p.name} must be {kind}in {p.range}, but got {value:g}")
+        full = self.named(x)
+        if self.constraints and not bool(self.feasible(x[None])[0]):
             rules = "; ".join(text for text, _ in self.constraints)
-            raise InputError(f"inputs must satisfy '{rules}', but got {full}")
+            raise InputError(f"inputs must satisfy '{rules}', but got {written(full)}")
         return full
+
+
+def _column(parameter: Parameter, x: Vector) -> Any:
+    """Return the (n,) values of an input: its numbers, or its choices as text."""
+    if not parameter.choices:
+        return x
+    return np.array(parameter.choices)[np.clip(x, parameter.low, parameter.high).astype(np.intp)]

@@ -24,7 +24,7 @@ from sbt.store.history import VALIDATION, History
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_metric", "plot_prediction", "plot_probability", "plot_runs"]
+__all__ = ["escaped", "plot_metric", "plot_prediction", "plot_probability", "plot_runs", "whole_ticks"]
 
 _RASTER = 1500
 """More markers than this become an image inside the SVG, which keeps the file small."""
@@ -43,7 +43,7 @@ def plot_runs(
 ) -> Axes:
     """Scatter the runs over two inputs; the axes show the whole range, also where no run lies.
 
-    Whole-number inputs are spread around their value, so that runs do not hide each other.
+    Runs of whole-number inputs and choices are spread around their value, so that runs do not hide each other.
 
     Args:
         history: finished runs.
@@ -58,7 +58,7 @@ def plot_runs(
     _scatter(history, requirement, x, y, ax, size)
     ax.set(xlabel=label(across.name, across.unit), ylabel=label(up.name, up.unit))
     ax.set(xlim=_limits(across, x), ylim=_limits(up, y))
-    _whole_ticks(ax, across, up)
+    whole_ticks(ax, across, up)
     return ax
 
 
@@ -79,29 +79,36 @@ def plot_metric(
     _scatter(history, requirement, history.x[:, column], np.where(known, y, floor), ax)
     ax.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(requirement.metric, unit))
     ax.set(xlim=_limits(parameter, history.x[:, column]), ylim=padded(floor, top))
+    whole_ticks(ax, parameter)
     return ax
 
 
-def plot_prediction(x: Vector, prediction: Prediction, ax: Axes) -> Axes:
-    """Draw the metamodel's mean of the metric over one input, and the band of its 5 % to 95 % quantiles."""
+def plot_prediction(x: Vector, prediction: Prediction, ax: Axes, *, choices: bool = False) -> Axes:
+    """Draw the metamodel's mean of the metric over one input, and the band (bars at choices) of its 5 % to 95 % quantiles."""
     low, high = prediction.quantile(0.05), prediction.quantile(0.95)
+    if choices:
+        ax.errorbar(x, prediction.mu, (prediction.mu - low, high - prediction.mu), fmt="o", color=MODEL, capsize=4, zorder=2,
+                    label="metamodel, mean and 5 % to 95 %")  # fmt: skip
+        return ax
     band = ax.fill_between(x, low, high, color=MODEL, alpha=0.18, linewidth=0, zorder=1.5)
     band.set_label("metamodel, 5 % to 95 %")
     ax.plot(x, prediction.mu, color=MODEL, linewidth=1.4, zorder=2, label="metamodel, mean")
     return ax
 
 
-def plot_probability(plane: Plane, space: ParameterSpace, ax: Axes) -> Axes:
+def plot_probability(plane: Plane, space: ParameterSpace, ax: Axes, *, bar: bool = True) -> Axes:
     """Draw P(critical): over two inputs as shade with contours, over one as curve.
 
-    The solid line is P = 0.5, the boundary as the metamodel sees it; dashed lines are 0.1 and 0.9.
+    The solid line is P = 0.5, the boundary as the metamodel sees it; dashed lines are 0.1 and 0.9. There are no lines
+    between choices. `bar` adds the scale of the shades.
     """
     from matplotlib.patheffects import withStroke
 
     inputs = [space.parameters[k] for k in plane.pair]
-    ax.set(xlabel=label(inputs[0].name, inputs[0].unit), xlim=padded(*inputs[0].bounds))
+    ax.set(xlabel=label(inputs[0].name, inputs[0].unit), xlim=_limits(inputs[0], np.empty(0)))
     if len(inputs) == 1:
-        ax.plot(plane.axes[0], plane.probability, color=MODEL)
+        ax.plot(plane.axes[0], plane.probability, "o" if inputs[0].choices else "-", color=MODEL)
+        whole_ticks(ax, *inputs)
         ax.axhline(0.5, color="#777777", linewidth=0.9, linestyle="--")
         ax.set(ylabel="P(critical)", ylim=(-0.03, 1.03))
         return ax
@@ -119,7 +126,7 @@ def plot_probability(plane: Plane, space: ParameterSpace, ax: Axes) -> Axes:
     )
     levels = {0.1: "--", 0.5: "-", 0.9: "--"}
     low, high = np.nanmin(plane.probability, initial=1.0), np.nanmax(plane.probability, initial=0.0)
-    inside = [level for level in levels if low < level < high]
+    inside = [level for level in levels if low < level < high and not any(p.choices for p in inputs)]
     if inside:
         styles, widths = (
             [levels[level] for level in inside],
@@ -135,11 +142,12 @@ def plot_probability(plane: Plane, space: ParameterSpace, ax: Axes) -> Axes:
             zorder=9,
         )
         lines.set_path_effects([withStroke(linewidth=3.2, foreground="white", alpha=0.7)])
-    bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, fraction=0.05, ticks=[0, 0.1, 0.5, 0.9, 1])
-    bar.set_label("P(critical)")
-    bar.outline.set_visible(False)
-    ax.set(ylabel=label(inputs[1].name, inputs[1].unit), ylim=padded(*inputs[1].bounds))
-    _whole_ticks(ax, *inputs)
+    if bar:
+        scale = ax.figure.colorbar(mesh, ax=ax, pad=0.02, fraction=0.05, ticks=[0, 0.1, 0.5, 0.9, 1])
+        scale.set_label("P(critical)")
+        scale.outline.set_visible(False)
+    ax.set(ylabel=label(inputs[1].name, inputs[1].unit), ylim=_limits(inputs[1], np.empty(0)))
+    whole_ticks(ax, *inputs)
     ax.grid(visible=False)
     return ax
 
@@ -180,19 +188,21 @@ def _hollow(marker: str, colour: str, scale: float) -> dict[str, Any]:
     return {"marker": marker, "facecolors": "none", "edgecolors": colour, "linewidths": 0.9, "s": scale}
 
 
-def _whole_ticks(ax: Axes, *inputs: Parameter) -> None:
-    """Let the axes of integer inputs have whole ticks only."""
+def whole_ticks(ax: Axes, *inputs: Parameter) -> None:
+    """Let the axes of integer inputs have whole ticks only, those of inputs with choices the choices."""
     from matplotlib.ticker import MaxNLocator
 
     for axis, parameter in zip((ax.xaxis, ax.yaxis), inputs, strict=False):
+        if parameter.choices:
+            axis.set_ticks(range(len(parameter.choices)), [escaped(choice) for choice in parameter.choices])
         if parameter.kind == "integer":
             axis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
 def _spread(history: History, space: ParameterSpace, column: int, step: float) -> Vector:
-    """Return (n,) places of the runs; whole numbers are moved by up to 0.3, evenly by the run's index."""
+    """Return (n,) places of the runs; whole numbers and choices are moved by up to 0.3, evenly by the run's index."""
     x = history.x[:, column]
-    if space.parameters[column].kind != "integer":
+    if not space.parameters[column].discrete:
         return x
     moved: Vector = x + 0.6 * ((history.index * step) % 1.0 - 0.5)
     return moved
@@ -201,4 +211,11 @@ def _spread(history: History, space: ParameterSpace, column: int, step: float) -
 def _limits(parameter: Parameter, x: Vector) -> tuple[float, float]:
     """Return the axis of an input: its range, and runs beyond it where the range is infinite."""
     low, high = parameter.bounds
+    if parameter.choices:
+        return low - 0.5, high + 0.5
     return padded(float(np.min(x, initial=low)), float(np.max(x, initial=high)))
+
+
+def escaped(text: str) -> str:
+    """Return a text as it is drawn: a dollar sign would begin a formula."""
+    return text.replace("$", r"\$")

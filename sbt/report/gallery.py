@@ -23,6 +23,7 @@ __all__ = ["Drawing", "draw"]
 _MARKERS = "Light circles are uncritical, dark triangles critical, crosses failed; hollow markers are held out."
 
 _MOST_RUNS_ON_MAP = 800
+_MOST_PANELS = 9
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,8 @@ def _runs(found: Findings, space: ParameterSpace, predict: Predict | None, weigh
         figures.plot_runs(found.history, found.requirement, space, ax, pair=pair)
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper center", ncols=3 if columns == 1 else 5)
     caption = f"Every run. {_MARKERS}"
-    if any(parameter.kind == "integer" for parameter in space.parameters):
-        caption += " Whole-number inputs are spread around their value."
+    if any(parameter.discrete for parameter in space.parameters):
+        caption += " Runs of whole-number inputs and of choices are spread around their value."
     if columns > 1:
         chosen = "all pairs of inputs" if space.dimension == 3 else "the pairs of the four most influential inputs"
         caption += f" Shown are {chosen}, most influential first; the other inputs vary unseen, so that verdicts overlap."
@@ -91,15 +92,22 @@ def _runs_over_one(found: Findings, space: ParameterSpace, predict: Predict | No
     ax = figures.plot_metric(found.history, found.requirement, space, figure.subplots(), unit=found.unit)
     caption = f"The safety metric of every run; shaded where critical. {_MARKERS} Failed runs lie on the floor."
     if predict is not None:
-        u = np.linspace(0.0, 1.0, 401)[:, None]
-        figures.plot_prediction(space.from_unit(u)[:, 0], predict(u), ax)
-        caption += " Line and band: the metamodel's mean and its 5 % to 95 % quantiles."
+        choices = space.parameters[0].choices
+        u = (np.arange(len(choices))[:, None] + 0.5) / len(choices) if choices else np.linspace(0.0, 1.0, 401)[:, None]
+        figures.plot_prediction(space.from_unit(u)[:, 0], predict(u), ax, choices=bool(choices))
+        how = "Dots and bars" if choices else "Line and band"
+        caption += f" {how}: the metamodel's mean and its 5 % to 95 % quantiles."
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return Drawing("runs", "Runs in input space", caption, to_svg(figure, "runs"))
 
 
 def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vector) -> Iterator[Drawing]:
-    """Yield the map of P(critical) by the metamodel."""
+    """Yield the map of P(critical) by the metamodel, one for each choice of the most influential input that has some."""
+    numeric = [k for k, p in enumerate(space.parameters) if not p.choices]
+    apart = [k for k, p in enumerate(space.parameters) if p.choices and len(p.choices) <= _MOST_PANELS]
+    if apart and len(numeric) >= 2:
+        yield _maps_by_choice(found, space, predict, weights, max(apart, key=lambda k: weights[k]), numeric)
+        return
     pair = (0,) if space.dimension == 1 else (most_influential_pairs(weights)[0] if space.dimension > 2 else (0, 1))
     plane = probability_plane(predict, found.requirement.critical, space, pair)
     figure = new_figure(5.4, 4.4)
@@ -123,6 +131,38 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
         caption += "; dashed: 0.1 and 0.9."
         caption += " The gap between the dashed lines is its uncertainty." if space.dimension == 2 else ""
     yield Drawing("probability", "Where critical runs are expected", caption, to_svg(figure, "probability"))
+
+
+def _maps_by_choice(
+    found: Findings, space: ParameterSpace, predict: Predict, weights: Vector, which: int, numeric: list[int]
+) -> Drawing:
+    """Return a map of P(critical) over the two most influential other inputs, for each choice of input `which`."""
+    choices, name = space.parameters[which].choices, space.parameters[which].name
+    across, up = sorted(sorted(numeric, key=lambda k: (-weights[k], k))[:2])
+    columns = min(len(choices), 3)
+    lines = -(-len(choices) // columns)
+    figure = new_figure(11.0, 0.35 + 3.5 * lines)
+    grid = np.atleast_1d(figure.subplots(lines, columns)).ravel()
+    learned = found.history.where(found.history.stage != VALIDATION)
+    planes = [
+        probability_plane(predict, found.requirement.critical, space, (across, up), fixed={which: float(k)})
+        for k in range(len(choices))
+    ]
+    for k, (choice, plane, ax) in enumerate(zip(choices, planes, grid, strict=False)):
+        figures.plot_probability(plane, space, ax, bar=(k + 1) % columns == 0 or k + 1 == len(choices))
+        if space.dimension == 3:
+            mine = learned.where(learned.x[:, which] == k)
+            figures.plot_runs(mine, found.requirement, space, ax, pair=(across, up), size=10.0)
+        ax.set_title(figures.escaped(f"{name} = {choice}"), fontsize="medium")
+    for ax in grid[len(choices) :]:
+        ax.set_visible(False)
+    caption = f"The metamodel's probability that a run is critical, for each choice of {name}."
+    if space.dimension == 3:
+        caption += " Markers: the runs it could learn from."
+    else:
+        caption += f" Each value is the mean over {planes[0].averaged} Sobol points of the other inputs (marginal P)."
+    caption += " Solid: P = 0.5; dashed: 0.1 and 0.9."
+    return Drawing("probability", "Where critical runs are expected", caption, to_svg(figure, "probability"), wide=True)
 
 
 def _held_out(found: Findings, space: ParameterSpace, predict: Predict) -> Iterator[Drawing]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from sbt.campaigns.modes import FailureMode
 from sbt.campaigns.wording import NOTHING, number, percent
 from sbt.problem.arrays import Vector
 from sbt.problem.space import ParameterSpace
+from sbt.report.figures import whole_ticks
 from sbt.report.style import new_figure, to_svg
 from sbt.report.tables import Cell, Table
 from sbt.report.words import Findings
@@ -57,8 +59,12 @@ def _change(mode: FailureMode, space: ParameterSpace) -> str:
         return "no uncritical run"
     spans = {p.name: p.bounds[1] - p.bounds[0] for p in space.parameters}
     units = {p.name: p.unit for p in space.parameters}
-    ranked = sorted(safe.change.items(), key=lambda item: -abs(item[1]) / spans[item[0]])[:3]
-    changes = ", ".join(f"{name} {change:+.3g} {units[name]}".strip() for name, change in ranked)
+    sizes = {k: math.inf if isinstance(v, str) else abs(v) / spans[k] for k, v in safe.change.items()}  # another choice first
+    ranked = sorted(safe.change.items(), key=lambda item: -sizes[item[0]])[:3]
+    changes = ", ".join(
+        f"{name} {change}" if isinstance(change, str) else f"{name} {change:+.3g} {units[name]}".strip()
+        for name, change in ranked
+    )
     rest = len(safe.change) - len(ranked)
     return f"{changes}{f' and {rest} more' if rest > 0 else ''}: {number(safe.metric)} (run {safe.run})"
 
@@ -97,6 +103,7 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
     names = [f"{p.name} ({p.unit})" if p.unit else p.name for p in space.parameters]
     ax.set_xlabel(names[across])
     ax.set_ylabel(found.requirement.metric if up is None else names[up])
+    whole_ticks(ax, space.parameters[across], *(() if up is None else (space.parameters[up],)))
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     caption = "Critical runs by failure mode; star: representative; arrow: to the nearest run that is not critical."
     if space.dimension > 2:

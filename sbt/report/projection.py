@@ -5,7 +5,7 @@ Everything is a deterministic function of the campaign's rows: the same rows, th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -92,19 +92,20 @@ def influence_from_runs(history: History, requirement: Requirement) -> Vector:
     """Return (d,) how much of the rank of the margin each input explains alone, relative to the largest.
 
     The correlation ratio over eight bins of equally many runs: it also sees influences that are not
-    monotone. It needs no metamodel.
+    monotone. An input with choices has a group for each. It needs no metamodel.
     """
     runs = history.where(history.ok)
     if len(runs) < 2 * _BINS:
         return np.zeros(len(history.names))
     margin = requirement.critical.margin(runs.y(requirement.metric))
     rank = np.searchsorted(np.sort(margin), margin).astype(np.float64)
-    return _relative(np.array([_explained(runs.x[:, k], rank) for k in range(runs.x.shape[1])]))
+    columns = ((runs.x[:, k], name in runs.choices) for k, name in enumerate(runs.names))
+    return _relative(np.array([_explained(x, rank, choices=choices) for x, choices in columns]))
 
 
-def _explained(x: Vector, y: Vector) -> float:
-    """Return the variance between bins of x of the mean y."""
-    edges = np.unique(np.quantile(x, np.linspace(0, 1, _BINS + 1)[1:-1]))
+def _explained(x: Vector, y: Vector, *, choices: bool) -> float:
+    """Return the variance between bins of x, or between choices, of the mean y."""
+    edges = np.unique(x if choices else np.quantile(x, np.linspace(0, 1, _BINS + 1)[1:-1]))
     groups = np.searchsorted(edges, x, side="right")
     return float(sum((groups == g).mean() * (y[groups == g].mean() - y.mean()) ** 2 for g in np.unique(groups)))
 
@@ -132,15 +133,19 @@ def probability_plane(
     pair: tuple[int, ...],
     *,
     samples: int = 256,
+    fixed: Mapping[int, float] | None = None,
 ) -> Plane:
     """Return P(critical) over one or two inputs: its mean over `samples` Sobol points of the others.
+
+    Inputs in `fixed`, by position, keep their value.
 
     Raises:
         ValueError: not one or two inputs.
     """
     if len(pair) not in (1, 2):
         raise ValueError(f"a plane has one or two inputs, but got {len(pair)}")
-    rest = [k for k in range(space.dimension) if k not in pair]
+    held = dict(fixed or {})
+    rest = [k for k in range(space.dimension) if k not in pair and k not in held]
     size = 25 if rest else (401 if len(pair) == 1 else 101)
     units = [_grid(space.parameters[k], size) for k in pair]
     mesh = np.stack(np.meshgrid(*units), axis=-1).reshape(-1, len(pair))  # (g, 1 or 2), first input fastest
@@ -148,6 +153,8 @@ def probability_plane(
     u = np.empty((len(mesh), len(others), space.dimension))
     u[:, :, list(pair)] = mesh[:, None, :]
     u[:, :, rest] = others[None, :, :]
+    for k, value in held.items():
+        u[:, :, k] = space.parameters[k].to_unit(np.array(value))
     flat = u.reshape(-1, space.dimension)
     weight = space.feasible(space.from_unit(flat)).reshape(len(mesh), len(others)).astype(np.float64)
     p = probability(predict, critical, flat).reshape(weight.shape)
@@ -159,8 +166,8 @@ def probability_plane(
 
 
 def _grid(parameter: Parameter, size: int) -> Vector:
-    """Return grid coordinates in [0, 1]; for integer inputs the middles of cells, each value once."""
-    if parameter.kind != "integer":
+    """Return grid coordinates in [0, 1]; for integer inputs and choices the middles of cells, each value once."""
+    if not parameter.discrete:
         return np.linspace(0.0, 1.0, size)
     low, high = parameter.bounds
     whole = np.unique(np.round(np.linspace(low, high, min(size, round(high - low) + 1))))

@@ -91,9 +91,9 @@ def _input(parameter: Parameter) -> tuple[Cell, ...]:
     whole = ", whole numbers" if parameter.kind == "integer" else ""
     return (
         Cell(parameter.name),
-        Cell(f"[{parameter.low:g}, {parameter.high:g}]{whole}"),
+        Cell(", ".join(parameter.choices) or f"[{parameter.low:g}, {parameter.high:g}]{whole}"),
         Cell(parameter.unit or NOTHING),
-        Cell(distribution_words(parameter.distribution)),
+        Cell(distribution_words(parameter)),
         Cell(parameter.description),
     )
 
@@ -144,7 +144,7 @@ def simulate_command(scenario: str, record: Record) -> str:
     """Return the command that runs a concrete scenario again, to the last digit; in Python where it was defined there."""
     if scenario.startswith(OBJECT):
         return f"sbt.simulate({scenario.removeprefix(OBJECT)}, {dict(record.inputs)!r}, seed={record.seed})"
-    inputs = (f"{name}={value!r}" for name, value in record.inputs.items())
+    inputs = (f"{name}={value if isinstance(value, str) else repr(value)}" for name, value in record.inputs.items())
     return shlex.join(["sumo-sbt", "simulate", scenario, *inputs, "--seed", str(record.seed)])
 
 

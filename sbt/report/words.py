@@ -12,7 +12,7 @@ from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.wording import number, percent
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Conclusion, Facts
-from sbt.problem.distribution import Distribution
+from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -26,7 +26,7 @@ __all__ = [
     "conclusion_sentences",
     "distribution_words",
     "requirement_words",
-        "warnings_for",
+    "warnings_for",
 ]
 
 SCORES: Mapping[str, str] = {
@@ -109,8 +109,13 @@ def requirement_words(requirement: Requirement, unit: str) -> str:
     return f"{name} in [{low:g}, {high:g}]{tail}"
 
 
-def distribution_words(distribution: Distribution | None) -> str:
-    """Return a distribution as its kind and parameters."""
+def distribution_words(parameter: Parameter) -> str:
+    """Return the distribution of an input as its kind and parameters, or the probabilities of its choices."""
+    if parameter.probabilities:
+        return ", ".join(f"{c} {percent(p)}" for c, p in zip(parameter.choices, parameter.probabilities, strict=True))
+    if parameter.choices:
+        return "equally likely"
+    distribution = parameter.distribution
     if distribution is None or distribution.kind == "uniform":
         return "uniform"
     values = ((name, value if isinstance(value, str) else f"{value:g}") for name, value in distribution.parameters)

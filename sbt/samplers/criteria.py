@@ -97,14 +97,16 @@ def propose_by(
     start = seen.u[np.argsort(margin, kind="stable")[:_STARTS]]
     best = float(margin.min())
     score = probability_of_violation if criterion is None else criterion
-    candidates, values = refine_best(lambda v: score(model, v, best), start, seen.admissible, rng)
+    candidates, values = refine_best(lambda v: score(model, v, best), start, seen.admissible, rng, search.cube)
     if criterion is None:
         return Picks(_thompson(model, candidates[np.argsort(-values, kind="stable")[:_DRAWN]], n, rng), (name,) * n)
-    values = values + log_repulsion(candidates, u, _CLEAR_OF_RUNS * np.sqrt(d))
+    at_candidates = search.cube.embedded(candidates)
+    values = values + log_repulsion(at_candidates, search.cube.embedded(u), _CLEAR_OF_RUNS * np.sqrt(d))
     picks = np.empty((n, d))
     for k in range(n):
-        picks[k] = candidates[int(np.argmax(values))]
-        values += log_repulsion(candidates, picks[k][None], _CLEAR * np.sqrt(d))
+        at = int(np.argmax(values))
+        picks[k] = candidates[at]
+        values += log_repulsion(at_candidates, at_candidates[at][None], _CLEAR * np.sqrt(d))
     return Picks(picks, (name,) * n)
 
 

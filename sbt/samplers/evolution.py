@@ -11,6 +11,7 @@ import numpy as np
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.samplers.search import Picks
 from sbt.seeds import stream
 
@@ -30,17 +31,19 @@ def require() -> None:
         raise InputError("acquisition cma_es needs the library cma, but it is not installed: pip install 'sumo-sbt[compare]'")
 
 
-def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int) -> Picks:
+def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int, cube: Cube = CONTINUOUS) -> Picks:
     """Return the next n points of a covariance matrix adaptation evolution strategy.
 
     The same seed and margins give the same points: earlier generations are drawn again and given their
-    margins. A strategy that has converged is restarted at a random point.
+    margins. A strategy that has converged is restarted at a random point. An input with choices has a coordinate for each
+    of them, and takes the one of the largest: the strategy never moves between choices along their list.
 
     Args:
         start: (d,) where the first one starts, in the unit cube.
         margins: of each generation so far, one for each of its points; NaN where a run failed.
         n: points wanted >= 1.
         seed: of the campaign.
+        cube: which coordinates take single values.
 
     Raises:
         InputError: the library is not installed.
@@ -49,8 +52,9 @@ def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int) -> Pick
         Hansen (2016), The CMA evolution strategy: a tutorial, arXiv 1604.00772; library pycma.
     """
     require()
-    d, restarts = len(start), 0
-    strategy = _started(start, n, seed, restarts)
+    first = cube.embedded(start[None])[0]
+    d, restarts = len(first), 0
+    strategy = _started(first, n, seed, restarts)
     for values in margins:
         generation = strategy.ask(len(values))
         strategy.tell(generation, np.where(np.isfinite(values), values, _FAILED).tolist())
@@ -58,7 +62,7 @@ def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int) -> Pick
             restarts += 1
             strategy = _started(stream(seed, "cma", "restart", restarts).random(d), n, seed, restarts)
     points: Points = np.clip(np.array(strategy.ask(n)), 0.0, 1.0).reshape(n, -1)[:, :d]
-    return Picks(points, ("cma_es",) * n)
+    return Picks(cube.restored(points, len(start)), ("cma_es",) * n)
 
 
 def _started(start: Vector, n: int, seed: int, restarts: int) -> Any:

@@ -15,12 +15,14 @@ from scipy.spatial.distance import cdist
 
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.cube import CONTINUOUS, Cube
 
 __all__ = ["influence_on_mean", "propose_greedily", "refine_diverse", "select_diverse", "select_representative"]
 
 _CANDIDATES = 4096  # uniform ones; the refinement adds up to 2,880
 _KEEP, _CHILDREN, _ROUNDS = 60, 16, 3  # best candidates of a round, steps from each, rounds
 _STEP, _NARROWER = 0.1, 2.5  # first step in the unit cube, by how much it shrinks from round to round
+_FLIPPED = 0.2  # chance that a step takes another choice: each of three is tried at every good candidate
 _PROBES = 128  # pairs of points that an influence is estimated from: its relative error is about 1 / sqrt(2 x 128)
 _LEAST = 0.05  # of the largest influence: an input the metamodel calls irrelevant may not be
 
@@ -34,6 +36,7 @@ def propose_greedily(
     *,
     snap: Callable[[Points], Points] = lambda u: u,
     admissible: Callable[[Points], Mask] | None = None,
+    cube: Cube = CONTINUOUS,
 ) -> tuple[Points, int]:
     """Return (<= n, d) points of the highest scores that lie apart, and the number of candidates scored.
 
@@ -45,12 +48,13 @@ def propose_greedily(
         rng: the only source of randomness.
         snap: points to those that will be run (integers); distances and constraints are those of the latter.
         admissible: (m, d) points -> (m,) booleans; None: all are.
+        cube: which coordinates take single values.
     """
-    u, value = refine_diverse(score, rng.random((_CANDIDATES, existing.shape[1])), scale, rng)
+    u, value = refine_diverse(score, rng.random((_CANDIDATES, existing.shape[1])), scale, rng, cube)
     u = snap(u)
     if admissible is not None:
         value = np.where(admissible(u), value, -np.inf)
-    return u[select_diverse(u, value, existing, n, scale)], len(u)
+    return u[select_diverse(cube.embedded(u), value, cube.embedded(existing), n, cube.spread(scale))], len(u)
 
 
 def influence_on_mean(predict: Callable[[Points], Prediction], dimension: int, rng: np.random.Generator) -> Vector:
@@ -73,7 +77,7 @@ def influence_on_mean(predict: Callable[[Points], Prediction], dimension: int, r
 
 
 def refine_diverse(
-    score: Callable[[Points], Vector], u: Points, scale: Vector, rng: np.random.Generator
+    score: Callable[[Points], Vector], u: Points, scale: Vector, rng: np.random.Generator, cube: Cube = CONTINUOUS
 ) -> tuple[Points, Vector]:
     """Return candidates (m, d) and their log scores (m,): the given ones and ever closer ones around good ones.
 
@@ -84,13 +88,16 @@ def refine_diverse(
         u: (n, d) candidates to begin with.
         scale: (d,) influence of the inputs; steps are longer where there is little.
         rng: the only source of randomness.
+        cube: which coordinates take single values; a step takes another choice with probability 0.2.
     """
     found, value = u, score(u)
     width = _STEP / scale
     for _ in range(_ROUNDS):
-        best = found[select_diverse(found, value, np.empty((0, u.shape[1])), _KEEP, scale)]
+        at = cube.embedded(found)
+        best = found[select_diverse(at, value, np.empty((0, at.shape[1])), _KEEP, cube.spread(scale))]
         step = width * rng.standard_normal((len(best) * _CHILDREN, u.shape[1]))
-        near = np.clip(np.repeat(best, _CHILDREN, axis=0) + step, 1e-9, 1 - 1e-9)
+        parents = np.repeat(best, _CHILDREN, axis=0)
+        near = cube.flipped(np.clip(parents + step, 1e-9, 1 - 1e-9), parents, _FLIPPED, rng)
         found, value = np.concatenate([found, near]), np.concatenate([value, score(near)])
         width = width / _NARROWER
     return found, value

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.samplers.search import Picks, Search, WarpedModel, fill_uniformly, fit_warped, log_repulsion, refine_best, search_data
 
 __all__ = ["Region", "propose", "regions"]
@@ -58,11 +59,11 @@ def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generat
     found = regions(
         np.vstack([seen.u[fresh], seen.failed]),
         np.concatenate([search.critical.margin(seen.y[fresh]), np.full(len(seen.failed), np.inf)]),
-        np.concatenate([seen.batch[fresh], seen.failed_batch]),
-    )
-    niches = _hopeful(model, found, seen.admissible, rng)
+        np.concatenate([seen.batch[fresh], seen.failed_batch]), search.cube,
+    )  # fmt: skip
+    niches = _hopeful(model, found, seen.admissible, rng, search.cube)
     drawn = _thompson(model, niches, round(_THOMPSON * n), d, rng)
-    picks = _globally(model, drawn, n, u, niches, seen.admissible, rng)
+    picks = _globally(model, drawn, n, u, niches, seen.admissible, rng, search.cube)
     why = ("thompson",) * len(drawn) + ("global",) * (n - len(drawn))
     order = np.argsort(-model.log_probability(picks), kind="stable")
     return Picks(picks[order], tuple(why[k] for k in order))
@@ -82,18 +83,22 @@ class Region:
     side: float
     failures: int = 0
 
-    def candidates(self, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, d) points of the box, of the cube too; at most about 20 coordinates are moved."""
+    def candidates(self, n: int, rng: np.random.Generator, cube: Cube = CONTINUOUS) -> Points:
+        """Return (n, d) points of the box, of the cube too; at most about 20 coordinates are moved.
+
+        Another choice is as likely as the candidate's step is long, so that a small box keeps to the choices of its centre.
+        """
         d = len(self.centre)
         moved = rng.random((n, d)) < min(1.0, 20.0 / d)
         moved[np.arange(n), rng.integers(0, d, n)] = True
         reach = 0.5 * self.side * 2.0 ** (-3.0 * rng.random((n, 1)))
         step = reach * rng.uniform(-1.0, 1.0, (n, d))
-        return np.clip(self.centre + np.where(moved, step, 0.0), 0.0, 1.0)
+        start = np.tile(self.centre, (n, 1))
+        return cube.flipped(np.clip(start + np.where(moved, step, 0.0), 0.0, 1.0), start, reach[:, 0], rng)
 
 
-def regions(u: Points, margin: Vector, batch: Vector) -> list[Region]:
-    """Return the trust regions around the best runs, at least 0.25 apart, the best first.
+def regions(u: Points, margin: Vector, batch: Vector, cube: Cube = CONTINUOUS) -> list[Region]:
+    """Return the trust regions around the best runs, at least 0.25 apart or of different choices, the best first.
 
     The side is replayed from the runs near the centre: halved after three batches without an
     improvement, doubled after two with one; a side below 2^-6 retires the region.
@@ -102,14 +107,16 @@ def regions(u: Points, margin: Vector, batch: Vector) -> list[Region]:
         u: (n, d) runs, none of them critical.
         margin: (n,) distance of the metric to the critical interval; inf where a run failed: it found no region, but tried.
         batch: (n,) number of the batch of each run, increasing.
+        cube: which coordinates take single values.
     """
     found: list[Region] = []
+    at = cube.embedded(u)
     finite = np.isfinite(margin)
     left = margin < (np.median(margin[finite]) if finite.any() else -np.inf)  # on a plateau no run is better than the others
     while left.any() and len(found) < _MOST_REGIONS:
         best = int(np.flatnonzero(left)[np.argmin(margin[left])])
-        near = np.abs(u - u[best]).max(axis=1) <= _APART
-        side, failures = _side(u[near], margin[near], batch[near])
+        near = np.abs(at - at[best]).max(axis=1) <= _APART
+        side, failures = _side(at[near], margin[near], batch[near])
         if side >= _SHORTEST:
             found.append(Region(u[best], side, failures))
         left &= ~near
@@ -135,12 +142,12 @@ def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
 
 
 def _hopeful(
-    model: WarpedModel, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator
+    model: WarpedModel, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator, cube: Cube
 ) -> list[tuple[Region, Points]]:
     """Return the regions in which a critical run may be, each with its candidates."""
     hopeful = []
     for region in found:
-        points = region.candidates(_LOCAL, rng)
+        points = region.candidates(_LOCAL, rng, cube)
         points = points[admissible(points)]
         if len(points) == 0:
             continue
@@ -171,7 +178,7 @@ def _thompson(model: WarpedModel, niches: list[tuple[Region, Points]], n: int, d
 
 def _globally(
     model: WarpedModel, picks: Points, n: int, u: Points, niches: list[tuple[Region, Points]],
-    admissible: Callable[[Points], Mask], rng: np.random.Generator,
+    admissible: Callable[[Points], Mask], rng: np.random.Generator, cube: Cube,
 ) -> Points:  # fmt: skip
     """Return the picks and further ones, n in all: the largest P(critical), every second time inflated.
 
@@ -179,13 +186,14 @@ def _globally(
     """
     d = u.shape[1]
     start = np.vstack([np.empty((0, d)), *(points for _, points in niches)])
-    candidates, wide = refine_best(lambda v: model.log_probability(v, _INFLATION), start, admissible, rng)
+    candidates, wide = refine_best(lambda v: model.log_probability(v, _INFLATION), start, admissible, rng, cube)
     scores = [np.maximum(values, np.log(_HOPELESS)) for values in (model.log_probability(candidates), wide)]
-    away = log_repulsion(candidates, u, _CLEAR_OF_RUNS * np.sqrt(d))
-    for point in picks:
-        away += log_repulsion(candidates, point[None], _CLEAR * np.sqrt(d))
+    at_candidates = cube.embedded(candidates)
+    away = log_repulsion(at_candidates, cube.embedded(u), _CLEAR_OF_RUNS * np.sqrt(d))
+    for point in cube.embedded(picks):
+        away += log_repulsion(at_candidates, point[None], _CLEAR * np.sqrt(d))
     for k in range(n - len(picks)):
         at = int(np.argmax(scores[k % 2] + away))
         picks = np.vstack([picks, candidates[at]])
-        away += log_repulsion(candidates, candidates[at][None], _CLEAR * np.sqrt(d))
+        away += log_repulsion(at_candidates, at_candidates[at][None], _CLEAR * np.sqrt(d))
     return picks

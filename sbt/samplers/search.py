@@ -20,6 +20,7 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.success import LogSuccess, log_success
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
@@ -49,6 +50,7 @@ class Search:
         columns: (n, d) unit-cube points to the metamodel's inputs (derived features).
         feasible: (n, d) unit-cube points to (n,) booleans.
         deflation: see `DEFLATION`.
+        cube: which coordinates take single values: distances and steps know that choices have no order.
     """
 
     critical: CriticalInterval
@@ -56,6 +58,7 @@ class Search:
     columns: Callable[[Points], Points] = lambda u: u
     feasible: Callable[[Points], Mask] = lambda u: np.ones(len(u), dtype=bool)
     deflation: float = DEFLATION
+    cube: Cube = CONTINUOUS
 
 
 @dataclass(frozen=True)
@@ -141,10 +144,12 @@ def fit_warped(
 
 @dataclass(frozen=True, eq=False)
 class FreeRegion:
-    """The part of the cube that is not deflated: all but k boxes.
+    """The part of the cube that is not deflated: all but k boxes, in the embedded coordinates of `Cube`.
+
+    A box holds runs of the same choices only: other ones are farther away than it reaches.
 
     Args:
-        low, high: (k, d) ends of the boxes.
+        low, high: (k, e) ends of the boxes.
         radius: by which each box reaches beyond its critical runs.
     """
 
@@ -154,7 +159,7 @@ class FreeRegion:
 
     @classmethod
     def without(cls, hits: Points, radius: float) -> FreeRegion:
-        """Return what boxes around critical runs (n, d) leave; runs whose boxes touch share one box, their hull."""
+        """Return what boxes around critical runs (n, e) leave; runs whose boxes touch share one box, their hull."""
         if len(hits) == 0:
             return cls(hits, hits, radius)
         count, group = connected_components(cdist(hits, hits, "chebyshev") <= 2.0 * radius, directed=False)
@@ -175,6 +180,7 @@ def deflate(search: Search, hits: Points, rng: np.random.Generator, dimension: i
     """Return what deflation leaves; the radius is halved until that is at least 5 % of the space."""
     probe = rng.random((_PROBES, dimension))
     probe = probe[search.feasible(probe)] if search.feasible(probe).any() else probe
+    probe, hits = search.cube.embedded(probe), search.cube.embedded(hits)
     radius = search.deflation
     while radius > 1e-6 and FreeRegion.without(hits, radius)(probe).mean() < _LEAST_FREE:
         radius /= 2
@@ -217,12 +223,13 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
     ok = np.isfinite(y)
     hit = ok & search.critical.contains(y)
     free = deflate(search, u[hit], rng, u.shape[1])
-    left = ok & ~hit & free(u)
-    flank = ~free(u[left], _FLANK)
+    at = search.cube.embedded
+    left = ok & ~hit & free(at(u))
+    flank = ~free(at(u[left]), _FLANK)
     success = log_success(search.columns(u), ok, rng)
 
     def admissible(points: Points) -> Mask:
-        left = search.feasible(points) & free(points)
+        left = search.feasible(points) & free(at(points))
         return left if success is None else left & np.isfinite(success(search.columns(points)))
 
     return SearchData(u[left], y[left], number[left], flank, admissible, u[~ok], number[~ok], success)
@@ -241,8 +248,9 @@ def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np
 
 
 def refine_best(
-    score: Callable[[Points], Vector], start: Points, admissible: Callable[[Points], Mask], rng: np.random.Generator
-) -> tuple[Points, Vector]:
+    score: Callable[[Points], Vector], start: Points, admissible: Callable[[Points], Mask], rng: np.random.Generator,
+    cube: Cube = CONTINUOUS,
+) -> tuple[Points, Vector]:  # fmt: skip
     """Return (m, d) candidates and (m,) scores: uniform ones, those of `start` (k, d), and steps from the best of them.
 
     The best are refined wherever they lie; `greedy.refine_diverse` spreads them.
@@ -252,9 +260,10 @@ def refine_best(
     values = score(candidates)
     for scale in _STEPS:
         best = candidates[np.argsort(-values, kind="stable")[:_BEST]]
-        around = np.repeat(best, _CHILDREN, axis=0)
-        moved = rng.random(around.shape) < max(_MOVED, 1.0 / d)
-        around = np.clip(around + scale * rng.standard_normal(around.shape) * moved, 0.0, 1.0)
+        parents = np.repeat(best, _CHILDREN, axis=0)
+        moved = rng.random(parents.shape) < max(_MOVED, 1.0 / d)
+        around = np.clip(parents + scale * rng.standard_normal(parents.shape) * moved, 0.0, 1.0)
+        around = cube.flipped(around, parents, max(_MOVED, 1.0 / d), rng)
         around = around[admissible(around)]
         if len(around):
             candidates, values = np.vstack([candidates, around]), np.concatenate([values, score(around)])

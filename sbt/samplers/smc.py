@@ -15,6 +15,7 @@ from scipy.special import logsumexp
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.cube import CONTINUOUS, Cube
 
 __all__ = ["SmcDraw", "smc"]
 
@@ -23,6 +24,7 @@ _TARGET_ESS = 0.5  # share of the effective sample size that a tempering step le
 _TARGET_ACCEPTANCE = 0.3  # of the Metropolis steps: near the optimal 0.234 to 0.44 (Roberts and Rosenthal 2001)
 _MAX_LEVELS = 40  # each halves the region: 2^-40 of the space
 _FIRST_SCALE, _SCALES = 0.3, (0.01, 1.5)  # of a step relative to the difference of two particles: at first, and its range
+_FLIPPED = 0.2  # chance that a step takes another choice
 _OWN_SCALE = 0.02  # of a step that particles do not share: it keeps duplicates from staying duplicates
 
 
@@ -45,7 +47,7 @@ class SmcDraw:
 
 def smc(
     score: Callable[[Points], Vector], dimension: int, rng: np.random.Generator, *, particles: int = 1024, start: int = 4096,
-    bound: Callable[[Points], Vector] | None = None,
+    bound: Callable[[Points], Vector] | None = None, cube: Cube = CONTINUOUS,
 ) -> SmcDraw | None:  # fmt: skip
     """Draw particles with a density proportional to exp(score(u)) on the unit cube.
 
@@ -56,6 +58,7 @@ def smc(
         particles: how many.
         start: uniform points the first level is resampled from, at least as many.
         bound: quick upper bounds of the scores: a move that they rule out is rejected without its score.
+        cube: which coordinates take single values.
 
     Returns:
         The particles; None where no uniform point has a score above -inf.
@@ -80,7 +83,7 @@ def smc(
         log_mean += float(logsumexp(log_weight) - np.log(len(log_weight)))
         keep = _systematic(np.exp(log_weight - logsumexp(log_weight)), particles, rng)
         u, log_score, temper, levels = u[keep], log_score[keep], temper + step, levels + 1
-        u, log_score, scale = _move(score, bound, u, log_score, temper, scale, rng)
+        u, log_score, scale = _move(score, bound, u, log_score, temper, scale, rng, cube)
     return SmcDraw(u, log_score, log_mean, levels)
 
 
@@ -117,7 +120,7 @@ def _systematic(weight: Vector, n: int, rng: np.random.Generator) -> np.ndarray:
 
 def _move(
     score: Callable[[Points], Vector], bound: Callable[[Points], Vector] | None, u: Points, log_score: Vector, temper: float,
-    scale: float, rng: np.random.Generator,
+    scale: float, rng: np.random.Generator, cube: Cube,
 ) -> tuple[Points, Vector, float]:  # fmt: skip
     """Return the particles after a few Metropolis steps at this temperature, and the scale adapted to them.
 
@@ -128,7 +131,7 @@ def _move(
     for _ in range(_MOVES):
         a, b = rng.permutation(n), rng.permutation(n)
         jump = scale * (u[a] - u[b]) + _OWN_SCALE * scale * rng.standard_normal((n, d))
-        proposed = _reflected(u + jump)
+        proposed = cube.flipped(_reflected(u + jump), u, _FLIPPED, rng)
         least = np.log(rng.random(n)) / temper + np.where(np.isneginf(log_score), -1e300, log_score)  # to be accepted
         hopeful = np.ones(n, dtype=bool) if bound is None else bound(proposed) > least
         new = np.full(n, -np.inf)

@@ -14,18 +14,17 @@ import json
 import sqlite3
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sbt.errors import StoreError
+from sbt.problem.description import described_choices
 from sbt.problem.outcome import Job, Outcome
-from sbt.problem.plain import Json, JsonMapping
-from sbt.store.history import PLANNED, History, Rows
+from sbt.problem.plain import Json, JsonMapping, Values
+from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.records import FitRecord, Iteration, from_json, to_json
 
 __all__ = ["DATABASE", "PlannedRun", "Store"]
@@ -59,7 +58,7 @@ class PlannedRun:
 
     Args:
         stage: what asks for it.
-        inputs: values by name, in their units.
+        inputs: values by name, numbers in their units, choices as text.
         log_q: log density that they were drawn with; None: they were chosen.
         seed: where it was chosen for what it draws; None: it is drawn.
         level: of fidelity, 0 the scenario's own.
@@ -67,7 +66,7 @@ class PlannedRun:
     """
 
     stage: str
-    inputs: Mapping[str, float]
+    inputs: Values
     log_q: float | None = None
     seed: int | None = None
     level: int = 0
@@ -240,7 +239,7 @@ class Store:
             proposal: how the batch was chosen: a record (dataclass) or JSON data.
             indices: of the runs; None: they continue those of the store.
         """
-        start, names = self.planned, self._names
+        start, names = self.planned, self._known.names
         places = range(start, start + len(runs)) if indices is None else indices
         rows = []
         for k, (index, run) in enumerate(zip(places, runs, strict=True)):
@@ -291,11 +290,12 @@ class Store:
         return dict(self._db.execute("SELECT status, COUNT(*) FROM runs GROUP BY status").fetchall())
 
     @property
-    def _names(self) -> tuple[str, ...]:
-        """Names of the inputs, in the order of the columns of x."""
+    def _known(self) -> Rows:
+        """The finished rows that were read so far, with the names of the inputs."""
         if self._rows is None:
-            self._rows = Rows(tuple(self.configuration["names"]))
-        return self._rows.names
+            kept = self.configuration
+            self._rows = Rows(tuple(kept["names"]), described_choices(kept.get("described") or {}))
+        return self._rows
 
     def unfinished(self) -> list[Job]:
         """Return the planned runs that have no outcome yet."""
@@ -304,7 +304,7 @@ class Store:
         ).fetchall()
         for row in rows:
             self._checked(f"run {row[0]}", row[-1], *row[:-1])
-        names = self._names
+        names = self._known.names
         return [Job(row[0], dict(zip(names, json.loads(row[3]), strict=True)), row[4]) for row in rows]
 
     def iterations(self) -> list[Iteration]:
@@ -327,8 +327,7 @@ class Store:
     def history(self) -> History:
         """Return all finished runs as columns; what was read before is not decoded again."""
         with _reported(self.folder):
-            names = self._names
-            done = self._rows if self._rows is not None else Rows(names)
+            done = self._known
             pending = self._db.execute("SELECT MIN(idx) FROM runs WHERE status = ?", (PLANNED,)).fetchone()[0]
             until = "" if pending is None else f" AND idx < {int(pending)}"
             self._read_into(done, f"idx >= {self._read_up_to}{until}")
@@ -336,7 +335,7 @@ class Store:
                 self._read_up_to = int(done.history().index[-1]) + 1
             if pending is None:
                 return done.history()
-            some = Rows(names)  # rows behind one that is still being run may get neighbours later
+            some = Rows(done.names, done.choices)  # rows behind one that is still being run may get neighbours later
             self._read_into(some, f"idx > {int(pending)} AND status != '{PLANNED}'")
             return done.history() if some.count == 0 else done.history().extended(some.history())
 
@@ -350,7 +349,7 @@ class Store:
                 self._checked(f"run {row[0]}", row[-2], *row[:n])
                 self._checked(f"the outcome of run {row[0]}", row[-1], row[0], *row[n:-2])
             columns = dict(zip((*_PLAN, *_OUTCOME), zip(*found, strict=True), strict=False))
-            x = np.array(json.loads(f"[{','.join(columns['inputs'])}]"), dtype=np.float64).reshape(len(found), len(rows.names))
+            x = as_numbers(json.loads(f"[{','.join(columns['inputs'])}]"), rows.names, rows.choices)
             metrics = json.loads(f"[{','.join(columns['metrics'])}]")
             rows.append(x, {"index": columns["idx"], **{name: columns[name] for name in _FIELDS}}, metrics)
 

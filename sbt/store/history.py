@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbt.errors import StoreError
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.outcome import Status
+from sbt.problem.plain import Value
 from sbt.problem.requirement import Requirement
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["PLANNED", "VALIDATION", "History", "Record", "Rows"]
+__all__ = ["PLANNED", "VALIDATION", "History", "Record", "Rows", "as_numbers", "named_columns"]
 
 PLANNED = "planned"
 """Status of a run that was decided on and has no outcome yet."""
@@ -33,7 +35,7 @@ class Record:
         index: of the run in the campaign, from 0.
         stage: what asked for it.
         iteration: number of its batch, from 0.
-        inputs: values by name, in their units.
+        inputs: values by name, numbers in their units, choices as text.
         seed: of the run.
         status: a `Status`.
         metrics: by name, empty unless the status is ok.
@@ -51,7 +53,7 @@ class Record:
     index: int
     stage: str
     iteration: int
-    inputs: Mapping[str, float]
+    inputs: Mapping[str, Value]
     seed: int
     status: str
     metrics: Mapping[str, float]
@@ -80,9 +82,11 @@ class Rows:
 
     Args:
         names: inputs, in the order of the columns of x.
+        choices: of the inputs that have some, by name.
     """
 
     names: tuple[str, ...]
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     count: int = 0
     _columns: dict[str, NDArray[Any]] = field(default_factory=dict, repr=False)
     _texts: dict[str, str] = field(default_factory=dict, repr=False)
@@ -122,7 +126,7 @@ class Rows:
         """Return the rows so far."""
         if not self._columns:
             self.append(np.empty((0, len(self.names))), {}, [])
-        return History(self.names, {name: column[: self.count] for name, column in self._columns.items()})
+        return History(self.names, {name: column[: self.count] for name, column in self._columns.items()}, self.choices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,16 +136,20 @@ class History:
     Args:
         names: inputs, in the order of the columns of `x`.
         columns: (n, ...) arrays: `x`, `y.<metric>`, and the other fields of a `Record` by name.
+        choices: of the inputs that have some, by name; `x` holds their positions.
     """
 
     names: tuple[str, ...]
     columns: Mapping[str, NDArray[Any]]
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, names: Sequence[str], records: Iterable[Record] = ()) -> History:
+    def of(
+        cls, names: Sequence[str], records: Iterable[Record] = (), choices: Mapping[str, tuple[str, ...]] | None = None
+    ) -> History:
         """Return the history of these records."""
-        found, rows = tuple(records), Rows(tuple(names))
-        x = np.array([[r.inputs[name] for name in names] for r in found], dtype=np.float64).reshape(len(found), len(names))
+        found, rows = tuple(records), Rows(tuple(names), choices or {})
+        x = as_numbers([[r.inputs[name] for name in names] for r in found], rows.names, rows.choices)
         fields = {name: [getattr(r, name) for r in found] for name in (*_NUMBERS, *_TEXTS)}
         rows.append(x, fields, [r.metrics for r in found])
         return rows.history()
@@ -218,7 +226,19 @@ class History:
     def where(self, mask: Mask) -> History:
         """Return the runs where `mask` holds."""
         keep = np.asarray(mask, dtype=bool)
-        return History(self.names, {name: column[keep] for name, column in self.columns.items()})
+        return History(self.names, {name: column[keep] for name, column in self.columns.items()}, self.choices)
+
+    def recoded(self, choices: Mapping[str, tuple[str, ...]]) -> History:
+        """Return the runs with inputs among these choices, their positions counted in them."""
+        if self.choices == choices:
+            return self
+        x, keep = self.x.copy(), np.ones(len(self), dtype=bool)
+        for name, given in choices.items():
+            k = self.names.index(name)
+            position = np.array([given.index(c) if c in given else -1 for c in self.choices[name]])
+            x[:, k] = position[x[:, k].astype(np.intp)]
+            keep &= x[:, k] >= 0
+        return History(self.names, {**self.columns, "x": x}, choices).where(keep)
 
     def extended(self, other: History) -> History:
         """Return these runs and, behind them, the others."""
@@ -226,7 +246,7 @@ class History:
         for name in {**self.columns, **other.columns}:
             parts = [h.y(name[2:]) if name.startswith("y.") else h.columns[name] for h in (self, other)]
             columns[name] = np.concatenate(parts)
-        return History(self.names, columns)
+        return History(self.names, columns, self.choices)
 
     def record(self, row: int) -> Record:
         """Return one row, counted from 0 among these runs."""
@@ -240,9 +260,12 @@ class History:
             str(c["unconfirmed"][row]),
         )  # fmt: skip
 
-    def inputs(self, row: int) -> dict[str, float]:
-        """Return the inputs of one row by name."""
-        return dict(zip(self.names, map(float, self.x[row]), strict=True))
+    def inputs(self, row: int) -> dict[str, Value]:
+        """Return the inputs of one row by name, choices as text."""
+        return {name: self._value(name, float(x)) for name, x in zip(self.names, self.x[row], strict=True)}
+
+    def _value(self, name: str, x: float) -> Value:
+        return self.choices[name][int(x)] if name in self.choices else x
 
     @property
     def records(self) -> tuple[Record, ...]:
@@ -272,12 +295,13 @@ class History:
                 (in the metric's unit, <= 0 critical).
 
         Returns:
-            Columns index, stage, iteration, x.<input>, y.<metric>, critical, margin, log_q, status, reason, seed, ...
+            Columns index, stage, iteration, x.<input> (categorical where it has choices), y.<metric>, critical, margin,
+            log_q, status, reason, seed, ...
         """
         import pandas as pd
 
         data: dict[str, Any] = {"index": self.index, "stage": self.columns["stage"], "iteration": self.iteration}
-        data |= {f"x.{name}": self.x[:, k] for k, name in enumerate(self.names)}
+        data |= {f"x.{name}": column for name, column in named_columns(self.x, self.names, self.choices).items()}
         data |= {f"y.{name}": self.y(name) for name in self.metrics}
         if requirement is not None:
             margin = requirement.margins(self)
@@ -291,3 +315,31 @@ class History:
         data["warm_up"] = pd.arrays.IntegerArray(warm_up, warm_up < 0)
         data["unconfirmed"] = self.columns["unconfirmed"]
         return pd.DataFrame(data)
+
+
+def as_numbers(rows: Sequence[Sequence[Value]], names: Sequence[str], choices: Mapping[str, tuple[str, ...]]) -> Points:
+    """Return (n, d) numbers of rows of values, a choice as its position.
+
+    Raises:
+        StoreError: a value is not among the choices of its input.
+    """
+    if not choices:
+        return np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+    positions = [{c: float(k) for k, c in enumerate(choices[name])} if name in choices else None for name in names]
+    try:
+        numbers = [
+            [float(v) if known is None else known[str(v)] for v, known in zip(row, positions, strict=True)] for row in rows
+        ]
+    except (KeyError, ValueError) as error:
+        raise StoreError(f"a run's inputs must be numbers, or choices of its scenario, but one is not: {error}") from None
+    return np.array(numbers, dtype=np.float64).reshape(len(rows), len(names))
+
+
+def named_columns(x: Points, names: Sequence[str], choices: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    """Return the columns of x (n, d) by name for a frame: numbers, or pandas categoricals."""
+    import pandas as pd
+
+    return {
+        name: pd.Categorical.from_codes(x[:, k].astype(np.int64), list(choices[name])) if name in choices else x[:, k]
+        for k, name in enumerate(names)
+    }

@@ -11,7 +11,7 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,11 @@ import numpy as np
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Values
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Pool
 from sbt.problem.space import ParameterSpace
-from sbt.store.history import History
+from sbt.store.history import History, named_columns
 
 __all__ = ["from_folder", "to_folder"]
 
@@ -46,8 +47,9 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     path = (Path(folder) / name).resolve()
     table = _table_of(path)
     described = _described(table.parent / "config.yml")
-    rows = _read(table)
     inputs, outputs = described.get("inputs", {}), described.get("outputs", {})
+    choices = {name: entry["choices"] for name, entry in inputs.items() if _has_choices(entry)}
+    rows = _read(table, choices)
     missing = [column for column in [*inputs, *outputs] if column not in rows]
     if missing or not inputs or not outputs:
         absent = ", ".join(missing) or "all"
@@ -63,18 +65,18 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     title, text = str(described.get("title", path.name)), str(described.get("logical_scenario", ""))
     return LogicalScenario(
         name=f"table:{name}", space=space, requirement=Requirement(next(iter(outputs)), high=0.0),
-        evaluate=_Lookup(space.names, pool), metric_names=tuple(outputs), description=f"{title} (recorded)\n{text}", pool=pool,
+        evaluate=_Lookup(space, pool), metric_names=tuple(outputs), description=f"{title} (recorded)\n{text}", pool=pool,
     )  # fmt: skip
 
 
 class _Lookup:
     """Gives the recorded outcome of exactly these inputs."""
 
-    def __init__(self, names: tuple[str, ...], pool: Pool):
-        self._names, self._pool = names, pool
+    def __init__(self, space: ParameterSpace, pool: Pool):
+        self._space, self._pool = space, pool
 
-    def __call__(self, values: Mapping[str, float], seed: int) -> dict[str, float]:
-        row = self._pool.row(np.array([values[name] for name in self._names]))
+    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+        row = self._pool.row(self._space.numbers(values))
         if row is None:
             raise RunError(Status.INVALID, f"a recorded table has only its own rows, but none with {dict(values)}")
         return {name: float(column[row]) for name, column in self._pool.metrics.items()}
@@ -102,14 +104,16 @@ def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix:
         "title": title or scenario.name, "introduction": "", "functional_scenario": title, "logical_scenario": text,
         "concrete_scenarios": f"runs of a campaign on {scenario.name}",
         "inputs": {p.name: {
-            "type": p.kind, "unit": p.unit, "min": p.bounds[0], "max": p.bounds[1], "explanation": p.description,
+            "type": p.kind, "unit": p.unit,
+            **({"choices": _choices(p)} if p.choices else {"min": p.bounds[0], "max": p.bounds[1]}),
+            "explanation": p.description,
         } for p in scenario.space.parameters},
         "outputs": {name: {"type": "continuous", "unit": units.get(name, "")} for name in done.metrics},
     }  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "config.yml").open("w", encoding="utf-8") as file:
         YAML().dump(described, file)
-    columns = {name: done.x[:, k] for k, name in enumerate(done.names)} | {name: done.y(name) for name in done.metrics}
+    columns = named_columns(done.x, done.names, done.choices) | {name: done.y(name) for name in done.metrics}
     path = folder / f"runs{suffix}"
     frame = pd.DataFrame(columns)
     frame.to_csv(path, index=False) if suffix == ".csv" else frame.to_parquet(path, index=False)
@@ -144,21 +148,45 @@ def _described(path: Path) -> dict[str, Any]:
     return loaded
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """Return the columns as float64."""
+def _has_choices(entry: Mapping[str, Any]) -> bool:
+    return entry.get("type") == "categorical" and bool(entry.get("choices"))
+
+
+def _choices(parameter: Parameter) -> list[str] | dict[str, float]:
+    """Return choices as a configuration has them."""
+    likely = zip(parameter.choices, map(float, parameter.probabilities), strict=False)
+    return dict(likely) or list(parameter.choices)
+
+
+def _read(path: Path, choices: Mapping[str, Iterable[str]]) -> dict[str, Any]:
+    """Return the columns as float64, choices as their positions."""
     import pandas as pd
 
+    texts: Any = dict.fromkeys(choices, str)  # as converters, which take "NA" and "1" for what they are
     try:
-        frame = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
+        frame = pd.read_csv(path, converters=texts) if path.suffix == ".csv" else pd.read_parquet(path)
     except ImportError:
         raise InputError(f"{path.name} needs pyarrow (pip install 'sumo-sbt[parquet]'); or save it as csv") from None
     except Exception as error:  # pandas and pyarrow raise whatever they like about a broken file
         raise InputError(f"{path} must be a readable table, but: {error}") from None
-    return {str(name): pd.to_numeric(frame[name], errors="coerce").to_numpy(np.float64) for name in frame}
+    found = {}
+    for name in map(str, frame):
+        if name in choices:
+            position = {choice: float(k) for k, choice in enumerate(choices[name])}
+            unknown = sorted(set(map(str, frame[name])) - set(position))
+            if unknown:
+                raise InputError(f"{path}: {name} must be one of {', '.join(position)}, but some row has '{unknown[0]}'")
+            found[name] = np.array([position[str(value)] for value in frame[name]])
+        else:
+            found[name] = pd.to_numeric(frame[name], errors="coerce").to_numpy(np.float64)
+    return found
 
 
 def _parameter(name: str, entry: Mapping[str, Any], column: np.ndarray) -> Parameter:
     """Return an input; min may exceed max in the data set, and rows may lie a rounding outside."""
+    if _has_choices(entry):
+        unit, text = str(entry.get("unit", "")), str(entry.get("explanation", ""))
+        return Parameter(name, unit=unit, description=text, choices=entry["choices"])
     low, high = sorted((float(entry.get("min", column.min())), float(entry.get("max", column.max()))))
     low, high = min(low, float(column.min())), max(high, float(column.max()))
     whole = str(entry.get("type", "continuous")) in ("integer", "discrete") and bool((column % 1 == 0).all())

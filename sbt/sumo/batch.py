@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from sbt import interruption
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
+from sbt.problem.plain import Values
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import Scene
 from sbt.sumo.insertion import insert, verify
@@ -46,8 +47,8 @@ class _Simulation(Protocol):
     @property
     def batched(self) -> bool: ...
 
-    def __call__(self, values: Mapping[str, float], seed: int) -> Trace: ...
-    def build_scene(self, values: Mapping[str, float], seed: int) -> Scene: ...
+    def __call__(self, values: Values, seed: int) -> Trace: ...
+    def build_scene(self, values: Values, seed: int) -> Scene: ...
     def setup(self, scene: Scene, replicas: int = 1) -> Setup: ...
 
 
@@ -63,9 +64,7 @@ class _ReplicaRun:
     advance: Callable[[], bool]
 
 
-def simulate_many(
-    simulation: _Simulation, work: Sequence[tuple[Mapping[str, float], int]], at_work: Report
-) -> list[Trace | BaseException]:
+def simulate_many(simulation: _Simulation, work: Sequence[tuple[Values, int]], at_work: Report) -> list[Trace | BaseException]:
     """Run concrete scenarios, in replicas of the network where allowed; see `SumoSimulation.simulate_many`."""
     results: dict[int, Trace | BaseException] = {}
     if simulation.batched and len(work) > 1:
@@ -88,7 +87,7 @@ def simulate_many(
 
 def _simulate_in_replicas(
     simulation: _Simulation,
-    work: Sequence[tuple[Mapping[str, float], int]],
+    work: Sequence[tuple[Values, int]],
     results: dict[int, Trace | BaseException],
     at_work: Report,
 ) -> None:

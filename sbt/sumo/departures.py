@@ -13,6 +13,7 @@ from typing import Any
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
+from sbt.problem.plain import Values
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import fill
 
@@ -42,7 +43,7 @@ class RequestedDeparture:
     lane: float | None
 
 
-def requested_departures(files: SumoFiles, values: Mapping[str, float], ego: str) -> dict[str, RequestedDeparture]:
+def requested_departures(files: SumoFiles, values: Values, ego: str) -> dict[str, RequestedDeparture]:
     """Return the requested departures of the ego and of every vehicle with a placeholder."""
     of_ego = files.vehicle(ego)
     compared = [(name, template) for template in files.templates for name in template.varying]

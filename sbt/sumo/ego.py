@@ -12,6 +12,7 @@ import numpy as np
 from sbt import plugins
 from sbt.errors import InputError
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Values
 from sbt.seeds import stream
 from sbt.sumo.actors import Controller, VehicleType
 from sbt.sumo.formatting import format_number, plain
@@ -87,7 +88,7 @@ class Ego:
         """The settings that are inputs of the scenario."""
         return tuple(value for _, value in self.settings if isinstance(value, Parameter))
 
-    def bind(self, values: Mapping[str, float]) -> Ego:
+    def bind(self, values: Values) -> Ego:
         """Return the ego of one run, with the values of the settings that are inputs."""
         if not self.inputs:
             return self

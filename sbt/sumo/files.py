@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 from sbt.errors import InputError
+from sbt.problem.plain import Values
 from sbt.sumo.formatting import format_number
 from sbt.sumo.outputs import begin_outputs
 from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template
@@ -128,7 +129,7 @@ class SumoFiles:
         """Return the ids of all vehicles, trips and flows."""
         return [name for one in self.templates for name in one.vehicles]
 
-    def launch(self, values: Mapping[str, float], folder: Path, step_length: float | None = None) -> Launch:
+    def launch(self, values: Values, folder: Path, step_length: float | None = None) -> Launch:
         """Return the command line for these values, writing copies of files with placeholders to `folder`.
 
         Raises:

@@ -13,6 +13,7 @@ import numpy as np
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Values
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
 from sbt.sumo.actors import Scene
@@ -27,7 +28,7 @@ from sbt.sumo.sumo_run import SumoRun
 
 __all__ = ["CLOCK_STEPS", "SumoSimulation"]
 
-SceneBuilder = Callable[[Mapping[str, float], Ego, np.random.Generator], Scene]
+SceneBuilder = Callable[[Values, Ego, np.random.Generator], Scene]
 """Values of the inputs, the ego, and the random generator of the run to the scene."""
 
 CLOCK_STEPS = 256
@@ -114,7 +115,7 @@ class SumoSimulation:
         """Return a copy with a wall-clock limit of its runs (s)."""
         return replace(self, timeout=timeout)
 
-    def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
+    def __call__(self, values: Values, seed: int) -> Trace:
         """Run one concrete scenario.
 
         Raises:
@@ -145,7 +146,7 @@ class SumoSimulation:
             return run.trace()
 
     def simulate_many(
-        self, work: Sequence[tuple[Mapping[str, float], int]], at_work: Callable[[Sequence[int]], None] = lambda _: None
+        self, work: Sequence[tuple[Values, int]], at_work: Callable[[Sequence[int]], None] = lambda _: None
     ) -> list[Trace | BaseException]:
         """Run several concrete scenarios, in one simulation where the isolation level allows it.
 
@@ -168,7 +169,7 @@ class SumoSimulation:
         """Whether several runs share one simulation."""
         return self.isolation_level == "replicas"
 
-    def build_scene(self, values: Mapping[str, float], seed: int) -> Scene:
+    def build_scene(self, values: Values, seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
         values = plain_values(values)
         return self.scene(values, self.ego.bind(values), stream(seed, "scene"))

@@ -1,9 +1,9 @@
-"""SUMO files with placeholders `${...}` in attribute values, which are replaced by numbers.
+"""SUMO files with placeholders `${...}` in attribute values, which are replaced by numbers, or by a choice.
 
-A placeholder is a formula over the inputs (`${gap}`, `${100 + gap}`, `${v / 3.6}`); all other bytes of a file
-are copied unchanged. Files without placeholders, also in the files they include, are used in place; of the
-others, filled copies are written. Document types and entities are refused, as they could make SUMO read
-files that the user does not know of.
+A placeholder is a formula over the inputs (`${gap}`, `${100 + gap}`, `${v / 3.6}`, `${4 + 8 * (kind == 'truck')}`), or the
+name of an input with choices (`${kind}`), whose text is filled in, escaped; all other bytes of a file are copied
+unchanged. Files without placeholders, also in the files they include, are used in place; of the others, filled copies
+are written. Document types and entities are refused, as they could make SUMO read files that the user does not know of.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr, unescape
 
 from sbt.errors import InputError, RunError
 from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
+from sbt.problem.plain import Values
 from sbt.sumo.outputs import MARKS, names_output, output_names, run_file
 
 __all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
@@ -35,6 +36,7 @@ _REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
 _REFERRING = ("include", "variableSpeedSign", "rerouter")
 """Elements whose `href` or `file` names another file, relative to the file that contains the element."""
 _VEHICLES = ("vehicle", "trip", "flow")
+_QUOTES = {'"': "&quot;", "'": "&apos;"}
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class Template:
         """Whether a run needs a copy: a placeholder is to be filled, or SUMO would write beside this file or an included one."""
         return any(p.target is None for t in self.tree() for p in t.parts)
 
-    def write(self, values: Mapping[str, float], folder: Path) -> Path:
+    def write(self, values: Values, folder: Path) -> Path:
         """Return the file as a run in `folder` uses it: a copy with placeholders filled and outputs there, or the file itself.
 
         Raises:
@@ -151,9 +153,10 @@ class Template:
         target.write_bytes(b"".join([*pieces, self.data[at:]]))
         return target
 
-    def _replacement(self, part: _Part, values: Mapping[str, float], folder: Path) -> bytes:
+    def _replacement(self, part: _Part, values: Values, folder: Path) -> bytes:
         if part.placeholder is not None:
-            return number(part.placeholder, values).encode()
+            written = escape(text_of(part.placeholder, values), _QUOTES)
+            return written.encode("ascii", "xmlcharrefreplace")  # whatever the file's encoding is
         if part.output is not None:
             return quoteattr(str(run_file(folder, self.path, fill(part.output, values)))).encode()
         if part.target is None:
@@ -173,17 +176,23 @@ def placeholders(text: str, place: str) -> tuple[Placeholder, ...]:
     return tuple(_placeholder(match.group(1), place, attribute) for match in _PLACEHOLDER.finditer(text))
 
 
-def fill(text: str, values: Mapping[str, float], place: str = "") -> str:
+def fill(text: str, values: Values, place: str = "") -> str:
     """Return a text with its placeholders filled."""
-    return _PLACEHOLDER.sub(lambda match: number(_placeholder(match.group(1), place), values), text)
+    return _PLACEHOLDER.sub(lambda match: text_of(_placeholder(match.group(1), place), values), text)
 
 
-def number(placeholder: Placeholder, values: Mapping[str, float]) -> str:
+def text_of(placeholder: Placeholder, values: Values) -> str:
     """Return the value of a placeholder as text; whole numbers have no decimal point, so that they can be lanes and counts.
 
     Raises:
-        RunError: it is not finite.
+        RunError: it is not finite, or takes a choice for a number.
     """
+    if placeholder.formula.is_name and isinstance(found := placeholder.formula(values), str):
+        return found
+    for name in placeholder.formula.numbers():
+        if isinstance(values.get(name), str):
+            rule = f"'{name}' is an input with choices and no number"
+            raise RunError(Status.INVALID, f"{placeholder.place}: ${{{placeholder.formula.text}}} must be a formula, but {rule}")
     value = float(placeholder.formula(values))
     if not math.isfinite(value):
         raise RunError(Status.INVALID, f"{placeholder.place}: ${{{placeholder.formula.text}}} must be finite, but got {value}")
@@ -281,6 +290,7 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_
         before = _ALONE.search(text, 0, match.start())
         alone = before is not None and text[match.end() : match.end() + 1] in (b'"', b"'")
         attribute = before.group(1).decode() if before is not None and alone else ""
-        hole = _placeholder(match.group(1).decode(), place, attribute)
+        written = unescape(match.group(1).decode(), {text: quote for quote, text in _QUOTES.items()})
+        hole = _placeholder(written, place, attribute)
         parts.append(_Part(at + match.start(), at + match.end(), placeholder=hole))
     yield from sorted(parts, key=lambda part: part.start)

@@ -28,6 +28,7 @@ import numpy as np
 from sbt import interruption
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
+from sbt.problem.plain import Values
 from sbt.problem.profile import Profile
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
@@ -42,13 +43,13 @@ from sbt.sumo.session import scratch_folder, session
 
 __all__ = ["Loop", "TraciProxy", "UserSimulation", "step_until_over"]
 
-Loop = Callable[[Any, Mapping[str, Any], np.random.Generator], object]
+Loop = Callable[[Any, Values, np.random.Generator], object]
 """The user's `simulate(sumo, values, rng)`."""
 Connect = Callable[[Launch], AbstractContextManager[Any]]
 """Starts SUMO and provides its client module: libsumo or traci."""
 
 
-def step_until_over(sumo: Any, values: Mapping[str, Any], rng: np.random.Generator) -> None:
+def step_until_over(sumo: Any, values: Values, rng: np.random.Generator) -> None:
     """Step until the run is over: the loop of a scenario without one."""
     while True:
         sumo.simulationStep()
@@ -119,7 +120,7 @@ class UserSimulation:
         """Return a copy with a wall-clock limit of its runs (s)."""
         return replace(self, timeout=timeout)
 
-    def __call__(self, values: Mapping[str, float], seed: int) -> Trace:
+    def __call__(self, values: Values, seed: int) -> Trace:
         """Run one concrete scenario in libsumo.
 
         Raises:
@@ -134,7 +135,7 @@ class UserSimulation:
         found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
         return (*filter(None, [session().ask(lambda sumo: levels_of(sumo).warning)]), *found)
 
-    def run_with_traci(self, values: Mapping[str, float], seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
+    def run_with_traci(self, values: Values, seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
         """Run one concrete scenario in a separate SUMO process, such as sumo-gui, through traci.
 
         Args:
@@ -149,7 +150,7 @@ class UserSimulation:
         """
         return self._run(values, seed, lambda launch: _traci_connection(traci, [*program, *launch.command(seed)]))
 
-    def files_of_run(self, values: Mapping[str, float], seed: int) -> SumoFiles:
+    def files_of_run(self, values: Values, seed: int) -> SumoFiles:
         """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.
 
         Raises:
@@ -170,7 +171,7 @@ class UserSimulation:
             raise RunError(Status.FAILED, "a loop must call sumo.start([...]), but it did not")
         return found[0]
 
-    def _run(self, values: Mapping[str, float], seed: int, connect: Connect) -> Trace:
+    def _run(self, values: Values, seed: int, connect: Connect) -> Trace:
         proxy: TraciProxy | None = None
         given = plain_values(values)
         try:
@@ -202,7 +203,7 @@ class TraciProxy:
         error_place: ` (file:line)` of the user's code where an error was raised, "" without one.
     """
 
-    def __init__(self, simulation: UserSimulation, values: Mapping[str, float], seed: int, connect: Callable[[SumoFiles], Any]):
+    def __init__(self, simulation: UserSimulation, values: Values, seed: int, connect: Callable[[SumoFiles], Any]):
         self._user_simulation, self._values, self._seed, self._connect = simulation, values, seed, connect
         self._module: Any = None
         self._recorder: Recorder | None = None

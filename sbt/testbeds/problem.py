@@ -14,6 +14,7 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector, as_points, as_vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Values
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
@@ -172,7 +173,7 @@ class _Pointwise:
     function: Function
     noise: float
 
-    def __call__(self, values: Mapping[str, float], seed: int) -> dict[str, float]:
+    def __call__(self, values: Values, seed: int) -> dict[str, float]:
         x = as_points([[values[name] for name in self.inputs]], len(self.inputs))
         y = float(as_vector(self.function(x), 1)[0])
         if self.noise:

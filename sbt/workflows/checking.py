@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,6 +15,7 @@ from sbt import interruption
 from sbt.errors import RunError, SbtError, described
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import elsewhere
+from sbt.problem.plain import Value, Values, written
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -30,8 +31,6 @@ _RUN_DEADLINE = 60.0
 """Longest run (s), where the scenario looks at the clock."""
 _WORKER_DEADLINE = 300.0
 """Longest wait (s) for the worker process."""
-
-Values = Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -82,17 +81,24 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
     return tuple(findings)
 
 
-def _points(space: ParameterSpace) -> Iterator[dict[str, float]]:
-    """Yield the centre and the corners that satisfy the constraints."""
+def _points(space: ParameterSpace) -> Iterator[dict[str, Value]]:
+    """Yield the centre, the corners and, at the first of them that admits it, every other choice, all within the constraints."""
     centre = {p.name: p.centre for p in space.parameters}
-    ends = [p.bounds for p in space.parameters]
-    if space.dimension <= _CORNERS_UP_TO:
-        corners = [dict(zip(space.names, corner, strict=True)) for corner in itertools.product(*ends)]
+    ranges = [p for p in space.parameters if not p.choices]
+    if len(ranges) <= _CORNERS_UP_TO:
+        ends = itertools.product(*(p.bounds for p in ranges)) if ranges else ()
+        corners = [{**centre, **dict(zip((p.name for p in ranges), corner, strict=True))} for corner in ends]
     else:
-        corners = [{**centre, p.name: end} for p in space.parameters for end in p.bounds]
-    for values in (centre, *corners):
-        if bool(space.feasible(np.array([[values[name] for name in space.names]]))[0]):
-            yield values
+        corners = [{**centre, p.name: end} for p in ranges for end in p.bounds]
+    points = np.array([[numbers[name] for name in space.names] for numbers in (centre, *corners)])
+    chosen = points[space.feasible(points)]
+    for k, p in enumerate(space.parameters):
+        for choice in range(len(p.choices)):
+            at = points.copy()
+            at[:, k] = choice
+            if choice != p.centre:
+                chosen = np.vstack([chosen, at[space.feasible(at)][:1]])
+    yield from (space.named(point) for point in chosen)
 
 
 def _runs(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run]:
@@ -146,8 +152,8 @@ def _digest(trace: Trace) -> str:
     return digest.hexdigest()
 
 
-def _all_ok(runs: list[_Run], points: list[dict[str, float]]) -> Finding:
-    bad = [f"at {_at(p)}: {r.problem}" for r, p in zip(runs, points, strict=True) if r.problem]
+def _all_ok(runs: list[_Run], points: Sequence[Values]) -> Finding:
+    bad = [f"at {written(p)}: {r.problem}" for r, p in zip(runs, points, strict=True) if r.problem]
     detail = f"{len(bad)} of {len(runs)} failed; {bad[0]}" if bad else f"{len(runs)} runs"
     return Finding("centre and corners run", not bad and bool(runs), detail)
 
@@ -162,19 +168,17 @@ def _finite(runs: list[_Run], scenario: LogicalScenario) -> Finding:
     return Finding("metrics are finite", ok=True, detail=", ".join(scenario.measured))
 
 
-def _equal(rule: str, first: list[_Run], second: list[_Run], points: list[dict[str, float]]) -> Finding:
+def _equal(rule: str, first: list[_Run], second: list[_Run], points: Sequence[Values]) -> Finding:
     """Return whether two series are bit-equal, and where they are not."""
     for a, b, values in zip(first, second, points, strict=True):
         if a != b:
             differ = [f"{n} {x!r} and {y!r}" for (n, x), (_, y) in zip(a.metrics, b.metrics, strict=False) if x != y]
             what = b.problem or a.problem or "; ".join(differ) or "the traces differ, their metrics do not"
-            return Finding(rule, ok=False, detail=f"at {_at(values)}: {what}")
+            return Finding(rule, ok=False, detail=f"at {written(values)}: {what}")
     return Finding(rule, ok=True, detail=f"{len(first)} runs bit-equal")
 
 
-def _in_worker(
-    spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], first: list[_Run], points: list[dict[str, float]]
-) -> Finding:
+def _in_worker(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], first: list[_Run], points: Sequence[Values]) -> Finding:
     """Return whether a spawned process, which gets plain data only, gives the same."""
     rule = "same seed, same trace in a worker process"
     try:
@@ -185,7 +189,7 @@ def _in_worker(
         return Finding(rule, ok=False, detail=str(error))
 
 
-def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: list[dict[str, float]]) -> list[Finding]:
+def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: Sequence[Values]) -> list[Finding]:
     """Return, for every allowed isolation level but `fresh`, whether it is bit-equal to `fresh`.
 
     The kept simulation runs the jobs in another order, and twice, so that each follows different ones.
@@ -219,7 +223,3 @@ def _sides(runs: list[_Run], scenario: LogicalScenario) -> Finding:
     low, high = scenario.requirement.critical.low, scenario.requirement.critical.high
     detail = f"{critical} of {len(runs)} critical by {scenario.requirement.metric} in [{low:g}, {high:g}]"
     return Finding("for information: both sides of the requirement", ok=True, detail=detail)
-
-
-def _at(values: Values) -> str:
-    return ", ".join(f"{name}={value:g}" for name, value in values.items())

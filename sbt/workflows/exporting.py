@@ -10,6 +10,7 @@ from sbt.errors import InputError, did_you_mean
 from sbt.files import write_atomically
 from sbt.plugins import Objects
 from sbt.store.database import Store
+from sbt.store.history import named_columns
 from sbt.workflows.study import Study
 
 __all__ = ["FORMS", "export_store"]
@@ -54,7 +55,8 @@ def _as_boundary(store: Store, study: Study) -> Path:
 
     from sbt.campaigns.boundary import boundary_points
 
-    points = pd.DataFrame(boundary_points(study.settings, store.history()), columns=list(study.scenario.space.names))
+    space = study.scenario.space
+    points = pd.DataFrame(named_columns(boundary_points(study.settings, store.history()), space.names, space.choices))
     return write_atomically(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from sbt import plugins
 from sbt.config.load import load
 from sbt.config.scenario_file import is_scenario
+from sbt.config.source import read_yaml
 from sbt.errors import InputError, PluginError, did_you_mean
 from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
@@ -22,7 +23,7 @@ from sbt.execution.worker import run_traced
 from sbt.plugins import OBJECT, Objects, Scope
 from sbt.problem.description import describe_scenario, scenario_differences
 from sbt.problem.outcome import Job, Outcome, Status
-from sbt.problem.plain import Json
+from sbt.problem.plain import Json, Value, written
 from sbt.problem.scenario import LogicalScenario, Metric, metric_from
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from sbt.campaigns.failures import FalsificationConclusion
 
 __all__ = ["Checked", "Run", "check_target", "installed", "open_result", "run_campaign", "simulate_scenario"]
+
 
 @overload
 def run_campaign(*, campaign: Literal["boundary"], **keys: Unpack[CampaignKeys]) -> Result[BoundaryConclusion]: ...
@@ -152,7 +154,7 @@ class Run:
     """
 
     scenario: LogicalScenario
-    inputs: Mapping[str, float]
+    inputs: Mapping[str, Value]
     seed: int
     outcome: Outcome
     states: Trace | None = None
@@ -166,6 +168,11 @@ class Run:
     def status(self) -> Status:
         """How the run ended."""
         return self.outcome.status
+
+    @property
+    def concrete(self) -> str:
+        """The concrete scenario on one line."""
+        return written(self.inputs)
 
     @property
     def metrics(self) -> Mapping[str, float]:
@@ -217,21 +224,22 @@ class Run:
 
 
 def simulate_scenario(
-    scenario: LogicalScenario | str | Path, inputs: Mapping[str, float] | None = None, *, seed: int = 0,
+    scenario: LogicalScenario | str | Path, inputs: Mapping[str, Value] | None = None, *, seed: int = 0,
     ego: Setting | None = None, step_length: float | None = None, isolation: str = "auto",
-    metrics: Sequence[Metric | str | Callable[[Trace], float]] = (), traced: bool = False,
+    metrics: Sequence[Metric | str | Callable[[Trace], float]] = (), traced: bool = False, as_text: bool = False,
 ) -> Run:  # fmt: skip
     """Run one concrete scenario.
 
     Args:
         scenario: an object, an installed name, `file.py:NAME`, `scenario.yaml`, `testbed:NAME` or `table:FOLDER`.
-        inputs: values by name; the others are at the centre of their range.
+        inputs: values by name; the others are at the centre of their range, or their likeliest choice.
         seed: of the run, >= 0.
         ego: the AV under test: a kind, or kind and settings.
         step_length: simulation step (s).
         isolation: how SUMO is kept between runs.
         metrics: further ones to measure.
         traced: refuse a scenario that gives no trace, before it runs.
+        as_text: values are texts of a command line; those of inputs with ranges are read as YAML.
 
     Returns:
         The run; one that fails says why in `status` and `reason`.
@@ -255,15 +263,12 @@ def simulate_scenario(
         raise InputError(f"a trace needs a scenario that is simulated, but {found.name} gives its metrics directly")
     if own:
         found = replace(found, metrics=(*found.metrics, *own))
-    values = found.space.values({name: _number(name, value) for name, value in (inputs or {}).items()})
+    given = dict(inputs or {})
+    if as_text:
+        given = {k: v if k in found.space.choices else read_yaml(str(v), f"input {k}")[0] for k, v in given.items()}
+    values = found.space.values(given)
     outcome, states = run_traced(found, Job(0, values, int(seed)))
     return Run(found, values, int(seed), outcome, states, "" if isinstance(scenario, LogicalScenario) else str(scenario))
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
-        raise InputError(f"input {name} must be a number, but got {value!r}")
-    return float(value)
 
 
 def _spec(scenario: LogicalScenario | str | Path, isolation: str) -> ScenarioSpec:

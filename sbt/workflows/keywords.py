@@ -91,7 +91,9 @@ def _input(change: Any) -> Any:
     """Return the change of an input as plain data: of a range, a distribution, or a whole parameter."""
     if isinstance(change, Parameter):
         distribution = {} if change.distribution is None else {"distribution": change.distribution}
-        change = {"min": change.low, "max": change.high, **distribution}
+        likely = dict(zip(change.choices, change.probabilities, strict=False))
+        ends = {"min": change.low, "max": change.high, **distribution}
+        change = {"choices": likely or change.choices} if change.choices else ends
     if isinstance(change, Distribution):
         change = {"distribution": change}
     if isinstance(change, Mapping):

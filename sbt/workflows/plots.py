@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion
 from sbt.problem.arrays import Mask, Vector
+from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.history import VALIDATION, History
 from sbt.workflows.study import Study
@@ -94,27 +96,38 @@ class Plots:
             drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, fontsize="small", frameon=False)
         return drawn
 
-    def boundary(self, ax: Axes | None = None, *, x: str | None = None, y: str | None = None) -> Axes:
+    def boundary(
+        self, ax: Axes | None = None, *, x: str | None = None, y: str | None = None, at: Mapping[str, Value] | None = None
+    ) -> Axes:
         """Draw P(critical) over two inputs, averaged over the others, with the runs that the metamodel learned from.
 
         Args:
             ax: where; None: a new figure.
             x: name of the input along the axis; None: the most influential one.
             y: likewise, upwards.
+            at: values of inputs that are held instead of averaged over, such as {"kind": "truck"}.
         """
         from sbt.report import figures
         from sbt.report.projection import probability_plane
 
         r, space = self.result, self.result.scenario.space
-        pair = (0,) if space.dimension == 1 else self._pair(x, y)
-        plane = probability_plane(self._fitted.predict, r.scenario.requirement.critical, space, pair)
+        values = space.numbers(space.values(at or {}))
+        fixed = {self._column(name): float(values[self._column(name)]) for name in at or {}}
+        free = space.dimension - len(fixed)
+        self._need(free > 0, "an input to draw along (at holds all)")
+        pair = self._pair(x, y, tuple(fixed)) if free > 1 else tuple(k for k in range(space.dimension) if k not in fixed)
+        if set(pair) & set(fixed):
+            raise InputError(f"an input is drawn along or held, not both, but got {', '.join(at or {})} in at")
+        plane = probability_plane(self._fitted.predict, r.scenario.requirement.critical, space, pair, fixed=fixed)
         drawn = figures.plot_probability(plane, space, _axes(ax))
-        learned = r.history.where(r.history.stage != VALIDATION)
-        if space.dimension == 2:
-            figures.plot_runs(learned, r.scenario.requirement, space, drawn, pair=self._pair(x, y), size=10.0)
+        if len(pair) == 2 and free == 2 and all(space.parameters[k].choices for k in fixed):
+            learned = r.history.where(r.history.stage != VALIDATION)
+            for k, value in fixed.items():
+                learned = learned.where(learned.x[:, k] == value)
+            figures.plot_runs(learned, r.scenario.requirement, space, drawn, pair=pair, size=10.0)
         return drawn
 
-    def slices(self, ax: Axes | None = None, *, x: str | None = None, at: int | dict[str, float] | None = None) -> Axes:
+    def slices(self, ax: Axes | None = None, *, x: str | None = None, at: int | dict[str, Value] | None = None) -> Axes:
         """Draw the metamodel's mean and its 5 % to 95 % band along one input through a point.
 
         Args:
@@ -128,15 +141,19 @@ class Plots:
 
         r, space = self.result, self.result.scenario.space
         k = int(np.argmax(self._influence)) if x is None else self._column(x)
-        point = np.tile(self._point(at), (_SLICE_POINTS, 1))
         low, high = space.parameters[k].bounds
-        point[:, k] = np.linspace(low, high, _SLICE_POINTS)
+        along = np.linspace(low, high, _SLICE_POINTS)
+        if space.parameters[k].discrete:
+            along = np.unique(along.round())
+        point = np.tile(self._point(at), (len(along), 1))
+        point[:, k] = along
         drawn, critical = _axes(ax), r.scenario.requirement.critical
         prediction = self._fitted.predict(np.clip(space.to_unit(point), 0.0, 1.0))
         ends = reach(np.concatenate([prediction.quantile(0.05), prediction.quantile(0.95)]), critical)
         shade(critical, ends, drawn, along="y")
-        figures.plot_prediction(point[:, k], prediction, drawn)
         parameter = space.parameters[k]
+        figures.plot_prediction(along, prediction, drawn, choices=bool(parameter.choices))
+        figures.whole_ticks(drawn, parameter)
         drawn.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(r.scenario.requirement.metric, r.scenario.unit))
         drawn.set(ylim=padded(*ends))
         drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
@@ -216,10 +233,10 @@ class Plots:
         if not there:
             raise InputError(f"this figure needs {what}, but {self.result.store} has none")
 
-    def _pair(self, x: str | None, y: str | None) -> tuple[int, int]:
-        """Return the columns of two inputs: those named, the most influential ones for the rest."""
+    def _pair(self, x: str | None, y: str | None, held: tuple[int, ...] = ()) -> tuple[int, int]:
+        """Return the columns of two inputs: those named, the most influential ones that are not held for the rest."""
         named = [None if name is None else self._column(name) for name in (x, y)]
-        rest = (int(k) for k in np.argsort(-self._influence, kind="stable") if int(k) not in named)
+        rest = (int(k) for k in np.argsort(-self._influence, kind="stable") if int(k) not in (*named, *held))
         if named == [None, None]:
             first, second = sorted((next(rest), next(rest)))
             return first, second
@@ -232,12 +249,12 @@ class Plots:
             raise InputError(f"an input must be one of {', '.join(names)}, but got '{name}'{did_you_mean(name, names)}")
         return names.index(name)
 
-    def _point(self, at: int | dict[str, float] | None) -> Vector:
+    def _point(self, at: int | dict[str, Value] | None) -> Vector:
         """Return the (d,) point that slices go through."""
         space, history = self.result.scenario.space, self.result.history
         if at is None or isinstance(at, dict):
             values = space.values(at or {})
-            return np.array([values[name] for name in space.names])
+            return space.numbers(values)
         rows = np.flatnonzero(history.index == at)
         if len(rows) == 0:
             raise InputError(f"a run must be a finished one (0 to {len(history) - 1}), but got {at}")

@@ -24,7 +24,7 @@ from sbt.metamodels.persistence import load, read_info, save
 from sbt.plugins import Objects
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
-from sbt.problem.plain import Json
+from sbt.problem.plain import Json, Value
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import Store
 from sbt.store.history import History
@@ -43,8 +43,8 @@ class Table:
     """Predictions for rows of inputs.
 
     Attributes:
-        inputs: names of the inputs.
-        x: (n, d) their values.
+        space: the inputs.
+        x: (n, d) their numbers.
         columns: (n,) mu, sigma, epistemic, noise (unit of the metric) and p_critical.
         metric: the safety metric.
         metamodel: kind, as configured.
@@ -53,7 +53,7 @@ class Table:
         ignored: columns of the file that are no inputs.
     """
 
-    inputs: tuple[str, ...]
+    space: ParameterSpace
     x: Points
     columns: Mapping[str, Vector]
     metric: str
@@ -62,11 +62,18 @@ class Table:
     source: str
     ignored: tuple[str, ...]
 
-    def rows(self) -> list[dict[str, float]]:
-        """Return one mapping a row: inputs, then predictions."""
-        names = (*self.inputs, *self.columns)
-        values = np.column_stack([self.x, *self.columns.values()])
-        return [dict(zip(names, map(float, row), strict=True)) for row in values]
+    def rows(self) -> list[dict[str, Value]]:
+        """Return one mapping a row: inputs, choices as text, then predictions."""
+        values = np.column_stack(list(self.columns.values()))
+        return [
+            {**self.space.named(x), **dict(zip(self.columns, map(float, row), strict=True))}
+            for x, row in zip(self.x, values, strict=True)
+        ]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.space.names
 
 
 def predict_rows(folder: Path, inputs: Path, device: str | None = None) -> Table:
@@ -118,22 +125,22 @@ def predict_inputs(
         parts.append([p.mu, p.sigma, p.epistemic, p.noise, p.probability(requirement.critical)])
     names = ("mu", "sigma", "epistemic", "noise", "p_critical")
     columns = dict(zip(names, np.concatenate(parts, axis=1), strict=True)) if parts else {n: np.empty(0) for n in names}
-    return Table(space.names, x, columns, requirement.metric, choice.kind, len(training), source, ignored)
+    return Table(space, x, columns, requirement.metric, choice.kind, len(training), source, ignored)
 
 
 def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, ...]]:
     """Return x (n, d) of a table in memory, and the names of its other columns.
 
     Args:
-        given: a DataFrame or a mapping with a column (or one number) for each input, named as the input or `x.<input>`;
-            or an array (n, d) in the order of the inputs.
+        given: a DataFrame or a mapping with a column (or one value) for each input, named as the input or `x.<input>`, of
+            numbers or of choices as text; or an array (n, d) in the order of the inputs.
         space: the inputs.
 
     Raises:
         InputError: columns missing, values that are no numbers or outside of the range; the message names row and column.
     """
     if not hasattr(given, "keys"):
-        x = np.atleast_2d(np.asarray(given, dtype=np.float64))
+        x = _numbers_of(given, space)
         if x.ndim != 2 or x.shape[1] != space.dimension:
             names = ", ".join(space.names)
             raise InputError(f"an array of inputs must be (n, {space.dimension}), for {names}, but got {x.shape}")
@@ -143,7 +150,9 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
     columns = []
     for name, key in zip(space.names, where, strict=True):
         try:
-            columns.append(np.atleast_1d(np.asarray(given[key], dtype=np.float64)))
+            columns.append(_column_of(given[key], space.parameters[space.names.index(name)]))
+        except InputError as error:
+            raise InputError(f"column {key}: {error}") from None
         except (TypeError, ValueError) as error:
             raise InputError(f"column {key} must hold numbers, for input {name}, but {error}") from None
     sizes = {len(column) for column in columns}
@@ -153,6 +162,23 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
     if len(sizes) > 1:
         raise InputError(f"columns of inputs must have one length, but got {', '.join(map(str, sorted(sizes)))}")
     return _within(np.column_stack(columns), space), tuple(name for name in head if name not in where)
+
+
+def _column_of(given: Any, parameter: Parameter) -> Vector:
+    """Return a column (n,) as numbers; one value is a column of one."""
+    if not parameter.choices:
+        return np.atleast_1d(np.asarray(given, dtype=np.float64))
+    return np.array([parameter.number(value) for value in np.atleast_1d(np.asarray(given, dtype=object))])
+
+
+def _numbers_of(given: Any, space: ParameterSpace) -> Points:
+    """Return rows in the order of the inputs as numbers."""
+    if not space.choices:
+        return np.atleast_2d(np.asarray(given, dtype=np.float64))
+    rows = np.atleast_2d(np.asarray(given, dtype=object))
+    if rows.shape[-1] != space.dimension:
+        return np.empty(rows.shape)
+    return np.column_stack([_column_of(rows[:, k], p) for k, p in enumerate(space.parameters)])
 
 
 def _column(name: str, head: list[str]) -> str:
@@ -174,6 +200,10 @@ def _within(x: Points, space: ParameterSpace) -> Points:
         row, k = (int(i) for i in np.argwhere(wrong)[0])
         p = space.parameters[k]
         raise InputError(f"row {row}: {p.name} must be in {p.range}, but got {x[row, k]:g}")
+    for k, p in enumerate(space.parameters):
+        if p.discrete and (x[:, k] % 1 != 0).any():
+            row = int(np.argmax(x[:, k] % 1 != 0))
+            raise InputError(f"row {row}: {p.name} must be a whole number in {p.range}, but got {x[row, k]:g}")
     return np.clip(x, low, high)
 
 
@@ -245,6 +275,11 @@ def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, .
 def _value(path: Path, number: int, line: list[str], column: int, parameter: Parameter) -> float:
     """Return one checked value of a line."""
     text = line[column].strip() if column < len(line) else ""
+    if parameter.choices:
+        try:
+            return parameter.number(text)
+        except InputError as error:
+            raise InputError(f"{path}:{number}: {error}") from None
     try:
         value = float(text)
     except ValueError:
@@ -253,4 +288,6 @@ def _value(path: Path, number: int, line: list[str], column: int, parameter: Par
     room = _TOLERANCE * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
     if not low - room <= value <= high + room:  # also NaN
         raise InputError(f"{path}:{number}: {parameter.name} must be in {parameter.range}, but got {text}")
+    if parameter.discrete and value % 1 != 0:
+        raise InputError(f"{path}:{number}: {parameter.name} must be a whole number in {parameter.range}, but got {text}")
     return min(max(value, low), high)

@@ -58,9 +58,7 @@ class Study:
         return cls(from_mapping(data, name=name, scope=scope))
 
     @classmethod
-    def from_store(
-        cls, store: Store, *, objects: Objects | None = None, live: bool = False
-    ) -> Study:
+    def from_store(cls, store: Store, *, objects: Objects | None = None, live: bool = False) -> Study:
         """Return the study that a store was made with.
 
         Args:
@@ -237,6 +235,11 @@ class Study:
                 f"warm_start.store must have the same inputs, but {folder} has others ({', '.join(there)} there, "
                 f"{', '.join(here)} here)"
             )
+        choices = self.scenario.space.choices
+        if set(choices) != set(history.choices):
+            named = (", ".join(found) or "none" for found in (history.choices, choices))
+            raise InputError("warm_start.store must have choices of the same inputs, but {} there, {} here".format(*named))
+        history = history.recoded(choices)
         runs = history.where(self.scenario.space.feasible(history.x)) if len(history) else history
         metric = self.scenario.requirement.metric
         if len(runs) and metric not in runs.metrics and runs.ok.any():
