@@ -97,6 +97,7 @@ RUN = {
     "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
     "docs/python.md": {"python"}, "docs/scenarios.md": {"python"}, "docs/testbeds.md": {"console", "python", "yaml"},
     "docs/tutorials/actors.md": {"bash", "python", "yaml"}, "docs/tutorials/own_files.md": {"bash", "xml", "yaml"},
+    "docs/tutorials/recorded_traffic.md": {"bash", "python", "xml", "yaml"},
     "docs/tutorials/traci_loop.md": {"bash", "python", "xml", "yaml"},
 }  # fmt: skip
 """What each page must show; all of it is run or checked, by this file or (a block that names a file) by test_tutorials.py."""
@@ -205,6 +206,8 @@ def test_commands_fit_the_command_line(block: Block):
             words = words[1:]
         if "sumo-sbt" in words:
             parsed(words[words.index("sumo-sbt") :])
+        elif words[0] == "python" and words[1] in {each.name for each in BLOCKS if each.page == block.page}:
+            continue  # run by test_tutorials.py
         elif words[0] == "python":
             script = ROOT / words[1]
             assert script.is_file()

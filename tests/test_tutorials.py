@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,7 @@ def extract(page: Path, folder: Path) -> list[list[str]]:
 
 
 def test_there_is_a_page_for_every_door():
-    assert {"own_files", "traci_loop", "actors"} <= {page.stem for page in PAGES}
+    assert {"own_files", "traci_loop", "actors", "recorded_traffic"} <= {page.stem for page in PAGES}
 
 
 @pytest.mark.sumo
@@ -35,6 +36,9 @@ def test_tutorials_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     assert {"check", "run"} <= {words[1] for words in commands}
     for program, *args in commands:
+        if program == "python":
+            runpy.run_path(args[0])
+            continue
         assert program == "sumo-sbt"
         extra = ["--set", "executor.kind=serial", "--json"] if args[0] == "run" else []
         done = CliRunner().invoke(app, [*args, *extra])

@@ -16,7 +16,9 @@ __all__ = ["metrics"]
 
 
 def metrics(
-    file: Annotated[Path, typer.Argument(metavar="FCD_FILE", help="SUMO's FCD output: .xml[.gz], .csv[.gz], .parquet.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FCD_FILE", help="SUMO's FCD (.xml[.gz], .csv[.gz], .parquet), or tracks (highD, inD).")
+    ],
     *,
     pairs: Annotated[
         str, typer.Option(metavar="within=METRES", help="Only pairs of road users that come so near (centres, m).")
@@ -28,11 +30,12 @@ def metrics(
 ) -> None:
     """Compute every installed metric for every pair of road users of recorded traffic, each as ego in turn."""
     with clean_stdout():
-        from sbt.metrics.fcd import catalogue, encounters, read_fcd
+        from sbt.metrics.fcd import catalogue, encounters
+        from sbt.metrics.tracks import read_recording
 
         within = _within(pairs)
         measured = catalogue()
-        recording = read_fcd(file, length=length, width=width)
+        recording = read_recording(file, length=length, width=width)
         rows = [
             {"ego": ego, "other": other, "begin": float(trace.time[0]), "end": float(trace.time[-1])}
             | {metric.name: _value(metric, trace) for metric in measured}

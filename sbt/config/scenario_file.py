@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of
 from sbt.config.profiles import guided_vehicles, profile_of
+from sbt.config.recorded import net_of_recording, recorded_traffic
 from sbt.config.scenario_model import EgoEntry, InputEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
@@ -25,7 +26,10 @@ from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
 from sbt.sumo.ego_vehicle import EgoVehicle
 from sbt.sumo.files import SumoFiles, options_of_config
+from sbt.sumo.guided import Participant
+from sbt.sumo.recorded import RecordedTraffic
 from sbt.sumo.recorder import RecordingSettings
+from sbt.sumo.template import placeholders
 from sbt.sumo.user_simulation import Loop, UserSimulation, step_until_over
 
 __all__ = ["from_file", "is_scenario"]
@@ -94,6 +98,7 @@ class _Builder:
         metrics = self._metrics()
         requirement = self._requirement(metrics)
         guided = guided_vehicles(model.actors, self._profiles, files, model.ego.id, problems)
+        moved: tuple[Participant, ...] = (*guided, *self._recorded())
         if files is not None:
             self._check_inputs(files, space)
         if model.sumo is None and model.simulate is None:
@@ -103,7 +108,7 @@ class _Builder:
         named = tuple(n for n in named if n != model.ego.id)
         simulation = problems.attempt(("step_length",), lambda: UserSimulation(
             RecordingSettings(ego or EgoVehicle(model.ego.id), model.duration, model.others.within, named, model.wait),
-            files, loop, self._folder, model.step_length, profiles=tuple(self._profiles.values()), participants=guided,
+            files, loop, self._folder, model.step_length, profiles=tuple(self._profiles.values()), participants=moved,
         ))  # fmt: skip
         problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
@@ -163,6 +168,14 @@ class _Builder:
         found = files
         return files if self._problems.attempt(("sumo",), lambda: found.templates) is not None else None
 
+    def _recorded(self) -> tuple[RecordedTraffic, ...]:
+        """Return the recorded traffic, if there is any."""
+        entry = self._model.recorded
+        if entry is None:
+            return ()
+        found = self._problems.attempt(("recorded",), lambda: recorded_traffic(entry, self._folder))
+        return () if found is None else (found,)
+
     def _options(self, entry: SumoEntry) -> dict[str, str]:
         """Return the options of the configuration with what the scenario file says on top."""
         options = {} if entry.config is None else options_of_config(self._folder / entry.config)
@@ -170,6 +183,9 @@ class _Builder:
                             ("additional-files", ",".join(entry.additional))):  # fmt: skip
             if value:
                 options[name] = value
+        recorded = self._model.recorded
+        if "net-file" not in options and recorded is not None:
+            options["net-file"] = str(net_of_recording(recorded, self._folder))
         written = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in entry.options.items()}
         return {**options, **written}
 
@@ -238,6 +254,8 @@ class _Builder:
         used = {name for name, profile in of_profile.items() if profile in followed}
         try:
             holes = list(files.placeholders())
+            if self._model.recorded is not None:
+                holes += placeholders(str(self._model.recorded.begin), "recorded.begin")
         except InputError as error:
             self._problems.add(("sumo",), str(error))
             return

@@ -10,7 +10,8 @@ from sbt.config.model import Choice, ChoicesGiven, Condition, CorrelationEntry, 
 from sbt.problem.plain import Json
 
 __all__ = [
-    "ActorEntry", "EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ProfileEntry", "ScenarioModel", "SumoEntry", "schema",
+    "ActorEntry", "EgoEntry", "InputEntry", "MetricEntry", "OthersEntry", "ProfileEntry", "RecordedEntry", "ScenarioModel",
+    "SumoEntry", "schema",
 ]  # fmt: skip
 
 
@@ -58,6 +59,41 @@ class DeformationEntry(_Strict):
     min: float = Field(description="Lower end of the range.")
     max: float = Field(description="Upper end of the range.")
     distribution: Choice | None = Field(default=None, description="Law on the range.")
+
+
+def _as_text(value: object) -> object:
+    """Return an id that YAML reads as a number as text."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _as_texts(value: object) -> object:
+    return [_as_text(one) for one in value] if isinstance(value, list) else [_as_text(value)]
+
+
+Ids = Annotated[tuple[Name, ...], BeforeValidator(_as_texts), Field(strict=False)]
+Point = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class RoadEntry(_Strict):
+    """A road of one lane in a network that is made of a recording."""
+
+    along: Annotated[Name | Annotated[tuple[Point, ...], Field(strict=False)], BeforeValidator(_as_text)] = Field(
+        description="A recorded road user whose path it follows, or [[x, y], ...] (m)."
+    )
+    width: float = Field(default=3.2, gt=0, allow_inf_nan=False, description="Of its lane (m).")
+    speed: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Allowed on it (m/s); null: not limited.")
+
+
+class RecordedEntry(_Strict):
+    """Recorded road users as traffic: they are moved as recorded, and do not react."""
+
+    file: Name = Field(description="SUMO's FCD, or NN_tracks.csv in the columns of highD or inD.")
+    begin: float | Name = Field(default=0.0, description="Time of the recording at SUMO's time 0 (s), or a placeholder \"${t}\".")
+    without: Ids = Field(default=(), description="Ids of road users that are left out.")
+    offset: Point = Field(default=(0.0, 0.0), description="Added to recorded positions, [x, y] (m).")
+    roads: dict[str, Annotated[RoadEntry, BeforeValidator(lambda v: v if isinstance(v, dict) else {"along": v})]] = Field(
+        default={}, description="Without sumo.net: the edges of the network; default: a motorway by its lane markings."
+    )
 
 
 class ProfileEntry(_Strict):
@@ -148,6 +184,9 @@ class ScenarioModel(_Strict):
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel.")
     ego: Annotated[EgoEntry, _under("id")] = Field(description="The vehicle under test, or just its id.")
     actors: dict[str, ActorEntry] = Field(default={}, description="By id: who follows a profile.")
+    recorded: Annotated[RecordedEntry, _under("file")] | None = Field(
+        default=None, description="Recorded road users as traffic, or just the file."
+    )
     others: OthersEntry = Field(default=OthersEntry(), description="Who is recorded.")
     duration: float = Field(gt=0, allow_inf_nan=False, description="From the ego's departure on (s).")
     wait: float = Field(default=3600.0, gt=0, allow_inf_nan=False, description="Longest time until the ego departs (s).")
@@ -170,7 +209,7 @@ class ScenarioModel(_Strict):
 def schema() -> Json:
     """Return the JSON schema of a `scenario.yaml`."""
     found = {k: v for k, v in ScenarioModel.model_json_schema().items() if k != "title"}
-    for name in ("sumo", "ego"):  # a bare text stands for {config: text} and {id: text}
+    for name in ("sumo", "ego", "recorded"):  # a bare text stands for {config: text}, {id: text} and {file: text}
         found["properties"][name] = {"anyOf": [{"type": "string"}, found["properties"][name]]}
     items = found["properties"]["metrics"]
     items["items"] = {"anyOf": [{"type": "string"}, items["items"]]}

@@ -31,7 +31,7 @@ from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
-__all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", "pair_traces", "read_fcd"]
+__all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", "pair_traces", "read_fcd", "recording_of_columns"]
 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
@@ -73,6 +73,8 @@ class Recording:
     acceleration: Vector
     length: Vector
     width: Vector
+    kinds: tuple[str, ...] = ()
+    """m texts, such as vehicle, person, truck or bicycle."""
 
 
 def read_fcd(path: Path, *, length: float = 5.0, width: float = 1.8) -> Recording:
@@ -98,11 +100,11 @@ def read_fcd(path: Path, *, length: float = 5.0, width: float = 1.8) -> Recordin
         raise InputError(f"an FCD file must be readable, but got '{path}': {error.strerror or error}") from None
     if not len(columns["time"]):
         raise InputError(f"an FCD file must have road users in it, but there is none in '{path}'")
-    return _recording(path, ids, kinds, columns, (length, width))
+    return recording_of_columns(path, ids, kinds, columns, (length, width))
 
 
-def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: tuple[float, float]) -> Recording:
-    """Return the recording with sorted and converted rows.
+def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: tuple[float, float]) -> Recording:
+    """Return the recording with sorted and converted rows; positions are of the front bumper, angles clockwise from north.
 
     Args:
         path: for messages.
@@ -115,7 +117,7 @@ def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: 
     data = {name: np.asarray(values, dtype=np.float64) for name, values in columns.items()}
     for name in (*_REQUIRED[2:], "time"):
         if not np.isfinite(data[name]).all():
-            raise InputError(f"{name} of every road user in an FCD file must be a finite number, but is not in '{path}'")
+            raise InputError(f"{name} of every road user in a recording must be a finite number, but is not in '{path}'")
     time, step = np.unique(data["time"], return_inverse=True)
     order = np.lexsort((step, user))
     user, step = user[order], step[order]
@@ -124,7 +126,7 @@ def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: 
     if duplicates.size:
         k = int(duplicates[0])
         where = f"'{users[user[k]]}' at {time[step[k]]:g} s"
-        raise InputError(f"a road user of an FCD file must occur once per time step, but in '{path}' {where} does not")
+        raise InputError(f"a road user of a recording must occur once per time step, but in '{path}' {where} does not")
     start = np.searchsorted(user, np.arange(len(users) + 1))
     _check_metres(path, data, user)
     person = np.asarray(kinds)[order][start[:-1]] == 1
@@ -139,6 +141,7 @@ def _recording(path: Path, ids: Any, kinds: Any, columns: dict[str, Any], size: 
     return Recording(
         tuple(users.tolist()), time, start, step.astype(np.int64), data["x"] - half * np.cos(heading),
         data["y"] - half * np.sin(heading), heading, data["speed"], acceleration, lengths, widths,
+        tuple(np.array(_KINDS)[person.astype(int)].tolist()),
     )  # fmt: skip
 
 
@@ -149,7 +152,7 @@ def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
     expected = (np.diff(data["time"]) * data["speed"][1:])[same].sum()
     if expected > 10.0 and moved < 0.01 * expected:
         raise InputError(
-            f"positions of an FCD file must be in metres, but in '{path}' the road users move {moved:.3g} "
+            f"positions of a recording must be in metres, but in '{path}' the road users move {moved:.3g} "
             f"instead of about {expected:.3g} m (was it written with --fcd-output.geo?)"
         )
 

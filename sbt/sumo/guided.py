@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
@@ -12,7 +12,7 @@ from sbt.problem.profile import Curve, Profile
 from sbt.sumo.dynamics import next_speed
 from sbt.sumo.insertion import SPEED_MODE
 
-__all__ = ["STRATEGIC_LANE_CHANGES", "GuidedVehicle", "Motion", "Participant"]
+__all__ = ["STRATEGIC_LANE_CHANGES", "GuidedVehicle", "Motion", "Participant", "Placed"]
 
 STRATEGIC_LANE_CHANGES = 513
 """SUMO's lane-change mode with strategic changes only, respecting other vehicles."""
@@ -22,6 +22,19 @@ _HARDEST = 10.0
 """Largest change of the speed when a profile takes over, in the step (m/s^2)."""
 
 
+class Placed(NamedTuple):
+    """Where a road user was put by position: SUMO knows neither its speed nor, off the lanes, that it is near.
+
+    x, y (m) of the front bumper of a vehicle or the centre of a person; angle in degrees, clockwise from north; speed in m/s.
+    """
+
+    x: float
+    y: float
+    angle: float
+    speed: float
+    person: bool = False
+
+
 class Motion(Protocol):
     """Moves road users during one run."""
 
@@ -29,8 +42,8 @@ class Motion(Protocol):
         """Command the next step; t: time since the departure of the ego (s), None before it."""
         ...
 
-    def after_step(self) -> Mapping[str, float]:
-        """Look at the step; return the speeds (m/s) of road users whose speed SUMO does not know."""
+    def after_step(self) -> Mapping[str, Placed]:
+        """Look at the step; return the road users that were put somewhere by position."""
         ...
 
 
@@ -87,7 +100,7 @@ class _Guidance:
         self._sumo.vehicle.setSpeed(self._guided.id, wanted)
         self._speed = wanted
 
-    def after_step(self) -> Mapping[str, float]:
+    def after_step(self) -> Mapping[str, Placed]:
         """Notice departure and arrival, and compare the speed with the commanded one."""
         name, simulation = self._guided.id, self._sumo.simulation
         if not self._present:

@@ -22,6 +22,7 @@ from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, listed_only, unconfirmed_contact
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture
 from sbt.sumo.ego_vehicle import ControlStep, EgoVehicle
+from sbt.sumo.guided import Placed
 from sbt.sumo.surroundings import Surroundings
 
 __all__ = ["Recorder", "RecordingSettings", "RunEnded"]
@@ -111,9 +112,9 @@ class Recorder:
         """Time since the departure of the ego (s); None before it."""
         return self._t if self._departed else None
 
-    def give_speeds(self, speeds: Mapping[str, float]) -> None:
-        """Record these speeds (m/s) in the next step instead of SUMO's, of road users that are moved by position."""
-        self._surroundings.given_speeds = speeds
+    def place(self, placed: Mapping[str, Placed]) -> None:
+        """Record these road users, which are moved by position, as they are given: SUMO does not know all about them."""
+        self._surroundings.place(placed)
 
     def expect_departure(self, name: str, requested: RequestedDeparture) -> None:
         """Compare the departure of a vehicle that the loop adds with what it requests."""
@@ -235,11 +236,12 @@ class Recorder:
                 sumo, self._ego, name, self._t, (rectangles[0], rectangles[1]), persons=persons, moved=near.rigid
             )
         listed = {name for name, t in self._listed.items() if self._t - t <= CONFIRMED_WITHIN} | collisions_of(sumo, self._ego)
+        moving = texts.keys() - near.placed.keys()  # nobody moves the others in the steps to come
         for k in range(1, math.ceil(CONFIRMED_WITHIN / self._dt) + 1):
-            if texts.keys() <= listed or self._ego not in sumo.vehicle.getIDList():
+            if moving <= listed or self._ego not in sumo.vehicle.getIDList():
                 break
             sumo.simulationStep()
-            found = collisions_of(sumo, self._ego) & texts.keys() - listed
+            found = collisions_of(sumo, self._ego) & moving - listed
             self._collisions += [f"{self._ego}>{name}@{self._t + k * self._dt:.3f}" for name in sorted(found)]
             listed |= found
         for name in listed:

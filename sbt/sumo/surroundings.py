@@ -19,6 +19,7 @@ from sbt.metrics.geometry import contact_part, rectangle_distance
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import State
+from sbt.sumo.guided import Placed
 from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Pose, TrailingBody, path_behind
@@ -53,7 +54,7 @@ class Surroundings:
         states: the last state of every road user seen so far; the ego first.
         present: names of those that are there now, the ego first.
         rigid: vehicles that are moved by poses; their bodies are rectangles, however long.
-        given_speeds: recorded in the next step instead of SUMO's, of road users that are moved by position (m/s).
+        placed: road users that are moved by position, as they are in the next step to be recorded.
     """
 
     def __init__(self, sumo: Any, ego: str, within: float, named: Iterable[str], dt: float):
@@ -68,7 +69,7 @@ class Surroundings:
         self.states: dict[str, State] = {}
         self.present: list[str] = []
         self.rigid: set[str] = set()
-        self.given_speeds: Mapping[str, float] = {}
+        self.placed: Mapping[str, Placed] = {}
         self.levels = levels_of(sumo)
         self.follow(sumo.vehicle.getIDList())
 
@@ -92,6 +93,11 @@ class Surroundings:
             if name in self._named:
                 self._named_present.add(name)
 
+    def place(self, placed: Mapping[str, Placed]) -> None:
+        """Take the states of these road users as they are given: SUMO neither sees them off the lanes nor knows their speed."""
+        self.placed = placed
+        self.rigid.update(placed)
+
     def subscribe(self) -> None:
         """Subscribe to the surroundings of the ego, which has just departed."""
         vehicle = self._sumo.vehicle
@@ -108,6 +114,8 @@ class Surroundings:
         if ego not in near:
             now = self._sumo.simulation.getTime()
             raise RunError(Status.FAILED, f"the ego '{ego}' must stay on the road, but it was gone at t = {now:g} s")
+        if self.placed:
+            near = {**near, **self._placed_near(near[ego][_POSITION])}
         row: dict[str, _Row] = {}
         parts: dict[str, tuple[Pose, ...]] = {}
         before = self._rows[-1] if self._rows else {}
@@ -118,13 +126,21 @@ class Surroundings:
             variables = near[name] if name in near else self._read(name)
             if name == ego or variables.get(_VEHICLE) or abs(variables[_POSITION][2] - height) >= LEVEL_HEIGHT:
                 continue
-            if apart is None or self._road(name, variables) not in apart:
+            if apart is None or name in self.placed or self._road(name, variables) not in apart:
                 self._record(row, parts, before, name, variables)
         for name in sorted(self._named_present - set(near) - set(row)):
             self._record(row, parts, before, name, self._read(name))
         self.present = list(row)
         self._rows.append(row)
         self._parts.append(parts)
+
+    def _placed_near(self, ego: tuple[float, ...]) -> dict[str, dict[int, Any]]:
+        """Return the variables of the placed road users that are within the radius, or named, on the ego's level."""
+        return {
+            name: {_POSITION: (s.x, s.y, ego[2]), _ANGLE: s.angle, _SPEED: s.speed, **({_VEHICLE: ""} if s.person else {})}
+            for name, s in self.placed.items()
+            if name in self._named or math.hypot(s.x - ego[0], s.y - ego[1]) <= self._within
+        }
 
     def _far(self, near: Mapping[str, Any]) -> list[str]:
         """Return the very long vehicles whose rear may be within the radius although their front is not."""
@@ -158,7 +174,7 @@ class Surroundings:
             state = self._first_seen(name, (x, y), variables)
         if variables[_ANGLE] != state.angle:
             state.turn(variables[_ANGLE])
-        half, speed = self._centre_offsets[name], float(self.given_speeds.get(name, variables[_SPEED]))
+        half, speed = self._centre_offsets[name], float(variables[_SPEED])
         last = before.get(name)
         state.acceleration = 0.0 if last is None else (speed - last[3]) / self._dt
         state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed

@@ -260,7 +260,7 @@ class TraciProxy:
                 motion.before_step(recorder.scenario_time)
             self._module.simulationStep()
             if self._motions:
-                recorder.give_speeds({name: v for motion in self._motions for name, v in motion.after_step().items()})
+                recorder.place({name: state for motion in self._motions for name, state in motion.after_step().items()})
             recorder.after_step()
             if self._module.simulation.getTime() >= until - 1e-9:
                 return
