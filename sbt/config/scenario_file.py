@@ -209,11 +209,11 @@ class _Builder:
         if kind is None:
             if entry.settings:
                 self._problems.add(("ego",), f"settings need a kind (a controller, or sumo), but got {', '.join(entry.settings)}")
-            return EgoVehicle(entry.id, None, entry.set_speed, entry.lights, entry.may_leave)
+            return EgoVehicle(entry.id, None, entry.set_speed, entry.lights, entry.may_leave, entry.delay)
         if ".py:" in kind:
             kind = str(self._folder / Path(kind).expanduser())
         driver = self._problems.attempt(("ego",), lambda: Ego.of(kind, **entry.settings))
-        return EgoVehicle(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave)
+        return EgoVehicle(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave, entry.delay)
 
     def _metrics(self) -> tuple[Metric, ...]:
         made: dict[str, Metric] = {}

@@ -146,6 +146,9 @@ class EgoEntry(_Open):
     set_speed: float | None = Field(default=None, gt=0, description="What a controller keeps (m/s); null: the allowed speed.")
     lights: bool = Field(default=True, description="To a controller a red light is an obstacle at its stop line.")
     may_leave: bool = Field(default=False, description="Arriving before the duration is over is no failure.")
+    delay: float | None = Field(
+        default=None, ge=0, allow_inf_nan=False, description="How much later than its depart it may enter (s); null: not at all."
+    )
 
 
 class OthersEntry(_Strict):
@@ -189,7 +192,9 @@ class ScenarioModel(_Strict):
     )
     others: OthersEntry = Field(default=OthersEntry(), description="Who is recorded.")
     duration: float = Field(gt=0, allow_inf_nan=False, description="From the ego's departure on (s).")
-    wait: float = Field(default=3600.0, gt=0, allow_inf_nan=False, description="Longest time until the ego departs (s).")
+    wait: float = Field(
+        default=3600.0, gt=0, allow_inf_nan=False, description="Longest time from the ego's depart until it departs (s)."
+    )
     step_length: float | None = Field(
         default=None, gt=0, allow_inf_nan=False, description="SUMO's step (s); null: the files', or 0.1."
     )

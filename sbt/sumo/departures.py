@@ -2,11 +2,14 @@
 
 SUMO silently delays a vehicle that fails its insertion checks; the run is then another concrete scenario
 than the requested one. Time, position, speed and lane of the departure are compared where they are
-numbers. A difference ends the run and names the vehicle, the request and the remedy.
+numbers. A difference ends the run in the step in which it shows, and names the vehicle, the request, the cause
+and the remedy.
 """
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,14 +17,15 @@ from typing import Any
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
+from sbt.sumo.absence import why_absent
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import fill
+from sbt.sumo.waiting import why_held_back
 
-__all__ = ["DepartureMonitor", "RequestedDeparture", "number_or_none", "requested_departures"]
+__all__ = ["DepartureMonitor", "RequestedDeparture", "WaitingEgo", "number_or_none", "requested_departures"]
 
 _TOLERANCE = 1e-3
 """Difference that is accepted (s, m, m/s): SUMO counts time in milliseconds."""
-_REMEDY = 'set insertionChecks="none" on the vehicle, or the option insertion-checks: none'
 
 
 @dataclass(frozen=True)
@@ -30,10 +34,11 @@ class RequestedDeparture:
 
     Attributes:
         place: `file:line:column: ` of the vehicle, "" for one added by a loop.
-        depart: time (s).
+        depart: time (s); of a flow that it begins.
         position: of the front bumper on its lane (m), from the end of the lane if negative.
         speed: m/s.
         lane: index.
+        of_flow: SUMO generates the vehicle when it can; nothing else of its departure is known.
     """
 
     place: str
@@ -41,21 +46,41 @@ class RequestedDeparture:
     position: float | None
     speed: float | None
     lane: float | None
+    of_flow: bool = False
+
+
+@dataclass(frozen=True)
+class WaitingEgo:
+    """How long the ego may wait for its departure.
+
+    Args:
+        id: its id in SUMO.
+        delay: longest time after its `depart` (s); None: not at all, or `wait` where it has no `depart` of its own.
+        wait: longest time (s) from its `depart`, or from the beginning of its flow or of the simulation.
+    """
+
+    id: str
+    delay: float | None
+    wait: float
 
 
 def requested_departures(files: SumoFiles, values: Values, ego: str) -> dict[str, RequestedDeparture]:
     """Return the requested departures of the ego and of every vehicle with a placeholder."""
     of_ego = files.vehicle(ego)
     compared = [(name, template) for template in files.templates for name in template.varying]
-    if of_ego is not None and ego in of_ego[1].vehicles:
-        compared.append((ego, of_ego[1]))
+    if of_ego is not None:
+        compared.append((ego if ego in of_ego[1].vehicles else ego.rpartition(".")[0], of_ego[1]))
     requested: dict[str, RequestedDeparture] = {}
     for name, template in compared:
         vehicle = template.vehicles[name]
+        place = f"{template.path}:{vehicle.place[0]}:{vehicle.place[1]}: "
         if vehicle.tag != "flow":
-            place = f"{template.path}:{vehicle.place[0]}:{vehicle.place[1]}: "
             start = (vehicle.depart, vehicle.position, vehicle.speed, vehicle.lane)
-            requested[name] = RequestedDeparture(place, *(number_or_none(fill(value or "", values, place)) for value in start))
+            depart, position, speed, lane = (number_or_none(fill(value or "", values, place)) for value in start)
+            requested[name] = RequestedDeparture(place, depart, position, speed, lane)
+        elif name == ego.rpartition(".")[0]:
+            begin = number_or_none(fill(vehicle.begin or "", values, place))
+            requested[ego] = RequestedDeparture(place, begin, None, None, None, of_flow=True)
     return requested
 
 
@@ -68,87 +93,149 @@ def number_or_none(value: Any) -> float | None:
 
 
 class DepartureMonitor:
-    """Compares each vehicle in the step in which it departs.
+    """Compares each vehicle in the step in which it departs, or should.
 
     Args:
         sumo: libsumo or traci.
+        ego: the vehicle under test.
         requested: departures by vehicle id.
+        files: of the simulation, for the causes.
+        values: of the inputs, likewise.
+
+    Attributes:
+        asked: all vehicles whose departures were requested.
     """
 
-    def __init__(self, sumo: Any, requested: Mapping[str, RequestedDeparture]):
-        self._sumo = sumo
-        self._requested = dict(requested)
-        self._requested_gap: dict[str, str] = {}
+    def __init__(
+        self, sumo: Any, ego: WaitingEgo, requested: Mapping[str, RequestedDeparture], files: SumoFiles,
+        values: Values,
+    ):  # fmt: skip
+        self._sumo, self._ego, self._files, self._values = sumo, ego, files, values
+        self._start = float(sumo.simulation.getTime())
+        self._requested: dict[str, RequestedDeparture] = {}
+        self._due: list[tuple[float, str]] = []
+        self._places: dict[str, str] = {}
+        self.asked: set[str] = set()
+        for name, departure in requested.items():
+            self.expect(name, departure)
 
     def expect(self, name: str, requested: RequestedDeparture) -> None:
         """Compare one more vehicle."""
         self._requested[name] = requested
+        self._places[name] = requested.place
+        self.asked.add(name)
+        if self._deadline(name) < math.inf:
+            heapq.heappush(self._due, (self._deadline(name), name))
 
     def ignore(self, name: str) -> None:
         """Do not compare this vehicle."""
         self._requested.pop(name, None)
 
+    def place_of(self, name: str) -> str:
+        """Return `file:line:column: ` of a vehicle whose departure was requested; "" of any other."""
+        return self._places.get(name, "")
+
     def after_step(self, departed: frozenset[str]) -> None:
-        """Compare the vehicles that departed in this step.
+        """Compare the vehicles that departed in this step, or should have.
 
         Raises:
-            RunError: one departed differently than requested.
+            RunError: one departed differently than requested, or has not departed in time.
         """
         if not self._requested:
             return
-        now, dt = self._sumo.simulation.getTime(), self._sumo.simulation.getDeltaT()
-        for name in [name for name in self._requested if name in departed]:
+        dt = float(self._sumo.simulation.getDeltaT())
+        for name in sorted(departed.intersection(self._requested)):
             self._compare(name, self._requested.pop(name), dt)
-        for name, requested in self._requested.items():
-            if requested.depart is not None and requested.depart <= now - dt and name not in self._requested_gap:
-                self._requested_gap[name] = self._gap_ahead(name, requested)
+        simulated = float(self._sumo.simulation.getTime()) - dt
+        while self._due and self._due[0][0] <= simulated + _TOLERANCE:
+            at, name = heapq.heappop(self._due)
+            if at == self._deadline(name):
+                self._refuse(name)
 
-    def why_waiting(self, name: str) -> str:
-        """Return the reason why a vehicle has not departed yet."""
-        if name in self._sumo.simulation.getPendingVehicles():
-            gap = self._requested_gap.get(name, "")
-            return f"SUMO holds it back since its departure{f', requested {gap}' if gap else ''}: {_REMEDY}"
-        return "SUMO has not loaded it: is its depart later, or the route file not sorted by depart (SUMO drops what comes late)?"
+    def await_ego(self) -> None:
+        """Check an ego that has not departed, and whose `depart` is not known or not over.
+
+        Raises:
+            RunError: it cannot depart any more, or has waited too long.
+        """
+        name, now = self._ego.id, float(self._sumo.simulation.getTime())
+        in_files = self._files.vehicle(name) is not None
+        if in_files and self._sumo.simulation.getMinExpectedNumber() == 0:
+            self._refuse(name)
+        if self._deadline(name) < math.inf:
+            return
+        requested, limit = self._requested.get(name), self._ego.wait if self._ego.delay is None else self._ego.delay
+        waited = self._delay(name)
+        if waited is not None and waited > limit:
+            self._refuse(name)
+        begin = self._start if requested is None or requested.depart is None else max(requested.depart, self._start)
+        if now - begin > self._ego.wait:
+            self._refuse(name)
+
+    def _deadline(self, name: str) -> float:
+        """Return until when a vehicle must have departed (s); inf where that is not known, or nothing is expected."""
+        requested = self._requested.get(name)
+        if requested is None or requested.depart is None or requested.of_flow:
+            return math.inf
+        return requested.depart + self._allowed(name)
+
+    def _allowed(self, name: str) -> float:
+        """Return how much later than its `depart` a vehicle may depart (s)."""
+        return min(self._ego.delay or 0.0, self._ego.wait) if name == self._ego.id else 0.0
+
+    def _delay(self, name: str) -> float | None:
+        """Return how long SUMO has held back a vehicle (s); None if it does not know it."""
+        try:
+            return float(self._sumo.vehicle.getDepartDelay(name))
+        except Exception as error:  # the class depends on the client: libsumo or traci
+            if "is not known" in str(error):
+                return None
+            raise
+
+    def _refuse(self, name: str) -> None:
+        """Raise the error for a vehicle that has not departed in time, with the cause."""
+        requested, is_ego = self._requested.get(name, RequestedDeparture("", None, None, None, None)), name == self._ego.id
+        if not is_ego and self._files.options.get("scale") is not None and self._delay(name) is None:
+            self.ignore(name)  # thinning the traffic is what the option asks for
+            return
+        rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
+        if self._delay(name) is None:
+            cause = why_absent(self._files, self._values, name, requested.depart, self._start, added=not requested.place)
+            raise RunError(Status.INVALID, f"{rule}, but {cause}")
+        gap, why, remedy = why_held_back(self._sumo, name, requested, self._files)
+        tolerance = ", or let it wait: ego: {delay: SECONDS}" if is_ego else ""
+        held = f"but SUMO holds it back, as {why}: {remedy}{tolerance}"
+        raise RunError(Status.INVALID, f"{rule}{f', {gap}' if gap else ''}, {held}")
+
+    def _when(self, name: str, requested: RequestedDeparture) -> str:
+        """Return until when a vehicle must depart, as text."""
+        if self._deadline(name) < math.inf:
+            delay = self._allowed(name)
+            return f" at t = {requested.depart:g} s" if not delay else f" within {delay:g} s of t = {requested.depart:g} s"
+        limit = self._ego.wait if self._ego.delay is None else self._ego.delay
+        return f" within {limit:g} s"
 
     def _compare(self, name: str, requested: RequestedDeparture, dt: float) -> None:
         vehicle = self._sumo.vehicle
         departure = vehicle.getDeparture(name)
-        if requested.depart is not None and departure - requested.depart > dt + _TOLERANCE:
-            gap, found = self._requested_gap.get(name, ""), self._gap_ahead(name, None)
-            raise RunError(
-                Status.INVALID,
-                f"{requested.place}'{name}' must depart at t = {requested.depart:g} s{f', {gap}' if gap else ''}, "
-                f"but SUMO inserted it at t = {departure:g} s{f', {found}' if found else ''}: {_REMEDY}",
-            )
+        late = 0.0 if requested.depart is None or requested.of_flow else departure - requested.depart - self._allowed(name)
+        if late > dt - _TOLERANCE:
+            rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
+            raise RunError(Status.INVALID, f"{rule}, but SUMO inserted it at t = {departure:g} s")
+        lane = vehicle.getLaneID(name)
+        length = self._sumo.lane.getLength(lane)
         position = requested.position
         if position is not None and position < 0:
-            position += self._sumo.lane.getLength(vehicle.getLaneID(name))
+            position += length
         compared = (
-            ("departPos", position, vehicle.getLanePosition(name), " m"),
-            ("departSpeed", requested.speed, vehicle.getSpeed(name), " m/s"),
-            ("departLane", requested.lane, vehicle.getLaneIndex(name), ""),
+            ("departPos", position, vehicle.getLanePosition(name), " m", f"lane {lane} is {length:g} m long"),
+            ("departSpeed", requested.speed, vehicle.getSpeed(name), " m/s", "its type and its lane must allow that speed"),
+            ("departLane", requested.lane, vehicle.getLaneIndex(name), "", "the edge must have that lane for its vehicle class"),
         )
-        for attribute, expected, actual, unit in compared:
+        for attribute, expected, actual, unit, remedy in compared:
             if expected is not None and abs(expected - actual) > _TOLERANCE:
                 raise RunError(
                     Status.INVALID,
                     f"{requested.place}'{name}' must depart with {attribute} {expected:g}{unit}, "
-                    f"but SUMO inserted it with {actual:g}{unit}: {_REMEDY}",
+                    f"but SUMO inserted it with {actual:g}{unit}: {remedy}",
                 )
-
-    def _gap_ahead(self, name: str, requested: RequestedDeparture | None) -> str:
-        """Return the gap to the leader as text: the requested one, or with None the actual one; "" without a leader."""
-        vehicle = self._sumo.vehicle
-        if requested is None:
-            lane, position = vehicle.getLaneID(name), vehicle.getLanePosition(name)
-        else:
-            if requested.position is None:
-                return ""
-            lane, position = f"{vehicle.getRoute(name)[0]}_{int(requested.lane or 0)}", requested.position
-            position += self._sumo.lane.getLength(lane) if position < 0 else 0.0
-        ahead = [
-            (vehicle.getLanePosition(other) - vehicle.getLength(other) - position, other)
-            for other in self._sumo.lane.getLastStepVehicleIDs(lane)
-            if other != name and vehicle.getLanePosition(other) > position
-        ]
-        return "{:.3g} m behind '{}'".format(*min(ahead)) if ahead else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -48,6 +49,10 @@ class EgoVehicle:
         lights: a controller sees a red traffic light as a standing obstacle at the stop line. The controller alone
             sets the speed (speed mode 32); SUMO changes lanes for the route unless the controller requests a lane.
         may_leave: arriving at the end of its route before the duration is over is not an error.
+        delay: how much later than its `depart` it may enter the road (s); None: not at all.
+
+    Raises:
+        InputError: the delay is negative or not finite.
     """
 
     id: str
@@ -55,6 +60,11 @@ class EgoVehicle:
     set_speed: float | None = None
     lights: bool = True
     may_leave: bool = False
+    delay: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.delay is not None and not 0.0 <= self.delay < math.inf:
+            raise InputError(f"ego.delay must be >= 0 s and finite, but got {self.delay}")
 
     def with_driver(self, driver: Ego) -> EgoVehicle:
         """Return the same vehicle with another driver."""

@@ -19,6 +19,7 @@ import numpy as np
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
+from sbt.sumo.appearances import AppearanceMonitor
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, listed_only, unconfirmed_contact
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture
 from sbt.sumo.ego_vehicle import ControlStep, EgoVehicle
@@ -52,7 +53,7 @@ class RecordingSettings:
         duration: time recorded, from the departure of the ego on (s).
         within: radius around the ego in which other road users are recorded (m).
         named: vehicles or persons that are recorded at any distance.
-        wait: longest simulated time until the ego departs (s).
+        wait: longest simulated time from the ego's `depart` until it departs; from the beginning where it has none (s).
 
     Raises:
         InputError: a time or radius is not positive.
@@ -77,20 +78,20 @@ class Recorder:
         sumo: libsumo or traci, started.
         settings: what to record.
         rng: for the controller of the ego.
-        requested: requested departures by vehicle id.
+        departures: compares them with what is requested.
         timeout: wall-clock limit (s); None: none.
     """
 
     def __init__(
-        self, sumo: Any, settings: RecordingSettings, rng: np.random.Generator, requested: Mapping[str, RequestedDeparture],
+        self, sumo: Any, settings: RecordingSettings, rng: np.random.Generator, departures: DepartureMonitor,
         timeout: float | None,
     ):  # fmt: skip
         self._sumo, self._settings = sumo, settings
         self._ego = settings.ego.id
         self._rng = rng
-        self._departures = DepartureMonitor(sumo, requested)
+        self._departures = departures
+        self._appearances = AppearanceMonitor(sumo, self._ego, departures)
         self._departed = False
-        self._start = sumo.simulation.getTime()
         self._dt = float(sumo.simulation.getDeltaT())
         self._surroundings = Surroundings(sumo, self._ego, settings.within, settings.named, self._dt)
         self._control: ControlStep | None = None
@@ -155,14 +156,14 @@ class Recorder:
         self._surroundings.follow(departed, arrived)
         if not self._departed:
             if self._ego not in departed:
-                self._check_waiting()
+                self._departures.await_ego()
                 return
             self._start_recording()
         elif self._ego in arrived:
             self._handle_arrival()
         if self._ego in simulation.getStartingTeleportIDList():
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but SUMO teleported it at {self._now()}")
-        self._record_step()
+        self._record_step(departed)
 
     def _end(self, reason: str) -> NoReturn:
         self._ended = RunEnded(reason)
@@ -180,15 +181,6 @@ class Recorder:
     def _now(self) -> str:
         return f"t = {self._sumo.simulation.getTime():g} s"
 
-    def _check_waiting(self) -> None:
-        """Raise an error where the ego cannot depart any more."""
-        simulation = self._sumo.simulation
-        nobody = simulation.getMinExpectedNumber() == 0
-        if nobody or simulation.getTime() - self._start > self._settings.wait:
-            why = "no vehicle is left to depart" if nobody else self._departures.why_waiting(self._ego)
-            rule = f"the ego '{self._ego}' must depart within {self._settings.wait:g} s"
-            raise RunError(Status.INVALID, f"{rule}, but had not at {self._now()}; {why}")
-
     def _start_recording(self) -> None:
         """Subscribe to the surroundings of the ego, and give it its controller."""
         self._departed = True
@@ -202,14 +194,16 @@ class Recorder:
         remedy = "make the route longer or the duration shorter, or set may_leave: true"
         raise RunError(Status.FAILED, f"{rule}, but it left after {self._t + self._dt:g} s, at the end of its route: {remedy}")
 
-    def _record_step(self) -> None:
+    def _record_step(self, departed: frozenset[str]) -> None:
         """Record the states, SUMO's list of collisions, and contacts; end the run at a contact of the ego."""
         near = self._surroundings
         near.record()
+        self._appearances.after_step(near, departed)
         touched = near.touching()
         if self._sumo.simulation.getCollidingVehiclesNumber():
             self._record_collisions({name for name, *_ in touched})
         if touched:
+            self._appearances.refuse_contact(touched[0][0])
             self._judge(touched)
             self._end("collision")
         if self._t >= self._settings.duration - 0.5 * self._dt:

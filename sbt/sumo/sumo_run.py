@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +13,8 @@ from sbt.errors import RunError
 from sbt.metrics.geometry import contact_part
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
-from sbt.sumo.actors import KEEP, Action, Actor, Scene, State
+from sbt.sumo.actors import KEEP, Action, Actor, Obstacle, Scene, State
+from sbt.sumo.appearances import refuse_overlap_at_start
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, unconfirmed_contact
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
@@ -23,6 +25,7 @@ __all__ = ["SumoRun"]
 _COLUMNS = 5
 _SLACK = 1e-6
 """Below this distance (m) of two rectangles the quick separation tests do not decide, but the exact one."""
+_START_REMEDY = "change where the actors start, or keep the inputs apart by constraints"
 _ROW = struct.Struct(f"={_COLUMNS}d")
 """x, y, heading, speed, acceleration of one actor; lists of floats would take four times the memory."""
 
@@ -39,7 +42,7 @@ class SumoRun:
 
     Attributes:
         advance: to be called after every step of SUMO: records the states and calls the controllers; returns
-            True once the run is over.
+            True once the run is over. In the first step it checks that the ego is clear of all others.
         recorded: returns the number of recorded instants.
     """
 
@@ -72,6 +75,8 @@ class SumoRun:
             k += 1
             t = k * dt
             observe(k)
+            if k == 0:
+                refuse_overlap_at_start(states[0], (*states[1:], *map(_standing, scene.obstacles)), _START_REMEDY)
             touched = touching(k)
             if touched is not None:
                 self._judge(sumo, prefix, t, touched)
@@ -132,6 +137,14 @@ class SumoRun:
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
             unconfirmed=self._unconfirmed,
         )
+
+
+def _standing(obstacle: Obstacle) -> State:
+    """Return an obstacle as a standing road user."""
+    state = State(obstacle.name, float(obstacle.length), float(obstacle.width))
+    state.x, state.y, state.heading = map(float, obstacle.pose)
+    state.cos, state.sin = math.cos(state.heading), math.sin(state.heading)
+    return state
 
 
 def _control(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str) -> Callable[[float], None]:

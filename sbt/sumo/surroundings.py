@@ -210,13 +210,20 @@ class Surroundings:
                 found.append((name, *touched[1:]))
         return found
 
+    def newcomers(self) -> list[str]:
+        """Return who is recorded now and was not at the instant before, sorted; in the first instant, everybody else."""
+        before = self._rows[-2].keys() if len(self._rows) > 1 else frozenset((self._ego,))
+        return sorted(self._rows[-1].keys() - before)
+
+    def body(self, name: str) -> ActorTrace:
+        """Return the body of a road user that is present now, as a trace of one instant."""
+        return self._track(name, [len(self._rows) - 1], [self._rows[-1][name]])
+
     def distance(self, name: str) -> float | None:
         """Return the distance between the bodies of the ego and another road user now (m); None where it is not there."""
         if name not in self.present:
             return None
-        at = [len(self._rows) - 1]
-        own, other = (self._track(who, at, [self._rows[-1][who]]) for who in (self._ego, name))
-        return float(rectangle_distance(own, other)[0])
+        return float(rectangle_distance(self.body(self._ego), self.body(name))[0])
 
     def _near(self, name: str) -> bool:
         """Return whether no axis of a rectangle separates any of the ego's from the other's during the last step."""

@@ -79,6 +79,7 @@ class Vehicle(NamedTuple):
     position: str | None
     speed: str | None
     lane: str | None
+    begin: str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +251,7 @@ def template(path: Path) -> Template:
         if tag in _VEHICLES and "id" in attributes:
             at = (parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
             varies = has_parts and any("${" in value for value in attributes.values())
-            departure = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane"))
+            departure = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane", "begin"))
             vehicles[attributes["id"]] = Vehicle(tag, at, varies, *departure)
         if has_parts and (tag in _REFERRING or names_output(tag) or any("${" in value for value in attributes.values())):
             parts.extend(_parts(path, data, parser.CurrentByteIndex, tag, place()))

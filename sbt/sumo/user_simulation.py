@@ -32,7 +32,7 @@ from sbt.problem.plain import Values
 from sbt.problem.profile import Profile
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
-from sbt.sumo.departures import RequestedDeparture, number_or_none, requested_departures
+from sbt.sumo.departures import DepartureMonitor, RequestedDeparture, WaitingEgo, number_or_none, requested_departures
 from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
 from sbt.sumo.formatting import plain, plain_values
@@ -247,8 +247,10 @@ class TraciProxy:
             files = replace(files, additional=(*files.additional, path))
         requested = requested_departures(files, self._values, ego.id)
         self._module = self._connect(files)
+        waiting = WaitingEgo(ego.id, ego.delay, simulation.recording.wait)
+        departures = DepartureMonitor(self._module, waiting, requested, files, self._values)
         rng = stream(self._seed, "ego")
-        self._recorder = Recorder(self._module, simulation.recording, rng, requested, simulation.timeout)
+        self._recorder = Recorder(self._module, simulation.recording, rng, departures, simulation.timeout)
         self._motions = tuple(p.begin(self._module, self._values) for p in simulation.participants)
 
     def simulationStep(self, until: float = 0.0) -> None:  # noqa: N802  (SUMO's name)
@@ -347,7 +349,8 @@ class _CommandProxy:
     ) -> None:  # fmt: skip
         """Register the departure that `vehicle.add` requests; the parameters have SUMO's names."""
         when = self._proxy.simulation.getTime() if depart in (None, "now") else number_or_none(depart)
-        requested = RequestedDeparture("", when, *map(number_or_none, (departPos, departSpeed, departLane)))
+        position, speed, lane = map(number_or_none, (departPos, departSpeed, departLane))
+        requested = RequestedDeparture("", when, position, speed, lane)
         self._proxy.recorder.expect_departure(vehID, requested)
 
 

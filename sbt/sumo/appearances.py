@@ -1,0 +1,141 @@
+"""Refuses runs in which somebody appears inside another: an artefact of the insertion, not a collision.
+
+Without insertion checks SUMO puts a vehicle wherever it is asked to, also into another one. Contact at the instant in
+which one of the two appears says nothing about driving. Nor does an accident that nobody can avoid because a vehicle of
+the traffic has appeared right before or behind the ego in the middle of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol
+
+from sbt.errors import RunError
+from sbt.problem.outcome import Status
+from sbt.problem.trace import ActorTrace
+from sbt.sumo.actors import State
+from sbt.sumo.overlaps import deepest_overlap, instant, required_braking
+
+__all__ = ["AppearanceMonitor", "refuse_overlap_at_start"]
+
+_MAX_BRAKING = 9.0
+"""Deceleration that tyres allow on a dry road (m/s^2); SUMO's default `emergencyDecel` too."""
+_REMEDY = (
+    "let SUMO check its insertion (neither it nor an option sets the insertion checks to none), or let it depart elsewhere"
+)
+
+
+class _Departures(Protocol):
+    """What is read of the requested departures."""
+
+    asked: set[str]
+
+    def place_of(self, name: str) -> str: ...
+
+
+class _Surroundings(Protocol):
+    """What is read of the recorded road users."""
+
+    states: dict[str, State]
+
+    def __len__(self) -> int: ...
+    def newcomers(self) -> list[str]: ...
+    def body(self, name: str) -> ActorTrace: ...
+
+
+def refuse_overlap_at_start(ego: State, others: Iterable[State], remedy: str, place: str = "") -> None:
+    """Check that the ego starts clear of all others.
+
+    Args:
+        ego: at its start.
+        others: all that are present then.
+        remedy: what to change.
+        place: `file:line:column: ` of the ego, or "".
+
+    Raises:
+        RunError: it overlaps or touches one of them.
+    """
+    _refuse_start(ego.name, deepest_overlap(instant(ego), {other.name: instant(other) for other in others}), remedy, place)
+
+
+def _refuse_start(ego: str, found: tuple[str, float] | None, remedy: str, place: str) -> None:
+    if found is not None:
+        raise RunError(
+            Status.INVALID,
+            f"{place}'{ego}' must start clear of all others, but its place is taken by '{found[0]}' (they overlap by "
+            f"{found[1]:.2g} m), which is no collision: {remedy}",
+        )
+
+
+class AppearanceMonitor:
+    """Checks who appears on the road: the ego at its departure, and others near it from then on.
+
+    Args:
+        sumo: libsumo or traci.
+        ego: its id.
+        departures: those that the user has requested one by one.
+    """
+
+    def __init__(self, sumo: Any, ego: str, departures: _Departures):
+        self._sumo, self._ego, self._departures = sumo, ego, departures
+        self._unparked: frozenset[str] = frozenset()
+        self._unparked_before: frozenset[str] = frozenset()
+
+    def after_step(self, near: _Surroundings, departed: frozenset[str]) -> None:
+        """Check a step that has been recorded.
+
+        Args:
+            near: the road users around the ego.
+            departed: vehicles that departed in this step.
+
+        Raises:
+            RunError: the ego appears inside another road user, or another one inside or right before it.
+        """
+        simulation = self._sumo.simulation
+        self._unparked_before, self._unparked = self._unparked, frozenset()
+        if simulation.getParkingEndingVehiclesNumber():
+            self._unparked = frozenset(simulation.getParkingEndingVehiclesIDList())
+        new = near.newcomers()
+        if len(near) == 1:
+            found = deepest_overlap(near.body(self._ego), {name: near.body(name) for name in new})
+            remedy = "change its departPos or depart, or keep the inputs apart by constraints"
+            _refuse_start(self._ego, found, remedy, self._departures.place_of(self._ego))
+        elif new:
+            persons = frozenset(simulation.getDepartedPersonIDList())
+            appeared = departed | persons | frozenset(simulation.getEndingTeleportIDList())
+            self._check(near, [name for name in new if name in appeared])
+
+    def refuse_contact(self, name: str) -> None:
+        """Check a contact of the ego: a vehicle that leaves its parking place jumps onto its lane, through all others.
+
+        Raises:
+            RunError: it is with such a vehicle, in that step.
+        """
+        if name in self._unparked | self._unparked_before:
+            raise RunError(
+                Status.INVALID,
+                f"'{name}' must leave its parking place where nobody is, but SUMO has moved it onto the ego at {self._now()}: "
+                f"{_REMEDY}",
+            )
+
+    def _now(self) -> str:
+        return f"t = {self._sumo.simulation.getTime():g} s"
+
+    def _check(self, near: _Surroundings, appeared: Sequence[str]) -> None:
+        found = deepest_overlap(near.body(self._ego), {name: near.body(name) for name in appeared})
+        if found is not None:
+            raise RunError(
+                Status.INVALID,
+                f"{self._departures.place_of(found[0])}'{found[0]}' must appear clear of the ego, but overlaps it by "
+                f"{found[1]:.2g} m at {self._now()}, which is no collision: {_REMEDY}",
+            )
+        for name in appeared:
+            asked = name in self._departures.asked
+            braking = 0.0 if asked else required_braking(near.states[self._ego], near.states[name])
+            if braking > _MAX_BRAKING:
+                limit = f"{braking:.3g} m/s^2 of braking would keep them apart (tyres allow about {_MAX_BRAKING:g})"
+                raise RunError(
+                    Status.INVALID,
+                    f"'{name}' must appear where drivers can react, but at {self._now()} it is so close to the ego "
+                    f"that only {limit}: {_REMEDY}",
+                )

@@ -1,0 +1,73 @@
+"""The elements of a user's route and additional files with their places, read again where a message must name one."""
+
+from __future__ import annotations
+
+import xml.parsers.expat
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+
+from sbt.sumo.files import SumoFiles
+
+__all__ = ["Element", "element", "elements"]
+
+_DEPARTING = {"vehicle": "depart", "trip": "depart", "person": "depart", "container": "depart", "flow": "begin",
+              "personFlow": "begin", "containerFlow": "begin"}  # fmt: skip
+"""Elements that depart, and their attribute for it."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """An XML element as it stands in a file, with its placeholders.
+
+    Attributes:
+        tag: its name.
+        attributes: their text.
+        file: that it stands in.
+        line, column: where, from 1.
+    """
+
+    tag: str
+    attributes: Mapping[str, str]
+    file: str
+    line: int
+    column: int
+
+    @property
+    def place(self) -> str:
+        """`file:line:column: `, as messages begin."""
+        return f"{self.file}:{self.line}:{self.column}: "
+
+    @property
+    def depart(self) -> str | None:
+        """The text of its departure; None for what does not depart, such as a route."""
+        return self.attributes.get(_DEPARTING.get(self.tag, ""))
+
+
+def elements(files: SumoFiles) -> Iterator[Element]:
+    """Yield all elements with an id of all files but the network, in the order in which they stand."""
+    for one in files.templates:
+        if one.root[0] == "net":
+            continue
+        found: list[Element] = []
+        parser = xml.parsers.expat.ParserCreate()
+
+        def start(
+            tag: str, attributes: dict[str, str], *, file: str = str(one.path), parser: xml.parsers.expat.XMLParserType = parser,
+            found: list[Element] = found,
+        ) -> None:  # fmt: skip
+            if "id" in attributes:
+                found.append(Element(tag, attributes, file, parser.CurrentLineNumber, parser.CurrentColumnNumber + 1))
+
+        parser.StartElementHandler = start
+        parser.Parse(one.opened().read(), True)
+        yield from found
+
+
+def element(files: SumoFiles, name: str, tags: Collection[str]) -> Element | None:
+    """Return the element of this id, or for `f.3` the flow `f`; None if there is none."""
+    known = [one for one in elements(files) if one.tag in tags]
+    for wanted in (name, name.rpartition(".")[0]):
+        for one in known:
+            if one.attributes["id"] == wanted:
+                return one
+    return None

@@ -1,0 +1,73 @@
+"""Overlap of road users at one instant, and the braking that keeps them apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sbt.metrics.geometry import overlap_depth, part_pairs
+from sbt.problem.trace import ActorTrace
+from sbt.sumo.actors import State
+
+__all__ = ["deepest_overlap", "instant", "required_braking", "state_in_sumo"]
+
+_TOLERANCE = 1e-3
+"""Distance up to which rectangles count as overlapping (m): SUMO's positions are rounded, and touching is no start."""
+_SAME_DIRECTION = math.cos(math.radians(45.0))
+
+
+def deepest_overlap(ego: ActorTrace, others: Mapping[str, ActorTrace]) -> tuple[str, float] | None:
+    """Return who overlaps the ego most, and by how much (m, >= 0); None if nobody does. Touching is overlapping.
+
+    Args:
+        ego: its body, at one instant.
+        others: those of the others, by name.
+    """
+    found: tuple[str, float] | None = None
+    for name, other in others.items():
+        reach = ego.length + ego.width + other.length + other.width
+        if max(abs(float(other.x[0] - ego.x[0])), abs(float(other.y[0] - ego.y[0]))) > reach:
+            continue
+        depth = max(float(overlap_depth(a, b)[0]) for a, b in part_pairs(ego, other))
+        if depth >= -_TOLERANCE and (found is None or depth > found[1]):
+            found = name, max(depth, 0.0)
+    return found
+
+
+def required_braking(ego: State, other: State) -> float:
+    """Return the constant deceleration (m/s^2) by which the one behind avoids the one ahead, which keeps its speed.
+
+    0 where they do not drive in one direction, one behind the other, or the gap grows; inf without a gap.
+    """
+    if ego.cos * other.cos + ego.sin * other.sin < _SAME_DIRECTION:
+        return 0.0
+    along = (other.x - ego.x) * ego.cos + (other.y - ego.y) * ego.sin
+    across = (other.y - ego.y) * ego.cos - (other.x - ego.x) * ego.sin
+    if abs(across) >= 0.5 * (ego.width + other.width):
+        return 0.0
+    closing = ego.speed - other.speed if along > 0 else other.speed - ego.speed
+    gap = abs(along) - 0.5 * (ego.length + other.length)
+    if closing <= 0.0:
+        return 0.0
+    return closing**2 / (2.0 * gap) if gap > 0.0 else math.inf
+
+
+def state_in_sumo(domain: Any, name: str, *, person: bool = False) -> State:
+    """Return the present state of a vehicle or person, as in a trace: its centre."""
+    state = State(name, float(domain.getLength(name)), float(domain.getWidth(name)))
+    state.turn(float(domain.getAngle(name)))
+    half = 0.0 if person else 0.5 * state.length
+    x, y = domain.getPosition(name)
+    state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, float(domain.getSpeed(name))
+    return state
+
+
+def instant(state: State) -> ActorTrace:
+    """Return a state as a trace of one instant, a rectangle."""
+    x, y, heading, speed, acceleration = np.array(
+        [[state.x], [state.y], [state.heading], [state.speed], [state.acceleration]]
+    )
+    return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width)
