@@ -13,8 +13,9 @@ from sbt.errors import InputError, RunError
 from sbt.execution.worker import run_job
 from sbt.metrics import longitudinal
 from sbt.metrics.comfort import deceleration_max
+from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import FAR, HORIZON, collision, drac_max, ttc_min
-from sbt.metrics.pairwise import in_traffic, joint_intervals, worst_signal
+from sbt.metrics.pairwise import in_traffic, worst_signal
 from sbt.metrics.paths import ttc_on_paths
 from sbt.metrics.planar import distance_min, post_encroachment_time, time_behind, ttc_2d
 from sbt.metrics.stl import stl

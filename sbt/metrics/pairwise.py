@@ -6,20 +6,20 @@ computed on every interval of time in which both road users are present, as the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metrics.cache import per_trace
+from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import D_MIN, FAR, HORIZON, TTC_MIN, d_min, ttc_min
 from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, signal
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
-__all__ = ["in_traffic", "joint_intervals", "without_overtaking", "worst_signal"]
+__all__ = ["in_traffic", "without_overtaking", "worst_signal"]
 
 _ABSENT = {
     "gap": FAR, "ttc": HORIZON, "thw": HORIZON, "mttc": HORIZON, "ttc2d": HORIZON, "distance": FAR,
@@ -27,30 +27,6 @@ _ABSENT = {
 }  # fmt: skip
 """Pairwise signals that can be compared between road users, with their value while nobody else is present."""
 _HIGH_IS_WORST = ("drac", "mdrac", "btn")
-
-
-@per_trace
-def joint_intervals(trace: Trace, ego: str, other: str) -> tuple[tuple[slice, Trace], ...]:
-    """Return the instants and the trace (actors `ego` and `co`) of every interval in which both are present.
-
-    A single instant is an interval only if the trace has no other.
-    """
-    return tuple(_joint_intervals(trace, ego, other))
-
-
-def _joint_intervals(trace: Trace, ego: str, other: str) -> Iterator[tuple[slice, Trace]]:
-    columns = [trace.actors.index(name) for name in (ego, other)]
-    present = trace.present[:, columns].all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
-    for first, last in edges.reshape(-1, 2).tolist():
-        if last - first > 1 or len(trace.time) == 1:
-            instants = slice(first, last)
-            yield instants, _part(trace, instants, columns)
-
-
-def _part(trace: Trace, i: slice, at: list[int]) -> Trace:
-    """Return some instants of one or two actors, named ego and co."""
-    return trace.select(i, dict(zip([trace.actors[k] for k in at], ("ego", "co"), strict=False)))
 
 
 def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "") -> Metric:
@@ -69,7 +45,7 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
 
     def function(trace: Trace) -> float:
         if metric.alone:
-            return metric.value(_part(trace, slice(None), [trace.actors.index(ego)]))
+            return metric.value(trace.select(slice(None), {ego: "ego"}))
         if other is not None:
             trace.actor(other)
         values = [

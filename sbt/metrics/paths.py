@@ -1,7 +1,7 @@
 """Time to collision along the paths that were driven: for bends and turns, where straight extrapolation misleads.
 
 On a roundabout or in a turn, road users that never come close may point at each other all the time. Here both are
-assumed to follow their own recorded paths; only their speeds are extrapolated.
+assumed to follow their own recorded paths, and then the lanes of their routes; only their speeds are extrapolated.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.metrics.geometry import contact_share, part_pairs
+from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import first_contact
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["HORIZON", "ttc_on_paths"]
+__all__ = ["HORIZON", "path_of", "ttc_on_paths"]
 
 HORIZON = 5.0
 """Time to collision of road users that do not interact, and the largest value reported (s)."""
@@ -35,9 +36,14 @@ class _Prediction:
 def ttc_on_paths(trace: Trace, ego: str = "ego", other: str = "co") -> Vector:
     """Return the (t,) time until the rectangles touch if both follow their recorded paths at their current speeds (s).
 
-    At most 5 s, and 0 from the first contact on. Beyond the end of its path an actor goes straight ahead.
+    At most 5 s, also while one of them is not there, and 0 from the first contact on. After its last instant an actor goes
+    on along its way (`Trace.ways`); where that is unknown, or at its end, straight ahead.
     """
     times = np.full(len(trace.time), HORIZON)
+    if not trace.present[:, [trace.actors.index(name) for name in (ego, other)]].all():
+        for instants, part in joint_intervals(trace, ego, other):
+            times[instants] = ttc_on_paths(part)
+        return times
     for a, b in part_pairs(trace.actor(ego), trace.actor(other)):
         _predict_contacts(a, b, times)
     contact = first_contact(trace, ego, other)
@@ -62,16 +68,27 @@ def _predict_contacts(a: ActorTrace, b: ActorTrace, times: Vector) -> None:
 
 
 def _predict(actor: ActorTrace, rows: np.ndarray, after: Vector) -> _Prediction:
-    """Return the prediction for the times `after` (s) each of the instants `rows`."""
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(actor.x), np.diff(actor.y)))])
-    heading = np.unwrap(actor.heading)
+    """Return the prediction for the times `after` (s) each of the instants `rows`; NaN once it has left the road."""
+    x, y, heading = path_of(actor)
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     travelled = way[rows, None] + actor.speed[rows, None] * after
     beyond = np.maximum(travelled - way[-1], 0.0)
+    if actor.way is not None and len(actor.way) and np.isnan(actor.way[-1, 0]):
+        beyond[beyond > 0.0] = np.nan
     return _Prediction(
-        np.interp(travelled, way, actor.x) + beyond * np.cos(heading[-1]),
-        np.interp(travelled, way, actor.y) + beyond * np.sin(heading[-1]),
+        np.interp(travelled, way, x) + beyond * np.cos(heading[-1]),
+        np.interp(travelled, way, y) + beyond * np.sin(heading[-1]),
         np.interp(travelled, way, heading),
     )
+
+
+def path_of(actor: ActorTrace) -> tuple[Vector, Vector, Vector]:
+    """Return x, y and heading along the path of an actor, which is there all the time, and along its way after that."""
+    x, y, heading = actor.x, actor.y, actor.heading
+    if actor.way is not None:
+        on = actor.way[~np.isnan(actor.way[:, 0])]
+        x, y, heading = (np.concatenate([part, rest]) for part, rest in zip((x, y, heading), on.T, strict=True))
+    return x, y, np.unwrap(heading)
 
 
 def _states(actor: ActorTrace, prediction: _Prediction, rows: np.ndarray, steps: np.ndarray) -> ActorTrace:

@@ -18,7 +18,7 @@ from sbt.errors import RunError
 from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 
-__all__ = ["ActorTrace", "Trace", "select_parts"]
+__all__ = ["ActorTrace", "States", "Trace", "select_parts"]
 
 States = NDArray[np.float64]
 
@@ -30,6 +30,8 @@ class ActorTrace:
     Attributes:
         parts: rectangles that follow each other, the front one first, where the body bends: a long vehicle in a bend.
             Their shape is that of the actor; its own rectangle is straight. Empty: the rectangle is the shape.
+        way: where it goes on after its last instant: (k, 3) x, y and heading; a last row of NaN where it leaves the road
+            there. None: unknown.
     """
 
     x: Vector
@@ -40,6 +42,7 @@ class ActorTrace:
     length: float
     width: float
     parts: tuple[ActorTrace, ...] = ()
+    way: States | None = None
 
 
 def select_parts(parts: tuple[ActorTrace, ...], i: slice | NDArray[Any]) -> tuple[ActorTrace, ...]:
@@ -65,6 +68,7 @@ class Trace:
         ended: why the run ended, such as "collision" or "duration".
         reported: SUMO's own collision list ("collider>victim@time"), a cross-check only.
         signals: name to (t,) numbers recorded beside the states, such as what the ego perceived.
+        ways: name to the way that an actor would go on after the last instant at which it is there (`ActorTrace.way`).
         parts: name to the parts of a long vehicle (`ActorTrace.parts`), NaN where it is not there.
         unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`).
 
@@ -88,6 +92,7 @@ class Trace:
     ended: str = ""
     reported: tuple[str, ...] = field(default=())
     signals: Mapping[str, Vector] = field(default_factory=dict)
+    ways: Mapping[str, States] = field(default_factory=dict)
     parts: Mapping[str, tuple[ActorTrace, ...]] = field(default_factory=dict)
     unconfirmed: tuple[str, ...] = ()
 
@@ -118,11 +123,11 @@ class Trace:
         k = self.actors.index(name)
         return ActorTrace(
             self.x[:, k], self.y[:, k], self.heading[:, k], self.speed[:, k], self.acceleration[:, k],
-            float(self.length[k]), float(self.width[k]), self.parts.get(name, ()),
+            float(self.length[k]), float(self.width[k]), self.parts.get(name, ()), self.ways.get(name),
         )  # fmt: skip
 
     def select(self, i: slice, actors: Mapping[str, str] | None = None) -> Trace:
-        """Return some instants, of all actors or of some under new names.
+        """Return some instants, of all actors or of some under new names; how they go on afterwards becomes their way.
 
         Args:
             i: the instants.
@@ -131,10 +136,11 @@ class Trace:
         names = self.actors if actors is None else tuple(actors)
         at: slice | list[int] = slice(None) if actors is None else [self.actors.index(name) for name in names]
         new = dict(zip(names, names, strict=True)) if actors is None else actors
-        parts = {new[name]: select_parts(self.parts[name], i) for name in names if name in self.parts}
+        parts = {new[n]: tuple(_selected(p, i) for p in self.parts[n]) for n in names if n in self.parts}
+        ways = {new[name]: way for name in names if (way := _way_after(self.actor(name), i)) is not None}
         some = Trace(
             self.time[i], tuple(new.values()), self.x[i][:, at], self.y[i][:, at], self.heading[i][:, at], self.speed[i][:, at],
-            self.acceleration[i][:, at], self.length[at], self.width[at], self.ended, parts=parts,
+            self.acceleration[i][:, at], self.length[at], self.width[at], self.ended, ways=ways, parts=parts,
         )  # fmt: skip
         if actors is not None:
             return some
@@ -158,6 +164,8 @@ class Trace:
         same = all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in arrays)
         same = same and list(self.signals) == list(other.signals)
         same = same and all(np.array_equal(values, other.signals[name]) for name, values in self.signals.items())
+        same = same and self.ways.keys() == other.ways.keys()
+        same = same and all(np.array_equal(way, other.ways[name], equal_nan=True) for name, way in self.ways.items())
         texts = ("actors", "ended", "reported", "unconfirmed")
         same = same and all(getattr(self, name) == getattr(other, name) for name in texts)
         return same and self.parts.keys() == other.parts.keys() and self._part_states() == other._part_states()
@@ -179,3 +187,19 @@ class Trace:
             for k, name in enumerate(self.actors)
             if present[i, k]
         ]  # fmt: skip
+
+
+def _selected(part: ActorTrace, i: slice) -> ActorTrace:
+    return replace(select_parts((part,), i)[0], way=_way_after(part, i))
+
+
+def _way_after(actor: ActorTrace, i: slice) -> States | None:
+    """Return the way of an actor after some instants: its recorded path as long as it stays, and where it goes on then."""
+    last = len(actor.x) if i.stop is None else i.stop
+    absent = np.isnan(actor.x[last:])
+    end = last + (int(absent.argmax()) if absent.any() else len(absent))
+    recorded = np.stack([actor.x[last:end], actor.y[last:end], actor.heading[last:end]], axis=1)
+    on = actor.way if absent[end - last :].all() else None
+    if len(recorded) == 0:
+        return on
+    return recorded if on is None else np.concatenate([recorded, on])

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import first_contact
-from sbt.metrics.pairwise import joint_intervals
 from sbt.problem.trace import Trace
 from sbt.report.style import CRITICAL
 

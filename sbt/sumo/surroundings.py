@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,13 @@ import numpy as np
 from sbt.errors import RunError
 from sbt.metrics.geometry import contact_part, rectangle_distance
 from sbt.problem.outcome import Status
-from sbt.problem.trace import ActorTrace, Trace
+from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
 from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Pose, TrailingBody, path_behind
+from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_way
 
 __all__ = ["Surroundings"]
 
@@ -66,6 +68,8 @@ class Surroundings:
         self._bodies: dict[str, TrailingBody] = {}
         self._rows: list[dict[str, _Row]] = []
         self._parts: list[dict[str, tuple[Pose, ...]]] = []
+        self._arrived: frozenset[str] = frozenset()
+        self._ways: dict[str, tuple[States, ...]] = {}
         self.states: dict[str, State] = {}
         self.present: list[str] = []
         self.rigid: set[str] = set()
@@ -83,6 +87,7 @@ class Surroundings:
 
     def follow(self, departed: Iterable[str], arrived: Iterable[str] = ()) -> None:
         """Note who came and who left, near or far."""
+        self._arrived = frozenset(arrived)
         for name in arrived:
             self._very_long.pop(name, None)
             self._named_present.discard(name)
@@ -130,6 +135,9 @@ class Surroundings:
                 self._record(row, parts, before, name, variables)
         for name in sorted(self._named_present - set(near) - set(row)):
             self._record(row, parts, before, name, self._read(name))
+        for name in self.present:
+            if name not in row:
+                self._keep_way(name)
         self.present = list(row)
         self._rows.append(row)
         self._parts.append(parts)
@@ -141,6 +149,29 @@ class Surroundings:
             for name, s in self.placed.items()
             if name in self._named or math.hypot(s.x - ego[0], s.y - ego[1]) <= self._within
         }
+
+    def _keep_way(self, name: str) -> None:
+        """Keep where a vehicle goes on that is recorded no more: its rectangle, and the parts of a long one.
+
+        Persons, and who is moved by poses or teleported, have no known way.
+        """
+        self._ways.pop(name, None)
+        if self.is_person(name) or name in self.rigid:
+            return
+        if name in self._arrived:
+            self._ways[name] = (LEFT_THE_ROAD,) * (1 + (self._bodies[name].count if name in self._bodies else 0))
+            return
+        ahead = line_ahead(self._sumo, name)
+        state, poses = self.states[name], self._parts[-1].get(name, ())
+        size = self._bodies[name].part_length if poses else state.length
+        corners = [(x - side * size * math.cos(h), y - side * size * math.sin(h)) for side in (0.5, -0.5)
+                   for x, y, h in (*poses[::-1],) or ((state.x, state.y, state.heading),)]  # fmt: skip
+        behind = np.array([*corners[: max(len(poses), 1)], corners[-1]])
+        ways = [] if ahead is None else [rectangle_way(behind, ahead, state.length)]
+        if ahead is not None:
+            ways += [rectangle_way(behind, ahead, size, k * size) for k in range(len(poses))]
+        if ways and all(way is not None for way in ways):
+            self._ways[name] = tuple(way for way in ways if way is not None)
 
     def _far(self, near: Mapping[str, Any]) -> list[str]:
         """Return the very long vehicles whose rear may be within the radius although their front is not."""
@@ -262,6 +293,10 @@ class Surroundings:
 
     def trace(self, ended: str, reported: Sequence[str], unconfirmed: Sequence[str]) -> Trace:
         """Return the recorded trace; states of absent road users are NaN."""
+        there = {*self._sumo.vehicle.getIDList(), *self._arrived}
+        for name in self.present:
+            if name in there:
+                self._keep_way(name)
         names = tuple(self.states)
         column = {name: k for k, name in enumerate(names)}
         table = np.full((len(self._rows), len(names), 5), np.nan)
@@ -272,7 +307,8 @@ class Surroundings:
         return Trace(
             np.arange(len(table), dtype=np.float64) * self._dt, names, x, y, heading, speed, acceleration,
             np.array([self.states[n].length for n in names]), np.array([self.states[n].width for n in names]),
-            ended, tuple(reported), parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
+            ended, tuple(reported), ways={name: ways[0] for name, ways in self._ways.items()},
+            parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
             unconfirmed=tuple(unconfirmed),
         )  # fmt: skip
 
@@ -287,7 +323,9 @@ class Surroundings:
         for k, parts in enumerate(self._parts):
             if name in parts:
                 poses[k] = parts[name]
-        return _parts(poses, table[:, 3], table[:, 4], body.part_length, state.width)
+        made = _parts(poses, table[:, 3], table[:, 4], body.part_length, state.width)
+        ways = self._ways.get(name, ())[1:]
+        return tuple(replace(part, way=way) for part, way in zip(made, ways, strict=True)) if ways else made
 
 
 def _parts(poses: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, length: float, width: float) -> tuple[ActorTrace, ...]:

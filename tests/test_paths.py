@@ -1,0 +1,122 @@
+"""Times to collision along paths, where road users come, go, and go on after the end of a run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from own_scenarios import make, program, tools
+
+from sbt.config.scenario_file import from_file
+from sbt.metrics.geometry import select_instants
+from sbt.metrics.intervals import joint_intervals
+from sbt.metrics.pairwise import in_traffic
+from sbt.metrics.paths import path_of, ttc_on_paths
+from sbt.metrics.traffic import TTC_PATH_MIN, ttc_path_min
+from sbt.problem.trace import Trace
+from sbt.sumo.ways import LEFT_THE_ROAD
+
+T = np.arange(0.0, 6.0, 0.1)
+Line = tuple[np.ndarray, np.ndarray]
+
+
+def trace_of(*lines: Line, ways: dict[str, np.ndarray] | None = None) -> Trace:
+    """Rectangles of 4 x 2 m on these lines; NaN: not there."""
+    x, y = (np.stack([line[k] for line in lines], axis=1) for k in (0, 1))
+    dx, dy = np.gradient(x, 0.1, axis=0), np.gradient(y, 0.1, axis=0)
+    speed = np.hypot(dx, dy)
+    heading = np.arctan2(dy, dx)
+    for column in range(len(lines)):  # one-sided at the ends of a presence
+        there = np.flatnonzero(~np.isnan(x[:, column]))
+        for values in (speed, heading):
+            values[there, column] = np.interp(there, there[1:-1], values[there[1:-1], column])
+    names = ("ego", *(f"co_{k}" for k in range(len(lines) - 1)))
+    size = np.full(len(lines), 4.0), np.full(len(lines), 2.0)
+    return Trace(T, names, x, y, heading, speed, np.zeros_like(x), *size, ways=ways or {})
+
+
+def during(line: Line, low: float, high: float) -> Line:
+    there = (low - 1e-9 <= T) & (high + 1e-9 >= T)
+    return np.where(there, line[0], np.nan), np.where(there, line[1], np.nan)
+
+
+EAST = (10.0 * T - 20.0, 0.0 * T)
+
+
+def test_who_comes_late_counts_from_then_on():
+    """The same conflict is found, whenever the other is recorded for the first time."""
+    lead = (30.0 + 4.0 * T, 0.0 * T)
+    whole = ttc_on_paths(trace_of(EAST, lead), "ego", "co_0")
+    for begin in (0.5, 2.0, 4.0):
+        late = ttc_on_paths(trace_of(EAST, during(lead, begin, 9.0)), "ego", "co_0")
+        there = begin + 0.15 < T
+        assert late[there] == pytest.approx(whole[there], abs=1e-9)
+        assert (late[begin - 0.05 > T] == 5.0).all(), "nobody is there"
+
+
+def test_the_path_of_ego_after_the_other_is_gone_is_known():
+    """Ego turns away before it would reach the place that the other passed: straight ahead it would have touched it."""
+    turn = (np.minimum(10.0 * T - 20.0, 10.0), np.maximum(10.0 * T - 30.0, 0.0))
+    waiting = (np.full_like(T, 25.0), -3.0 + 0.5 * T)
+    trace = trace_of(turn, during(waiting, 0.0, 2.0))
+    assert in_traffic(TTC_PATH_MIN, "ego")(trace) == 5.0
+    assert ttc_path_min()(trace) == 5.0
+    ((_, part),) = joint_intervals(trace, "ego", "co_0")
+    x, y, _ = path_of(part.actor("ego"))
+    assert (x[-1], y[-1]) == (trace.x[-1, 0], trace.y[-1, 0])
+
+
+def test_a_way_goes_on_where_the_record_ends():
+    """Two meet, or do not, by where their ways go after the last instant."""
+    north = (np.full_like(T, 60.0), 8.0 * T - 64.0)  # both would be at (60, 0) about 2 s after the end
+    straight = trace_of(EAST, north)
+    assert ttc_on_paths(straight, "ego", "co_0")[-1] < 3.0
+    bend = np.array([[40.0, 0.0, 0.0], [45.0, 5.0, math.pi / 2], [45.0, 90.0, math.pi / 2]])
+    assert ttc_on_paths(trace_of(EAST, north, ways={"ego": bend}), "ego", "co_0").min() == 5.0
+    assert ttc_on_paths(trace_of(EAST, north, ways={"ego": LEFT_THE_ROAD}), "ego", "co_0").min() == 5.0, "gone before"
+    meets = np.array([[60.0, -10.0, math.pi / 2], [60.0, 90.0, math.pi / 2]])
+    assert ttc_on_paths(trace_of(EAST, north, ways={"co_0": meets}), "ego", "co_0") == pytest.approx(
+        ttc_on_paths(straight, "ego", "co_0"), abs=1e-9
+    )
+
+
+@pytest.mark.skipif(program("netgenerate") is None or tools() is None, reason="pip install 'sumo-sbt[tools]'")
+@pytest.mark.sumo
+def test_ways_are_those_that_are_driven(tmp_path: Path):
+    """A run that ends earlier predicts the paths of the same run that ends later, and so the times to collision."""
+    make("numeric", tmp_path / "n")
+
+    def run(duration: float) -> Trace:
+        path = tmp_path / f"scenario{duration:g}.yaml"
+        path.write_text(
+            "sumo: {config: n/my.sumocfg, options: {seed: 3, time-to-teleport: '${patience}'}}\n"
+            "inputs: {patience: {min: 500, max: 600}}\nego: 30\nothers: {within: 60}\n"
+            f"duration: {duration}\nmetrics: [ttc_path_min]\nrequirement: {{metric: ttc_path_min, critical: [-.inf, 1.0]}}\n"
+        )
+        simulate = from_file(str(path), tmp_path).simulate
+        assert simulate is not None
+        return simulate({"patience": 550.0}, 4)
+
+    short, long = run(12.0), run(20.0)
+    n, off, apart = len(short.time), [], []
+    assert np.array_equal(short.x[:, 0], long.x[:n, 0])
+    for name in [name for name in short.actors if short.present[-1, short.actors.index(name)] and name in short.ways]:
+        k = long.actors.index(name)
+        later = slice(n, n + int(np.argmin(np.append(long.present[n:, k], False))))
+        actor = short.actor(name)
+        x, y, _ = path_of(replace(select_instants(actor, slice(n - 2, n)), way=actor.way))
+        dense = np.arange(0.0, 1.0, 0.0004) * (len(x) - 1)
+        line = np.stack([np.interp(dense, np.arange(len(x)), v) for v in (x, y)], axis=1)
+        driven = np.stack([long.x[later, k], long.y[later, k]], axis=1)
+        if len(driven):
+            off.append(np.hypot(*(driven[:, None] - line[None]).transpose(2, 0, 1)).min(axis=1).max())
+        if name != "30":
+            apart.append(np.abs(ttc_on_paths(short, "30", name) - ttc_on_paths(long, "30", name)[:n])[-20:].max())
+    assert len(off) >= 4
+    assert np.median(off) < 0.1
+    assert max(off) < 1.0, f"{off} m: where a car turns round"
+    assert max(apart) < 0.05
+
