@@ -24,6 +24,9 @@ __all__ = ["SCENARIO"]
 
 LANE_CHANGE = 3.0
 """Duration of a lane change of an ego with `lane_change: true` (s)."""
+JERK = 30.0
+"""Rate at which the braking of co grows and ends (m/s^3): -10 m/s^2 after 0.33 s, as hydraulic brakes do in an emergency
+stop. The data set names no jerk; "at once" is when it begins."""
 DURATION = 20.0
 """Longest simulated time (s)."""
 START = 20.0
@@ -40,7 +43,7 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     return Scene(
         (
             Actor("ego", ("road",), 1, START, v_ego, ego.driver(rng, v_ego), kind, lane_changes=changes),
-            Actor("co", ("road",), 1, START + gap + CAR.length, v_co, Braking(-values["a_co"], final), CAR),
+            Actor("co", ("road",), 1, START + gap + CAR.length, v_co, Braking(-values["a_co"], final, JERK), CAR),
         ),
         end_condition(final),
     )

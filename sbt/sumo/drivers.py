@@ -148,14 +148,35 @@ class Braking:
     Args:
         deceleration: m/s^2, positive.
         final_speed: m/s.
+        jerk: rate at which the deceleration grows and ends (m/s^3); infinite: at once.
     """
 
-    def __init__(self, deceleration: float, final_speed: float):
+    def __init__(self, deceleration: float, final_speed: float, jerk: float = math.inf):
         self._action = Action(acceleration=-deceleration, speed=final_speed)
+        self._deceleration, self._final, self._jerk = deceleration, final_speed, jerk
+        self._first: float | None = None
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
-        """Return the deceleration with the final speed as its limit."""
-        return self._action
+        """Return the deceleration with the final speed as its limit, or the speed at the end of the step on a ramp."""
+        if self._jerk == math.inf:
+            return self._action
+        if self._first is None:
+            self._first = own.speed
+        return Action(speed=self._at(t + own.step, self._first))
+
+    def _at(self, t: float, first: float) -> float:
+        """Return the speed at time t (m/s), in closed form: the deceleration is a trapezoid, or a triangle."""
+        drop = max(first - self._final, 0.0)
+        ramp = min(self._deceleration / self._jerk, math.sqrt(drop / self._jerk))
+        if ramp <= 0.0:
+            return first
+        strongest = self._jerk * ramp
+        end = ramp + drop / strongest
+        if t >= end:
+            return self._final
+        if t > end - ramp:
+            return self._final + 0.5 * self._jerk * (end - t) ** 2
+        return first - 0.5 * self._jerk * min(t, ramp) ** 2 - strongest * max(t - ramp, 0.0)
 
 
 class GivenSpeed:
