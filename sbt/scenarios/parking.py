@@ -63,9 +63,9 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
     return Scene(
         (
             Actor("ego", ("aisle",), 0, 10.0, speed, driver, CAR, (values["x_ego"], values["y_ego"], WEST)),
-            Actor("co_1", ("aisle",), 0, 30.0, 0.0, leaving, CAR, start),
-            Actor("co_2", ("aisle",), 0, 50.0, 0.0, Stationary(), CAR, bay(2, values)),
-            Actor("co_3", ("aisle",), 0, 70.0, 0.0, Stationary(), CAR, bay(3, values)),
+            Actor("co_1", ("bay_1",), 0, CAR.length, 0.0, leaving, CAR, start),
+            Actor("co_2", ("bay_2",), 0, CAR.length, 0.0, Stationary(), CAR, bay(2, values)),
+            Actor("co_3", ("bay_3",), 0, CAR.length, 0.0, Stationary(), CAR, bay(3, values)),
         ),
         end_condition(leaving.end),
     )
