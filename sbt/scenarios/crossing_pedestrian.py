@@ -24,7 +24,7 @@ __all__ = ["SCENARIO"]
 
 LIMIT = 50 / 3.6
 """Speed limit of the street (m/s)."""
-BEFORE, GAP, BLOCK = 167.58, 14.4, 60.96
+BEFORE, GAP, BLOCK = 167.09, 15.4, 60.96
 """Lengths of the ego's street before the junction, across it, and from it to the crossing (m), in `town`."""
 DISTANCE = 90.0
 """Initial distance from the ego's front to the crossing (m)."""
@@ -42,6 +42,12 @@ leaves the network during a run."""
 PAVEMENTS = (("14#1", "13"), ("-14#0", "-15"))
 WALKERS = 3.0
 """Mean number of other pedestrians."""
+APART = 1.5
+"""Smallest initial distance of two of them on a pavement (m)."""
+WIDTH = "3"
+"""Of pavements and crossing in `town` (m), and of the stripes in which SUMO's pedestrians walk: one stripe, so that they walk
+along its centre line. With several, SUMO moves them to another stripe wherever one way ends and another begins, at once."""
+STRIPES = ("--pedestrian.striping.stripe-width", WIDTH, "--pedestrian.striping.walkingarea-detail", "40")
 PASSED = 10.0
 """Distance behind the crossing at which the ego has passed it (m)."""
 CROSSING = (297.46, 285.96)
@@ -67,12 +73,15 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def walkers(rng: np.random.Generator) -> tuple[Actor, ...]:
-    """Draw the other pedestrians, who stay on the pavements of the block."""
-    return tuple(
-        Actor(f"walker_{k}", PAVEMENTS[int(rng.integers(2))], 0, float(rng.uniform(1.0, 30.0)), float(rng.uniform(0.8, 1.6)),
-              type=WALKER, person=True)
-        for k in range(int(rng.poisson(WALKERS)))
-    )  # fmt: skip
+    """Draw the other pedestrians, who stay on the pavements of the block, with some distance between them at the start."""
+    drawn: list[Actor] = []
+    for k in range(int(rng.poisson(WALKERS))):
+        way, pace = PAVEMENTS[int(rng.integers(2))], float(rng.uniform(0.8, 1.6))
+        at = float(rng.uniform(1.0, 30.0))
+        while any(other.route == way and abs(other.position - at) < APART for other in drawn):
+            at = float(rng.uniform(1.0, 30.0))
+        drawn.append(Actor(f"walker_{k}", way, 0, at, pace, type=WALKER, person=True))
+    return tuple(drawn)
 
 
 def end_condition(t: float, states: Mapping[str, State]) -> str | None:
@@ -98,7 +107,9 @@ SCENARIO = LogicalScenario(
             *EGO.inputs,
         )
     ),
-    simulate=SumoSimulation(net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",)),
+    simulate=SumoSimulation(
+        net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",), options=STRIPES
+    ),
     metrics=(ttc_path_min(), nearest_distance(), any_collision(), any_impact_speed()),
     requirement=Requirement("ttc_path_min", high=0.5),
 )
