@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 from scenario_points import sobol
 
-from sbt.plugins import load
+from sbt.metrics.physics import breaches
+from sbt.plugins import load, names
+from sbt.problem.trace import Trace
+from sbt.sumo.actors import State
+from sbt.sumo.drivers import Braking
+from sbt.sumo.road_ahead import RoadAhead
 
 ONE_LANE = ("emergency_braking", "cut_in")
 
@@ -26,3 +34,106 @@ def test_an_ego_of_sumo_changes_lanes_only_where_asked_and_then_takes_its_time(n
                 assert np.abs(np.diff(y)).max() <= 3.5 / 3.0 * float(trace.time[1]) + 0.01, "a lane change lasts 3 s"
     assert max(lateral[False]) == 0.0
     assert max(lateral[True]) > 1.0
+
+
+def moving(x: np.ndarray, y: np.ndarray, *, speed: np.ndarray | None = None, size: tuple[float, float] = (5.0, 1.8)) -> Trace:
+    """Return the trace of one road user with steps of 0.1 s that heads along x."""
+    t = 0.1 * np.arange(len(x))
+    speed = np.append(np.diff(x), 0.0) / 0.1 if speed is None else speed
+    acceleration = np.append(0.0, np.diff(speed)) / 0.1
+    columns = [np.asarray(c, dtype=float)[:, None] for c in (x, y, np.zeros(len(x)), speed, acceleration)]
+    return Trace(t, ("ego",), *columns, np.array(size[:1]), np.array(size[1:]))
+
+
+STEADY = 2.0 * np.arange(30.0)  # 20 m/s
+STILL = np.zeros(30)
+
+
+@pytest.mark.parametrize(
+    ("law", "trace"),
+    [
+        ("longitudinal", moving(STEADY, STILL, speed=np.append(np.full(15, 20.0), np.full(15, 18.5)))),
+        ("sideways", moving(STEADY, np.append(np.zeros(15), np.full(15, 3.5)))),
+        ("lateral", moving(STEADY, 0.5 * 6.0 * (0.1 * np.arange(30)) ** 2)),
+        ("jerk", moving(STEADY, STILL, speed=20.0 - np.append(np.zeros(10), np.cumsum([1.02] * 2 + [0.0] * 18)))),
+        ("mismatch", moving(STEADY, STILL, speed=np.full(30, 15.0))),
+        ("walking", moving(np.append(0.1 * np.arange(15.0), 0.5 + 0.1 * np.arange(15.0)), STILL, size=(0.5, 0.5))),
+    ],
+)
+def test_each_law_is_broken_by_what_it_forbids(law: str, trace: Trace) -> None:
+    assert law in [b.law for b in breaches(trace)]
+    steady = moving(STEADY, STILL, speed=np.full(30, 20.0))
+    assert breaches(steady) == ()
+
+
+def test_contacts_and_collisions_at_the_start_are_found() -> None:
+    one = moving(STEADY, STILL, speed=np.full(30, 20.0))
+    ahead = {n: np.concatenate([getattr(one, n)] * 2, axis=1) for n in ("x", "y", "heading", "speed", "acceleration")}
+    for distance, expected in ((4.0, ["start"]), (9.0, [])):
+        x = ahead["x"] + np.array([0.0, distance])
+        pair = Trace(one.time, ("ego", "co"), **ahead | {"x": x}, length=np.full(2, 5.0), width=np.full(2, 1.8))
+        assert [b.law for b in breaches(pair)] == expected
+    reported = dataclasses.replace(pair, reported=("ego>co@0.050", "ego>co@2.000"))
+    assert [str(b) for b in breaches(reported)] == ["start must be <= 0, but ego has 1 at 0.00 s"]
+
+
+def test_only_drivers_whom_ego_does_not_force_are_judged() -> None:
+    t = 0.1 * np.arange(30)
+    speed = np.maximum(20.0 - 8.0 * t, 0.0)
+    x = np.cumsum(np.append(0.0, 0.05 * (speed[1:] + speed[:-1])))
+    for offset, expected in ((30.0, []), (-30.0, ["braking_of_others"])):
+        both = [np.stack([a, b], axis=1) for a, b in ((STEADY + offset, x), (STILL, STILL), (STILL, STILL), (STILL + 20.0, speed),
+                                                    (STILL, np.append(0.0, np.diff(speed) / 0.1)))]  # fmt: skip
+        trace = Trace(t, ("ego", "co"), *both, np.full(2, 5.0), np.full(2, 1.8))
+        assert [b.law for b in breaches(trace)] == expected
+        assert breaches(trace, scripted=("co",)) == ()
+
+
+JERKY = {"following": "co", "parking": "co_1", "highway_merge": "ego"}
+"""Whose acceleration changes at once: by the profiles of the data set, and by SUMO's model where it brakes in an emergency."""
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("name", names("scenarios"))
+def test_no_built_in_scenario_breaks_a_law(name: str) -> None:
+    scenario = load("scenarios", name)
+    scripted = (scenario.roles.other or "",)
+    broken = [b for k, v in enumerate(sobol(scenario, 10)) for b in breaches(scenario.simulate(v, k), scripted)]
+    assert [str(b) for b in broken if not (b.law == "jerk" and b.actor == JERKY.get(name))] == []
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("name", ["roundabout_entry", "unprotected_left_turn", "highway_merge"])
+def test_a_controller_slows_down_for_bends_and_the_end_of_its_lane(name: str) -> None:
+    scenario = load("scenarios", name).configured(ego={"kind": "acc_aeb"})
+    for k, values in enumerate(sobol(scenario, 6)):
+        trace = scenario.simulate(values, k)
+        assert not [b for b in breaches(trace) if b.actor == "ego" and b.law in ("lateral", "longitudinal", "sideways")]
+
+
+def test_the_road_ahead_knows_bends_and_where_a_lane_ends() -> None:
+    ring = RoadAhead("roundabout", ("in_south", "ring_south_east", "ring_east_north"), 0)
+    assert ring.limit(100.0) > 20.0
+    entry = min(ring.limit(s) for s in np.arange(570.0, 590.0))
+    assert entry == pytest.approx(math.sqrt(4.0 * 6.8), abs=0.4)
+    assert ring.limit(560.0) ** 2 - entry**2 < 2 * 3.0 * 30.0
+    ramp = RoadAhead("on_ramp", ("ramp", "merge", "after"), 0)
+    end = 250.2329 + 3.0 + 244.5
+    assert ramp.limit(end) == 0.0
+    assert ramp.limit(end - 50.0) == pytest.approx(math.sqrt(2 * 3.0 * 49.0), rel=0.02)
+    assert ramp.beside(400.0, 0.0, 0.0)
+
+
+def test_braking_with_a_limited_jerk_reaches_its_deceleration_and_final_speed() -> None:
+    for deceleration, final in ((10.0, 5.0), (10.0, 29.5), (1.0, 30.0)):
+        driver, own = Braking(deceleration, final, 30.0), State("co", 5.0, 1.8, 0.01)
+        own.speed, speeds = 30.0, [30.0]
+        for k in range(600):
+            speed = driver.act(0.01 * k, own, ()).speed
+            assert speed is not None
+            own.speed = speed
+            speeds.append(speed)
+        a = np.diff(speeds) / 0.01
+        assert speeds[-1] == final
+        assert np.abs(np.diff(a)).max(initial=0.0) / 0.01 <= 30.0 + 1e-6
+        assert -a.min() <= deceleration + 1e-9

@@ -13,11 +13,13 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
 from sbt.sumo.ego import Ego
+from sbt.sumo.road_ahead import on_road
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
 
 __all__ = ["SCENARIO"]
 
+NET = "on_ramp"
 LIMIT = 120 / 3.6
 """Speed limit (m/s)."""
 DESIRED = 100 / 3.6
@@ -36,6 +38,7 @@ HORIZON = 5.0
 """Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 30.0
 """Longest simulated time (s)."""
+ROUTE = ("ramp", "merge", "after")
 EGO = Ego.of("sumo", tau={"min": 0.4, "max": 1.6}, lcAssertive={"min": 1.0, "max": 5.0}, accel={"min": 1.5, "max": 3.5})
 LANES = tuple(TrafficStream(name, ("main", "merge", "after"), lane, LIMIT) for lane, name in enumerate(("right", "left")))
 
@@ -43,14 +46,14 @@ LANES = tuple(TrafficStream(name, ("main", "merge", "after"), lane, LIMIT) for l
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
     """Return the ego on the ramp and a stream of cars in each lane of the motorway, the left one 10 % faster."""
     speed, flow = values["v_ego"] / 3.6, values["flow_co"]
-    driver = ego.driver(rng, speed)
+    driver = on_road(ego.driver(rng, speed), NET, ROUTE, 0, RAMP - DISTANCE)
     right, left = (
         lane.draw(rng, flow, values["v_co"] / 3.6 * factor, NEAREST, FARTHEST)
         for lane, factor in zip(LANES, (1.0, 1.1), strict=True)
     )
     kind = ego_type(ego, DESIRED, LIMIT)
     changes = ego.changes_lanes(usual=True)
-    car = Actor("ego", ("ramp", "merge", "after"), 0, RAMP - DISTANCE, speed, driver, kind, lane_changes=changes)
+    car = Actor("ego", ROUTE, 0, RAMP - DISTANCE, speed, driver, kind, lane_changes=changes)
     return Scene((car, *right, *left), end_condition)
 
 
@@ -75,7 +78,7 @@ SCENARIO = LogicalScenario(
         )
     ),
     simulate=SumoSimulation(
-        net="on_ramp",
+        net=NET,
         scene=scene,
         duration=DURATION,
         step_length=0.1,

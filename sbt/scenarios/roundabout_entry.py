@@ -17,43 +17,51 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
 from sbt.sumo.ego import Ego
+from sbt.sumo.road_ahead import on_road
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
 
 __all__ = ["SCENARIO"]
 
-LIMIT, RING_LIMIT = 50 / 3.6, 30 / 3.6
-"""Speed limits of the arms and of the ring (m/s)."""
+NET = "roundabout"
+LIMIT, RING_LIMIT = 50 / 3.6, 8.5
+"""Speed limit of the arms, and what the bend of the ring allows: 4 m/s^2 (m/s)."""
 ARM = 600.0
 """From the centre of the roundabout to the end of an arm (m)."""
 DISTANCE = 80.0
 """Initial distance from the ego's front to the centre of the roundabout (m)."""
-NEAREST, FARTHEST = 560.0, 60.0
-"""Range of the initial positions of the circulating cars, on the western arm (m)."""
+NEAREST, FARTHEST = 530.0, 60.0
+"""Range of the initial positions of the circulating cars, on the western arm (m), whose entry begins at 577 m: all can still
+slow down for its curve."""
 CLEAR = 35.0
 """y at which the ego has left the roundabout (m)."""
 ENTRY = (0.0, -18.0, 12.0)
 """x, y and radius of a circle around the ego's entry (m): beyond it the ego follows other cars and does not yield."""
+FOLLOW_UP = 2.5
+"""Time gap (s) at which drivers in a queue follow each other into a one-lane roundabout (Highway Capacity Manual, 6th
+edition: 2.6 s): who has the right of way must not be left less."""
 HORIZON = 5.0
 """Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 27.0
 """Longest simulated time (s); even the fastest car has not arrived by then."""
-EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
+EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5},
+             jmSigmaMinor=1.0)  # fmt: skip
 RING = ("ring_south_east", "ring_east_north", "out_north")
-PASSING = TrafficStream("co", ("in_west", "ring_west_south", *RING), 0, RING_LIMIT)
+ROUTE = ("in_south", *RING)
+PASSING = TrafficStream("co", ("in_west", "ring_west_south", *RING), 0, RING_LIMIT, fastest=RING_LIMIT)
 LEAVING = ("in_west", "ring_west_south", "out_south")
 
 
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
     """Return the ego on the southern arm and cars from the western one, which pass the ego's entry or leave before it."""
     speed = values["v_ego"] / 3.6
-    driver = ego.driver(rng, speed)
+    driver = on_road(ego.driver(rng, speed), NET, ROUTE, 0, ARM - DISTANCE)
     cars = PASSING.with_driver(tau=values["tau_co"]).draw(
         rng, values["flow_co"], values["v_co"] / 3.6, NEAREST, FARTHEST, start=values["v_co"] / 3.6 * LIMIT / RING_LIMIT
     )
     leaves = rng.random(len(cars)) < values["p_leave"]
     cars = tuple(replace(car, route=LEAVING) if out else car for car, out in zip(cars, leaves, strict=True))
-    car = Actor("ego", ("in_south", *RING), 0, ARM - DISTANCE, speed, driver, ego_type(ego, LIMIT, LIMIT))
+    car = Actor("ego", ROUTE, 0, ARM - DISTANCE, speed, driver, ego_type(ego, LIMIT, LIMIT))
     return Scene((car, *cars), end_condition)
 
 
@@ -66,8 +74,8 @@ SCENARIO = LogicalScenario(
     name="roundabout_entry",
     description=(
         "Entry into a roundabout with circulating traffic.\n"
-        "One-lane roundabout, 30 km/h. Ego comes from the south at v_ego and enters as soon as its driver model accepts a gap "
-        "between the cars from the west, flow_co an hour at v_co in the ring; a share p_leave of them leaves just before ego."
+        "One-lane roundabout, 30 km/h in the ring. Ego comes from the south at v_ego and enters as soon as its driver model "
+        "accepts a gap between the cars from the west, flow_co an hour at v_co in the ring; a share p_leave of them leaves just before ego."
     ),
     space=ParameterSpace(
         (
@@ -79,7 +87,7 @@ SCENARIO = LogicalScenario(
             *EGO.inputs,
         )
     ),
-    simulate=SumoSimulation(net="roundabout", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
+    simulate=SumoSimulation(net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
     metrics=(
         pet_ego_first(horizon=HORIZON, zone=ENTRY),
         ttc_path_min(),
@@ -88,5 +96,5 @@ SCENARIO = LogicalScenario(
         any_impact_speed(),
         others_braking_max(),
     ),
-    requirement=Requirement("pet_ego_first", high=1.5),
+    requirement=Requirement("pet_ego_first", high=FOLLOW_UP),
 )

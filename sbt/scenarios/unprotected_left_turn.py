@@ -17,11 +17,13 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, EndCondition, Scene, State
 from sbt.sumo.ego import Ego
+from sbt.sumo.road_ahead import on_road
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
 
 __all__ = ["SCENARIO"]
 
+NET = "left_turn"
 LIMIT = 50 / 3.6
 """Speed limit of all roads (m/s)."""
 ARM = 1000.0
@@ -36,6 +38,7 @@ HORIZON = 5.0
 """Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 38.0
 """Longest simulated time (s); even the fastest oncoming car has not arrived by then."""
+ROUTE = ("in_west", "out_north")
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
 ONCOMING = TrafficStream("oncoming", ("in_east", "out_west"), 0, LIMIT)
 
@@ -43,9 +46,9 @@ ONCOMING = TrafficStream("oncoming", ("in_east", "out_west"), 0, LIMIT)
 def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Scene:
     """Return the ego before the junction, about to turn left, and a stream of oncoming cars."""
     speed = values["v_ego"] / 3.6
-    driver = ego.driver(rng, speed)
+    driver = on_road(ego.driver(rng, speed), NET, ROUTE, 0, ARM - DISTANCE)
     cars = ONCOMING.draw(rng, values["flow_co"], values["v_co"] / 3.6, NEAREST, FARTHEST)
-    car = Actor("ego", ("in_west", "out_north"), 0, ARM - DISTANCE, speed, driver, ego_type(ego, speed, LIMIT))
+    car = Actor("ego", ROUTE, 0, ARM - DISTANCE, speed, driver, ego_type(ego, speed, LIMIT))
     return Scene((car, *cars), end_condition())
 
 
@@ -76,7 +79,7 @@ SCENARIO = LogicalScenario(
             *EGO.inputs,
         )
     ),
-    simulate=SumoSimulation(net="left_turn", scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
+    simulate=SumoSimulation(net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
     metrics=(
         pet_ego_first(horizon=HORIZON),
         ttc_path_min(),
