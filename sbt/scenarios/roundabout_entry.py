@@ -75,7 +75,8 @@ SCENARIO = LogicalScenario(
     description=(
         "Entry into a roundabout with circulating traffic.\n"
         "One-lane roundabout, 30 km/h in the ring. Ego comes from the south at v_ego and enters as soon as its driver model "
-        "accepts a gap between the cars from the west, flow_co an hour at v_co in the ring; a share p_leave of them leaves just before ego."
+        "accepts a gap between the cars from the west, flow_co an hour at v_co in the ring; a share p_leave of them leaves "
+        "just before ego."
     ),
     space=ParameterSpace(
         (
