@@ -32,8 +32,10 @@ SMALL = {"budget": 24, "initial": 12, "batch": 12}
 
 def small(config: Path) -> list[str]:
     """Options that make a campaign end in a second or two."""
-    reference = min(20, load(config).config.validation.reference)
-    settings = {**SMALL, "validation.reference": reference, "executor.kind": "serial"}
+    of_file = load(config).config
+    learns = {"validation.reference": min(20, of_file.validation.reference)}
+    size = {"budget": 8} if of_file.campaign == "coverage" else {**SMALL, **learns}
+    settings = {**size, "executor.kind": "serial"}
     return [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
 
 
@@ -44,16 +46,18 @@ def test_there_are_configurations_and_examples():
 
 @pytest.mark.sumo
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
-def test_configurations_run(config: Path, tmp_path: Path):
+def test_configurations_run(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assemble(load(config))
-    command = [sys.executable, "-m", "sbt", "run", str(config), "--store", str(tmp_path / "s"), "--json", *small(config)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["run", str(config), "--store", str(tmp_path / "s"), "--json", *small(config)])
+    assert done.exit_code == 0, done.output
     result = json.loads(done.stdout)
     assert done.stdout.count("\n") == 1
     assert (result["ok"], result["failed"]) == (result["runs"], 0)
     repeated = sum(mode["confirmation_runs"] for mode in result["conclusion"].get("failure_modes", []))
-    assert result["runs"] == 24 + repeated + min(20, load(config).config.validation.reference)
+    of_file = load(config).config
+    bought = 8 if of_file.campaign == "coverage" else 24 + min(20, of_file.validation.reference)
+    assert result["runs"] == bought + repeated
     assert (tmp_path / "s" / "report.html").is_file()
 
 
