@@ -21,7 +21,7 @@ inputs: {{{input}}}
 ego: {{id: {ego}, may_leave: true}}
 duration: {duration}
 metrics: [ttc_path_min, distance_min, collision]
-requirement: {{metric: distance_min, critical: [-.inf, 0.5]}}
+requirement: {{metric: {metric}, critical: [-.inf, 0.5]}}
 """
 
 
@@ -38,12 +38,12 @@ def run_program(folder: Path, name: str, *options: str) -> None:
     subprocess.run([program(name), *options], cwd=folder, check=True, capture_output=True, env=environment)
 
 
-def _write(folder: Path, traffic: str, value: str, *, types: str = _TYPES, ego: str = "ego", more: str = "", duration: float = 8, options: str = "") -> Path:
+def _write(folder: Path, traffic: str, value: str, *, types: str = _TYPES, ego: str = "ego", more: str = "", duration: float = 8, options: str = "", metric: str = "ttc_path_min") -> Path:
     """Write routes, configuration and scenario."""
     (folder / "my.rou.xml").write_text(f"<routes>\n  {types}\n{traffic}</routes>\n")
     files = f'<net-file value="net.net.xml"/><route-files value="my.rou.xml"/>{more}'
     (folder / "my.sumocfg").write_text(f"<configuration><input>{files}</input>{options}</configuration>\n")
-    (folder / "scenario.yaml").write_text(_YAML.format(input=value, ego=ego, duration=duration))
+    (folder / "scenario.yaml").write_text(_YAML.format(input=value, ego=ego, duration=duration, metric=metric))
     return folder / "scenario.yaml"
 
 
@@ -65,7 +65,7 @@ def grid(folder: Path) -> Path:
         return rng.choice([(f"A{i}B{i}", f"D{j}E{j}"), (f"E{i}D{i}", f"B{j}A{j}"), (f"{'ABCDE'[i]}0{'ABCDE'[i]}1", f"{'ABCDE'[j]}3{'ABCDE'[j]}4")])
 
     ego = '  <trip id="ego" depart="60" from="A2B2" to="D2E2" departSpeed="${speed}"/>\n'
-    path = _write(folder, ego, types="", value="speed: {min: 2, max: 13, unit: m/s}", more='<additional-files value="more.add.xml,traffic.rou.xml.gz"/>')
+    path = _write(folder, ego, types="", value="speed: {min: 2, max: 13, unit: m/s}", more='<additional-files value="more.add.xml,traffic.rou.xml.gz"/>', metric="distance_min")
     with gzip.open(folder / "traffic.rou.xml.gz", "wt") as file:
         file.write(f"<routes>\n{_cars(110, across, every=0.6, seed=2, kinds='truck bus')}</routes>\n")
     (folder / "more.add.xml").write_text(
@@ -141,7 +141,7 @@ def crossing(folder: Path) -> Path:
     )
     ego = '  <trip id="ego" depart="20" from="B0B1" to="B1B2" departSpeed="${speed}" departPos="10"/>\n'
     lines = sorted((people + flows + ego).splitlines(keepends=True), key=lambda line: float((line.split('depart="')[-1] if "depart=" in line else "0").split('"')[0]))
-    return _write(folder, "".join(lines), "speed: {min: 3, max: 12, unit: m/s}", duration=9)
+    return _write(folder, "".join(lines), "speed: {min: 3, max: 12, unit: m/s}", duration=9, metric="distance_min")
 
 
 def merge(folder: Path) -> Path:

@@ -218,7 +218,7 @@ def test_a_run_that_hangs_is_stopped_and_the_others_go_on(analytic: Path, monkey
     assert (found[4].status, found[4].reason) == (
         Status.TIMEOUT, "a run must take at most 0.7 s: its process was stopped",
     )  # fmt: skip
-    assert time.monotonic() - start < 15
+    assert time.monotonic() - start < 60, "it would hang for ever"
 
 
 def test_a_worker_killed_from_outside_costs_nothing(analytic: Path):

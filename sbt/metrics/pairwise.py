@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -57,7 +58,21 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
         worst = max if metric.direction == "high" else min
         return worst(values, default=metric.without)
 
-    return replace(metric, name=name or metric.name, function=function)
+    times = None if metric.over_time is None else partial(_over_time, metric, metric.over_time, ego, other)
+    return replace(metric, name=name or metric.name, function=function, over_time=times)
+
+
+def _over_time(metric: Metric, of_pair: Callable[[Trace], Vector], ego: str, other: str | None, trace: Trace) -> Vector:
+    """Return the (t,) values of a metric over time in traffic: the worst of those who are there."""
+    if metric.alone:
+        return of_pair(_part(trace, slice(None), [trace.actors.index(ego)]))
+    worst = np.maximum if metric.direction == "high" else np.minimum
+    values = np.full(len(trace.time), metric.without)
+    for actor in trace.actors:
+        if actor != ego and other in (None, actor):
+            for instants, part in joint_intervals(trace, ego, actor):
+                values[instants] = worst(values[instants], of_pair(part))
+    return values
 
 
 def without_overtaking(metric: Metric) -> Metric:
