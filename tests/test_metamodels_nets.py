@@ -62,16 +62,13 @@ def rows(n: int, d: int = 3, seed: int = 0, noise: float = 0.1) -> tuple[np.ndar
     return u, np.sin(5 * u[:, 0]) + u[:, 1] ** 2 + noise * rng.normal(size=n)
 
 
-DIMENSIONS = (1, 2, 7, 20)
-
-
 @pytest.mark.parametrize("name", QUICK)
 def test_metamodels_obey_their_contract(name):
-    check_metamodel(QUICK[name], dimensions=DIMENSIONS)
+    check_metamodel(QUICK[name], dimensions=(1, 20))  # 2 and 7: see the slow ones
 
 
 def test_auto_obeys_its_contract():
-    check_metamodel(Auto(folds=2, ensemble_rows=10**6), dimensions=(2, 20))  # 1 and 7: see the slow ones
+    check_metamodel(Auto(folds=2, ensemble_rows=10**6), dimensions=(7,))  # 1 and 2: see the slow ones
 
 
 @pytest.mark.slow
