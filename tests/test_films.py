@@ -210,3 +210,14 @@ def test_a_metric_so_far_is_that_of_the_run_up_to_then():
     names = ("time", "x", "y", "heading", "speed", "acceleration")
     for k in instants[::7]:
         assert found[k] == metric(replace(trace, **{name: getattr(trace, name)[: k + 1] for name in names}))
+
+
+@in_sumo
+def test_a_run_that_cannot_be_shown_says_why(tmp_path: Path):
+    path = FIVE["merge"](tmp_path)
+    path.write_text(path.read_text().replace("may_leave: true, ", "").replace("duration: 9", "duration: 200"))
+    text = f"campaign: coverage\nscenario: {path}\nbudget: 1\nexecutor: {{kind: serial}}\nstore: {tmp_path}/store\n"
+    assert run_study(Study(parse(text)), report=False).failed == 1
+    done = CliRunner().invoke(app, ["replay", str(tmp_path / "store"), "0", "--gif", str(tmp_path / "a.gif")])
+    assert (done.exit_code, (tmp_path / "a.gif").exists()) == (2, False)
+    assert "only a run with a trace can be shown, but run 0 has none: the ego 'ego' must stay for the duration" in done.output
