@@ -32,10 +32,15 @@ class Contact(NamedTuple):
 
 
 def contacts_of(trace: Trace) -> tuple[Contact, ...]:
-    """Return the contacts of the first actor, in the order of time."""
+    """Return the contacts of the first actor, in the order of time.
+
+    What never moves and does not end the run that touches it, such as a bar that hides a marking, is no road user.
+    """
     ego = trace.actors[0]
     found = []
     for j, other in enumerate(trace.actors[1:], start=1):
+        if trace.ended != "collision" and not np.nanmax(trace.speed[:, j], initial=0.0) > 0.0:
+            continue
         for instants, part in joint_intervals(trace, ego, other):
             k = first_contact(part, "ego", "co")
             if k is not None:
