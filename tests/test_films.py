@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from own_networks import FIVE, program
 from typer.testing import CliRunner
 
@@ -25,7 +26,7 @@ from sbt.metrics.planar import DISTANCE_MIN
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.trace import Trace
-from sbt.report.contacts import contacts_of
+from sbt.report.contacts import Contacts, contacts_of
 from sbt.report.film import write_film
 from sbt.report.scene import EGO, ROAD, view_of
 from sbt.report.style import CRITICAL
@@ -183,6 +184,9 @@ def test_a_film_of_two_hundred_road_users_marks_the_contact(tmp_path: Path):
     assert (contact.other, trace.time[contact.instant]) == ("c1", pytest.approx(2.6))
     assert (contact.x, contact.y) == (pytest.approx(trace.x[contact.instant, 0] + 2.4, abs=0.2), pytest.approx(0.0))
     assert worst_moment(trace, metric) == (contact.instant, 1)
+    for text, word in (("with 'c1' at 2.600 s: SUMO ...", "unconfirmed "), ("with 'c11' at 2.600 s: SUMO ...", "")):
+        doubtful = replace(trace, unconfirmed=(f"contact {text}",))
+        assert Contacts(Figure().add_subplot(), doubtful).show(59) == f"{word}contact with c1 at 2.6 s"
     write_film(tmp_path / "a.gif", trace, metric, Requirement("distance_min", high=0.5))
     pictures = pictures_of(tmp_path / "a.gif")
     assert len(pictures) <= 90

@@ -65,7 +65,7 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
 def _over_time(metric: Metric, of_pair: Callable[[Trace], Vector], ego: str, other: str | None, trace: Trace) -> Vector:
     """Return the (t,) values of a metric over time in traffic: the worst of those who are there."""
     if metric.alone:
-        return of_pair(_part(trace, slice(None), [trace.actors.index(ego)]))
+        return of_pair(trace.select(slice(None), {ego: "ego"}))
     worst = np.maximum if metric.direction == "high" else np.minimum
     values = np.full(len(trace.time), metric.without)
     for actor in trace.actors:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import first_contact
+from sbt.problem.outcome import UNCONFIRMED
 from sbt.problem.trace import Trace
 from sbt.report.style import CRITICAL
 
@@ -67,10 +68,13 @@ def _nearest_point(trace: Trace, k: int, of: int, to: int) -> tuple[float, float
 
 
 class Contacts:
-    """A ring on axes at every contact, for a moment; `show(k)` draws those of an instant and returns all so far in words."""
+    """A ring on axes at every contact, for a moment; `show(k)` draws those of an instant and returns all so far in words.
+
+    A contact that SUMO does not list is called unconfirmed.
+    """
 
     def __init__(self, axes: Axes, trace: Trace):
-        self._contacts, self._time = contacts_of(trace), trace.time
+        self._contacts, self._time, self._unconfirmed = contacts_of(trace), trace.time, trace.unconfirmed
         look: dict[str, Any] = {"ms": 17, "mfc": "none", "mec": CRITICAL, "mew": 2.0, "zorder": 7, "visible": False}
         self._rings = [axes.plot([c.x], [c.y], "o", **look)[0] for c in self._contacts]
 
@@ -80,5 +84,6 @@ class Contacts:
         for contact, ring in zip(self._contacts, self._rings, strict=True):
             ring.set_visible(contact.instant <= k and self._time[k] - self._time[contact.instant] < _SHOWN)
             if contact.instant <= k:
-                words.append(f"contact with {contact.other[:20]} at {self._time[contact.instant]:.1f} s")
+                doubt = "unconfirmed " if any(f"{UNCONFIRMED}'{contact.other}'" in text for text in self._unconfirmed) else ""
+                words.append(f"{doubt}contact with {contact.other[:20]} at {self._time[contact.instant]:.1f} s")
         return ", ".join(words[:2])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -86,11 +85,9 @@ def _due_to(trace: Trace, metric: Metric, among: Sequence[int]) -> Sequence[int]
         return among
     values: dict[int, float] = {}
     for j in among:
-        pair = [0, j]
-        states: dict[str, Any] = {name: getattr(trace, name)[:, pair] for name in ("x", "y", "heading", "speed", "acceleration")}
-        states |= {"length": trace.length[pair], "width": trace.width[pair]}
+        pair = trace.select(slice(None), {name: name for name in (trace.actors[0], trace.actors[j])})
         try:
-            values[j] = metric(replace(trace, actors=(trace.actors[0], trace.actors[j]), **states))
+            values[j] = metric(replace(pair, signals=trace.signals))
         except RunError:  # a metric of somebody else
             continue
     if not values:
