@@ -390,6 +390,104 @@ def test_placeholders_take_choices_as_text_escaped_and_formulas_compare(tmp_path
     assert (types[0].get("length"), types[1].get("accel")) == ("12", "0")
 
 
+# SUMO
+
+ROAD = """<net version="1.20" junctionCornerDetail="5" limitTurnSpeed="5.50">
+    <location netOffset="0,0" convBoundary="0,0,2000,0" origBoundary="0,0,2000,0" projParameter="!"/>
+    <edge id="road" from="west" to="east" priority="-1">
+        <lane id="road_0" index="0" speed="50.00" length="2000.00" shape="0.00,-1.60 2000.00,-1.60"/>
+    </edge>
+    <junction id="east" type="dead_end" x="2000.00" y="0.00" incLanes="road_0" intLanes="" shape="2000.00,-3.20 2000.00,0.00"/>
+    <junction id="west" type="dead_end" x="0.00" y="0.00" incLanes="" intLanes="" shape="0.00,0.00 0.00,-3.20"/>
+</net>
+"""
+ROUTES = """<routes>
+    <vType id="car_trailer" length="9.0" sigma="0"/>
+    <vType id="truck" vClass="truck" length="12.0" sigma="0"/>
+    <vType id="ego" length="5.0" sigma="0"/>
+    <route id="ahead" edges="road"/>
+    <vehicle id="lead" type="${kind}" route="ahead" depart="0" departSpeed="10"
+             departPos="${100 + gap + 12 * (kind == 'truck') + 9 * (kind != 'truck')}" insertionChecks="none"/>
+    <vehicle id="ego" type="ego" route="ahead" depart="0" departPos="100" departSpeed="20" insertionChecks="none"/>
+</routes>
+"""
+OWN = """sumo: {net: road.net.xml, routes: cars.rou.xml}
+inputs:
+  gap: {min: 20, max: 60, unit: m}
+  kind: {choices: {car_trailer: 0.75, truck: 0.25}}
+ego: ego
+duration: 3
+metrics: [ttc_min, d_min]
+requirement: {metric: ttc_min, critical: [-.inf, 1.0]}
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    for name, text in {"road.net.xml": ROAD, "cars.rou.xml": ROUTES, "scenario.yaml": OWN}.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+@pytest.mark.sumo
+def test_own_files_take_the_text_and_formulas_compare_with_it(own):
+    for kind, length in {"car_trailer": 9.0, "truck": 12.0}.items():
+        run = sbt.simulate(own / "scenario.yaml", {"kind": kind, "gap": 30.0})
+        lead = run.trace[run.trace["actor"] == "lead"].iloc[0]
+        ego = run.trace[run.trace["actor"] == "ego"].iloc[0]
+        assert lead["length"] == length
+        assert lead["x"] - ego["x"] - (length + 5.0) / 2 == pytest.approx(30.0, abs=1.1)  # after the first step of 0.1 s
+    done = sbt.run(
+        campaign="coverage", scenario=str(own / "scenario.yaml"), budget=8, seed=1, store=str(own / "s"), executor="serial",
+        report=False,
+    )  # fmt: skip
+    assert set(done.frame["status"]) == {"ok"}
+    assert set(done.frame["x.kind"]) == {"car_trailer", "truck"}
+    assert done.replay(3).identical
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize(
+    ("change", "told"),
+    {
+        "choices: [1, 2]": "inputs.kind: input kind: a choice must be text (write a number in quotes), but got 1",
+        "{min: 0, max: 1, choices: [a, b]}": "inputs.kind: an input must have a range, choices, or a profile, one of them",
+        "{unit: m}": "inputs.kind: an input must have min and max, choices, or a profile",
+        "choices: [truck, truk]": "",
+    }.items(),
+)
+def test_a_scenario_file_says_what_is_wrong_with_choices(own, change, told):
+    text = OWN.replace("{choices: {car_trailer: 0.75, truck: 0.25}}", change if change[0] == "{" else f"{{{change}}}")
+    (own / "scenario.yaml").write_text(text)
+    if not told:  # the formula compares with a choice that there is, the text with a type that there is not
+        run = sbt.simulate(own / "scenario.yaml", {"kind": "truk", "gap": 30.0})
+        assert run.status != "ok"
+        assert "truk" in run.reason
+        return
+    with pytest.raises(InputError) as error:
+        sbt.simulate(own / "scenario.yaml", {})
+    assert told in str(error.value)
+
+
+@pytest.mark.sumo
+def test_a_placeholder_that_takes_a_choice_for_a_number_is_refused_at_its_place(own):
+    (own / "cars.rou.xml").write_text(ROUTES.replace("${100 + gap", "${100 + kind + gap"))
+    with pytest.raises(InputError, match=r"cars.rou.xml:6:5: .* 'kind' must be an input with choices .*, but is both"):
+        sbt.simulate(own / "scenario.yaml", {})
+
+
+@pytest.mark.sumo
+def test_a_setting_of_the_ego_with_choices_is_an_input():
+    ego = {"kind": "sumo", "model": {"choices": ["IDM", "Krauss"]}}
+    runs = [sbt.simulate("cut_in", {"ego_model": model, "d_v": 90.0, "d_t": 1.0}, ego=ego) for model in ("IDM", "Krauss")]
+    assert [run.inputs["ego_model"] for run in runs] == ["IDM", "Krauss"]
+    assert runs[0].metrics != runs[1].metrics
+    with pytest.raises(InputError, match="did you mean 'IDM'"):
+        sbt.simulate("cut_in", {}, ego={"kind": "sumo", "model": {"choices": ["IDN", "Krauss"]}})
+    with pytest.raises(InputError, match="it decides how SUMO is started"):
+        sbt.simulate("cut_in", {}, ego={"kind": "sumo", "lane_change": {"choices": ["LC2013", "SL2015"]}})
+
+
 @pytest.mark.slow
 def test_falsification_finds_a_failure_of_one_choice_sooner_than_random_runs(tmp_path):
     def runs_to_first(seed: int) -> int:

@@ -54,6 +54,10 @@ class Expression:
     text: str
 
     def __post_init__(self) -> None:
+        both = [name for name, _ in self.choices() if name in self.numbers()]
+        if both:
+            rule = f"'{both[0]}' must be an input with choices (it is compared with a text) or a number"
+            raise InputError(f"{rule}, but is both in '{self.text}'")
         with np.errstate(all="ignore"):
             _evaluate(self._tree(), self.example(), self.text)
             for node in ast.walk(self._tree()):

@@ -139,9 +139,9 @@ def _maps_by_choice(
     """Return a map of P(critical) over the two most influential other inputs, for each choice of input `which`."""
     choices, name = space.parameters[which].choices, space.parameters[which].name
     across, up = sorted(sorted(numeric, key=lambda k: (-weights[k], k))[:2])
-    columns = min(len(choices), 3)
+    columns = 2 if len(choices) == 4 else min(len(choices), 3)
     lines = -(-len(choices) // columns)
-    figure = new_figure(11.0, 0.35 + 3.5 * lines)
+    figure = new_figure(11.0, 0.35 + (3.5 if columns == 3 else 4.2) * lines)
     grid = np.atleast_1d(figure.subplots(lines, columns)).ravel()
     learned = found.history.where(found.history.stage != VALIDATION)
     planes = [

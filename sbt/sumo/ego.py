@@ -23,6 +23,7 @@ __all__ = ["SUMO", "Ego"]
 SUMO = "sumo"
 """The kind of an ego that one of SUMO's models drives."""
 _DEFAULTS = {"decel": "4.5", "emergencyDecel": "9", "accel": "2.6", "minGap": "2.5"}
+_DECIDED_BEFORE = ("lane_change", "laneChangeModel")
 _RANGE_KEYS = ({"min", "max"}, {"min", "max", "unit"})
 
 
@@ -30,7 +31,8 @@ _RANGE_KEYS = ({"min", "max"}, {"min", "max", "unit"})
 class Ego:
     """Kind and settings of the AV under test.
 
-    A setting given as a range, such as `{min: 0.5, max: 2.0}`, is an input of the scenario with the prefix `ego_`.
+    A setting given as a range, such as `{min: 0.5, max: 2.0}`, or by choices, such as `{choices: [IDM, Krauss]}`, is an input of
+    the scenario with the prefix `ego_`.
 
     Args:
         kind: a controller by name or `file.py:NAME`, constructed as `NAME(rng, set_speed, **settings)` once
@@ -43,17 +45,19 @@ class Ego:
 
     @classmethod
     def of(cls, kind: str = "acc_aeb", **settings: Any) -> Ego:
-        """Return an ego of this kind; tries the settings once, with ranges at their centre.
+        """Return an ego of this kind; tries the settings, with ranges at their centre and each choice in turn.
 
         Raises:
             InputError: the kind is unknown, or its settings are.
         """
         ego = cls(kind, tuple((name, _setting(name, value)) for name, value in sorted(settings.items())))
-        trial = ego.bind({p.name: p.centre for p in ego.inputs})
-        if kind == SUMO:
-            vtype_attributes(dict(trial.settings))
-        elif not callable(getattr(trial.driver(stream(0, "ego"), 1.0), "act", None)):
-            raise InputError(f"ego.kind must name a controller with act(t, own, others), but '{kind}' has none")
+        centre = {p.name: p.value(p.centre) for p in ego.inputs}
+        for values in (centre, *({**centre, p.name: choice} for p in ego.inputs for choice in p.choices)):
+            trial = ego.bind(values)
+            if kind == SUMO:
+                vtype_attributes(dict(trial.settings))
+            elif not callable(getattr(trial.driver(stream(0, "ego"), 1.0), "act", None)):
+                raise InputError(f"ego.kind must name a controller with act(t, own, others), but '{kind}' has none")
         return ego
 
     @property
@@ -127,11 +131,16 @@ class Ego:
 
 
 def _setting(name: str, value: Any) -> Any:
-    """Return a setting: a plain number, or the scenario input that a range such as `{min: 0.5, max: 2.0}` declares."""
+    """Return a setting: a plain number, or the scenario input that a range, or `{choices: [IDM, Krauss]}`, declares."""
     if not isinstance(value, Mapping):
         return plain(value)
+    if set(value) == {"choices"}:
+        if name in _DECIDED_BEFORE:
+            raise InputError(f"ego.{name} must be one value, as it decides how SUMO is started, but got choices")
+        return Parameter(f"ego_{name}", kind="categorical", choices=value["choices"], description=f"setting {name} of the ego")
     numbers = all(isinstance(value.get(key), Real) and not isinstance(value.get(key), bool) for key in ("min", "max"))
     if set(value) not in _RANGE_KEYS or not numbers:
-        raise InputError(f"ego.{name} must be a value or a range such as {{min: 0.5, max: 2.0}}, but got {dict(value)}")
+        rule = "a value, a range such as {min: 0.5, max: 2.0}, or {choices: [a, b]}"
+        raise InputError(f"ego.{name} must be {rule}, but got {dict(value)}")
     unit = str(value.get("unit", unit_of(name)))
     return Parameter(f"ego_{name}", float(value["min"]), float(value["max"]), unit, description=f"setting {name} of the ego")

@@ -154,6 +154,8 @@ class Plots:
         parameter = space.parameters[k]
         figures.plot_prediction(along, prediction, drawn, choices=bool(parameter.choices))
         figures.whole_ticks(drawn, parameter)
+        if parameter.choices:
+            drawn.set_xlim(-0.5, len(parameter.choices) - 0.5)
         drawn.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(r.scenario.requirement.metric, r.scenario.unit))
         drawn.set(ylim=padded(*ends))
         drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
