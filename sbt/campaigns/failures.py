@@ -10,6 +10,7 @@ import numpy as np
 
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of
 from sbt.campaigns.parts import share_among_held_out
+from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import plural
 from sbt.errors import InputError
@@ -114,7 +115,8 @@ class FalsificationConclusion:
                 f"The requirement is falsified: the first critical run is run {self.first_critical_run},"
                 f" after {plural(self.runs_to_first or 0, 'run')} of the search; {modes}."
             ))  # fmt: skip
-        return [*said, *share_among_held_out(facts).sentence()]
+        judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
+        return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence()]
 
 
 class FailureSearch:

@@ -16,6 +16,7 @@ from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
+from sbt.store.records import Judgement, optional
 
 __all__ = ["FailureMode", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of"]
 
@@ -77,6 +78,7 @@ class FailureMode:
         confirmation_runs: repetitions.
         most_likely: its run of largest density.
         nearest_safe: the uncritical run nearest to the representative; None: there is none.
+        preventable: what the reference drivers made of the representative; None: they were not asked.
     """
 
     representative: int
@@ -89,6 +91,7 @@ class FailureMode:
     confirmation_runs: int
     most_likely: RunPoint
     nearest_safe: NearestSafe | None
+    preventable: tuple[Judgement, ...] | None = optional()
 
 
 def connected(fitted: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]:

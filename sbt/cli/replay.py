@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sbt.cli.campaign import Folder
 from sbt.cli.console import Exit, clean_stdout, fail, print_json
+
+if TYPE_CHECKING:
+    from sbt.store.records import Judgement
 
 __all__ = ["replay"]
 
@@ -23,15 +26,18 @@ def replay(
     export: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Write network, trajectories (FCD, CSV) and a scene for sumo-gui.")
     ] = None,
+    judge: Annotated[bool, typer.Option("--judge", help="Run it with each reference driver in the place of ego.")] = False,
     trace: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write the states over time.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
+        from sbt.workflows.judging import judge_run, stored_judgements
         from sbt.workflows.running import replay_run
         from sbt.workflows.showing import show_replay
 
         again = replay_run(folder, run)
+        judgements = judge_run(folder, run) if judge else stored_judgements(folder, run)
         record, outcome, states = again.record, again.outcome, again.trace
         shown = gui or gif or export or trace
         if shown and not show_replay(again, gui=gui, gif=gif, folder=export, csv=trace):
@@ -42,6 +48,7 @@ def replay(
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),
             "metrics": dict(outcome.metrics), "identical": same, "reason": outcome.reason,
             "ended": states.ended if states is not None else "",
+            **({"preventable": [vars(each) for each in judgements]} if judgements else {}),
         })  # fmt: skip
     else:
         ended = f", ended: {states.ended}" if states is not None else ""
@@ -49,6 +56,18 @@ def replay(
         for name, value in outcome.metrics.items():
             print(f"  {name:<23} {value:.6g}")
         print("identical to the stored run" if same else "NOT identical to the stored run")
+        if judgements:
+            print("\n".join(["with a reference driver in the place of ego:", *map(_line, judgements)]))
     if not same:
         now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
         raise fail(f"a replay must equal the stored run, but got {now}, not {stored}", Exit.INTERNAL)
+
+
+def _line(judgement: Judgement) -> str:
+    """Return what one driver made of the run."""
+    if judgement.avoided is None:
+        verdict = f"not applicable: {judgement.reason}"
+    else:
+        how = "" if judgement.avoided or not judgement.collision else ", collision"
+        verdict = f"{'avoided' if judgement.avoided else 'not avoided'}{how} ({judgement.metric:.6g})"
+    return f"  {judgement.driver:<23} {verdict}"

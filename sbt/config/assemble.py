@@ -59,6 +59,8 @@ def assemble(loaded: Loaded) -> Assembly:
     metamodel = _metamodel(loaded, problems)
     acquisition = _acquisition(loaded, problems)
     scenario = _scenario(loaded, problems)
+    for k, driver in enumerate(loaded.config.judges or ()):
+        problems.attempt(("judges", k), partial(loaded.scope.load, "controllers", driver))
     problems.check()
     return Assembly(scenario, spec_of(loaded), metamodel, acquisition)
 

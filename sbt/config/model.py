@@ -348,6 +348,9 @@ class Configuration(_Strict):
     warm_start: WarmStart | None = Field(
         default=None, description="Estimation: an earlier campaign whose runs teach the metamodel; null: none."
     )
+    judges: Annotated[tuple[Name, ...] | None, Field(strict=False)] = Field(
+        default=None, description="Egos to run failures again with; default: falsification, the four reference drivers.",
+    )  # fmt: skip
     executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")
     store: Name = Field(default_factory=_store, description="Folder of the results; default: runs/<campaign>_<scenario>.")
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from sbt.errors import InputError, PluginError
 from sbt.execution.carrying import delivered
+from sbt.execution.exchange import with_drivers
 from sbt.metrics.conflict_types import conflict_type
 from sbt.metrics.pairwise import in_traffic, without_overtaking
 from sbt.plugins import load
@@ -40,6 +41,8 @@ class ScenarioSpec:
         conflict_type: measure how ego and the nearest other met as well, where runs have a trace.
         metrics: measured as well, in place of the scenario's of the same name: installed ones (of ego and each
             other in turn, the worst counts), or `file.py:NAME`, a `Metric` or a function of the trace.
+        drivers: egos (kind and settings) that are exchanged for the scenario's own from run to run, as `sbt.execution.exchange`
+            says; none: the ego is not exchanged.
         carried: the scenario itself, as `sbt.execution.carrying.carry` gives it; empty where the name says which it is.
     """
 
@@ -52,6 +55,7 @@ class ScenarioSpec:
     conflict_type: bool = False
     metrics: tuple[str, ...] = ()
     carried: bytes = field(default=b"", repr=False)
+    drivers: tuple[Mapping[str, Any], ...] = ()
 
     def resolve(self) -> LogicalScenario:
         """Return the scenario; loaded once per process and specification.
@@ -61,8 +65,9 @@ class ScenarioSpec:
             InputError: the scenario does not offer one of the choices, or was carried and cannot be loaded here.
         """
         ego = None if self.ego is None else json.dumps(dict(self.ego), sort_keys=True)
-        plain = replace(self, ego=None, folder=str(Path(self.folder).resolve()))
-        return _resolved(plain, ego)
+        plain = replace(self, ego=None, drivers=(), folder=str(Path(self.folder).resolve()))
+        scenario = _resolved(plain, ego)
+        return with_drivers(scenario, self.drivers) if self.drivers else scenario
 
     def resolve_at(self, attempt: Attempt) -> LogicalScenario | None:
         """Return the scenario, one choice after the other.

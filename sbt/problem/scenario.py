@@ -150,11 +150,13 @@ class Roles:
         ego: the road user under test.
         other: the other one; None: all others, the worst at every instant.
         margin: lateral clearance below which the other is in ego's path (m).
+        not_judged: why reference drivers, which keep their lane and only brake, cannot stand in for ego; "": they can.
     """
 
     ego: str = "ego"
     other: str | None = "co"
     margin: float = 0.0
+    not_judged: str = ""
 
 
 @dataclass(frozen=True, init=False)

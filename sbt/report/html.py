@@ -61,7 +61,7 @@ def write_report(
         "modes": mode_table(found, scenario.space),
         "inputs": input_table(scenario, weights),
         "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement),
-        "critical": critical_table(found.history, scenario.requirement, reference),
+        "critical": critical_table(found.history, scenario.requirement, reference, store.judgements),
         "failed": failed_table(found.history, reference),
         "ego": found.configuration.get("ego"),
         "commands": _commands(found, store),

@@ -9,6 +9,7 @@ import numpy as np
 
 from sbt.campaigns.failures import FalsificationConclusion
 from sbt.campaigns.modes import FailureMode
+from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, number, percent
 from sbt.problem.arrays import Vector
 from sbt.problem.space import ParameterSpace
@@ -33,18 +34,21 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     """Return one row a failure mode; no rows where the campaign found none or does not look for them."""
     modes = _modes(found)
     rows, typed = [], any(mode.conflict for mode in modes)
+    judged = any(mode.preventable for mode in modes)
     for number_of, mode in enumerate(modes, 1):
         confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.confirmation_runs}"
         rows.append((
             Cell.of(number_of), Cell.of(mode.representative), Cell.of(mode.metric), Cell.of(mode.size), Cell(confirmed),
             *(() if not typed else (Cell(mode.conflict or NOTHING),)),
             *(Cell.of(mode.inputs[name]) for name in space.names), Cell(_change(mode, space)),
-            Cell.of(mode.most_likely.run),
+            *((Cell(describe_judgements(mode.preventable or ()) or NOTHING),) if judged else ()), Cell.of(mode.most_likely.run),
         ))  # fmt: skip
     metric = found.requirement.metric
     who = ("other road user",) if typed else ()
-    columns = ("mode", "representative", metric, "runs", "confirmed", *who, *space.names, "what makes it safe", "most likely")
-    return Table(columns, tuple(rows), _NOTE if rows else "")
+    columns = ("mode", "representative", metric, "runs", "confirmed", *who, *space.names, "what makes it safe",
+               *(("avoided by",) if judged else ()), "most likely")  # fmt: skip
+    note = _NOTE + (f" {KNOWN_LIMITS}" if judged else "")
+    return Table(columns, tuple(rows), note if rows else "")
 
 
 def _modes(found: Findings) -> Sequence[FailureMode]:

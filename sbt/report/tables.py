@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
 from sbt.plugins import OBJECT
 from sbt.problem.arrays import Vector
@@ -18,7 +19,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.words import SCORES, distribution_words
 from sbt.store.history import History, Record
-from sbt.store.records import FitRecord, Iteration
+from sbt.store.records import FitRecord, Iteration, Judgement
 
 __all__ = [
     "Cell",
@@ -148,8 +149,13 @@ def simulate_command(scenario: str, record: Record) -> str:
     return shlex.join(["sumo-sbt", "simulate", scenario, *inputs, "--seed", str(record.seed)])
 
 
-def critical_table(history: History, requirement: Requirement, reference: str) -> Table:
-    """Return the critical runs, the deepest in the critical interval first, at most 200."""
+def critical_table(
+    history: History, requirement: Requirement, reference: str, judgements: Sequence[Judgement] = ()
+) -> Table:
+    """Return the critical runs, the deepest in the critical interval first, at most 200, with who would have avoided them."""
+    judged: dict[int, list[Judgement]] = {}
+    for each in judgements:
+        judged.setdefault(each.run, []).append(each)
     margin = requirement.margins(history)
     found = [int(k) for k in np.argsort(margin, kind="stable") if margin[k] <= 0]
     metrics = sorted(history.metrics, key=lambda name: name != requirement.metric)
@@ -159,11 +165,13 @@ def critical_table(history: History, requirement: Requirement, reference: str) -
         rows.append((
             Cell.of(record.index), Cell.of(float(margin[k])), *(Cell.of(record.inputs[name]) for name in history.names),
             *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
+            *((Cell(describe_judgements(judged.get(record.index, ())) or NOTHING),) if judged else ()),
             Cell("command", code=simulate_command(reference, record)),
         ))  # fmt: skip
     rest = len(found) - len(rows)
     note = f"{rest:,} more critical runs are in the store: sumo-sbt export lists all." if rest else ""
-    return Table(("run", "margin", *history.names, *metrics, "seed", "again"), tuple(rows), note)
+    columns = ("run", "margin", *history.names, *metrics, "seed", *(("avoided by",) if judged else ()), "again")
+    return Table(columns, tuple(rows), " ".join(filter(None, (note, KNOWN_LIMITS if judged and rows else ""))))
 
 
 def failed_table(history: History, reference: str) -> Table:

@@ -13,7 +13,7 @@ import numpy as np
 from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State, VehicleType
 from sbt.sumo.ego import Ego
@@ -112,4 +112,5 @@ SCENARIO = LogicalScenario(
     ),
     metrics=(ttc_path_min(), nearest_distance(), any_collision(), any_impact_speed()),
     requirement=Requirement("ttc_path_min", high=0.5),
+    roles=Roles(not_judged="the other is a pedestrian: the models are of vehicles"),
 )

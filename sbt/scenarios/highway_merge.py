@@ -9,7 +9,7 @@ import numpy as np
 from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
 from sbt.sumo.ego import Ego
@@ -95,4 +95,5 @@ SCENARIO = LogicalScenario(
         others_braking_max(),
     ),
     requirement=Requirement("ttc_path_min", high=2.0),
+    roles=Roles(not_judged="ego itself changes lanes: the reference drivers keep theirs"),
 )

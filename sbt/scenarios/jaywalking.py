@@ -220,6 +220,6 @@ SCENARIO = LogicalScenario(
         ego=Ego("pedestrian_braking"),
     ),
     metrics=(MIN_DIST, COLLISION, IMPACT_SPEED),
-    roles=Roles(other="child"),
+    roles=Roles(other="child", not_judged="the other is a pedestrian: the models are of vehicles"),
     requirement=Requirement("min_dist", high=-1e-6),
 )

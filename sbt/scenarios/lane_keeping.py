@@ -17,7 +17,7 @@ from sbt.errors import InputError
 from sbt.metrics.reference_line import Curve, lateral_metrics
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import Actor, EndCondition, Obstacle, Scene, State, VehicleType
@@ -164,4 +164,5 @@ SCENARIO = LogicalScenario(
     ),
     metrics=(*lateral_metrics(ROAD), LANE_LOST),
     requirement=Requirement("pos_lat_abs_err_max", low=3.0),
+    roles=Roles(not_judged="ego steers: the reference drivers only brake, for others"),
 )  # fmt: skip

@@ -161,6 +161,6 @@ SCENARIO = LogicalScenario(
         net="parking_lot", scene=scene, duration=DURATION, step_length=0.05, ego=Ego("emergency_stop"),
     ),
     metrics=(CRITERION, D_MIN, COLLISION, V_EGO, V_CO),
-    roles=Roles(other="co_1"),
+    roles=Roles(other="co_1", not_judged="a car leaves a parking space: no manoeuvre of the models"),
     requirement=Requirement("criterion", high=-10.0),
 )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, EndCondition, Scene, State
 from sbt.sumo.ego import Ego
@@ -89,4 +89,5 @@ SCENARIO = LogicalScenario(
         others_braking_max(),
     ),
     requirement=Requirement("pet_ego_first", high=1.5),
+    roles=Roles(not_judged="ego turns across the others' way: the reference drivers drive along a lane"),
 )

@@ -24,8 +24,9 @@ from sbt.errors import StoreError
 from sbt.problem.description import described_choices
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.plain import Json, JsonMapping, Values
+from sbt.store.connection import connected, set_journal
 from sbt.store.history import PLANNED, History, Rows, as_numbers
-from sbt.store.records import FitRecord, Iteration, from_json, to_json
+from sbt.store.records import FitRecord, Iteration, Judgement, from_json, to_json
 
 __all__ = ["DATABASE", "PlannedRun", "Store"]
 
@@ -113,7 +114,7 @@ class Store:
             except BlockingIOError:
                 raise StoreError(f"a store takes one writer, but another process is writing {folder}") from None
             db = sqlite3.connect(folder / DATABASE, isolation_level=None)
-            mode = _set_journal(db, durable=durable)
+            mode = set_journal(db, durable=durable)
             store = cls(folder, db, lock)
             store._may_hurry = durable and mode == "wal"
             if db.execute("PRAGMA user_version").fetchone()[0] != 0:
@@ -138,7 +139,7 @@ class Store:
         if not cls.begun(folder):
             raise StoreError(f"a store is a folder with a campaign in its {DATABASE}, but there is none in {folder}")
         with _reported(Path(folder)):
-            store = cls(Path(folder), _connected(Path(folder) / DATABASE))
+            store = cls(Path(folder), connected(Path(folder) / DATABASE))
             store._check_version()
             return store
 
@@ -148,7 +149,7 @@ class Store:
         path = Path(folder) / DATABASE
         if not path.is_file():
             return False
-        with _reported(Path(folder)), closing(_connected(path)) as db:
+        with _reported(Path(folder)), closing(connected(path)) as db:
             return bool(db.execute("PRAGMA user_version").fetchone()[0])
 
     def __enter__(self) -> Store:
@@ -224,6 +225,16 @@ class Store:
         """Keep the result of the campaign."""
         with self._transaction():
             self._set_meta("conclusion", dict(conclusion))
+
+    @property
+    def judgements(self) -> list[Judgement]:
+        """What reference drivers made of some of the runs."""
+        return [from_json(Judgement, each) for each in self._get_meta("judgements") or []]
+
+    def judge(self, judgements: Sequence[Judgement]) -> None:
+        """Keep what reference drivers made of some of the runs, in place of what was kept."""
+        with self._transaction():
+            self._set_meta("judgements", to_json(list(judgements)))
 
     def plan(
         self, iteration: int, stage: str, runs: Sequence[PlannedRun], seeds: Sequence[int], proposal: object,
@@ -361,27 +372,6 @@ def _checksum(*parts: Any) -> int:
 
 def _dump(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"), allow_nan=False)
-
-
-def _connected(path: Path) -> sqlite3.Connection:
-    """Open a file for reading only."""
-    address = path.resolve().as_uri()
-    db = sqlite3.connect(f"{address}?mode=ro", uri=True, isolation_level=None)
-    try:
-        db.execute("PRAGMA schema_version").fetchone()
-    except sqlite3.OperationalError:  # a WAL file that may not be written beside: read what is committed
-        db.close()
-        db = sqlite3.connect(f"{address}?immutable=1", uri=True, isolation_level=None)
-    return db
-
-
-def _set_journal(db: sqlite3.Connection, *, durable: bool) -> str:
-    """Use WAL, or the DELETE journal where the file system cannot; return which."""
-    mode = db.execute("PRAGMA journal_mode = WAL").fetchone()[0]
-    if mode != "wal":
-        db.execute("PRAGMA journal_mode = DELETE")
-    db.execute(f"PRAGMA synchronous = {'FULL' if durable else 'OFF'}")
-    return str(mode)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from sbt.errors import StoreError
 from sbt.problem.plain import Json, JsonMapping
 
-__all__ = ["FitRecord", "Iteration", "Validation", "from_json", "optional", "to_json"]
+__all__ = ["FitRecord", "Iteration", "Judgement", "Validation", "from_json", "optional", "to_json"]
 
 T = TypeVar("T")
 
@@ -150,3 +150,24 @@ class Iteration:
     def read(self, kind: type[T]) -> T:
         """Return how it was chosen as the stage's own record."""
         return from_json(kind, self.proposal)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a reference driver in the place of the ego made of a run: the same inputs, the same seed.
+
+    Attributes:
+        run: index of the run that is judged.
+        driver: which one.
+        avoided: the requirement holds with it; None: it cannot judge the run.
+        collision: it has a collision; None where it cannot judge.
+        metric: the requirement's metric with it; None where there is none.
+        reason: why it cannot judge; "" where it can.
+    """
+
+    run: int
+    driver: str
+    avoided: bool | None
+    collision: bool | None = None
+    metric: float | None = None
+    reason: str = ""

@@ -105,7 +105,8 @@ class Ego:
         Args:
             rng: random generator of the run.
             set_speed: initial and desired speed (m/s).
-            overrides: settings that the scenario determines; they take precedence.
+            overrides: settings that the scenario determines; they take precedence. A controller that is `complete`, such as
+                a reference driver, takes none of them.
 
         Raises:
             InputError: the controller does not take the settings.
@@ -113,7 +114,7 @@ class Ego:
         if self.kind == SUMO:
             return None
         factory = plugins.load("controllers", self.kind)
-        settings = {**dict(self.settings), **overrides}
+        settings = {**dict(self.settings), **({} if getattr(factory, "complete", False) else overrides)}
         try:
             built: Controller = factory(rng, set_speed, **settings)
         except TypeError as error:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from sbt.campaigns.preventable import with_judgements
 from sbt.errors import InputError, did_you_mean
 from sbt.files import write_atomically
 from sbt.plugins import Objects
 from sbt.store.database import Store
 from sbt.store.history import named_columns
 from sbt.workflows.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["FORMS", "export_store"]
 
@@ -37,15 +42,20 @@ def export_store(folder: Path, form: str = "csv", *, objects: Objects | None = N
         return FORMS[form](store, Study.from_store(store, objects=objects))
 
 
+def _frame(store: Store, study: Study) -> pd.DataFrame:
+    """Return a row a run, with its verdict, and what reference drivers made of it where they were asked."""
+    return with_judgements(store.history().to_frame(study.scenario.requirement), store.judgements)
+
+
 def _as_csv(store: Store, study: Study) -> Path:
     """Write one row a run."""
-    frame = store.history().to_frame(study.scenario.requirement)
+    frame = _frame(store, study)
     return write_atomically(store.folder / "exports" / "runs.csv", lambda part: frame.to_csv(part, index=False))
 
 
 def _as_parquet(store: Store, study: Study) -> Path:
     """Write one row a run."""
-    frame = store.history().to_frame(study.scenario.requirement)
+    frame = _frame(store, study)
     return write_atomically(store.folder / "exports" / "runs.parquet", lambda part: frame.to_parquet(part, index=False))
 
 

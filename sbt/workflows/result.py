@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import html
 import tempfile
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from sbt.campaigns.preventable import with_judgements
 from sbt.campaigns.wording import plural
 from sbt.errors import InputError, StoreError
 from sbt.loop.learner import FittedMetamodel
@@ -20,8 +22,9 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import History
-from sbt.store.records import FitRecord
+from sbt.store.records import FitRecord, Judgement
 from sbt.workflows.exporting import export_store
+from sbt.workflows.judging import judge_run
 from sbt.workflows.plots import Plots
 from sbt.workflows.prediction import inputs_from, predict_inputs
 from sbt.workflows.running import Replay, rebuild_report, replay_run
@@ -98,7 +101,32 @@ class Result(Generic[C]):
     @cached_property
     def frame(self) -> pd.DataFrame:
         """A row a run: x.<input>, y.<metric>, critical, margin, status, stage, iteration, seed, log_q, reason, ..."""
-        return self.history.to_frame(self.scenario.requirement)
+        return with_judgements(self.history.to_frame(self.scenario.requirement), self.judgements)
+
+    @cached_property
+    def judgements(self) -> list[Judgement]:
+        """What reference drivers in the place of the ego made of the failures."""
+        with Store.read(self.store) as store:
+            return store.judgements
+
+    def preventable(self, run: int | None = None, drivers: Sequence[str] | None = None) -> pd.DataFrame:
+        """Return which reference drivers would have avoided a run: the same inputs and seed, with each in the place of the ego.
+
+        Args:
+            run: its index, executed with each driver unless that was done; None: the runs that the campaign has judged.
+            drivers: kinds of ego; None: those of the campaign, or cc_human, reg157, rss and fsm.
+
+        Returns:
+            A row a run and driver: run, driver, avoided (NA: not applicable), collision, metric, reason.
+
+        Raises:
+            InputError: there is no such run or driver, or the scenario's code is not at hand.
+        """
+        import pandas as pd
+
+        found = self.judgements if run is None else judge_run(self.store, run, drivers, objects=self.objects)
+        frame = pd.DataFrame([vars(each) for each in found], columns=[f.name for f in fields(Judgement)])
+        return frame.astype({"avoided": "boolean", "collision": "boolean", "metric": float})
 
     @cached_property
     def fitted(self) -> FittedMetamodel | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,12 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import Record
+from sbt.workflows.judging import judge_campaign
 from sbt.workflows.study import RESOLVED, Study
 
 __all__ = ["Replay", "Summary", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
 
-_MAY_CHANGE = {"budget", "folder", "yaml", "described", "kind"}
+_MAY_CHANGE = {"budget", "folder", "yaml", "described", "kind", "judges"}
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
 
@@ -100,6 +101,8 @@ def run_study(
                 finished = run_stages(campaign, store, executor, budget=study.budget, **common)
             else:
                 finished = run_shard(campaign, shard, store, executor, **common)
+        if shard is None:
+            finished = replace(finished, conclusion=judge_campaign(study, store, finished.conclusion))
         summary = summarise(store, study, finished)
         store.conclude(summary.to_dict())
         if report and shard is None:

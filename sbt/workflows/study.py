@@ -182,15 +182,20 @@ class Study:
         """Number of runs, those included that only score."""
         return self.config.budget + self.config.validation.reference
 
-    def executor(self) -> Executor:
-        """Return what executes the runs, as configured."""
-        choice = self.config.executor
+    def executor(self, spec: ScenarioSpec | None = None, *, workers: int | None = None) -> Executor:
+        """Return what executes the runs, as configured.
+
+        Args:
+            spec: of the scenario; None: the study's own.
+            workers: processes; None: as configured.
+        """
+        choice, scenario = self.config.executor, self.spec if spec is None else spec
         limit = None if choice.timeout == float("inf") else choice.timeout
         if choice.kind == "serial":
-            return SerialExecutor(self.spec, limit)
+            return SerialExecutor(scenario, limit)
         if choice.kind == "dask":
-            return DaskExecutor(self.spec, choice.address, choice.workers, limit)
-        return LocalExecutor(self.spec, choice.workers, limit)
+            return DaskExecutor(scenario, choice.address, choice.workers, limit)
+        return LocalExecutor(scenario, choice.workers if workers is None else workers, limit)
 
     def snapshot(self, shard: Shard | None = None) -> Json:
         """Return what the store remembers of the configuration: plain JSON, and the YAML to read back."""
