@@ -9,17 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import qmc
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Points
 from sbt.seeds import stream
 
+if TYPE_CHECKING:
+    from scipy.stats import qmc  # takes a second to import
+
 __all__ = ["SobolSequence"]
 
 _BITS = 32  # the most that SciPy's fast_forward takes; 4.3e9 positions
+_MOST_DIMENSIONS = 21201  # of SciPy's direction numbers
 _HALF_CELL = 0.5 * 2.0**-_BITS
 _LOCK = Lock()
 
@@ -48,8 +52,8 @@ class SobolSequence:
     seed: int
 
     def __post_init__(self) -> None:
-        if not 1 <= self.dimension <= qmc.Sobol.MAXDIM:
-            raise InputError(f"a Sobol sequence needs 1 <= dimension <= {qmc.Sobol.MAXDIM}, but got {self.dimension}")
+        if not 1 <= self.dimension <= _MOST_DIMENSIONS:
+            raise InputError(f"a Sobol sequence needs 1 <= dimension <= {_MOST_DIMENSIONS}, but got {self.dimension}")
 
     def points(self, start: int, stop: int) -> Points:
         """Return the points at positions start, ..., stop - 1, strictly inside the unit cube.
@@ -85,4 +89,6 @@ class SobolSequence:
 @lru_cache(maxsize=8)
 def _engine(dimension: int, seed: int) -> qmc.Sobol:
     """Return the engine at any position: the next points mostly follow those it gave last."""
+    from scipy.stats import qmc
+
     return qmc.Sobol(dimension, scramble=True, bits=_BITS, rng=stream(seed, "sobol", dimension))

@@ -26,7 +26,6 @@ from sbt.store.records import FitRecord, Judgement
 from sbt.workflows.exporting import export_store
 from sbt.workflows.judging import judge_run
 from sbt.workflows.plots import Plots
-from sbt.workflows.prediction import inputs_from, predict_inputs
 from sbt.workflows.running import Replay, rebuild_report, replay_run
 from sbt.workflows.showing import net_of_run, save_film, shown_trace
 from sbt.workflows.study import Study
@@ -153,6 +152,8 @@ class Result(Generic[C]):
             InputError: a column is missing, a value is outside of its range, or there is no metamodel.
         """
         import pandas as pd
+
+        from sbt.workflows.prediction import inputs_from, predict_inputs  # all metamodels, and so torch
 
         table = predict_inputs(
             self.store, lambda space: inputs_from(inputs, space), device=device, objects=self.objects
