@@ -214,9 +214,9 @@ def test_any_number_of_inputs(tmp_path, d, held_out, predictor):
 def test_thousands_of_runs_stay_a_small_file(tmp_path):
     scenario = scenario_of(5)
     with fill(tmp_path, scenario, 4500, 500) as store:
-        start = time.perf_counter()
+        start = time.process_time()
         path = write_report(store, scenario, predict, None)
-        assert time.perf_counter() - start < 20
+        assert time.process_time() - start < 10
     assert path.stat().st_size < 3_000_000
     assert "more critical runs are in the store" in path.read_text(encoding="utf-8")
 
