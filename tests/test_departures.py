@@ -6,78 +6,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from departing import ANYWHERE, NET, car, flow, run, stopped
 
 from sbt.errors import RunError
-from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.geometry import overlap_depth, rectangle_distance
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import Action, Actor, Obstacle, Scene, VehicleType
 from sbt.sumo.simulation import SumoSimulation
 
-NET = """<net version="1.20" junctionCornerDetail="5" limitTurnSpeed="5.50">
-    <location netOffset="0.00,0.00" convBoundary="0.00,0.00,600.00,0.00" origBoundary="0.00,0.00,600.00,0.00" projParameter="!"/>
-    <edge id=":mid_0" function="internal">
-        <lane id=":mid_0_0" index="0" speed="50.00" length="10.00" shape="300.00,-4.80 310.00,-4.80"/>
-        <lane id=":mid_0_1" index="1" speed="50.00" length="10.00" shape="300.00,-1.60 310.00,-1.60"/>
-    </edge>
-    <edge id="road" from="west" to="mid" priority="1">
-        <lane id="road_0" index="0" speed="50.00" length="300.00" shape="0.00,-4.80 300.00,-4.80"/>
-        <lane id="road_1" index="1" speed="50.00" length="300.00" shape="0.00,-1.60 300.00,-1.60"/>
-    </edge>
-    <edge id="next" from="mid" to="east" priority="1">
-        <lane id="next_0" index="0" speed="50.00" length="290.00" shape="310.00,-4.80 600.00,-4.80"/>
-        <lane id="next_1" index="1" speed="50.00" length="290.00" shape="310.00,-1.60 600.00,-1.60"/>
-    </edge>
-    <junction id="west" type="dead_end" x="0.00" y="0.00" incLanes="" intLanes="" shape="0.00,0.00 0.00,-6.40"/>
-    <junction id="mid" type="priority" x="305.00" y="0.00" incLanes="road_0 road_1" intLanes=":mid_0_0 :mid_0_1" shape="300.00,0.00 310.00,0.00 310.00,-6.40 300.00,-6.40">
-        <request index="0" response="00" foes="00" cont="0"/>
-        <request index="1" response="00" foes="00" cont="0"/>
-    </junction>
-    <junction id="east" type="dead_end" x="600.00" y="0.00" incLanes="next_0 next_1" intLanes="" shape="600.00,-6.40 600.00,0.00"/>
-    <connection from="road" to="next" fromLane="0" toLane="0" via=":mid_0_0" dir="s" state="M"/>
-    <connection from="road" to="next" fromLane="1" toLane="1" via=":mid_0_1" dir="s" state="M"/>
-    <connection from=":mid_0" to="next" fromLane="0" toLane="0" dir="s" state="M"/>
-    <connection from=":mid_0" to="next" fromLane="1" toLane="1" dir="s" state="M"/>
-</net>
-"""
-HEAD = '<routes><vType id="car" length="5" width="1.8" sigma="0"/><vType id="truck" length="16.5" width="2.5" vClass="truck" sigma="0"/><vType id="bus" length="12" width="2.5" vClass="bus" sigma="0"/><vType id="unused" length="${p + 1}"/><route id="all" edges="road next"/><route id="end" edges="next"/>'
-YAML = "sumo: {{net: net.net.xml, routes: [cars.rou.xml], options: {{{options}}}}}\ninputs: {{p: {{min: 0, max: 500}}}}\nego: {{id: {ego}{more}}}\nduration: 5\nothers: {{within: 120}}\nmetrics: [ttc_min, collision]\nrequirement: {{metric: ttc_min, critical: [-.inf, 1.0]}}\n"
-ANYWHERE = 'insertionChecks="none"'
 Case = Callable[..., tuple[str, str]]
-
-
-def car(name: str, pos: str, *, kind: str = "car", route: str = "all", depart: str = "0", speed: str = "0", lane: str = "0", more: str = ANYWHERE, inner: str = "") -> str:
-    return f'<vehicle id="{name}" type="{kind}" route="{route}" depart="{depart}" departLane="{lane}" departPos="{pos}" departSpeed="{speed}" {more}>{inner}</vehicle>\n'
-
-
-def stopped(lane: str, end: float, more: str = "") -> str:
-    return f'<stop lane="{lane}" startPos="{max(end - 20, 0)}" endPos="{end}" duration="100" {more}/>'
 
 
 @pytest.fixture
 def case(tmp_path: Path) -> Case:
-    """Run the ego among the vehicles of a route file; returns the status and the reason, or why the run ended."""
-
-    def run(vehicles: str, p: float = 100.0, *, ego: str = "ego", more: str = "", **options: str) -> tuple[str, str]:
-        folder = tmp_path / str(len(list(tmp_path.iterdir())))  # each file is read once per process
-        folder.mkdir()
-        (folder / "net.net.xml").write_text(NET)
-        (folder / "cars.rou.xml").write_text(f"{HEAD}\n{vehicles}</routes>")
-        written = ", ".join(f"{name.replace('_', '-')}: {value}" for name, value in options.items())
-        (folder / "scenario.yaml").write_text(YAML.format(ego=ego, more=more, options=written))
-        scenario = ScenarioSpec(str(folder / "scenario.yaml")).resolve()
-        try:
-            return "ok", scenario.simulate({"p": p}, 1).ended
-        except RunError as error:
-            return str(error.status), error.reason
-
-    return run
+    return partial(run, tmp_path)
 
 
 EGO = car("ego", "${p}", speed="5")
@@ -90,6 +39,7 @@ INSIDE: list[Any] = [
     ("a stopped bus", car("other", "120", kind="bus", inner=stopped("road_0", 120)) + car("ego", "${p}", depart="2", speed="5"), 110),
     ("a person who walks on the edge", '<person id="other" depart="0" departPos="100"><walk edges="road" arrivalPos="290"/></person>' + car("ego", "${p}", depart="1", speed="5", more=ANYWHERE + ' departPosLat="right"'), 103),
     ("one that starts where it will park", car("other", "stop", inner=stopped("road_0", 100, 'parking="true"')) + EGO, 100),
+    ("one that crosses the junction where its tail is", car("other", "299", speed="5", more=ANYWHERE + ' speedFactor="0.1"') + car("ego", "1", depart="2", route="end", speed="1"), 0),
     ("one on the same departPos=base", car("other", "stop", inner=stopped("road_0", 7)) + car("ego", "base", depart="1"), 0),
 ]  # fmt: skip
 CLEAR: list[Any] = [
@@ -116,10 +66,6 @@ def test_an_ego_that_starts_inside_somebody_is_invalid_and_says_inside_whom(case
 def test_an_ego_that_starts_next_to_somebody_is_fine(case, vehicles, p):
     status, reason = case(vehicles, p)
     assert (status, reason) in (("ok", "duration"), ("ok", "collision")), reason
-
-
-def flow(pos: str, *, begin: str = "0", period: str = "0.5", speed: str = "5", more: str = "", name: str = "f") -> str:
-    return f'<flow id="{name}" type="car" route="all" begin="{begin}" end="100" period="{period}" departLane="0" departPos="{pos}" departSpeed="{speed}" {more}/>\n'
 
 
 APPEARING: list[Any] = [
@@ -179,6 +125,15 @@ def test_the_advice_lets_a_held_back_ego_in(case, vehicles, options, rounds):
         assert (status, bool(re.search(r"cars.rou.xml:\d+:1: 'ego' must depart at t = .* but SUMO holds it back, as ", reason))) == ("invalid", True), reason
         vehicles, more, options = advised(reason, vehicles, more, options)
     assert case(vehicles, more=more, **options)[0] == "ok"
+
+
+@pytest.mark.sumo
+def test_traffic_that_the_options_leave_out_is_not_missed(case):
+    """Vehicles with placeholders that depart before the beginning, or that `scale` drops."""
+    early = car("early", "${p + 50}", depart="1") + car("ego", "10", depart="5")
+    assert case(early, begin="4")[0] == "ok"
+    thinned = "".join(car(f"o{k}", f"${{p + {20 * k}}}") for k in range(6)) + '<vType id="own" scale="2"/>' + car("ego", "10", kind="own")
+    assert case(thinned, scale="0.5")[0] == "ok"
 
 
 @pytest.mark.sumo
@@ -249,16 +204,9 @@ def simulate(sumo, values, rng):
     ],
     ids=["inside", "right behind", "put right before it", "put onto it", "held back", "added to an empty road"],
 )
-def test_the_same_holds_for_loops(tmp_path, changed, status, message):
-    (tmp_path / "net.net.xml").write_text(NET)
-    (tmp_path / "loop.py").write_text(LOOP.format(**{"checks": "none", "empty": 0, "speed": 5, "depart": "now", **changed}))
-    tail = YAML.format(ego="ego", more="", options="").split("\n", 1)[1]
-    (tmp_path / "scenario.yaml").write_text("simulate: loop.py:simulate\n" + tail)
-    scenario = ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve()
-    try:
-        found = "ok", scenario.simulate({"p": 100}, 1).ended
-    except RunError as error:
-        found = str(error.status), error.reason
+def test_the_same_holds_for_loops(case, changed, status, message):
+    loop = LOOP.format(**{"checks": "none", "empty": 0, "speed": 5, "depart": "now", **changed})
+    found = case("", loop=loop)
     assert (found[0], bool(re.search(message, found[1]))) == (status, True), found
 
 

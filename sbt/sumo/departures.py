@@ -112,6 +112,7 @@ class DepartureMonitor:
     ):  # fmt: skip
         self._sumo, self._ego, self._files, self._values = sumo, ego, files, values
         self._start = float(sumo.simulation.getTime())
+        self._in_files = files.vehicle(ego.id) is not None
         self._requested: dict[str, RequestedDeparture] = {}
         self._due: list[tuple[float, str]] = []
         self._places: dict[str, str] = {}
@@ -159,8 +160,7 @@ class DepartureMonitor:
             RunError: it cannot depart any more, or has waited too long.
         """
         name, now = self._ego.id, float(self._sumo.simulation.getTime())
-        in_files = self._files.vehicle(name) is not None
-        if in_files and self._sumo.simulation.getMinExpectedNumber() == 0:
+        if self._in_files and self._sumo.simulation.getMinExpectedNumber() == 0:
             self._refuse(name)
         if self._deadline(name) < math.inf:
             return
@@ -195,8 +195,8 @@ class DepartureMonitor:
     def _refuse(self, name: str) -> None:
         """Raise the error for a vehicle that has not departed in time, with the cause."""
         requested, is_ego = self._requested.get(name, RequestedDeparture("", None, None, None, None)), name == self._ego.id
-        if not is_ego and self._files.options.get("scale") is not None and self._delay(name) is None:
-            self.ignore(name)  # thinning the traffic is what the option asks for
+        if not is_ego and self._delay(name) is None and self._left_out(requested):
+            self.ignore(name)
             return
         rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
         if self._delay(name) is None:
@@ -206,6 +206,10 @@ class DepartureMonitor:
         tolerance = ", or let it wait: ego: {delay: SECONDS}" if is_ego else ""
         held = f"but SUMO holds it back, as {why}: {remedy}{tolerance}"
         raise RunError(Status.INVALID, f"{rule}{f', {gap}' if gap else ''}, {held}")
+
+    def _left_out(self, requested: RequestedDeparture) -> bool:
+        """Return whether options ask for leaving out a vehicle of the traffic: a part of it, or what departs too early."""
+        return "scale" in self._files.options or (requested.depart is not None and requested.depart < self._start)
 
     def _when(self, name: str, requested: RequestedDeparture) -> str:
         """Return until when a vehicle must depart, as text."""

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
@@ -35,9 +34,12 @@ from sbt.seeds import stream
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture, WaitingEgo, number_or_none, requested_departures
 from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
+from sbt.sumo.foreign import check_not_stepped, error_in_loop, place_in_loop, started_another
 from sbt.sumo.formatting import plain, plain_values
 from sbt.sumo.guided import Motion, Participant
 from sbt.sumo.levels import levels_of
+from sbt.sumo.messages import explained
+from sbt.sumo.phases import PHASES, Stopwatch
 from sbt.sumo.recorder import Recorder, RecordingSettings, RunEnded
 from sbt.sumo.session import scratch_folder, session
 
@@ -127,7 +129,18 @@ class UserSimulation:
             RunError: SUMO or the loop fails, a vehicle departs differently than requested, the ego is absent
                 or leaves, or the run takes too long.
         """
-        return self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"))
+        return self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"), Stopwatch())
+
+    def timed(self, values: Values, seed: int) -> tuple[Trace | RunError, dict[str, float]]:
+        """Return what a call gives, its error too, and the CPU seconds of each phase (`sbt.sumo.phases`)."""
+        watch = Stopwatch()
+        result: Trace | RunError
+        try:
+            result = self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"), watch)
+        except RunError as error:
+            result = error
+        watch.enter(watch.phase)
+        return result, watch.seconds
 
     def warnings(self) -> tuple[str, ...]:
         """Return SUMO's warnings about the files in the last run of this process, each once, and that on missing heights."""
@@ -148,7 +161,7 @@ class UserSimulation:
         Returns:
             The trace, identical to that of a call.
         """
-        return self._run(values, seed, lambda launch: _traci_connection(traci, [*program, *launch.command(seed)]))
+        return self._run(values, seed, lambda launch: _traci_connection(traci, [*program, *launch.command(seed)]), Stopwatch())
 
     def files_of_run(self, values: Values, seed: int) -> SumoFiles:
         """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.
@@ -162,7 +175,7 @@ class UserSimulation:
             found.append(files)
             raise RunEnded("start")
 
-        proxy = TraciProxy(self, plain_values(values), seed, stop)
+        proxy = TraciProxy(self, plain_values(values), seed, stop, Stopwatch())
         with contextlib.chdir(self.folder), contextlib.suppress(RunEnded):
             if self.files is not None:
                 proxy.start_files(self.files)
@@ -171,7 +184,7 @@ class UserSimulation:
             raise RunError(Status.FAILED, "a loop must call sumo.start([...]), but it did not")
         return found[0]
 
-    def _run(self, values: Values, seed: int, connect: Connect) -> Trace:
+    def _run(self, values: Values, seed: int, connect: Connect, watch: Stopwatch) -> Trace:
         proxy: TraciProxy | None = None
         given = plain_values(values)
         try:
@@ -181,13 +194,13 @@ class UserSimulation:
                 def start(files: SumoFiles) -> Any:
                     return stack.enter_context(connect(files.launch(given, scratch_folder(), self.step)))
 
-                proxy = TraciProxy(self, given, seed, start)
+                proxy = TraciProxy(self, given, seed, start, watch)
                 if self.files is not None:
                     proxy.start_files(self.files)
                 ended = proxy.run_loop()
                 return proxy.recorder.trace(ended)
         except RunError as error:
-            raise RunError(error.status, f"{error.reason}{proxy.error_place if proxy is not None else ''}") from None
+            raise RunError(error.status, error.reason if proxy is None else proxy.explained(error.reason)) from None
 
 
 class TraciProxy:
@@ -198,19 +211,27 @@ class TraciProxy:
         values: inputs of the run.
         seed: of the run.
         connect: starts SUMO with files and returns its client module.
-
-    Attributes:
-        error_place: ` (file:line)` of the user's code where an error was raised, "" without one.
+        watch: of the phases of the run.
     """
 
-    def __init__(self, simulation: UserSimulation, values: Values, seed: int, connect: Callable[[SumoFiles], Any]):
+    def __init__(
+        self, simulation: UserSimulation, values: Values, seed: int, connect: Callable[[SumoFiles], Any],
+        watch: Stopwatch,
+    ):  # fmt: skip
         self._user_simulation, self._values, self._seed, self._connect = simulation, values, seed, connect
+        self._watch = watch
+        self._files: SumoFiles | None = None
+        self._time = 0.0
         self._module: Any = None
         self._recorder: Recorder | None = None
         self._motions: tuple[Motion, ...] = ()
         self.simulation = _SimulationProxy(self)
         self.vehicle, self.person = _CommandProxy(self, "vehicle"), _CommandProxy(self, "person")
-        self.error_place = ""
+        self._error_place = ""
+
+    def explained(self, reason: str) -> str:
+        """Return the reason of an error with its place in the files and in the loop, and what to change."""
+        return f"{reason if self._files is None else explained(reason, self._files)}{self._error_place}"
 
     def __getattr__(self, name: str) -> Any:
         """Return the attribute of SUMO's client module."""
@@ -222,7 +243,8 @@ class TraciProxy:
     def recorder(self) -> Recorder:
         """The recorder of the run."""
         if self._recorder is None:
-            raise RunError(Status.FAILED, "a loop must call sumo.start([...]), but it did not")
+            why = started_another(self._user_simulation.loop)
+            raise RunError(Status.FAILED, f"a loop must call sumo.start([...]), but it did not{why}")
         return self._recorder
 
     def start(self, command: Sequence[str], *_: Any, **__: Any) -> tuple[int, str]:
@@ -246,25 +268,32 @@ class TraciProxy:
             path.write_text(f"<additional>{vehicle_type}</additional>")
             files = replace(files, additional=(*files.additional, path))
         requested = requested_departures(files, self._values, ego.id)
+        self._files = files
         self._module = self._connect(files)
+        self._time = float(self._module.simulation.getTime())
         waiting = WaitingEgo(ego.id, ego.delay, simulation.recording.wait)
         departures = DepartureMonitor(self._module, waiting, requested, files, self._values)
         rng = stream(self._seed, "ego")
         self._recorder = Recorder(self._module, simulation.recording, rng, departures, simulation.timeout)
         self._motions = tuple(p.begin(self._module, self._values) for p in simulation.participants)
+        self._watch.enter(PHASES[1])
 
     def simulationStep(self, until: float = 0.0) -> None:  # noqa: N802  (SUMO's name)
         """Make one step, or all steps until a time (s), and record each."""
         while True:
             recorder = self.recorder
             recorder.before_step()
+            check_not_stepped(self._module, self._time, self._user_simulation.loop)
             for motion in self._motions:
                 motion.before_step(recorder.scenario_time)
             self._module.simulationStep()
+            self._time = float(self._module.simulation.getTime())
             if self._motions:
                 recorder.place({name: state for motion in self._motions for name, state in motion.after_step().items()})
             recorder.after_step()
-            if self._module.simulation.getTime() >= until - 1e-9:
+            if self._watch.phase != PHASES[2] and recorder.scenario_time is not None:
+                self._watch.enter(PHASES[2])
+            if self._time >= until - 1e-9:
                 return
 
     def close(self, *_: Any) -> None:
@@ -283,23 +312,19 @@ class TraciProxy:
         except RunEnded as end:
             return end.reason
         except BaseException as error:  # SystemExit too
-            self.error_place = _place_in_loop(error, loop)
-            if isinstance(error, RunError) or "TraCI" in type(error).__name__ or interruption.is_interruption(error):
+            self._error_place = "" if loop is step_until_over else place_in_loop(error, loop)
+            if isinstance(error, RunError) or interruption.is_interruption(error):
                 raise
-            message = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
-            raise RunError(Status.FAILED, message) from error
+            translated = error_in_loop(error, self._module)
+            if translated is error:
+                raise
+            raise translated from error
         if self._recorder is not None and self._recorder.ended:  # a bare `except` in the loop has caught the end
             return self._recorder.ended
         if self._module is not None:
+            check_not_stepped(self._module, self._time, loop)
             self._module.simulationStep()  # SUMO holds pointers to actors moved since the last step, which a load would free
         return "loop"
-
-
-def _place_in_loop(error: BaseException, loop: Loop) -> str:
-    """Return the last line of the user's file in the traceback of an error, as ` (file:line)`."""
-    file = getattr(getattr(loop, "__code__", None), "co_filename", "")
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-    return f" ({file}:{lines[-1]})" if lines and loop is not step_until_over else ""
 
 
 class _SimulationProxy:

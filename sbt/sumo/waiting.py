@@ -15,6 +15,8 @@ __all__ = ["why_held_back"]
 _BASE_MARGIN = 0.1
 """How far behind the rear bumper `departPos="base"` begins, as in SUMO (m)."""
 _DEPARTING = ("vehicle", "trip", "flow")
+_TRIGGERS = ("triggered", "containerTriggered", "split")
+"""Words for departures that others cause."""
 
 
 class _Requested(Protocol):
@@ -39,6 +41,8 @@ def why_held_back(sumo: Any, name: str, requested: _Requested, files: SumoFiles)
     checks = checks if checks is not None else files.options.get("insertion-checks", "all")
     state = _requested_state(sumo, name, requested, found.attributes if found is not None else {})
     gap = _gap_ahead(sumo, name, requested)
+    if found is not None and found.depart in _TRIGGERS:
+        return gap, f'its depart="{found.depart}" waits for somebody who rides in it', "give it a depart in seconds"
     queue = _queue_before(sumo, name)
     if queue and files.options.get("eager-insert") not in ("true", "1"):
         why = f"'{queue}' waits before it to depart on the same edge, and SUMO tries no other one there"
@@ -50,8 +54,6 @@ def why_held_back(sumo: Any, name: str, requested: _Requested, files: SumoFiles)
     if taken is not None:
         why = f"its place is taken by '{taken[0]}' (they would overlap by {taken[1]:.2g} m)"
         return gap, why, "move its departPos, or let it depart at another time"
-    if checks == "none":
-        return gap, f"its depart is '{_depart(found)}'", "give it a depart in seconds"
     why = "its insertion checks find that unsafe"
     if found is None:
         return gap, why, "start SUMO with the option insertion-checks: none, which lets in every vehicle unchecked"
@@ -59,10 +61,6 @@ def why_held_back(sumo: Any, name: str, requested: _Requested, files: SumoFiles)
         flow = f"it is one of the flow '{found.attributes['id']}'"
         return gap, why, f'give it a <vehicle> of its own with insertionChecks="none", as {flow}'
     return gap, why, 'set insertionChecks="none" on the vehicle'
-
-
-def _depart(found: Any) -> str:
-    return str(found.depart) if found is not None else "now"
 
 
 def _queue_before(sumo: Any, name: str) -> str:

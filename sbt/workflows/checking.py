@@ -20,6 +20,8 @@ from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.seeds import run_seed
+from sbt.workflows.findings import Finding
+from sbt.workflows.rehearsal import rehearse
 
 __all__ = ["Finding", "check_scenario"]
 
@@ -31,15 +33,6 @@ _RUN_DEADLINE = 60.0
 """Longest run (s), where the scenario looks at the clock."""
 _WORKER_DEADLINE = 300.0
 """Longest wait (s) for the worker process."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One rule of the contract, whether it holds, and what was seen."""
-
-    rule: str
-    ok: bool
-    detail: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,7 +53,8 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
         scenario: the configured scenario, where its ranges or requirement differ from those of `spec`.
 
     Returns:
-        One finding a rule; what SUMO warned of and, at last, whether both sides of the requirement were met is only information.
+        One finding a rule. What SUMO warned of, the share of invalid runs, where the time goes and, at last, whether both
+        sides of the requirement were met are only information.
 
     Raises:
         InputError: the scenario cannot be loaded.
@@ -70,7 +64,7 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
     first = _runs(spec, jobs)
     warned = _warned(spec)
-    findings = [_all_ok(first, points), _finite(first, asked), *warned]
+    findings = [_all_ok(first, points), _finite(first, asked), *warned, *rehearse(spec, asked, seed)]
     if not findings[0].ok:
         return tuple(findings)
     again = _runs(spec, jobs[::-1])[::-1]

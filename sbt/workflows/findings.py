@@ -1,0 +1,18 @@
+"""What a check of a scenario finds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+__all__ = ["Finding"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One rule of the contract, whether it holds, what was seen, and the same as numbers by name."""
+
+    rule: str
+    ok: bool
+    detail: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)
