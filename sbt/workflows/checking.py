@@ -20,6 +20,7 @@ from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.seeds import run_seed
+from sbt.workflows.comparing import compared_times
 from sbt.workflows.findings import Finding
 from sbt.workflows.rehearsal import rehearse
 
@@ -72,6 +73,7 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
     findings.append(_in_worker(spec, jobs, first, points))
     findings += _isolations(spec, jobs, points)
     findings.append(_sides(first, asked))
+    findings += [Finding(f"for information: {name}", ok=True, detail=said) for name, said in compared_times(asked, jobs)]
     return tuple(findings)
 
 
