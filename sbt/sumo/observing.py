@@ -50,6 +50,7 @@ class Observed:
         running: vehicles on the road when it entered.
         stay: how long it drove (s), so far if it was still there in the end.
         neighbours: mean number of others within 50 m.
+        busiest: how long after its departure most others were that near (s).
     """
 
     id: str
@@ -62,6 +63,7 @@ class Observed:
     running: int
     stay: float = 0.0
     neighbours: float = 0.0
+    busiest: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,6 @@ class Traffic:
     Args:
         vehicles: in the order of their departure.
         most: most vehicles on the road at once.
-        steps: vehicle-steps from the beginning until the last departure, a measure of what a run costs.
         junctions: the junctions that each observed edge leads from and to.
         types: properties of the types of the vehicles, by type id: `tau`, `decel`, `emergencyDecel`, `maxSpeed`.
     """
@@ -113,7 +114,7 @@ def observe(files: SumoFiles, values: Mapping[str, float], wanted: str | None = 
 def _watch(sumo: Any, wanted: str | None) -> Traffic:
     found: dict[str, Observed] = {}
     gone: dict[str, float] = {}
-    counts: dict[str, list[int]] = {}
+    counts: dict[str, list[tuple[float, int]]] = {}
     first, most, steps, clock = None, 0, 0, time.monotonic() + _CLOCK
     while sumo.simulation.getMinExpectedNumber() > 0 and time.monotonic() < clock:
         sumo.simulationStep()
@@ -131,7 +132,7 @@ def _watch(sumo: Any, wanted: str | None) -> Traffic:
             break
     end = float(sumo.simulation.getTime())
     vehicles = tuple(
-        replace(v, stay=gone.get(v.id, end) - v.depart, neighbours=float(np.mean(counts.get(v.id, [0])))) for v in found.values()
+        _surrounded(replace(v, stay=gone.get(v.id, end) - v.depart), counts.get(v.id, [])) for v in found.values()
     )
     edges = {edge for v in vehicles for edge in v.route}
     junctions = {edge: (sumo.edge.getFromJunction(edge), sumo.edge.getToJunction(edge)) for edge in sorted(edges)}
@@ -156,16 +157,24 @@ def _properties(sumo: Any, name: str) -> dict[str, float]:
     }  # fmt: skip
 
 
-def _count_neighbours(sumo: Any, counts: dict[str, list[int]]) -> None:
+def _surrounded(vehicle: Observed, counts: list[tuple[float, int]]) -> Observed:
+    """Return a vehicle with how many others were near, and when most of them."""
+    if not counts:
+        return vehicle
+    time, _ = max(counts, key=lambda one: one[1])
+    return replace(vehicle, neighbours=float(np.mean([n for _, n in counts])), busiest=time - vehicle.depart)
+
+
+def _count_neighbours(sumo: Any, counts: dict[str, list[tuple[float, int]]]) -> None:
     """Append to the counts of every vehicle how many others are within 50 m now."""
     from scipy.spatial import KDTree
 
-    names = sumo.vehicle.getIDList()
+    names, now = sumo.vehicle.getIDList(), float(sumo.simulation.getTime())
     points = np.array([sumo.vehicle.getPosition(name) for name in names]).reshape(-1, 2)
     if len(points):
         near = KDTree(points).query_ball_point(points, _NEAR, return_length=True)
         for name, count in zip(names, near.tolist(), strict=True):
-            counts.setdefault(name, []).append(count - 1)
+            counts.setdefault(name, []).append((now, count - 1))
 
 
 def candidates(traffic: Traffic) -> list[Observed]:

@@ -200,16 +200,16 @@ def _crossing_flows(
         its_own = own is not None and own[0].tag == "flow" and chosen.id.startswith(f"{name}.")
         if name in elements and taken < _MOST_FLOWS and not its_own:
             template, element = elements[name]
-            suggested = _flow_input(element)
+            suggested = _flow_input(element, taken)
             if suggested is not None:
                 taken += 1
                 yield name, (template, name, *suggested)
 
 
-def _flow_input(flow: ET.Element) -> tuple[Suggestion, str, str] | None:
+def _flow_input(flow: ET.Element, number: int) -> tuple[Suggestion, str, str] | None:
     """Return the input that varies a flow by half, the attribute, and its new text; None where it is given otherwise."""
     name = flow.get("id", "")
-    variable = "flow_" + re.sub(r"\W", "_", name)
+    variable = f"flow_{number + 1}_{re.sub('[^A-Za-z0-9]+', '_', name)}".strip("_")
     units = {"vehsPerHour": "1/h", "perHour": "1/h", "probability": "1/s", "period": "s", "number": ""}
     for attribute, unit in units.items():
         text = flow.get(attribute)

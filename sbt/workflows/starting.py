@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from sbt.config.scenario_file import from_file
-from sbt.errors import InputError, RunError, SbtError, did_you_mean
+from sbt.errors import InputError, RunError, did_you_mean
 from sbt.files import write_atomically
-from sbt.problem.scenario import LogicalScenario
-from sbt.sumo.departures import number_or_none
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.observing import Observed, Traffic, candidates, observe
 from sbt.sumo.own_ego import Suggestion, own_ego
@@ -25,8 +24,13 @@ _TRIED = 4
 """Vehicles that are tried at most, until one departs as asked at every end of the inputs."""
 _STEP = 0.1
 """Step of the simulation where the files set none (s); SUMO's own default is 1 s."""
-_DURATION, _SHORTEST = 30.0, 10.0
-"""Time that is recorded, and at least recorded of a vehicle that leaves earlier (s)."""
+_DURATION, _SHORTEST, _LONGEST = 30.0, 10.0, 120.0
+"""Time that is usually recorded, at least of a vehicle that leaves earlier, and at most of one that meets others later (s)."""
+_AFTER = 15.0
+"""Time that is recorded after the moment with most others around (s)."""
+
+_BUDGET, _MINUTE = (12, 40), 60.0
+"""Fewest and most runs of the first campaign, which is to take about so long (s)."""
 
 _SCENARIO = """\
 # A logical scenario of your own SUMO files, which stay as they are. Try it: sumo-sbt check {folder}/scenario.yaml
@@ -43,11 +47,10 @@ inputs:                     # min, max, and if you like: unit, distribution, kin
 ego:
   id: {ego}
   may_leave: true           # arriving early is no failure
-  # kind: acc_aeb           # drive it by a controller, file.py:NAME for your own; or {{kind: sumo, model: IDM, tau: 1.2}}
+{delay}  # kind: acc_aeb           # drive it by a controller, file.py:NAME for your own; or {{kind: sumo, model: IDM, tau: 1.2}}
 
 others: {{within: 100}}       # record everybody who comes this near (m); named: [lead] records lead wherever it is
 duration: {duration:g}                # from the ego's departure on (s)
-wait: {wait:g}                    # longest time until it departs (s)
 {step}
 metrics:                    # of ego and each of the others, the worst counts; other: lead asks for that one
   - ttc_path_min            # time to collision along the paths driven: right in bends and at crossings, too
@@ -57,6 +60,9 @@ metrics:                    # of ego and each of the others, the worst counts; o
   - {{stl: "G(distance > 0.5)", name: keeps_clear}}
 
 requirement: {{metric: ttc_path_min, critical: [-.inf, 1.0]}}   # less than 1 s to a collision
+"""
+_DELAY = """\
+  delay: 10                 # how much later than its depart it may enter, where the traffic leaves no gap (s)
 """
 _CAMPAIGN = """\
 # Run it: sumo-sbt run {folder}/campaign.yaml
@@ -80,6 +86,42 @@ class Written:
 
     paths: tuple[Path, ...]
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """What came of the runs at the centre and at both ends of every input.
+
+    Args:
+        problems: what went wrong, a line each.
+        required: the values of the metric of the requirement.
+        without: its value where nobody comes near.
+        unit: of the metric.
+        seconds: that a run took, on average.
+    """
+
+    problems: tuple[str, ...]
+    required: tuple[float, ...]
+    without: float
+    unit: str
+    seconds: float
+
+    @property
+    def fine(self) -> bool:
+        """Whether all runs are right, and the ego meets somebody in one of them."""
+        return not self.problems and any(value != self.without for value in self.required)
+
+    @property
+    def rank(self) -> tuple[int, bool]:
+        """Smaller is better."""
+        return len(self.problems), all(value == self.without for value in self.required)
+
+    def said(self) -> Iterator[str]:
+        """Yield what a user wants to know, a line each."""
+        runs = len(self.problems) + len(self.required)
+        span = f", ttc_path_min {min(self.required):.2g} to {max(self.required):.2g} {self.unit}" if self.required else ""
+        yield f"tried at the ends of its inputs: {len(self.required)} of {runs} runs are right, {self.seconds:.2g} s each{span}"
+        yield from self.problems
 
 
 @dataclass(frozen=True)
@@ -108,21 +150,22 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Writte
         names = files.names()
         known = ", ".join(names[:8]) or "none"
         raise InputError(f"--ego must be a vehicle of the files ({known}), but got '{ego}'{did_you_mean(ego, names)}")
-    best: tuple[int, _Draft, list[str]] | None = None
+    best: tuple[_Trial, _Draft] | None = None
     made: set[Path] = set()
     for draft in _drafts(files, config, folder, ego):
         _write(draft, folder, made)
-        problems = _tried(folder / "scenario.yaml")
-        if best is None or len(problems) < best[0]:
-            best = (len(problems), draft, problems)
-        if not problems:
+        trial = _tried(folder / "scenario.yaml")
+        if best is None or trial.rank < best[0].rank:
+            best = trial, draft
+        if trial.fine:
             break
     if best is None:
         raise InputError(f"{config}: a road vehicle must depart, but none did while the traffic was watched; name one: --ego ID")
     _write(best[1], folder, made)
-    campaign = _CAMPAIGN.format(folder=folder, budget=40, initial=20)
+    budget = max(_BUDGET[0], min(_BUDGET[1], int(_MINUTE / max(best[0].seconds, 1e-3))))
+    campaign = _CAMPAIGN.format(folder=folder, budget=budget, initial=budget // 2)
     made.add(write_atomically(folder / "campaign.yaml", campaign))
-    return Written(tuple(sorted(made)), (f"the vehicle under test: {best[1].why}", *best[2]))
+    return Written(tuple(sorted(made)), (f"the vehicle under test: {best[1].why}", *best[0].said()))
 
 
 def _drafts(files: SumoFiles, config: Path, folder: Path, ego: str | None) -> Iterator[_Draft]:
@@ -154,8 +197,8 @@ def _draft(files: SumoFiles, config: Path, folder: Path, traffic: Traffic, chose
     if any(path in own.copies for path in files.additional):
         named += f"  additional: [{', '.join(_shown(copies.get(p, p), folder) for p in files.additional)}]\n"
     why = (
-        f"{own.how}.\n# It departs at {chosen.depart:g} s, when {chosen.running} of at most {traffic.most} vehicles are on the"
-        f" road, and has {chosen.neighbours:.1f} others within 50 m on average"
+        f"{own.how}.\n# '{chosen.id}' departs at {chosen.depart:g} s, when {chosen.running} of at most {traffic.most} vehicles"
+        f" are on the road, and has {chosen.neighbours:.1f} others within 50 m on average"
     )
     scenario = _scenario(files, config, folder, own.id, own.inputs, why, named, chosen)
     texts: dict[Path, str | bytes] = {new: own.xml, **{copies[path]: data for path, data in own.copies.items()}}
@@ -180,12 +223,12 @@ def _scenario(
     files: SumoFiles, config: Path, folder: Path, ego: str, inputs: tuple[Suggestion, ...], why: str, named: str,
     chosen: Observed | None,
 ) -> str:  # fmt: skip
-    found = files.vehicle(ego)
-    depart = chosen.depart if chosen is not None else None if found is None else number_or_none(found[0].depart)
-    duration = _DURATION if chosen is None else max(_SHORTEST, min(_DURATION, chosen.stay))
+    duration = _DURATION
+    if chosen is not None:
+        duration = round(max(_SHORTEST, min(max(_DURATION, chosen.busiest + _AFTER), chosen.stay, _LONGEST)))
     return _SCENARIO.format(
         folder=folder, config=_shown(config, folder), files=named, ego=json.dumps(ego, ensure_ascii=False), why=why,
-        duration=duration, wait=3600.0 if depart is None else depart + 60.0, first=inputs[0].name if inputs else "name",
+        duration=duration, delay=_DELAY if chosen is not None else "", first=inputs[0].name if inputs else "name",
         step="" if files.step_length() is not None else f"step_length: {_STEP}            # SUMO's own default is 1 s\n",
         inputs="".join(f"  {s.name}: {_entry(s)}\n" for s in inputs),
     )  # fmt: skip
@@ -218,20 +261,17 @@ def _write(draft: _Draft, folder: Path, made: set[Path]) -> None:
     template.cache_clear()
 
 
-def _tried(path: Path) -> list[str]:
-    """Return what goes wrong in the runs at the centre and at both ends of every input, a line each."""
+def _tried(path: Path) -> _Trial:
+    """Return what comes of the runs at the centre and at both ends of every input."""
     scenario = from_file(str(path), Path.cwd())
-    space = scenario.space
+    space, metric = scenario.space, scenario.metrics[0]
     centre = {p.name: p.centre for p in space.parameters}
     points = [centre, *({**centre, p.name: end} for p in space.parameters for end in p.bounds)]
-    return [line for seed, values in enumerate(points) if (line := _problem(scenario, values, seed))]
-
-
-def _problem(scenario: LogicalScenario, values: Mapping[str, float], seed: int) -> str:
-    if scenario.simulate is None:
-        return ""
-    try:
-        scenario.measure(scenario.simulate(values, seed))
-    except (RunError, SbtError) as error:
-        return f"at {', '.join(f'{k}={v:g}' for k, v in values.items())}: {error}"
-    return ""
+    problems, required, begin = [], [], time.perf_counter()
+    for seed, values in enumerate(points):
+        try:
+            required.append(scenario.run(values, seed)[scenario.requirement.metric])
+        except RunError as error:
+            problems.append(f"at {', '.join(f'{k}={v:g}' for k, v in values.items())}: {error}")
+    seconds = (time.perf_counter() - begin) / len(points)
+    return _Trial(tuple(problems), tuple(required), metric.without, metric.unit, seconds)
