@@ -11,13 +11,20 @@ import pytest
 from own_scenarios import make, program, tools
 
 from sbt.config.scenario_file import from_file
+from sbt.metrics.closeness import path_clearance, worst_pair
 from sbt.metrics.geometry import select_instants
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.paths import path_of, ttc_on_paths
+from sbt.metrics.planar import TTC_2D_MIN
 from sbt.metrics.traffic import TTC_PATH_MIN, ttc_path_min
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario, Roles
+from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.sumo.ways import LEFT_THE_ROAD
+from sbt.workflows.comparing import compared_times
 
 T = np.arange(0.0, 6.0, 0.1)
 Line = tuple[np.ndarray, np.ndarray]
@@ -81,6 +88,26 @@ def test_a_way_goes_on_where_the_record_ends():
     assert ttc_on_paths(trace_of(EAST, north, ways={"co_0": meets}), "ego", "co_0") == pytest.approx(
         ttc_on_paths(straight, "ego", "co_0"), abs=1e-9
     )
+
+
+def test_check_says_which_metric_invents_conflicts():
+    """Oncoming in a bend, 3.5 m apart: straight ahead they would collide, on their lanes they never meet."""
+    angle = 0.5 * T
+    inner, outer = ((r * np.cos(a), r * np.sin(a)) for r, a in ((20.0, angle), (23.5, 2.0 - 0.4 * angle)))
+    trace = trace_of(inner, outer)
+    assert worst_pair(trace, TTC_2D_MIN, "ego").value < 1.5
+    found = worst_pair(trace, TTC_PATH_MIN, "ego")
+    assert (found.value, found.other) == (5.0, "co_0")
+    assert found.clearance == pytest.approx(1.5 - 0.3, abs=0.25), "3.5 m less the widths of 2 m and what corners reach out"
+    assert path_clearance(trace.actor("ego"), trace_of(inner, (inner[1], inner[0])).actor("co_0")) == 0.0, "crossing paths meet"
+    scenario = LogicalScenario(
+        "bend", ParameterSpace((Parameter("v", 0, 1),)), Requirement("ttc_path_min", high=1.5), lambda values, seed: trace,
+        (ttc_path_min(),), roles=Roles("ego", None),
+    )  # fmt: skip
+    said = dict(compared_times(scenario, [({"v": 0.5}, 1)] * 3))
+    assert said["ttc_path_min"].startswith("0 of 3 runs at most 1.5 s")
+    assert "3 of these 3 with somebody whose path never meets that of the ego" in said["ttc_2d_min"]
+    assert dict(compared_times(replace(scenario, roles=Roles()), [({"v": 0.5}, 1)])) == {}, "a named opponent has its own metrics"
 
 
 @pytest.mark.skipif(program("netgenerate") is None or tools() is None, reason="pip install 'sumo-sbt[tools]'")

@@ -36,7 +36,16 @@ class Changes:
 def definitions(template: Template, *tags: str) -> Iterator[ET.Element]:
     """Yield the elements with these tags of one file, whole, at any depth."""
     with template.opened() as file:
-        yield from (element for _, element in ET.iterparse(file) if element.tag in tags)
+        above: list[ET.Element] = []
+        for event, element in ET.iterparse(file, ("start", "end")):
+            if event == "start":
+                above.append(element)
+                continue
+            above.pop()
+            if element.tag in tags:
+                yield element
+            if len(above) == 1:
+                above[0].clear()  # route files are large
 
 
 def changed_copy(template: Template, changes: Changes, folder: Path) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +30,7 @@ _AFTER = 15.0
 """Time that is recorded after the moment with most others around (s)."""
 
 _BUDGET, _MINUTE = (12, 40), 60.0
-"""Fewest and most runs of the first campaign, which is to take about so long (s)."""
+"""Fewest and most runs of the first campaign, which is to take about so long (s), as long as a vehicle is tried at most."""
 
 _SCENARIO = """\
 # A logical scenario of your own SUMO files, which stay as they are. Try it: sumo-sbt check {folder}/scenario.yaml
@@ -191,7 +191,7 @@ def _drafts(files: SumoFiles, config: Path, folder: Path, ego: str | None) -> It
 def _draft(files: SumoFiles, config: Path, folder: Path, traffic: Traffic, chosen: Observed, step: float) -> _Draft:
     own = own_ego(files, traffic, chosen, folder.resolve(), step)
     new = folder / "ego.rou.xml"
-    copies = {path: folder / f"without_ego.{path.name}" for path in own.copies}
+    copies = dict(zip(own.copies, _new_names(own.copies, folder), strict=True))
     routes = [*(copies.get(path, path) for path in files.routes), new]
     named = f"  routes: [{', '.join(_shown(p, folder) for p in routes)}]\n"
     if any(path in own.copies for path in files.additional):
@@ -203,6 +203,15 @@ def _draft(files: SumoFiles, config: Path, folder: Path, traffic: Traffic, chose
     scenario = _scenario(files, config, folder, own.id, own.inputs, why, named, chosen)
     texts: dict[Path, str | bytes] = {new: own.xml, **{copies[path]: data for path, data in own.copies.items()}}
     return _Draft(texts, scenario, why.replace("\n#", ""))
+
+
+def _new_names(paths: Iterable[Path], folder: Path) -> Iterator[Path]:
+    """Yield a name in the folder for the copy of each file; files of different folders may have the same name."""
+    taken: list[str] = []
+    for path in paths:
+        taken.append(path.name)
+        number = taken.count(path.name)
+        yield folder / f"copy{'' if number == 1 else number}_of.{path.name}"
 
 
 def _with_placeholders(
@@ -262,16 +271,18 @@ def _write(draft: _Draft, folder: Path, made: set[Path]) -> None:
 
 
 def _tried(path: Path) -> _Trial:
-    """Return what comes of the runs at the centre and at both ends of every input."""
+    """Return what comes of the runs at the centre and at both ends of every input, of as many as a minute allows."""
     scenario = from_file(str(path), Path.cwd())
     space, metric = scenario.space, scenario.metrics[0]
     centre = {p.name: p.centre for p in space.parameters}
     points = [centre, *({**centre, p.name: end} for p in space.parameters for end in p.bounds)]
     problems, required, begin = [], [], time.perf_counter()
     for seed, values in enumerate(points):
+        if time.perf_counter() - begin > _MINUTE:
+            break
         try:
             required.append(scenario.run(values, seed)[scenario.requirement.metric])
         except RunError as error:
             problems.append(f"at {', '.join(f'{k}={v:g}' for k, v in values.items())}: {error}")
-    seconds = (time.perf_counter() - begin) / len(points)
+    seconds = (time.perf_counter() - begin) / max(len(problems) + len(required), 1)
     return _Trial(tuple(problems), tuple(required), metric.without, metric.unit, seconds)
