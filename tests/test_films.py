@@ -101,6 +101,8 @@ def test_a_film_follows_the_ego_on_its_lanes_and_files_hold_who_was_there(stored
     assert "nan" not in "".join((out / name).read_text() for name in ("fcd.xml", "scene.add.xml", "trace.csv"))
     counts = [len(step) for step in ET.parse(out / "fcd.xml").getroot()]
     assert counts == stored.trace.present.sum(axis=1).tolist()
+    scene = subprocess.run([program("sumo"), "-c", "scene.sumocfg", "--no-step-log"], cwd=out, capture_output=True, text=True)
+    assert (scene.returncode, scene.stderr) == (0, "")
 
 
 @in_sumo
@@ -151,7 +153,7 @@ def display() -> Iterator[str]:
 
 
 @in_sumo
-@pytest.mark.parametrize("stored", ["grid", "crossing"], indirect=True)
+@pytest.mark.parametrize("stored", ["grid", "crossing", "merge"], indirect=True)
 def test_sumo_gui_shows_the_same_run(stored: Stored, display: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DISPLAY", display)
     again = stored.again

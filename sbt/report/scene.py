@@ -24,8 +24,8 @@ __all__ = [
 EGO, OTHER, STANDING, ROAD, EDGE = "#1f6fb4", "#d9822b", "#8a8f94", "#dcdfe3", "#ffffff"
 PERSON, BICYCLE = "#7b4fa3", "#2f7d4f"
 _GROUND, _WALK, _BIKE, _STRIPE = "#f3f4f1", "#ebe6dc", "#e3d3cd", "#c9ccd1"
-_FILL = {"road": ROAD, "area": ROAD, "walk": _WALK, "walking_area": _WALK, "crossing": _STRIPE, "bike": _BIKE}
-_ORDER = ("area", "road", "walk", "walking_area", "crossing", "bike")
+_FILL = {"road": ROAD, "internal": ROAD, "area": ROAD, "walk": _WALK, "walking_area": _WALK, "crossing": _STRIPE, "bike": _BIKE}
+_ORDER = ("area", "internal", "road", "walk", "walking_area", "crossing", "bike")
 """Of what is drawn, from below."""
 _BRIDGE = "#a9adb3"
 """The rim of what leads over something else."""
@@ -70,7 +70,8 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane]) -> None:
         axes.add_collection(PolyCollection(borders, facecolors=rim, edgecolors="none", zorder=z), autolim=False)
         faces = [_FILL[lane.kind] for lane in here]
         z += 0.5 / (len(lanes) + 1.0)
-        axes.add_collection(PolyCollection(surfaces, facecolors=faces, edgecolors="none", zorder=z), autolim=False)
+        lines = [EDGE if lane.kind == "road" else "none" for lane in here]  # seen from any height
+        axes.add_collection(PolyCollection(surfaces, facecolors=faces, edgecolors=lines, linewidths=0.5, zorder=z), autolim=False)
         stripes = [bar for lane in here if lane.kind == "crossing" for bar in _stripes(lane)]
         if stripes:
             axes.add_collection(PolyCollection(stripes, facecolors=EDGE, edgecolors="none", zorder=1.0), autolim=False)

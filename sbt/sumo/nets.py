@@ -20,7 +20,8 @@ class Lane(NamedTuple):
     Attributes:
         shape: (n, 2) points of its centre line; of an area, its outline.
         width: of a lane (m).
-        kind: `road`, `walk`, `bike`, `crossing` (of people), or `area` and `walking_area` where the shape is an outline.
+        kind: `road`, `internal` (a road across a junction), `walk`, `bike`, `crossing` (of people), or `area` and
+            `walking_area`, where the shape is an outline.
         height: mean of the points (m); 0 in a network without heights.
     """
 
@@ -91,6 +92,8 @@ def _lane(element: ET.Element, function: str) -> list[Lane]:
         kind = "area"
     elif function in ("crossing", "walkingarea"):
         kind = "crossing" if function == "crossing" else "walking_area"
+    elif function == "internal" and (not allowed or "passenger" in allowed):
+        kind = "internal"
     else:
         kind = "walk" if allowed == {"pedestrian"} else "bike" if allowed and allowed <= {"pedestrian", "bicycle"} else "road"
     return [Lane(tuple((p[0], p[1]) for p in points), float(element.get("width", "3.2")), kind, height)]
