@@ -23,6 +23,8 @@ SMALLEST = {
     "boundary_table.py": "--problems testbed:borehole_1e-3:box --methods even --seeds 1 --reference 500 --store {folder}/table",
     "estimation.py": "--problems gayton_hat@200 --seeds 1 --table {folder}/table.jsonl",
     "faults.py": "--kills 2",
+    "choices.py": "--task falsification --seeds 1 --store {folder}/choices",
+    "failing_runs.py": "--seeds 1 --only falsification",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py", "throughput.py"}

@@ -287,7 +287,7 @@ def test_wrong_input_of_simulate_ends_with_2(folder: Path, args: list[str], expe
 
 @pytest.mark.sumo
 def test_simulate_writes_the_trace(folder: Path):
-    done = process("simulate", "cut_in", "d_v=60", "d_t=1.2", "--seed", "3", "--json", "--trace", "t.csv")
+    done = call("simulate", "cut_in", "d_v=60", "d_t=1.2", "--seed", "3", "--json", "--trace", "t.csv")
     assert json.loads(done.stdout)["status"] == "ok"
     with (folder / "t.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -297,8 +297,8 @@ def test_simulate_writes_the_trace(folder: Path):
 
 @pytest.mark.parametrize("target", ["plane.py:SCENARIO", "c.yaml"])
 def test_check_of_a_sound_scenario(folder: Path, target: str):
-    done = process("check", target)
-    assert done.returncode == 0
+    done = call("check", target)
+    assert done.exit_code == 0
     assert [line[:4] for line in done.stdout.splitlines()] == ["ok  "] * 5
     assert "critical by margin" in done.stdout.splitlines()[-1]
 
@@ -321,15 +321,15 @@ def test_check_prints_one_json_object(folder: Path, name: str, ok: bool, code: i
     ],
 )
 def test_check_of_an_unsound_scenario(folder: Path, name: str, rule: str):
-    done = process("check", f"plane.py:{name}")
-    assert done.returncode == 2
+    done = call("check", f"plane.py:{name}")
+    assert done.exit_code == 2
     assert f"FAIL  {rule}" in done.stdout
 
 
 @pytest.mark.sumo
 def test_check_compares_the_isolation_levels():
-    done = process("check", "cut_in")
-    assert done.returncode == 0
+    done = call("check", "cut_in")
+    assert done.exit_code == 0
     assert "ok    isolation reuse = fresh: 10 runs bit-equal" in done.stdout
 
 
