@@ -72,10 +72,20 @@ def worst_moment(trace: Trace, metric: Metric) -> tuple[int, int | None]:
 
 
 def _first_at_its_worst(trace: Trace, metric: Metric) -> int | None:
-    """Return the first instant at which the metric so far is that of the run; None where it is so from the beginning."""
+    """Return the first instant at which the metric so far is that of the run; None where it is so from the beginning.
+
+    Found by bisection, as a metric never recovers.
+    """
     last = len(trace.time) - 1
-    values = metric_so_far(trace, metric, range(last + 1))
-    reached = int(np.argmax(values == values[-1]))
+    if metric.over_time is not None:
+        values = metric_so_far(trace, metric, range(last + 1))
+        reached = int(np.argmax(values == values[-1]))
+        return reached if reached > 0 else None
+    final = _until(trace, metric, last)
+    before, reached = -1, last
+    while reached - before > 1:
+        middle = (before + reached) // 2
+        before, reached = (before, middle) if _until(trace, metric, middle) == final else (middle, reached)
     return reached if reached > 0 else None
 
 
