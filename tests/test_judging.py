@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import sbt
 from sbt.campaigns.preventable import DRIVERS, describe_judgements, with_judgements
 from sbt.cli import app
+from sbt.cli.campaign import conclusion_lines
 from sbt.errors import InputError
 from sbt.metrics.preventability import applicability, why_not
 from sbt.problem.trace import Trace
@@ -19,7 +20,14 @@ from sbt.store.database import Store
 from sbt.store.records import Judgement
 from sbt.workflows import judging
 
-SETTINGS = {"scenario": "cut_in", "campaign": "falsification", "metamodel": "et", "executor": "serial", "seed": 1, "budget": 30}
+SETTINGS = {
+    "scenario": "cut_in", "campaign": "falsification", "metamodel": "et", "executor": "serial", "seed": 1, "budget": 16,
+    "stop": {"failures": 3}, "report": False,
+}  # fmt: skip
+BRAKING = {
+    "campaign": "coverage", "scenario": "emergency_braking", "budget": 12, "initial": 12, "seed": 3, "executor": "serial",
+    "report": False,
+}  # fmt: skip
 
 
 def trace(*actors: tuple[float, float, float, float], size: float = 4.5, heading_ego: np.ndarray | None = None) -> Trace:
@@ -85,6 +93,7 @@ def test_every_failure_mode_says_who_would_have_avoided_it(tmp_path: Path, monke
     assert len(table) == len(DRIVERS) * len(modes)
     assert result.frame["preventable"].iloc[modes[0].representative] == describe_judgements(modes[0].preventable)
     assert "avoided by" in result.report().read_text()
+    assert f"avoided {describe_judgements(modes[0].preventable)}" in "\n".join(conclusion_lines(result.summary))
     assert "avoided.rss" in result.export("csv").read_text().splitlines()[0]
     assert "reference drivers" in " ".join(result.sentences())
 
@@ -106,8 +115,7 @@ def test_every_failure_mode_says_who_would_have_avoided_it(tmp_path: Path, monke
 
 @pytest.mark.sumo
 def test_any_run_can_be_judged_by_replay_and_the_store_stays_as_it_is(tmp_path: Path):
-    result = sbt.run(campaign="coverage", scenario="emergency_braking", budget=12, initial=12, seed=3, executor="serial",
-                     store=tmp_path / "runs")  # fmt: skip
+    result = sbt.run(**BRAKING, store=tmp_path / "runs")
     assert result.judgements == []
     before = (tmp_path / "runs" / "campaign.sqlite").read_bytes()
     shown = CliRunner().invoke(app, ["replay", str(tmp_path / "runs"), "5", "--judge"])
@@ -115,10 +123,16 @@ def test_any_run_can_be_judged_by_replay_and_the_store_stays_as_it_is(tmp_path: 
     assert all(f"  {name} " in shown.stdout for name in DRIVERS)
     assert (tmp_path / "runs" / "campaign.sqlite").read_bytes() == before
     assert result.preventable(5, ["fsm"])["driver"].tolist() == ["fsm"]
+    film, inputs = result.film(5, driver="fsm"), result.history.inputs(5)
+    run = sbt.simulate("emergency_braking", inputs, seed=int(result.history.seed[5]), ego="fsm")
+    assert np.array_equal(film.states.x, run.states.x)
+    command = ["replay", str(tmp_path / "runs"), "5", "--driver", "rss", "--trace", str(tmp_path / "rss.csv")]
+    only = CliRunner().invoke(app, command)
+    assert "  rss " in only.stdout
+    assert (tmp_path / "rss.csv").is_file()
     with pytest.raises(InputError, match="a run must be a finished one"):
         result.preventable(99)
-    explicit = sbt.run(campaign="coverage", scenario="emergency_braking", budget=12, initial=12, seed=3, executor="serial",
-                       judges=["fsm"], store=tmp_path / "runs")  # fmt: skip
+    explicit = sbt.run(**BRAKING, judges=["fsm"], store=tmp_path / "runs")
     critical = explicit.frame[explicit.frame["critical"]]
     assert {each.run for each in explicit.judgements} == set(critical["index"])
 

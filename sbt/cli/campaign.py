@@ -127,7 +127,12 @@ def _plain(item: Mapping[str, Any]) -> str:
     """Return the numbers of a record on one line, those inside inner records by their own names."""
     inner = item.get("inputs", {})
     values = {k: v for k, v in item.items() if isinstance(v, (int, float, str))} | dict(inner)
-    return ", ".join(f"{name.replace('_', ' ')} {_number(value)}" for name, value in values.items())
+    found = [f"{name.replace('_', ' ')} {_number(value)}" for name, value in values.items()]
+    if item.get("preventable"):
+        from sbt.workflows.judging import in_words
+
+        found.append(f"avoided {in_words(item['preventable'])}")
+    return ", ".join(found)
 
 
 def _number(value: Any) -> str:

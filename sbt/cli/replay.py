@@ -27,20 +27,24 @@ def replay(
         Path | None, typer.Option(metavar="FOLDER", help="Write network, trajectories (FCD, CSV) and a scene for sumo-gui.")
     ] = None,
     judge: Annotated[bool, typer.Option("--judge", help="Run it with each reference driver in the place of ego.")] = False,
+    driver: Annotated[
+        str | None, typer.Option(metavar="KIND", help="Show it with this driver in the place of ego, such as fsm.")
+    ] = None,
     trace: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write the states over time.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
-        from sbt.workflows.judging import judge_run, stored_judgements
+        from sbt.workflows.judging import judge_run, stored_judgements, with_driver
         from sbt.workflows.running import replay_run
         from sbt.workflows.showing import show_replay
 
         again = replay_run(folder, run)
-        judgements = judge_run(folder, run) if judge else stored_judgements(folder, run)
+        asked = None if driver is None else [driver]
+        judgements = judge_run(folder, run, asked) if judge or driver else stored_judgements(folder, run)
         record, outcome, states = again.record, again.outcome, again.trace
-        shown = gui or gif or export or trace
-        if shown and not show_replay(again, gui=gui, gif=gif, folder=export, csv=trace):
+        shown, view = gui or gif or export or trace, again if driver is None else with_driver(again, driver)
+        if shown and not show_replay(view, gui=gui, gif=gif, folder=export, csv=trace):
             print("what sumo-gui showed differs from the run in the last digits", file=sys.stderr)
     same = again.identical
     if as_json:

@@ -317,13 +317,14 @@ class _Kind:
     """A kind of ego: makes the driver of a run; its settings are those of the model.
 
     Attributes:
+        description: for people, one line.
         complete: the model fixes all settings: those that a scenario has for the AV under test do not apply to it.
     """
 
     complete = True
 
     def __init__(self, model: Callable[..., ReferenceModel]):
-        self._model = model
+        self._model, self.description = model, (model.__doc__ or "").splitlines()[0]
 
     def __call__(self, rng: np.random.Generator, set_speed: float, *, recovery: float = 2.0, **settings: Any) -> ReferenceDriver:
         """Return the driver of one run; it draws nothing from `rng`.

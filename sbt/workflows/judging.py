@@ -9,14 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sbt.campaigns.failures import FalsificationConclusion
-from sbt.campaigns.preventable import DRIVERS
+from sbt.campaigns.preventable import DRIVERS, describe_judgements
 from sbt.errors import InputError
 from sbt.execution.exchange import DRIVER
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.worker import run_traced
 from sbt.loop.stages import Conclusion
 from sbt.metrics.preventability import METRIC_NAME, why_not
 from sbt.plugins import Objects
@@ -27,7 +29,10 @@ from sbt.store.history import History, Record
 from sbt.store.records import Judgement
 from sbt.workflows.study import Study
 
-__all__ = ["MOST_JUDGED", "judge_campaign", "judge_run", "judge_runs", "stored_judgements"]
+if TYPE_CHECKING:
+    from sbt.workflows.running import Replay
+
+__all__ = ["MOST_JUDGED", "in_words", "judge_campaign", "judge_run", "judge_runs", "stored_judgements", "with_driver"]
 
 MOST_JUDGED = 10
 """Runs of a campaign that are judged: one a failure mode, or the deepest critical ones."""
@@ -110,6 +115,23 @@ def stored_judgements(folder: Path, run: int) -> tuple[Judgement, ...]:
     """Return what the store keeps of the judgements of a run; empty where it was not judged."""
     with Store.read(folder) as store:
         return tuple(each for each in store.judgements if each.run == run)
+
+
+def with_driver(again: Replay, driver: str) -> Replay:
+    """Return a run that was executed again, executed once more with a driver in the place of the ego, to be shown.
+
+    Raises:
+        InputError: the scenario does not take the driver.
+    """
+    scenario, record = again.scenario.configured(ego={"kind": driver}), again.record
+    inputs = {name: record.inputs[name] for name in scenario.space.names}
+    outcome, trace = run_traced(scenario, Job(record.index, inputs, record.seed))
+    return replace(again, outcome=outcome, trace=trace, scenario=scenario)
+
+
+def in_words(judgements: Iterable[JsonMapping]) -> str:
+    """Return in words which drivers avoided a run, from the JSON of a conclusion."""
+    return describe_judgements(Judgement(**each) for each in judgements)
 
 
 def judge_runs(

@@ -24,7 +24,7 @@ from sbt.store.database import Store
 from sbt.store.history import History
 from sbt.store.records import FitRecord, Judgement
 from sbt.workflows.exporting import export_store
-from sbt.workflows.judging import judge_run
+from sbt.workflows.judging import judge_run, with_driver
 from sbt.workflows.plots import Plots
 from sbt.workflows.running import Replay, rebuild_report, replay_run
 from sbt.workflows.showing import net_of_run, save_film, shown_trace
@@ -190,10 +190,17 @@ class Result(Generic[C]):
 
         return pd.DataFrame(shown_trace(self.replay(run)).rows())
 
-    def film(self, run: int) -> Film:
-        """Return a run as a film from above, with its metric over time; by executing it again, verified."""
-        again = self.replay(run)
-        return Film(shown_trace(again), again.scenario, f"{again.scenario.name}, run {run}", net_of_run(again))
+    def film(self, run: int, driver: str | None = None) -> Film:
+        """Return a run as a film from above, with its metric over time; by executing it again, verified.
+
+        Args:
+            run: its index, from 0.
+            driver: who is in the place of the ego in the film, such as fsm; None: the ego itself.
+        """
+        again, title = self.replay(run), f"{self.scenario.name}, run {run}"
+        if driver is not None:
+            again, title = with_driver(again, driver), f"{title}, {driver} in the place of ego"
+        return Film(shown_trace(again), again.scenario, title, net_of_run(again))
 
     def report(self) -> Path:
         """Write `report.html` in the store's folder, and return its path."""
