@@ -80,7 +80,9 @@ def test_words_and_columns():
 
 @pytest.mark.sumo
 def test_every_failure_mode_says_who_would_have_avoided_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    result = sbt.run(**SETTINGS, store=tmp_path / "judged")
+    told: list[str] = []
+    result = sbt.run(**SETTINGS, store=tmp_path / "judged", progress=lambda where: told.append(where.activity))
+    assert told[-1] == "judging failures"
     modes = result.conclusion.failure_modes
     assert modes
     for mode in modes:

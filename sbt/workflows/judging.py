@@ -6,7 +6,7 @@ reading a store needs no simulation.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,13 +56,16 @@ class _Panel:
     refused: dict[str, str]
 
 
-def judge_campaign(study: Study, store: Store, conclusion: Conclusion) -> Conclusion:
+def judge_campaign(
+    study: Study, store: Store, conclusion: Conclusion, *, tell: Callable[[str], None] = lambda _: None
+) -> Conclusion:
     """Judge the failures of a campaign that has ended, as configured; what the store has is not judged again.
 
     Args:
         study: as configured.
         store: open for writing; it keeps what is found.
         conclusion: of the campaign.
+        tell: told what is done, before it takes time.
 
     Returns:
         The conclusion, in which every judged failure mode says who would have avoided it.
@@ -75,6 +78,7 @@ def judge_campaign(study: Study, store: Store, conclusion: Conclusion) -> Conclu
     runs = [mode.representative for mode in modes[:MOST_JUDGED]] if modes is not None else _deepest(study, history)
     known = [each for each in store.judgements if each.driver in drivers]
     if drivers and runs:
+        tell("judging failures")
         judged = judge_runs(study, history, runs, drivers, known=known)
         if judged != store.judgements:
             store.judge(judged)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -102,12 +103,21 @@ def run_study(
             else:
                 finished = run_shard(campaign, shard, store, executor, **common)
         if shard is None:
-            finished = replace(finished, conclusion=judge_campaign(study, store, finished.conclusion))
+            tell = partial(_tell, store, study, common["listener"])
+            finished = replace(finished, conclusion=judge_campaign(study, store, finished.conclusion, tell=tell))
         summary = summarise(store, study, finished)
         store.conclude(summary.to_dict())
         if report and shard is None:
             _report(store, study, finished.conclusion, finished.fitted)
     return summary
+
+
+def _tell(store: Store, study: Study, listener: Callable[[Progress], None], activity: str) -> None:
+    """Tell the listener what is done after the last run."""
+    history = store.history()
+    critical = int(np.count_nonzero(study.scenario.requirement.critical_runs(history)))
+    counts = len(history), study.budget, int((~history.ok).sum()), critical, len(store.iterations())
+    listener(Progress(*counts, activity))
 
 
 def _check_code(store: Store, study: Study, executor: Executor) -> None:
