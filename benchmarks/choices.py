@@ -4,7 +4,8 @@
 
 Two ranges and a kind of road user with four choices (70, 20, 9 and 1 %). Falsification: only the bicycle fails, in an
 ellipse; runs to the first failure, of the campaigns for each choice all four in turn. Boundary and estimation: all kinds
-fail, each beyond a boundary of its own. Finished cells are lines of FOLDER/cells.jsonl.
+fail, each beyond a boundary of its own. Metamodel: RMSE of a Gaussian process after 120 random runs, that sees an axis for
+each choice, or their positions as a number. Finished cells are lines of FOLDER/cells.jsonl.
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ from pathlib import Path
 import numpy as np
 
 import sbt
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.seeds import stream
 
 SHARES = {"car": 0.7, "truck": 0.2, "bicycle": 0.09, "bus": 0.01}
 EDGES = {"car": 3.2, "truck": 2.2, "bicycle": 1.0, "bus": 0.0}
-BUDGETS = {"falsification": 100, "boundary": 120, "estimation": 120}
-WAYS = {"falsification": ("choices", "each", "random"), "boundary": ("choices", "each"), "estimation": ("choices", "each")}
-SEEDS = {"falsification": 20, "boundary": 10, "estimation": 50}
+BUDGETS = {"falsification": 100, "boundary": 120, "estimation": 120, "metamodel": 120}
+WAYS = {"falsification": ("choices", "each", "random"), "boundary": ("choices", "each"), "estimation": ("choices", "each"),
+        "metamodel": ("axes", "positions")}  # fmt: skip
+SEEDS = {"falsification": 20, "boundary": 10, "estimation": 50, "metamodel": 20}
 V = sbt.Parameter("v", -5, 5, distribution=sbt.Normal(0, 1))
 GAP = sbt.Parameter("gap", -5, 5, distribution=sbt.Normal(0, 1))
 
@@ -40,7 +43,7 @@ def edges(kind: str, v: float, gap: float) -> float:
     return EDGES[kind] + 0.25 * gap**2 - v if kind != "truck" else EDGES[kind] + 0.5 * gap - v
 
 
-FUNCTIONS = {"falsification": ellipse, "boundary": edges, "estimation": edges}
+FUNCTIONS = {"falsification": ellipse, "boundary": edges, "estimation": edges, "metamodel": ellipse}
 
 
 def scenario(task: str, kind: str | None) -> sbt.Scenario:
@@ -109,7 +112,16 @@ def estimation(way: str, seed: int) -> dict:
     return {"value": value, "low": low, "high": high}
 
 
-TASKS = {"falsification": falsification, "boundary": boundary, "estimation": estimation}
+def metamodel(way: str, seed: int) -> dict:
+    space, rng = scenario("metamodel", None).space, stream(seed, "metamodel")
+    u = rng.random((2120, 3))
+    y = np.array([ellipse(**space.named(x)) for x in space.from_unit(u)])
+    seen = space.metamodel_inputs(u) if way == "axes" else space.cube.snapped(u)
+    predicted = GaussianProcess().fit(seen[:120], y[:120], stream(seed, "fit"))(seen[120:]).mu
+    return {"value": float(np.sqrt(np.mean((predicted - y[120:]) ** 2)) / y.std())}
+
+
+TASKS = {"falsification": falsification, "boundary": boundary, "estimation": estimation, "metamodel": metamodel}
 SCRATCH: list[str] = []
 
 
@@ -118,6 +130,9 @@ def line(task: str, way: str, cells: list[dict]) -> str:
     if task == "falsification":
         ends = np.quantile(values, [0.1, 0.9])
         said = f"{np.median(values):.0f} runs to the first failure ({ends[0]:.0f} to {ends[1]:.0f})"
+    elif task == "metamodel":
+        ends = np.quantile(values, [0.1, 0.9])
+        said = f"RMSE {100 * np.median(values):.1f} % of the spread ({100 * ends[0]:.1f} to {100 * ends[1]:.1f} %)"
     elif task == "boundary":
         said = f"F1 {np.median(values):.3f} ({np.quantile(values, 0.1):.3f} to {np.quantile(values, 0.9):.3f})"
     else:

@@ -144,7 +144,7 @@ def _outside(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
     config, parts = loaded.config, assemble(loaded)
     space, requirement = parts.scenario.space, parts.scenario.requirement
     limit = None if config.executor.timeout == float("inf") else config.executor.timeout
-    sampler = OUTSIDE[name](space.dimension, seed, config.initial)
+    sampler = OUTSIDE[name](space.dimension, seed, config.initial, space.cube)
     points, margins, most = np.empty((0, space.dimension)), np.empty(0), config.stop.failures
     with SerialExecutor(parts.spec, limit) as executor:
         while len(margins) < config.budget and (most is None or (margins <= 0).sum() < most):
