@@ -11,6 +11,7 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 SMALLEST = {
     "boundary.py": "--scenario cut_in --seeds 1 --budget 30 --batch 10 --reference 200",
+    "contacts.py": "--runs 2 --nets roundabout",
     "cut_in_plane.py": "--size 4 --out {folder}/plane.png",
     "metamodels.py": "--kinds et --rows 20 --inputs 2 --points 64 --repeat 1",
     "overhead.py": "--runs 32",
@@ -27,12 +28,14 @@ SMALLEST = {
     "failing_runs.py": "--seeds 1 --only falsification",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
-SUMO = {"boundary.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py", "throughput.py"}
+SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
+SUMO |= {"throughput.py", "watcher.py"}
 LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
+SHARED = {"street_traffic.py"}  # networks and traffic of the scripts
 
 
 def test_every_script_is_known():
-    assert {path.name for path in BENCHMARKS.glob("*.py")} == set(SMALLEST) | LONG
+    assert {path.name for path in BENCHMARKS.glob("*.py")} == set(SMALLEST) | LONG | SHARED
 
 
 @pytest.mark.slow

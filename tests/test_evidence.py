@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable
@@ -9,7 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+import sbt
+from sbt.cli import app
 from sbt.execution.worker import run_job
 from sbt.metrics.geometry import contact_index, corners, rectangle_distance, rectangles
 from sbt.metrics.longitudinal import COLLISION, encounter
@@ -258,3 +262,59 @@ def test_a_straight_long_vehicle_has_the_metrics_of_its_rectangle():
     assert {corners(p).shape for p in rectangles(b)} == {(80, 4, 2)}
     assert not split.identical(whole)
     assert split.identical(split.select(slice(None)))
+
+
+SCENARIO = """sumo: a.sumocfg
+simulate: loop.py:simulate
+inputs:
+  v_ego: {min: 6, max: 12, unit: m/s}
+ego: {id: ego, may_leave: true}
+duration: 4
+metrics: [collision]
+requirement: {metric: collision, critical: [0.5, .inf]}
+"""
+LOOP = """
+def simulate(sumo, values, rng):
+    sumo.simulationStep()
+    for name in ("ego", "bus"):
+        sumo.vehicle.setSpeedMode(name, 32)
+        sumo.vehicle.setLaneChangeMode(name, 0)
+        sumo.vehicle.setSpeed(name, sumo.vehicle.getSpeed(name))
+    while True:
+        sumo.simulationStep()
+"""
+
+
+@pytest.mark.sumo
+def test_row_report_and_conclusion_tell_an_unconfirmed_contact_apart_and_show_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    vehicles = vehicle("bus", "we", "bus", departPos=40, departSpeed=5)
+    vehicles += vehicle("ego", "we", "wide", departLane=1, departPos=20.3, departSpeed="${v_ego}")
+    Path("a.net.xml").write_text(net({"we": WEST_EAST}, lanes=2, width=2.2))
+    Path("a.rou.xml").write_text(f"<routes>{TYPES}{vehicles}</routes>")
+    named = {"net-file": "a.net.xml", "route-files": "a.rou.xml", "insertion-checks": "none"}
+    options = "".join(f'<{name} value="{value}"/>' for name, value in named.items())
+    Path("a.sumocfg").write_text(f"<configuration>{options}</configuration>")
+    Path("scenario.yaml").write_text(SCENARIO)
+    Path("loop.py").write_text(LOOP)
+    Path("c.yaml").write_text(json.dumps({
+        "campaign": "falsification", "scenario": "scenario.yaml", "budget": 8, "initial": 8, "metamodel": {"kind": "et"},
+        "store": "runs", "executor": {"kind": "serial"},
+    }))  # fmt: skip
+    done = CliRunner().invoke(app, ["run", "c.yaml", "--json"])
+    assert done.exit_code == 0, done.output
+    summary = sbt.open("runs")
+    rows = summary.frame
+    critical = rows["critical"].astype(bool).to_numpy()
+    assert 0 < critical.sum() < len(rows)
+    told = rows["unconfirmed"].str.contains("side by side on lanes").to_numpy()
+    assert (told == critical).all()
+    assert sum(mode.unconfirmed for mode in summary.conclusion.failure_modes) == (critical & (rows["stage"] != "confirm")).sum()
+    assert json.loads(done.stdout)["unconfirmed"] == critical.sum()
+    page = Path("runs/report.html").read_text()
+    assert f"{critical.sum()} of the {critical.sum()} critical runs have a contact that SUMO" in page
+    assert 'id="contacts"' in page
+    run = int(rows.index[critical][0])
+    assert f"sumo-sbt replay runs {run} --gif {run}.gif" in page
+    assert CliRunner().invoke(app, ["replay", "runs", str(run), "--gif", f"{run}.gif"]).exit_code == 0
+    assert Path(f"{run}.gif").stat().st_size > 1000

@@ -79,6 +79,7 @@ class FailureMode:
         most_likely: its run of largest density.
         nearest_safe: the uncritical run nearest to the representative; None: there is none.
         preventable: what the reference drivers made of the representative; None: they were not asked.
+        unconfirmed: its critical runs with a contact that SUMO's own list does not confirm.
     """
 
     representative: int
@@ -92,6 +93,7 @@ class FailureMode:
     most_likely: RunPoint
     nearest_safe: NearestSafe | None
     preventable: tuple[Judgement, ...] | None = optional()
+    unconfirmed: int = 0
 
 
 def connected(fitted: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]:
@@ -184,6 +186,7 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, confirmed:
         float(critical.contains(confirmed).mean()) if len(confirmed) else None, len(confirmed),
         RunPoint(int(history.index[likely]), history.inputs(likely), float(y[likely])),
         None if mode.safe is None else _nearest_safe(mode.safe, inputs, history, y),
+        unconfirmed=int(history.unconfirmed[list(mode.rows)].sum()),
     )  # fmt: skip
 
 

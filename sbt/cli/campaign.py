@@ -101,9 +101,11 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
 def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
     """Return the result of a campaign (`run --json`) for people."""
     ended = f", stopped: {result['stopped']}" if result.get("stopped") else ""
+    doubtful = result.get("unconfirmed", 0)
+    unconfirmed = f", of them {doubtful} with a contact that SUMO does not list" if doubtful else ""
     lines = [
         f"{result['campaign']} of {result['scenario']}: {result['runs']} runs in {result['iterations']} iterations{ended}",
-        f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}",
+        f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}{unconfirmed}",
     ]
     for key, value in result.get("conclusion", {}).items():
         if key == "convergence":

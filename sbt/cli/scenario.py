@@ -67,6 +67,8 @@ def _print_run(run: Run) -> None:
     need = run.scenario.requirement
     verdict = "critical" if run.critical else "not critical"
     print(f"{verdict} ({need.metric} critical in [{need.critical.low:g}, {need.critical.high:g}])")
+    if run.unconfirmed:
+        print(f"SUMO's own list differs: {run.unconfirmed}")
 
 
 def _write_trace(path: Path, run: Run) -> None:

@@ -8,10 +8,15 @@ from enum import StrEnum
 
 from sbt.problem.plain import Values
 
-__all__ = ["LISTED_ONLY", "UNCONFIRMED", "Job", "Outcome", "Status"]
+__all__ = ["LISTED_ONLY", "UNCONFIRMED", "Job", "Outcome", "Status", "has_unconfirmed_contact"]
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
 """How the text begins of a contact that SUMO's own list does not have, and of an entry of that list without a contact."""
+
+
+def has_unconfirmed_contact(text: str) -> bool:
+    """Return whether what differs (`Outcome.unconfirmed`) holds a contact that SUMO does not list."""
+    return any(part.startswith(UNCONFIRMED) for part in text.split(" | "))
 
 
 class Status(StrEnum):

@@ -17,7 +17,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
 from sbt.report.modes import mode_table
 from sbt.report.projection import Predict, influence_from_runs, influence_on_probability
-from sbt.report.tables import critical_table, failed_table, input_table, iteration_table
+from sbt.report.tables import contact_table, critical_table, failed_table, input_table, iteration_table
 from sbt.report.words import SCORES, Findings, conclusion_sentences, requirement_words, warnings_for
 from sbt.store.database import Store
 
@@ -62,6 +62,7 @@ def write_report(
         "inputs": input_table(scenario, weights),
         "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement),
         "critical": critical_table(found.history, scenario.requirement, reference, store.judgements),
+        "contacts": contact_table(found.history, scenario.requirement, _commands(found, store)["film"]),
         "failed": failed_table(found.history, reference),
         "ego": found.configuration.get("ego"),
         "commands": _commands(found, store),
@@ -143,11 +144,13 @@ def _commands(found: Findings, store: Store) -> dict[str, str]:
         return {
             "run": f"sbt.run({f'{folder}/config.resolved.yaml'!r}, {given})",
             "replay": f"sbt.open({folder!r}, {given}).replay(RUN)",
+            "film": f"sbt.open({folder!r}, {given}).film(RUN)",
             "export": f"sbt.open({folder!r}).export('csv')",
         }
     return {
         "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml"]),
         "replay": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN",
+        "film": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN --gif RUN.gif",
         "export": shlex.join(["sumo-sbt", "export", folder, "--format", "csv"]),
     }
 

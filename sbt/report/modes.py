@@ -35,17 +35,20 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     modes = _modes(found)
     rows, typed = [], any(mode.conflict for mode in modes)
     judged = any(mode.preventable for mode in modes)
+    doubtful = any(mode.unconfirmed for mode in modes)
     for number_of, mode in enumerate(modes, 1):
         confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.confirmation_runs}"
         rows.append((
             Cell.of(number_of), Cell.of(mode.representative), Cell.of(mode.metric), Cell.of(mode.size), Cell(confirmed),
+            *(() if not doubtful else (Cell.of(mode.unconfirmed),)),
             *(() if not typed else (Cell(mode.conflict or NOTHING),)),
             *(Cell.of(mode.inputs[name]) for name in space.names), Cell(_change(mode, space)),
             *((Cell(describe_judgements(mode.preventable or ()) or NOTHING),) if judged else ()), Cell.of(mode.most_likely.run),
         ))  # fmt: skip
     metric = found.requirement.metric
     who = ("other road user",) if typed else ()
-    columns = ("mode", "representative", metric, "runs", "confirmed", *who, *space.names, "what makes it safe",
+    evidence = ("contacts SUMO does not list",) if doubtful else ()
+    columns = ("mode", "representative", metric, "runs", "confirmed", *evidence, *who, *space.names, "what makes it safe",
                *(("avoided by",) if judged else ()), "most likely")  # fmt: skip
     note = _NOTE + (f" {KNOWN_LIMITS}" if judged else "")
     return Table(columns, tuple(rows), note if rows else "")

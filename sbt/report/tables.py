@@ -13,6 +13,7 @@ from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
 from sbt.plugins import OBJECT
 from sbt.problem.arrays import Vector
+from sbt.problem.outcome import has_unconfirmed_contact
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
@@ -24,6 +25,7 @@ from sbt.store.records import FitRecord, Iteration, Judgement
 __all__ = [
     "Cell",
     "Table",
+    "contact_table",
     "critical_table",
     "failed_table",
     "input_table",
@@ -172,6 +174,27 @@ def critical_table(
     note = f"{rest:,} more critical runs are in the store: sumo-sbt export lists all." if rest else ""
     columns = ("run", "margin", *history.names, *metrics, "seed", *(("avoided by",) if judged else ()), "again")
     return Table(columns, tuple(rows), " ".join(filter(None, (note, KNOWN_LIMITS if judged and rows else ""))))
+
+
+def contact_table(history: History, requirement: Requirement, replay: str) -> Table:
+    """Return the runs in which contacts and SUMO's own list differ, critical ones first, at most 200.
+
+    Args:
+        history: finished runs.
+        requirement: that tells which are critical.
+        replay: command that opens a run as a film, with RUN where its index belongs.
+    """
+    critical, texts = requirement.critical_runs(history), history.columns["unconfirmed"]
+    found = sorted(np.flatnonzero(texts != "").tolist(), key=lambda k: (not critical[k], k))
+    rows = tuple(
+        (Cell.of(int(history.index[k])), Cell("critical" if critical[k] else "not critical"),
+         Cell("unconfirmed" if has_unconfirmed_contact(str(texts[k])) else "listed only"),
+         Cell(str(texts[k])), Cell("film", code=replay.replace("RUN", str(history.index[k]))))
+        for k in found[:_MOST]
+    )  # fmt: skip
+    rest = len(found) - len(rows)
+    note = f"{rest:,} more are in the store: sumo-sbt export lists all (column unconfirmed)." if rest else ""
+    return Table(("run", "verdict", "SUMO's list", "what differs", "see it"), rows, note)
 
 
 def failed_table(history: History, reference: str) -> Table:

@@ -134,9 +134,19 @@ def conclusion_sentences(found: Findings) -> list[str]:
         sentences.append(f"{critical:,} of {ok:,} runs were critical.{_not_a_share(found)}")
     else:
         sentences.append("No run has given a metric yet.")
+    sentences += _about_contacts(found)
     if found.ended.get("stopped"):
         sentences.append(f"The campaign ended because: {found.ended['stopped']}.")
     return sentences
+
+
+def _about_contacts(found: Findings) -> list[str]:
+    """Return how many critical runs have a contact that SUMO does not list; nothing where there is none."""
+    critical, n = int(found.critical.sum()), int((found.critical & found.history.unconfirmed).sum())
+    if n == 0:
+        return []
+    which = "The critical run has" if critical == 1 else f"{n:,} of the {critical:,} critical runs have"
+    return [f"{which} a contact that SUMO's own list of collisions does not confirm; the table of contacts says what differs."]
 
 
 def _not_a_share(found: Findings) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sbt.errors import StoreError
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.problem.outcome import Status
+from sbt.problem.outcome import Status, has_unconfirmed_contact
 from sbt.problem.plain import Value
 from sbt.problem.requirement import Requirement
 
@@ -192,6 +192,11 @@ class History:
     def reason(self) -> NDArray[Any]:
         """(n,) why a run has no metrics, "" where it has."""
         return self.columns["reason"]
+
+    @property
+    def unconfirmed(self) -> NDArray[np.bool_]:
+        """(n,) the run has a contact that SUMO's own list does not confirm; `columns["unconfirmed"]` says what differs."""
+        return np.array([has_unconfirmed_contact(text) for text in self.columns["unconfirmed"]], dtype=bool)
 
     @property
     def versions(self) -> NDArray[Any]:

@@ -167,6 +167,11 @@ def _why_person(person: _Place, vehicle: _Place) -> str:
         return f"'{person.name}' walks on edge '{person.edge}', and SUMO compares pedestrians with vehicles only on crossings"
     if vehicle.person:
         return "SUMO does not compare pedestrians with each other"
+    if person.edge.rpartition("_")[2].startswith("w"):
+        return (
+            f"'{person.name}' is on the walking area '{person.edge}' beside lane '{vehicle.lane}', and SUMO compares pedestrians"
+            " with vehicles only on crossings"
+        )
     return (
         f"'{person.name}' is on '{person.edge}' and '{vehicle.name}' on lane '{vehicle.lane}': SUMO compares a crossing with the"
         " vehicles of lanes that cross it, by shapes with corners cut off"

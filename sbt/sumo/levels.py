@@ -121,7 +121,7 @@ def _find(sumo: Any) -> Levels:
     inferred = []
     for i, j, at_i, at_j, x, y in crossings:
         a, b = roads[i], roads[j]
-        height = sumo.simulation.convert3D(a.edge, at_i, 0)[2] - sumo.simulation.convert3D(b.edge, at_j, 0)[2]
+        height = _height(sumo, a, at_i) - _height(sumo, b, at_j)
         flat = abs(height) < _FLAT
         if (not flat and abs(height) < LEVEL_HEIGHT) or network.connected(a, at_i, b, at_j):
             continue
@@ -132,6 +132,13 @@ def _find(sumo: Any) -> Levels:
                 apart[one.edge].add(other.edge)
                 apart[other.edge].add(one.edge)
     return Levels({edge: frozenset(others) for edge, others in apart.items()}, tuple(inferred))
+
+
+def _height(sumo: Any, road: _Road, at: float) -> float:
+    """Return the height of a place on an edge (m), 0 where the network has none; SUMO's lengths may differ from the lines'."""
+    length = sumo.lane.getLength(f"{road.edge}_0")
+    position = min(max(at * length / max(_length(road.line), 1e-3), 0.0), length)
+    return float(sumo.simulation.convert3D(road.edge, position, 0)[2])
 
 
 class _Network:

@@ -209,9 +209,15 @@ class Run:
             raise InputError(f"only a run with a trace can be shown, but this one has none: {reason}")
         return pd.DataFrame(self.states.rows())
 
+    @property
+    def unconfirmed(self) -> str:
+        """Where contacts and SUMO's own list of collisions differ, and how; "" where they do not."""
+        return self.outcome.unconfirmed
+
     def to_dict(self) -> Json:
-        """Return what `simulate --json` prints."""
-        return {
+        """Return what `simulate --json` prints; `unconfirmed` only where there is something to say."""
+        evidence = {"unconfirmed": self.unconfirmed} if self.unconfirmed else {}
+        return evidence | {
             "scenario": self.name, "seed": self.seed, "inputs": dict(self.inputs), "status": str(self.status),
             "metrics": dict(self.metrics), "critical": self.critical, "reason": self.reason, "seconds": self.outcome.seconds,
         }  # fmt: skip

@@ -40,6 +40,7 @@ class Summary:
     Attributes:
         campaign, scenario, store: as configured.
         runs, ok, failed, critical: counts.
+        unconfirmed: critical runs with a contact that SUMO's own list does not confirm.
         iterations: batches.
         stopped: why it ended.
         seconds: of `simulate`, `fit` and `propose`.
@@ -57,6 +58,7 @@ class Summary:
     stopped: str
     seconds: Mapping[str, float]
     conclusion: Conclusion
+    unconfirmed: int = 0
 
     def to_dict(self) -> Json:
         """Return what `run --json` prints."""
@@ -145,11 +147,12 @@ def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> Non
 def summarise(store: Store, study: Study, finished: Finished) -> Summary:
     """Return how a campaign ended."""
     history, config = store.history(), study.config
-    ok = int(history.ok.sum())
+    ok, critical = int(history.ok.sum()), study.scenario.requirement.critical_runs(history)
     return Summary(
         config.campaign, config.scenario, str(Path(config.store)), len(history), ok, len(history) - ok,
-        int(np.count_nonzero(study.scenario.requirement.critical_runs(history))), len(store.iterations()), finished.stopped,
+        int(np.count_nonzero(critical)), len(store.iterations()), finished.stopped,
         {k: round(v, 4) for k, v in finished.seconds.items()}, finished.conclusion,
+        int(np.count_nonzero(critical & history.unconfirmed)),
     )  # fmt: skip
 
 
