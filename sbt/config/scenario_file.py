@@ -26,6 +26,7 @@ from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
 from sbt.sumo.ego_vehicle import EgoVehicle
 from sbt.sumo.files import SumoFiles, options_of_config
+from sbt.sumo.friction import Friction, has_friction
 from sbt.sumo.guided import Participant
 from sbt.sumo.recorded import RecordedTraffic
 from sbt.sumo.recorder import RecordingSettings
@@ -98,7 +99,7 @@ class _Builder:
         metrics = self._metrics()
         requirement = self._requirement(metrics)
         guided = guided_vehicles(model.actors, self._profiles, files, model.ego.id, problems)
-        moved: tuple[Participant, ...] = (*guided, *self._recorded())
+        moved: tuple[Participant, ...] = (*self._friction(files), *guided, *self._recorded())
         if files is not None:
             self._check_inputs(files, space)
         if model.sumo is None and model.simulate is None:
@@ -175,6 +176,20 @@ class _Builder:
             return ()
         found = self._problems.attempt(("recorded",), lambda: recorded_traffic(entry, self._folder))
         return () if found is None else (found,)
+
+    def _friction(self, files: SumoFiles | None) -> tuple[Friction, ...]:
+        """Return the friction of the roads, where it is given or the network has it."""
+        given = self._model.friction
+        if isinstance(given, str) and not given.startswith("${"):
+            rule = 'friction must be a number, or a placeholder such as "${mu}"'
+            self._problems.add(("friction",), f"{rule}, but got '{given}'")
+        elif given is not None and not isinstance(given, str) and not 0 < given < math.inf:
+            self._problems.add(("friction",), f"friction must be > 0, but got {given:g}")
+        elif given is not None:
+            return (Friction(str(given)),)
+        elif files is None or has_friction(files.net):
+            return (Friction(),)
+        return ()
 
     def _options(self, entry: SumoEntry) -> dict[str, str]:
         """Return the options of the configuration with what the scenario file says on top."""
@@ -256,6 +271,7 @@ class _Builder:
             holes = list(files.placeholders())
             if self._model.recorded is not None:
                 holes += placeholders(str(self._model.recorded.begin), "recorded.begin")
+            holes += placeholders(str(self._model.friction), "friction")
         except InputError as error:
             self._problems.add(("sumo",), str(error))
             return

@@ -190,6 +190,9 @@ class ScenarioModel(_Strict):
     recorded: Annotated[RecordedEntry, _under("file")] | None = Field(
         default=None, description="Recorded road users as traffic, or just the file."
     )
+    friction: float | Name | None = Field(
+        default=None, description="Of all roads, also a placeholder; bounds every acceleration by mu g; null: that of the lanes."
+    )
     others: OthersEntry = Field(default=OthersEntry(), description="Who is recorded.")
     duration: float = Field(gt=0, allow_inf_nan=False, description="From the ego's departure on (s).")
     wait: float = Field(

@@ -110,7 +110,7 @@ class _Guidance:
         elif self._speed is not None and abs(self._sumo.vehicle.getSpeed(name) - self._speed) > _TOLERANCE:
             rule = f"'{name}' must drive {self._speed:g} m/s at t = {simulation.getTime():g} s, as its profile says"
             actual = self._sumo.vehicle.getSpeed(name)
-            raise RunError(Status.INVALID, f"{rule}, but SUMO gave {actual:g} m/s (a stop on its route?)")
+            raise RunError(Status.INVALID, f"{rule}, but SUMO gave {actual:g} m/s (a stop on its route, or too little friction?)")
         return {}
 
     def _take_over(self, t: float, now: float) -> None:
