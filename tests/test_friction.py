@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scenario_points import sobol
 from test_doors import files_of
 
 from sbt.errors import InputError
@@ -130,6 +132,42 @@ def test_a_vehicle_gets_its_limits_back_where_the_ice_ends(tmp_path):
     on, off = (front > 101) & (front < 148), (front > 155) & (ego.speed > 2.1)
     assert ego.acceleration[on] == pytest.approx(-0.1 * G, abs=1e-6)
     assert ego.acceleration[off] == pytest.approx(-20.0, abs=1e-6)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("name", ["emergency_braking", "following", "unprotected_left_turn"])
+def test_built_in_scenarios_stay_within_friction(name):
+    scenario = ScenarioSpec(name, friction=(0.1, 0.9)).resolve()
+    assert scenario.space.names[-1] == "friction"
+    binding = 0
+    for k, values in enumerate(sobol(scenario, 12)):
+        trace = scenario.simulate(values, k)
+        hardest = np.nanmax(np.abs(trace.acceleration))
+        assert hardest <= values["friction"] * G + 1e-6
+        binding += hardest > 0.98 * values["friction"] * G
+        if k < 2:
+            assert trace.identical(scenario.configured(isolation="fresh").simulate(values, k))
+    assert binding >= 2
+
+
+@pytest.mark.sumo
+def test_replicas_have_a_friction_each():
+    scenario = ScenarioSpec("emergency_braking", friction=(0.1, 0.9), isolation="replicas").resolve()
+    work = [(values, 3) for values in sobol(scenario, 8)]
+    alone = ScenarioSpec("emergency_braking", friction=(0.1, 0.9), isolation="fresh").resolve()
+    for (values, seed), trace in zip(work, scenario.simulate.simulate_many(work), strict=True):
+        assert trace.identical(alone.simulate(values, seed))
+
+
+def test_a_range_of_friction_belongs_to_the_scenario_file(tmp_path):
+    files_of("own_files", tmp_path)
+    spec = ScenarioSpec(str(tmp_path / "profile.yaml"), friction=(0.2, 0.4))
+    with pytest.raises(InputError, match=r"must be an input of scenario\.yaml"):
+        spec.resolve()
+    with pytest.raises(InputError, match="0 < min <= max"):
+        ScenarioSpec("cut_in", friction=(0.4, 0.2)).resolve()
+    with pytest.raises(InputError, match="offers no choice of friction"):
+        ScenarioSpec("testbed:four_branch_7", friction=(0.2, 0.2)).resolve()
 
 
 @pytest.mark.parametrize(

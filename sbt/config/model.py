@@ -43,6 +43,11 @@ EXECUTORS = ("serial", "local", "dask")
 """Where runs can be executed."""
 
 
+def _same_ends(value: Any) -> Any:
+    """Return a range for a number."""
+    return {"min": value, "max": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
 def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
     """Return a check for these values."""
 
@@ -194,8 +199,19 @@ class CorrelationEntry(_Strict):
     value: float = Field(gt=-1, lt=1, description="Correlation of their normal scores, between -1 and 1.")
 
 
+class FrictionRange(_Strict):
+    """Friction as an input."""
+
+    min: float = Field(gt=0, allow_inf_nan=False, description="Lower end.")
+    max: float = Field(gt=0, allow_inf_nan=False, description="Upper end.")
+
+
 class SimulationChoice(_Strict):
     """How SUMO simulates."""
+
+    friction: Annotated[FrictionRange, BeforeValidator(_same_ends)] | None = Field(
+        default=None, description="Of the roads, or {min, max} as an input: bounds accelerations by mu g; null: no bound."
+    )
 
     step_length: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Step (s); null: the scenario's own.")
 

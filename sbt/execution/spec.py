@@ -37,6 +37,7 @@ class ScenarioSpec:
         ego: the AV under test; None: the scenario's own.
         isolation: auto, fresh, reuse or replicas; scenarios without SUMO ignore it.
         step_length: simulation step (s); None: the scenario's own.
+        friction: smallest and largest coefficient of friction of the roads, an input where they differ; None: the scenario's own.
         formula: of signal temporal logic, measured as the metric `stl` and required; None: the scenario's own requirement.
         conflict_type: measure how ego and the nearest other met as well, where runs have a trace.
         metrics: measured as well, in place of the scenario's of the same name: installed ones (of ego and each
@@ -56,6 +57,7 @@ class ScenarioSpec:
     metrics: tuple[str, ...] = ()
     carried: bytes = field(default=b"", repr=False)
     drivers: tuple[Mapping[str, Any], ...] = ()
+    friction: tuple[float, float] | None = None
 
     def resolve(self) -> LogicalScenario:
         """Return the scenario; loaded once per process and specification.
@@ -98,6 +100,9 @@ class ScenarioSpec:
             yield ("ego",), partial(LogicalScenario.configured, ego=self.ego)
         if self.step_length is not None:
             yield ("simulation", "step_length"), partial(LogicalScenario.configured, step_length=self.step_length)
+        if self.friction is not None:
+            low, high = self.friction
+            yield ("simulation", "friction"), partial(LogicalScenario.with_friction, low=low, high=high)
         yield ("executor", "isolation"), partial(LogicalScenario.configured, isolation=self.isolation)  # may depend on the ego
 
 

@@ -75,6 +75,15 @@ class Configurable(Protocol):
         ...
 
 
+@runtime_checkable
+class OnRoads(Protocol):
+    """A `Simulate` whose vehicles drive on roads with a friction."""
+
+    def with_friction(self, low: float, high: float) -> Simulate:
+        """Return a copy on roads of this coefficient of friction, an input where it is a range."""
+        ...
+
+
 @dataclass(frozen=True)
 class Metric:
     """A named function of a trace.
@@ -262,6 +271,19 @@ class LogicalScenario:
         if not isinstance(self.simulate, Configurable):
             raise InputError(f"scenario {self.name} offers no choice of ego or step length")
         simulate = self.simulate.configured(ego, isolation, step_length)
+        return replace(self, simulate=simulate, space=self._space_with(getattr(simulate, "inputs", ())))
+
+    def with_friction(self, low: float, high: float) -> LogicalScenario:
+        """Return a copy on roads of this coefficient of friction, an input where it is a range.
+
+        Raises:
+            InputError: the scenario has no roads.
+        """
+        if not isinstance(self.simulate, OnRoads):
+            raise InputError(f"scenario {self.name} offers no choice of friction")
+        if not 0 < low <= high < math.inf:
+            raise InputError(f"friction must be > 0, in a range 0 < min <= max, but got {low:g} to {high:g}")
+        simulate = self.simulate.with_friction(low, high)
         return replace(self, simulate=simulate, space=self._space_with(getattr(simulate, "inputs", ())))
 
     def _space_with(self, inputs: tuple[Parameter, ...]) -> ParameterSpace:

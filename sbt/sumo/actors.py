@@ -189,9 +189,11 @@ class Scene:
         until: end condition of the run; None: only collision and duration.
         obstacles: static rectangles.
         signals: name to a function that is sampled after the actions of every step, recorded in `Trace.signals`.
+        friction: coefficient of the road, which bounds accelerations of vehicles on lanes by mu g; None: no bound.
     """
 
     actors: tuple[Actor, ...]
     until: EndCondition | None = None
     obstacles: tuple[Obstacle, ...] = ()
     signals: Mapping[str, Callable[[], float]] = field(default_factory=dict)
+    friction: float | None = None

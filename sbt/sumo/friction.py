@@ -18,21 +18,15 @@ from typing import Any
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
+from sbt.sumo.grip import Limits, limit_to_friction, set_limits
 from sbt.sumo.guided import Motion, Placed
 from sbt.sumo.template import fill
 
-__all__ = ["GRAVITY", "Friction", "has_friction", "limit_to_friction"]
+__all__ = ["Friction", "has_friction"]
 
-GRAVITY = 9.81
-"""m/s^2."""
 _DRY = 1.0
 """SUMO's friction of lanes where a network says nothing; it bounds nothing."""
-_BOUNDED = 2 | 4
-"""Speed modes in which SUMO keeps to the vehicle's acceleration and deceleration."""
 _CHUNK = 1 << 22
-
-_Limits = tuple[float, float, float, float, int]
-"""Of a vehicle: accel, decel, emergencyDecel, apparentDecel (m/s^2), and its speed mode."""
 
 
 @cache
@@ -45,32 +39,6 @@ def has_friction(net: Path) -> bool:
                 return True
             tail = chunk[-16:]
     return False
-
-
-def limit_to_friction(sumo: Any, name: str, mu: float) -> _Limits:
-    """Bound the acceleration of a vehicle by a coefficient of friction, and return its limits from before."""
-    vehicle, most = sumo.vehicle, mu * GRAVITY
-    before: _Limits = (
-        vehicle.getAccel(name), vehicle.getDecel(name), vehicle.getEmergencyDecel(name), vehicle.getApparentDecel(name),
-        vehicle.getSpeedMode(name),
-    )  # fmt: skip
-    if before[-1] & _BOUNDED:  # a driver of SUMO, with limits of its own
-        _set(sumo, name, (*(min(value, most) for value in before[:4]), before[-1]))  # type: ignore[arg-type]
-    else:
-        _set(sumo, name, (most, most, most, most, before[-1] | _BOUNDED))
-    return before
-
-
-def _set(sumo: Any, name: str, limits: _Limits) -> None:
-    vehicle = sumo.vehicle
-    accel, decel, emergency, apparent, mode = limits
-    vehicle.setEmergencyDecel(name, max(emergency, vehicle.getDecel(name)))  # never below decel, of which SUMO would warn
-    vehicle.setDecel(name, decel)
-    vehicle.setEmergencyDecel(name, emergency)
-    vehicle.setApparentDecel(name, apparent)
-    vehicle.setAccel(name, accel)
-    if mode != vehicle.getSpeedMode(name):
-        vehicle.setSpeedMode(name, mode)
 
 
 @dataclass(frozen=True)
@@ -122,7 +90,7 @@ class _Lanes:
 
     def __init__(self, sumo: Any, friction: Mapping[str, float]):
         self._sumo, self._friction = sumo, friction
-        self._limited: dict[str, tuple[float, _Limits]] = {}
+        self._limited: dict[str, tuple[float, Limits]] = {}
 
     def before_step(self, t: float | None) -> None:
         """Bound who is on a slippery lane; between two, the lower friction counts."""
@@ -136,7 +104,7 @@ class _Lanes:
         for name in changed:
             _, before = self._limited.pop(name)
             if name in there:
-                _set(self._sumo, name, before)
+                set_limits(self._sumo, name, before)
         for name, mu in now.items():
             if name not in self._limited:
                 self._limited[name] = mu, limit_to_friction(self._sumo, name, mu)

@@ -11,6 +11,7 @@ from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.actors import Actor, Pose, Scene
 from sbt.sumo.formatting import format_number
+from sbt.sumo.grip import limit_to_friction
 from sbt.sumo.session import INVALID_DOUBLE, session, unwrapped
 
 __all__ = ["LANE_REQUEST_DURATION", "SPEED_MODE", "insert", "pose_setter", "type_name", "verify"]
@@ -64,6 +65,8 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
             if actor.driver is not None:
                 sumo.vehicle.setSpeedMode(name, SPEED_MODE)
                 set_speed(name, speed)  # SUMO would accelerate until the first command of the controller
+            if scene.friction is not None and actor.pose is None:
+                limit_to_friction(sumo, name, scene.friction)
         if actor.pose is not None:
             pose_setter(sumo, actor, prefix)(actor.pose)
     for obstacle in scene.obstacles:

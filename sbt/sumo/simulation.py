@@ -51,6 +51,7 @@ class SumoSimulation:
         isolation: the level of this simulation; None: the fastest.
         options: further SUMO options.
         timeout: wall-clock limit of a run (s); None: none.
+        friction: of the road, which bounds accelerations of vehicles on lanes by mu g, also as an input; None: no bound.
 
     Raises:
         InputError: step and duration do not fit, or the isolation level is not allowed.
@@ -67,6 +68,7 @@ class SumoSimulation:
     isolation: str | None = None
     options: tuple[str, ...] = ()
     timeout: float | None = None
+    friction: Parameter | float | None = None
 
     def __post_init__(self) -> None:
         if not (self.duration > 0 and 0 < self.step_length <= self.duration):
@@ -97,10 +99,15 @@ class SumoSimulation:
             step_length=self.step_length if step_length is None else step_length,
         )  # fmt: skip
 
+    def with_friction(self, low: float, high: float) -> SumoSimulation:
+        """Return a copy on roads of this friction; an input, where it is a range."""
+        mu = low if low == high else Parameter("friction", low, high, description="coefficient of friction of the road")
+        return replace(self, friction=mu)
+
     @property
     def inputs(self) -> tuple[Parameter, ...]:
-        """Inputs that belong to the AV under test; part of the parameter space of the scenario."""
-        return self.ego.inputs
+        """Inputs that belong to the AV under test and the road; part of the parameter space of the scenario."""
+        return (*self.ego.inputs, *((self.friction,) if isinstance(self.friction, Parameter) else ()))
 
     def prepare(self) -> None:
         """Import libsumo and check the network.
@@ -172,7 +179,11 @@ class SumoSimulation:
     def build_scene(self, values: Values, seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
         values = plain_values(values)
-        return self.scene(values, self.ego.bind(values), stream(seed, "scene"))
+        scene = self.scene(values, self.ego.bind(values), stream(seed, "scene"))
+        if self.friction is None:
+            return scene
+        mu = self.friction
+        return replace(scene, friction=float(values[mu.name]) if isinstance(mu, Parameter) else mu)
 
     def setup(self, scene: Scene, replicas: int = 1) -> Setup:
         """Return what SUMO is loaded from for a scene."""

@@ -36,6 +36,7 @@ from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
 from sbt.sumo.foreign import check_not_stepped, error_in_loop, place_in_loop, started_another
 from sbt.sumo.formatting import plain, plain_values
+from sbt.sumo.friction import Friction
 from sbt.sumo.guided import Motion, Participant
 from sbt.sumo.levels import levels_of
 from sbt.sumo.messages import explained
@@ -107,6 +108,18 @@ class UserSimulation:
         if ego is not None:
             recording = replace(recording, ego=recording.ego.with_driver(Ego.of(**ego)))
         return replace(self, recording=recording, step=self.step if step_length is None else step_length)
+
+    def with_friction(self, low: float, high: float) -> UserSimulation:
+        """Return a copy on roads of this friction.
+
+        Raises:
+            InputError: it is a range, which is an input of the scenario file.
+        """
+        if low != high:
+            rule = 'a range of friction must be an input of scenario.yaml (friction: "${mu}")'
+            raise InputError(f"{rule}, but got simulation.friction from {low:g} to {high:g}")
+        others = tuple(p for p in self.participants if not isinstance(p, Friction))
+        return replace(self, participants=(Friction(str(low)), *others))
 
     def prepare(self) -> None:
         """Import libsumo, and read and check the files.

@@ -258,4 +258,5 @@ class Study:
         own = ".py:" in config.scenario or Path(config.scenario).suffix == ".yaml"
         name = str((self.loaded.folder / config.scenario).resolve()) if own else config.scenario
         ego = None if config.ego is None else config.ego.model_dump()
-        return name, ego, config.simulation.step_length
+        friction = config.simulation.friction
+        return (name, ego, config.simulation.step_length, *(() if friction is None else (friction.min, friction.max)))
