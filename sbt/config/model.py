@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 from sbt.config.kinds import kind_of
+from sbt.config.simulation_model import SimulationChoice
 from sbt.errors import did_you_mean
 from sbt.plugins import OBJECT
 from sbt.problem.expression import Expression
@@ -41,11 +42,6 @@ __all__ = [
 
 EXECUTORS = ("serial", "local", "dask")
 """Where runs can be executed."""
-
-
-def _same_ends(value: Any) -> Any:
-    """Return a range for a number."""
-    return {"min": value, "max": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
 def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
@@ -197,23 +193,6 @@ class CorrelationEntry(_Strict):
 
     inputs: Annotated[tuple[Name, Name], BeforeValidator(_two), Field(strict=False)] = Field(description="Two inputs.")
     value: float = Field(gt=-1, lt=1, description="Correlation of their normal scores, between -1 and 1.")
-
-
-class FrictionRange(_Strict):
-    """Friction as an input."""
-
-    min: float = Field(gt=0, allow_inf_nan=False, description="Lower end.")
-    max: float = Field(gt=0, allow_inf_nan=False, description="Upper end.")
-
-
-class SimulationChoice(_Strict):
-    """How SUMO simulates."""
-
-    friction: Annotated[FrictionRange, BeforeValidator(_same_ends)] | None = Field(
-        default=None, description="Of the roads, or {min, max} as an input: bounds accelerations by mu g; null: no bound."
-    )
-
-    step_length: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Step (s); null: the scenario's own.")
 
 
 class ValidationChoice(_Strict):
