@@ -117,7 +117,7 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     return ScenarioSpec(
         config.scenario, str(loaded.folder.resolve()), ego, config.executor.isolation, config.simulation.step_length,
         config.requirement.stl, types, named, carried,
-        None if config.simulation.friction is None else (config.simulation.friction.min, config.simulation.friction.max),
+        friction=None if config.simulation.friction is None else (config.simulation.friction.min, config.simulation.friction.max),
     )  # fmt: skip
 
 
