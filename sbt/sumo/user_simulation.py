@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +31,7 @@ from sbt.problem.plain import Values
 from sbt.problem.profile import Profile
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
+from sbt.sumo.connecting import traci_connection
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture, WaitingEgo, number_or_none, requested_departures
 from sbt.sumo.ego import Ego
 from sbt.sumo.files import Launch, SumoFiles, options_of_command
@@ -174,7 +175,7 @@ class UserSimulation:
         Returns:
             The trace, identical to that of a call.
         """
-        return self._run(values, seed, lambda launch: _traci_connection(traci, [*program, *launch.command(seed)]), Stopwatch())
+        return self._run(values, seed, lambda launch: traci_connection(traci, [*program, *launch.command(seed)]), Stopwatch())
 
     def files_of_run(self, values: Values, seed: int) -> SumoFiles:
         """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.
@@ -390,16 +391,3 @@ class _CommandProxy:
         position, speed, lane = map(number_or_none, (departPos, departSpeed, departLane))
         requested = RequestedDeparture("", when, position, speed, lane)
         self._proxy.recorder.expect_departure(vehID, requested)
-
-
-@contextlib.contextmanager
-def _traci_connection(traci: Any, command: list[str]) -> Iterator[Any]:
-    """Start a SUMO program, provide traci connected to it, and close it in the end."""
-    try:
-        traci.start(command)
-        yield traci
-    except (traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError) as error:
-        raise RunError(Status.FAILED, f"SUMO: {error}") from None
-    finally:
-        with contextlib.suppress(traci.exceptions.FatalTraCIError, traci.exceptions.TraCIException, KeyError):
-            traci.close()

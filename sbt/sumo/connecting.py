@@ -1,0 +1,25 @@
+"""A connection to a SUMO program in a process of its own, through traci."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+from sbt.errors import RunError
+from sbt.problem.outcome import Status
+
+__all__ = ["traci_connection"]
+
+
+@contextlib.contextmanager
+def traci_connection(traci: Any, command: list[str]) -> Iterator[Any]:
+    """Start a SUMO program, provide traci connected to it, and close it in the end."""
+    try:
+        traci.start(command)
+        yield traci
+    except (traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError) as error:
+        raise RunError(Status.FAILED, f"SUMO: {error}") from None
+    finally:
+        with contextlib.suppress(traci.exceptions.FatalTraCIError, traci.exceptions.TraCIException, KeyError):
+            traci.close()
