@@ -162,7 +162,7 @@ def test_seed_is_the_runs_and_repeats(study):
         ({ROAD: [('version="1.20"', 'version="1.99"')]}, r"road.net.xml: a network must be of a version up to 1.20, but is of '1.99', made by another SUMO"),
         ({ROAD: [('<net version="1.20" junctionCornerDetail="5" limitTurnSpeed="5.50">', "<OpenDRIVE>"), ("</net>", "</OpenDRIVE>")]}, r"has <OpenDRIVE>; make it with netconvert --opendrive road.net.xml -o road.net.xml"),
         ({"my.sumocfg": [("road.net.xml", "rode.net.xml")]}, r"net-file must name a file that exists"),
-        ({YAML: [("ego: ego", "ego: egon")]}, r"scenario.yaml:5:6: ego: the ego must be a vehicle, trip or flow of the files \(lead, beside, ego\), but got 'egon' \(did you mean 'ego'"),
+        ({YAML: [("ego: ego", "ego: egon")]}, r"scenario.yaml:5:6: ego: the ego must be a vehicle, trip, flow or person of the files \(lead, beside, ego\), but got 'egon' \(did you mean 'ego'"),
         ({YAML: [("- ttc_min", "- ttc_mim")]}, r"scenario.yaml:8:5: metrics.0: metrics must be one of .*did you mean 'ttc_min'"),
         ({YAML: [("- collision", "- {kind: tet, treshold: 2}")]}, r"metrics.1: settings of tet must be among .*threshold"),
         ({YAML: [("G[0,10](gap > 2", "G[0,10](gap > > 2")]}, r"scenario.yaml:11:5: metrics.3: stl, column 15"),

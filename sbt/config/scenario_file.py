@@ -25,6 +25,7 @@ from sbt.problem.scenario import LogicalScenario, Metric, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
 from sbt.sumo.ego_vehicle import EgoVehicle
+from sbt.sumo.elements import person
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.friction import Friction, has_friction
 from sbt.sumo.guided import Participant
@@ -215,10 +216,14 @@ class _Builder:
         return loop
 
     def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> EgoVehicle | None:
-        if files is not None and self._model.simulate is None and files.vehicle(entry.id) is None:
+        there = files is None or self._model.simulate is not None or files.vehicle(entry.id) is not None
+        walks = files is not None and not there and person(files.templates, entry.id) is not None
+        if walks and entry.kind is not None:
+            self._problems.add(("ego", "kind"), f"a person as the ego is moved by SUMO and has no kind, but got '{entry.kind}'")
+        if files is not None and not there and not walks:
             names = files.names()
             known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
-            rule = f"the ego must be a vehicle, trip or flow of the files ({known})"
+            rule = f"the ego must be a vehicle, trip, flow or person of the files ({known})"
             self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{did_you_mean(entry.id, names)}")
         kind = entry.kind
         if kind is None:

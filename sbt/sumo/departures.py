@@ -18,6 +18,7 @@ from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.sumo.absence import why_absent
+from sbt.sumo.elements import person
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import fill
 from sbt.sumo.waiting import why_held_back
@@ -39,6 +40,7 @@ class RequestedDeparture:
         speed: m/s.
         lane: index.
         of_flow: SUMO generates the vehicle when it can; nothing else of its departure is known.
+        on_foot: it is a person.
     """
 
     place: str
@@ -47,6 +49,7 @@ class RequestedDeparture:
     speed: float | None
     lane: float | None
     of_flow: bool = False
+    on_foot: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,11 @@ def requested_departures(files: SumoFiles, values: Values, ego: str) -> dict[str
     if of_ego is not None:
         compared.append((ego if ego in of_ego[1].vehicles else ego.rpartition(".")[0], of_ego[1]))
     requested: dict[str, RequestedDeparture] = {}
+    walker = None if of_ego is not None else person(files.templates, ego)
+    if walker is not None:
+        texts = (walker.depart or "", walker.attributes.get("departPos", ""))
+        depart, position = (number_or_none(fill(text, values, walker.place)) for text in texts)
+        requested[ego] = RequestedDeparture(walker.place, depart, position, None, None, on_foot=True)
     for name, template in compared:
         vehicle = template.vehicles[name]
         place = f"{template.path}:{vehicle.place[0]}:{vehicle.place[1]}: "
@@ -220,6 +228,9 @@ class DepartureMonitor:
         return f" within {limit:g} s"
 
     def _compare(self, name: str, requested: RequestedDeparture, dt: float) -> None:
+        if requested.on_foot:
+            self._compare_person(name, requested, dt)
+            return
         vehicle = self._sumo.vehicle
         departure = vehicle.getDeparture(name)
         late = 0.0 if requested.depart is None or requested.of_flow else departure - requested.depart - self._allowed(name)
@@ -243,3 +254,17 @@ class DepartureMonitor:
                     f"{requested.place}'{name}' must depart with {attribute} {expected:g}{unit}, "
                     f"but SUMO inserted it with {actual:g}{unit}: {remedy}",
                 )
+
+    def _compare_person(self, name: str, requested: RequestedDeparture, dt: float) -> None:
+        """Compare time and position of a person in the step in which it begins to walk."""
+        departure = float(self._sumo.simulation.getTime()) - dt
+        if requested.depart is not None and departure - requested.depart > dt - _TOLERANCE:
+            rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
+            raise RunError(Status.INVALID, f"{rule}, but SUMO inserted it at t = {departure:g} s")
+        domain = self._sumo.person
+        edge, expected, actual = domain.getRoadID(name), requested.position, domain.getLanePosition(name)
+        if expected is not None and expected < 0:
+            expected += self._sumo.lane.getLength(f"{edge}_0")
+        if expected is not None and abs(expected - actual) > _TOLERANCE:
+            rule = f"{requested.place}'{name}' must depart with departPos {expected:g} m, but SUMO inserted it with {actual:g} m"
+            raise RunError(Status.INVALID, f"{rule}: edge {edge} must be that long, and the walk begin there")

@@ -77,14 +77,22 @@ class EgoVehicle:
         settings = vtype_attributes(dict(self.driver.settings))
         return '<vType id="{}" {}/>'.format(EGO_TYPE, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
 
-    def take_over(self, sumo: Any, rng: np.random.Generator) -> ControlStep | None:
+    def take_over(self, sumo: Any, rng: np.random.Generator, *, walks: bool = False) -> ControlStep | None:
         """Give the ego its driver; to be called in the step in which it departs.
+
+        Args:
+            sumo: libsumo or traci.
+            rng: for the controller.
+            walks: it is a person, whom only SUMO's pedestrian model moves.
 
         Returns:
             The function to be called before every step; None where SUMO drives.
         """
         if self.driver is None:
             return None
+        if walks:
+            rule = "a person as the ego is moved by SUMO (no ego.kind)"
+            raise RunError(Status.FAILED, f"{rule}, but '{self.id}' has the kind {self.driver.kind}")
         if self.driver.kind == SUMO:
             self._change_type(sumo)
             return None

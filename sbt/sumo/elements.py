@@ -5,10 +5,12 @@ from __future__ import annotations
 import xml.parsers.expat
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 
 from sbt.sumo.files import SumoFiles
+from sbt.sumo.template import Template
 
-__all__ = ["Element", "element", "elements"]
+__all__ = ["Element", "element", "elements", "person"]
 
 _DEPARTING = {"vehicle": "depart", "trip": "depart", "person": "depart", "container": "depart", "flow": "begin",
               "personFlow": "begin", "containerFlow": "begin"}  # fmt: skip
@@ -46,21 +48,29 @@ class Element:
 def elements(files: SumoFiles) -> Iterator[Element]:
     """Yield all elements with an id of all files but the network, in the order in which they stand."""
     for one in files.templates:
-        if one.root[0] == "net":
-            continue
-        found: list[Element] = []
-        parser = xml.parsers.expat.ParserCreate()
+        if one.root[0] != "net":
+            yield from _elements_of(one)
 
-        def start(
-            tag: str, attributes: dict[str, str], *, file: str = str(one.path), parser: xml.parsers.expat.XMLParserType = parser,
-            found: list[Element] = found,
-        ) -> None:  # fmt: skip
-            if "id" in attributes:
-                found.append(Element(tag, attributes, file, parser.CurrentLineNumber, parser.CurrentColumnNumber + 1))
 
-        parser.StartElementHandler = start
-        parser.Parse(one.opened().read(), True)
-        yield from found
+def _elements_of(one: Template) -> list[Element]:
+    """Return the elements with an id of one file."""
+    found: list[Element] = []
+    parser = xml.parsers.expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if "id" in attributes:
+            found.append(Element(tag, attributes, str(one.path), parser.CurrentLineNumber, parser.CurrentColumnNumber + 1))
+
+    parser.StartElementHandler = start
+    parser.Parse(one.opened().read(), True)
+    return found
+
+
+@cache
+def person(templates: tuple[Template, ...], name: str) -> Element | None:
+    """Return the person of this id, None if there is none; looked for once per process."""
+    of_files = (one for each in templates if each.root[0] != "net" for one in _elements_of(each))
+    return next((one for one in of_files if one.tag == "person" and one.attributes["id"] == name), None)
 
 
 def element(files: SumoFiles, name: str, tags: Collection[str]) -> Element | None:

@@ -92,6 +92,7 @@ class Recorder:
         self._departures = departures
         self._appearances = AppearanceMonitor(sumo, self._ego, departures)
         self._departed = False
+        self._walks: bool | None = None
         self._dt = float(sumo.simulation.getDeltaT())
         self._surroundings = Surroundings(sumo, self._ego, settings.within, settings.named, self._dt)
         self._control: ControlStep | None = None
@@ -152,8 +153,10 @@ class Recorder:
         self._check_clock()
         simulation = self._sumo.simulation
         departed, arrived = frozenset(simulation.getDepartedIDList()), frozenset(simulation.getArrivedIDList())
-        self._departures.after_step(departed)
         self._surroundings.follow(departed, arrived)
+        if self._walks is not False:  # a person, or not known yet
+            departed, arrived = self._with_ego_on_foot(departed, arrived)
+        self._departures.after_step(departed)
         if not self._departed:
             if self._ego not in departed:
                 self._departures.await_ego()
@@ -164,6 +167,18 @@ class Recorder:
         if self._ego in simulation.getStartingTeleportIDList():
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but SUMO teleported it at {self._now()}")
         self._record_step(departed)
+
+    def _with_ego_on_foot(self, departed: frozenset[str], arrived: frozenset[str]) -> tuple[frozenset[str], frozenset[str]]:
+        """Return who departed and arrived in this step, with the ego if it is a person."""
+        simulation, ego = self._sumo.simulation, frozenset((self._ego,))
+        if self._walks is None and self._ego in departed:
+            self._walks = False
+        elif self._walks is None and self._ego in simulation.getDepartedPersonIDList():
+            self._walks = True
+            return departed | ego, arrived
+        elif self._walks and self._ego in simulation.getArrivedPersonIDList():
+            return departed, arrived | ego
+        return departed, arrived
 
     def _end(self, reason: str) -> NoReturn:
         self._ended = RunEnded(reason)
@@ -184,8 +199,8 @@ class Recorder:
     def _start_recording(self) -> None:
         """Subscribe to the surroundings of the ego, and give it its controller."""
         self._departed = True
-        self._surroundings.subscribe()
-        self._control = self._settings.ego.take_over(self._sumo, self._rng)
+        self._surroundings.subscribe(walks=self._walks is True)
+        self._control = self._settings.ego.take_over(self._sumo, self._rng, walks=self._walks is True)
 
     def _handle_arrival(self) -> None:
         if self._settings.ego.may_leave:
@@ -232,7 +247,7 @@ class Recorder:
         listed = {name for name, t in self._listed.items() if self._t - t <= CONFIRMED_WITHIN} | collisions_of(sumo, self._ego)
         moving = texts.keys() - near.placed.keys()  # nobody moves the others in the steps to come
         for k in range(1, math.ceil(CONFIRMED_WITHIN / self._dt) + 1):
-            if moving <= listed or self._ego not in sumo.vehicle.getIDList():
+            if moving <= listed or self._ego not in (sumo.person if self._walks else sumo.vehicle).getIDList():
                 break
             sumo.simulationStep()
             found = collisions_of(sumo, self._ego) & moving - listed

@@ -61,6 +61,7 @@ class Surroundings:
 
     def __init__(self, sumo: Any, ego: str, within: float, named: Iterable[str], dt: float):
         self._sumo, self._ego, self._within, self._dt = sumo, ego, within, dt
+        self._own_domain: Any = sumo.vehicle
         self._named = frozenset(named)
         self._named_present: set[str] = set()
         self._very_long: dict[str, float] = {}
@@ -103,11 +104,11 @@ class Surroundings:
         self.placed = placed
         self.rigid.update(placed)
 
-    def subscribe(self) -> None:
-        """Subscribe to the surroundings of the ego, which has just departed."""
-        vehicle = self._sumo.vehicle
-        vehicle.subscribeContext(self._ego, _VEHICLES, self._within, [_POSITION, _ANGLE, _SPEED])
-        vehicle.subscribeContext(self._ego, _PERSONS, self._within, [_POSITION, _ANGLE, _SPEED, _VEHICLE])
+    def subscribe(self, *, walks: bool = False) -> None:
+        """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
+        self._own_domain = domain = self._sumo.person if walks else self._sumo.vehicle
+        domain.subscribeContext(self._ego, _VEHICLES, self._within, [_POSITION, _ANGLE, _SPEED])
+        domain.subscribeContext(self._ego, _PERSONS, self._within, [_POSITION, _ANGLE, _SPEED, _VEHICLE])
 
     def record(self) -> None:
         """Append the states of all road users that are present.
@@ -115,10 +116,13 @@ class Surroundings:
         Raises:
             RunError: the ego is not on the road.
         """
-        ego, near = self._ego, self._sumo.vehicle.getContextSubscriptionResults(self._ego)
+        ego, near = self._ego, self._own_domain.getContextSubscriptionResults(self._ego)
         if ego not in near:
             now = self._sumo.simulation.getTime()
             raise RunError(Status.FAILED, f"the ego '{ego}' must stay on the road, but it was gone at t = {now:g} s")
+        if near[ego].get(_VEHICLE):
+            rule = f"the ego '{ego}' must walk while it is recorded"
+            raise RunError(Status.FAILED, f"{rule}, but it rides in '{near[ego][_VEHICLE]}'")
         if self.placed:
             near = {**near, **self._placed_near(near[ego][_POSITION])}
         row: dict[str, _Row] = {}
@@ -126,7 +130,7 @@ class Surroundings:
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
         height = near[ego][_POSITION][2]
-        apart = self.levels.apart.get(self._sumo.vehicle.getRoadID(ego)) if self.levels.apart else None
+        apart = self.levels.apart.get(self._own_domain.getRoadID(ego)) if self.levels.apart else None
         for name in sorted([*near, *self._far(near)] if self._very_long else near):
             variables = near[name] if name in near else self._read(name)
             if name == ego or variables.get(_VEHICLE) or abs(variables[_POSITION][2] - height) >= LEVEL_HEIGHT:
