@@ -39,7 +39,7 @@ _SCENARIO = """\
 
 sumo:                       # or just: sumo: my.sumocfg
   config: {config}
-{files}  options: {{}}               # further SUMO options, such as {{scale: 1.2, insertion-checks: none}}
+{files}  options: {{}}               # further SUMO options, such as {{scale: 1.2, eager-insert: true}}
 
 inputs:                     # min, max, and if you like: unit, distribution, kind: integer, description
 {inputs}
