@@ -128,6 +128,17 @@ def test_the_advice_lets_a_held_back_ego_in(case, vehicles, options, rounds):
 
 
 @pytest.mark.sumo
+def test_an_ego_of_a_flow_waits_for_its_turn_and_no_advice_is_in_vain(case):
+    """Its own flow is in its way, which no option changes; with time, or a vehicle of its own, it gets in."""
+    busy = flow("${20 + 0 * p}", period="0.2")
+    status, reason = case(busy, ego="f.4", more=", delay: 1")
+    assert (status, "the vehicles of its flow 'f' wait for a safe gap one after the other: give it a <vehicle> of its own" in reason) == ("invalid", True), reason
+    assert "or let it wait longer: ego: {delay: SECONDS}" in reason
+    assert case(busy, ego="f.4", more=", delay: 60")[0] == "ok"
+    assert case(busy + car("ego", "60", depart="0.5"), eager_insert="true")[0] == "ok"
+
+
+@pytest.mark.sumo
 def test_traffic_that_the_options_leave_out_is_not_missed(case):
     """Vehicles with placeholders that depart before the beginning, or that `scale` drops."""
     early = car("early", "${p + 50}", depart="1") + car("ego", "10", depart="5")

@@ -211,7 +211,8 @@ class DepartureMonitor:
             cause = why_absent(self._files, self._values, name, requested.depart, self._start, added=not requested.place)
             raise RunError(Status.INVALID, f"{rule}, but {cause}")
         gap, why, remedy = why_held_back(self._sumo, name, requested, self._files)
-        tolerance = ", or let it wait: ego: {delay: SECONDS}" if is_ego else ""
+        longer = " longer" if self._ego.delay or requested.of_flow else ""
+        tolerance = f", or let it wait{longer}: ego: {{delay: SECONDS}}" if is_ego else ""
         held = f"but SUMO holds it back, as {why}: {remedy}{tolerance}"
         raise RunError(Status.INVALID, f"{rule}{f', {gap}' if gap else ''}, {held}")
 

@@ -43,23 +43,26 @@ def why_held_back(sumo: Any, name: str, requested: _Requested, files: SumoFiles)
     gap = _gap_ahead(sumo, name, requested)
     if found is not None and found.depart in _TRIGGERS:
         return gap, f'its depart="{found.depart}" waits for somebody who rides in it', "give it a depart in seconds"
+    own_flow = f"{found.attributes['id']}." if found is not None and found.tag == "flow" else None
     queue = _queue_before(sumo, name)
-    if queue and files.options.get("eager-insert") not in ("true", "1"):
+    if queue and not (own_flow and queue.startswith(own_flow)) and files.options.get("eager-insert") not in ("true", "1"):
         why = f"'{queue}' waits before it to depart on the same edge, and SUMO tries no other one there"
         return gap, why, "set the option eager-insert: true"
-    limit = float(files.options.get("max-num-vehicles", -1))
-    if 0 <= limit <= sumo.vehicle.getIDCount():
-        return gap, "no more vehicles may be on the road", f"raise the option max-num-vehicles from {limit:g}"
+    limit = files.options.get("max-num-vehicles", "")
+    if limit.isdigit() and int(limit) <= sumo.vehicle.getIDCount():
+        return gap, "no more vehicles may be on the road", f"raise the option max-num-vehicles from {limit}"
     taken = None if state is None else deepest_overlap(instant(state), {one.name: instant(one) for one in _others(sumo, name)})
     if taken is not None:
         why = f"its place is taken by '{taken[0]}' (they would overlap by {taken[1]:.2g} m)"
         return gap, why, "move its departPos, or let it depart at another time"
+    if checks == "none":
+        return gap, "SUMO finds no place for it", "move its departPos, departLane or depart"
     why = "its insertion checks find that unsafe"
     if found is None:
         return gap, why, "start SUMO with the option insertion-checks: none, which lets in every vehicle unchecked"
-    if found.tag == "flow":
-        flow = f"it is one of the flow '{found.attributes['id']}'"
-        return gap, why, f'give it a <vehicle> of its own with insertionChecks="none", as {flow}'
+    if own_flow:
+        why = f"the vehicles of its flow '{own_flow[:-1]}' wait for a safe gap one after the other"
+        return gap, why, 'give it a <vehicle> of its own with insertionChecks="none", or let fewer depart'
     return gap, why, 'set insertionChecks="none" on the vehicle'
 
 
