@@ -29,7 +29,7 @@ DRIFT = 1.5
 START = 0.1
 """Collisions that SUMO reports up to this time belong to the start (s)."""
 _PERSON = 1.0
-_AHEAD, _BESIDE = 60.0, 5.0
+_AHEAD, _BESIDE = 60.0, 7.0
 
 Table = NDArray[np.float64]
 """(t, m) values over time and road user; NaN where there is nothing to measure."""
@@ -178,7 +178,7 @@ def overlap(trace: Trace) -> Table:
 def braking_of_others(trace: Trace) -> Table:
     """Return the decelerations of all vehicles but the first, the ego, where it is not ahead of them (m/s^2).
 
-    Who finds the ego within 60 m ahead, and less than 5 m beside its course, may have to brake as hard as it can.
+    Who finds the ego within 60 m ahead, and less than 7 m beside its course, may have to brake as hard as it can.
     """
     values = -trace.acceleration[1:]
     dx, dy = trace.x[1:, :1] - trace.x[1:], trace.y[1:, :1] - trace.y[1:]

@@ -34,6 +34,9 @@ LANE_CHANGE = 3.0
 """Duration of a lane change (s)."""
 MERGED = 400.0
 """x at which the ego is well past the acceleration lane (m), which ends at 250 m."""
+WAITS, LAST, EDGE = 3.0, 200.0, -7.5
+"""Speed (m/s), x from which on, and y up to which (m) the ego counts as waiting at the end of the acceleration lane. There
+SUMO would move it sideways into the right lane while it stands, which no car can."""
 HORIZON = 5.0
 """Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 30.0
@@ -58,8 +61,11 @@ def scene(values: Mapping[str, float], ego: Ego, rng: np.random.Generator) -> Sc
 
 
 def end_condition(t: float, states: Mapping[str, State]) -> str | None:
-    """End the run when the ego is well past the acceleration lane."""
-    return "merged" if states["ego"].x > MERGED else None
+    """End the run when the ego is well past the acceleration lane, or waits at its end."""
+    ego = states["ego"]
+    if ego.x > LAST and ego.y < EDGE and ego.speed < WAITS:
+        return "waits"
+    return "merged" if ego.x > MERGED else None
 
 
 SCENARIO = LogicalScenario(
