@@ -15,6 +15,7 @@ SMALLEST = {
     "cut_in_plane.py": "--size 4 --out {folder}/plane.png",
     "metamodels.py": "--kinds et --rows 20 --inputs 2 --points 64 --repeat 1",
     "overhead.py": "--runs 32",
+    "physics.py": "emergency_braking --runs 2 --others 1 --egos IDM",
     "proposals.py": "--runs 30 --repeats 1",
     "screening.py": "--rows 50 --inputs 4 --samples 4 --kinds gp",
     "slice_teeth.py": "--scenario following --points 2 --values 4",
@@ -29,7 +30,7 @@ SMALLEST = {
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
-SUMO |= {"throughput.py", "watcher.py"}
+SUMO |= {"physics.py", "throughput.py", "watcher.py"}
 LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
 SHARED = {"street_traffic.py"}  # networks and traffic of the scripts
 

@@ -15,6 +15,7 @@ from sbt import interruption
 from sbt.errors import RunError, SbtError, described
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import elsewhere
+from sbt.metrics.physics import breaches
 from sbt.problem.plain import Value, Values, written
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
@@ -38,10 +39,11 @@ _WORKER_DEADLINE = 300.0
 
 @dataclass(frozen=True)
 class _Run:
-    """One run as plain data: its metrics, a digest of its trace, or the reason why there are none."""
+    """One run as plain data: its metrics, a digest of its trace, the laws of motion it breaks, or why there are none of these."""
 
     metrics: tuple[tuple[str, float], ...] = ()
     digest: str = ""
+    breaches: tuple[str, ...] = ()
     problem: str = ""
 
 
@@ -54,8 +56,8 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
         scenario: the configured scenario, where its ranges or requirement differ from those of `spec`.
 
     Returns:
-        One finding a rule. What SUMO warned of, the share of invalid runs, where the time goes and, at last, whether both
-        sides of the requirement were met are only information.
+        One finding a rule. What SUMO warned of, the share of invalid runs, where the time goes, which laws of motion
+        (`sbt.metrics.physics`) are broken and, at last, whether both sides of the requirement were met are only information.
 
     Raises:
         InputError: the scenario cannot be loaded.
@@ -71,7 +73,7 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
     again = _runs(spec, jobs[::-1])[::-1]
     findings.append(_equal("same seed, same trace", first, again, points))
     findings.append(_in_worker(spec, jobs, first, points))
-    findings += _isolations(spec, jobs, points)
+    findings += [*_isolations(spec, jobs, points), *_physics(first, points)]
     findings.append(_sides(first, asked))
     findings += [Finding(f"for information: {name}", ok=True, detail=said) for name, said in compared_times(asked, jobs)]
     return tuple(findings)
@@ -120,7 +122,8 @@ def _run(scenario: LogicalScenario, execute: Callable[[], Trace | dict[str, floa
         result = execute()
         if not isinstance(result, Trace):
             return _Run(tuple(result.items()))
-        return _Run(tuple(scenario.measure(result).items()), _digest(result))
+        broken = tuple(map(str, breaches(result, (scenario.roles.other or "",))))
+        return _Run(tuple(scenario.measure(result).items()), _digest(result), broken)
     except RunError as error:
         return _Run(problem=f"{error.status}: {error.reason}")
     except BaseException as error:
@@ -211,6 +214,17 @@ def _warned(spec: ScenarioSpec) -> list[Finding]:
     more = f" (and {len(lines) - _WARNINGS} more)" if len(lines) > _WARNINGS else ""
     detail = "; ".join(line.removeprefix("Warning: ") for line in lines[:_WARNINGS]) + more
     return [Finding("for information: SUMO warns", ok=True, detail=detail)] if lines else []
+
+
+def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:
+    """Return which laws of motion are broken, and where first: a failure in such a run is hardly one of the AV."""
+    broken = [(breach, values) for run, values in zip(runs, points, strict=True) for breach in run.breaches]
+    if not broken:
+        return []
+    share = f"{sum(bool(run.breaches) for run in runs)} of {len(runs)} runs"
+    first = {breach.partition(" must")[0]: (breach, values) for breach, values in broken[::-1]}
+    detail = "; ".join(f"{breach} ({written(values)})" for breach, values in first.values())
+    return [Finding("for information: laws of motion are broken", ok=True, detail=f"in {share}: {detail}")]
 
 
 def _sides(runs: list[_Run], scenario: LogicalScenario) -> Finding:
