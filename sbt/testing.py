@@ -13,6 +13,7 @@ from sbt.workflows.contracts import (
     check_sampler,
     check_scenario,
 )
+from sbt.workflows.plausibility import check_physics
 
 __all__ = [
     "ContractError",
@@ -20,6 +21,7 @@ __all__ = [
     "check_campaign",
     "check_metamodel",
     "check_metric",
+    "check_physics",
     "check_sampler",
     "check_scenario",
 ]

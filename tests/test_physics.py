@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scenario_points import sobol
 
+from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.physics import breaches
 from sbt.plugins import load, names
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import State
 from sbt.sumo.drivers import Braking
 from sbt.sumo.road_ahead import RoadAhead
+from sbt.testing import ContractError, check_physics, check_scenario
 
 ONE_LANE = ("emergency_braking", "cut_in")
 
@@ -137,3 +140,25 @@ def test_braking_with_a_limited_jerk_reaches_its_deceleration_and_final_speed() 
         assert speeds[-1] == final
         assert np.abs(np.diff(a)).max(initial=0.0) / 0.01 <= 30.0 + 1e-6
         assert -a.min() <= deceleration + 1e-9
+
+
+def test_check_tells_a_user_which_laws_an_own_scenario_breaks(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "import numpy as np\nfrom sbt import Parameter, Requirement, Scenario\nfrom sbt.problem.trace import Trace\n\n\n"
+        "def simulate(values, seed):\n    x = 2.0 * np.arange(30.0)[:, None]\n"
+        "    zero, v = np.zeros((30, 1)), np.full((30, 1), 20.0)\n"
+        "    y = np.where(x > 20.0, values['aside'], 0.0)\n"
+        "    return Trace(0.1 * np.arange(30), ('ego',), x, y, zero, v, zero, np.array([5.0]), np.array([1.8]))\n\n\n"
+        "def y_max(trace):\n    return float(trace.y.max())\n\n\n"
+        "INPUTS = [Parameter('aside', 0.0, 3.5, 'm')]\n"
+        "SCENARIO = Scenario('own', INPUTS, Requirement('y_max', high=-1.0), simulate, [y_max])\n"
+    )
+    findings = check_scenario(ScenarioSpec(f"{tmp_path}/own.py:SCENARIO"))
+    told = next(f for f in findings if "laws of motion" in f.rule)
+    assert told.ok
+    assert told.detail.startswith("in 2 of 3 runs: ")
+    assert "sideways must be <= 1.5 m/s, but ego has" in told.detail
+    scenario = ScenarioSpec(f"{tmp_path}/own.py:SCENARIO").resolve()
+    check_physics(scenario.simulate({"aside": 0.0}, 0))
+    with pytest.raises(ContractError, match=r"sideways must be <= 1\.5 m/s, but ego has 31 m/s at 1\.10 s"):
+        check_physics(scenario.simulate({"aside": 3.5}, 0))
