@@ -118,7 +118,7 @@ def test_a_signal_is_answered_at_once_and_leaves_nothing(
     assert time.monotonic() - at < 1.5, "alone on a machine it takes some milliseconds"
     name = signal.Signals(number).name
     assert line == f"stopping ({name}): run again to resume; a second signal stops at once\n"
-    _, rest = driver.communicate(timeout=20)
+    _, rest = driver.communicate(timeout=90)
     assert (driver.returncode, rest) == (130, "interrupted, run again to resume\n")
     assert until(lambda: not tagged(str(temporary)), 5.0)
     assert list(temporary.iterdir()) == []
@@ -170,19 +170,19 @@ def test_a_run_that_catches_everything_cannot_catch_ctrl_c(configured: Callable[
     assert until((rude.parent / "running").exists)
     os.kill(driver.pid, signal.SIGINT)
     at = time.monotonic()
-    _, told = driver.communicate(timeout=30)
+    _, told = driver.communicate(timeout=90)
     assert time.monotonic() - at < 5.0
     assert (driver.returncode, told.splitlines()[-1]) == (130, "interrupted, run again to resume")
     assert finished(config.parent / "c") <= 1, "the run that was interrupted is no row"
 
 
 def test_before_there_is_a_store_an_interruption_says_so(configured: Callable[..., Path], rude: Path, started: Any):
-    rude.write_text("import time\nfrom pathlib import Path\nPath(__file__).with_name('running').touch()\ntime.sleep(60)\n")
+    rude.write_text("import time\nfrom pathlib import Path\nPath(__file__).with_name('running').touch()\ntime.sleep(600)\n")
     config = configured("c")
     driver = started(*SBT, "run", str(config), "--set", "scenario=rude.py:DEAF")
     assert until((rude.parent / "running").exists)
     os.kill(driver.pid, signal.SIGINT)
-    _, told = driver.communicate(timeout=20)
+    _, told = driver.communicate(timeout=90)
     assert driver.returncode == 130
     assert told.splitlines() == [
         "stopping (SIGINT): nothing was run yet; a second signal stops at once", "interrupted, nothing was run yet",
@@ -299,7 +299,7 @@ def test_a_worker_that_lets_no_other_code_run_ends_with_its_driver(analytic: Pat
     """As a hanging step of SUMO: the interpreter's lock is held, so that no thread of the worker can look for the driver."""
     (analytic.parent / "holding.py").write_text(
         analytic.read_text() + "\n\ndef hold(values, seed):\n    import ctypes\n    print('holding\\n', end='', flush=True)\n"
-        "    ctypes.PyDLL(None).sleep(60)\n\n\nAWKWARD = scenario(hold)\n"
+        "    ctypes.PyDLL(None).sleep(600)\n\n\nAWKWARD = scenario(hold)\n"
     )
     driver = started(sys.executable, "-c", DRIVER.replace("analytic", "holding"), str(analytic.parent))
     assert driver.stdout.readline() == "holding\n"
