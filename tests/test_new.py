@@ -95,7 +95,7 @@ def test_new_check_and_run_succeed_without_an_edit(name, tmp_path, monkeypatch):
     assert called("check", folder / "scenario.yaml", "--json")["ok"]
     monkeypatch.chdir(tmp_path)
     result = called("run", folder / "campaign.yaml", "--set", "executor.kind=serial", "--json")
-    assert result["ok"] >= 0.95 * result["runs"] >= 38
+    assert result["ok"] >= 0.95 * result["runs"] > 11, result
 
 
 @pytest.mark.parametrize("packed", [False, True])
