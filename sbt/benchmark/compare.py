@@ -130,7 +130,7 @@ def _own(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
     with scratch("compare") as folder:
         store = str(Path(folder) / "store")
         acquisition = loaded.config.acquisition.model_copy(update={"kind": name})
-        config = loaded.config.model_copy(update={"seed": seed, "store": store, "acquisition": acquisition})
+        config = loaded.config.model_copy(update={"seed": seed, "store": store, "acquisition": acquisition, "judges": ()})
         run_study(Study(replace(loaded, config=config)), report=False)
         with Store.read(Path(store)) as opened:
             history = opened.history()
