@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sbt.config.scenario_model import MetricEntry
 from sbt.errors import InputError
@@ -15,8 +19,9 @@ from sbt.metrics.stl import stl
 from sbt.plugins import load
 from sbt.problem.plain import Json
 from sbt.problem.scenario import Metric
+from sbt.problem.trace import Trace
 
-__all__ = ["actors_of", "metric_of"]
+__all__ = ["actors_of", "metric_of", "metrics_of_several"]
 
 
 def metric_of(entry: MetricEntry, folder: Path, ego: str) -> Metric:
@@ -82,3 +87,22 @@ def actors_of(entry: MetricEntry) -> Iterator[str]:
                 terms.append(of)
             case Binary(_, left, right):
                 terms += [left, right]
+
+
+def metrics_of_several(of_each: Mapping[str, Metric]) -> tuple[Metric, ...]:
+    """Return a metric over several vehicles under test, the worst counts, and that of each as `NAME_ID`.
+
+    Args:
+        of_each: the same metric of each vehicle, by its id.
+    """
+    first = next(iter(of_each.values()))
+    each = {ego: replace(metric, name=f"{first.name}_{ego}", function=partial(_while_present, metric, ego))
+            for ego, metric in of_each.items()}  # fmt: skip
+    worst = max if first.direction == "high" else min
+    return (replace(first, function=lambda trace: worst(metric.value(trace) for metric in each.values())), *each.values())
+
+
+def _while_present(metric: Metric, ego: str, trace: Trace) -> float:
+    """Return the metric from the arrival of its vehicle on the road to its end; `without` where it never was there."""
+    at = np.flatnonzero(trace.present[:, trace.actors.index(ego)]) if ego in trace.actors else np.empty(0, dtype=int)
+    return metric.value(trace.select(slice(int(at[0]), int(at[-1]) + 1))) if len(at) else metric.without

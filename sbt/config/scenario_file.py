@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from sbt.config.load import located, read_text
-from sbt.config.own_metrics import actors_of, metric_of
+from sbt.config.own_metrics import actors_of, metric_of, metrics_of_several
 from sbt.config.profiles import guided_vehicles, profile_of
 from sbt.config.recorded import net_of_recording, recorded_traffic
 from sbt.config.scenario_model import EgoEntry, InputEntry, MetricEntry, ScenarioModel, SumoEntry
@@ -57,12 +58,33 @@ def from_file(name: str, folder: Path) -> LogicalScenario:
     data, source, wrong = read_yaml(read_text(path), name)
     problems = Problems(source)
     try:
+        data, source = _with_one_ego(data, source)
+        problems = Problems(source)
         model = ScenarioModel.model_validate(_with_ids(data, source))
     except ValidationError as error:
         raise located(source, error, ScenarioModel, wrong) from None
     if wrong:
         raise ConfigError(wrong)
     return _Builder(model, path.parent, problems).scenario(path)
+
+
+def _with_one_ego(data: Any, source: SourceMap) -> tuple[Any, SourceMap]:
+    """Return the data with a list under `ego` as its first entry, the others under `egos`, and where the keys then stand."""
+    egos = data.get("ego") if isinstance(data, dict) else None
+    if not isinstance(egos, list) or not egos or data.get("egos"):
+        return data, source
+
+    def moved(path: Key) -> Key:
+        match path:
+            case ("ego", 0, *rest):
+                return ("ego", *rest)
+            case ("ego", int(k), *rest):
+                return ("egos", k - 1, *rest)
+        return path
+
+    places = {moved(path): place for path, place in source.places.items() if path != ("ego",)}
+    texts = {moved(path): text for path, text in source.texts.items()}
+    return {**data, "ego": egos[0], "egos": egos[1:]}, replace(source, places=places, texts=texts)
 
 
 def _with_ids(data: Any, source: SourceMap) -> Any:
@@ -80,6 +102,8 @@ def _with_ids(data: Any, source: SourceMap) -> Any:
 
 def _is_id(path: Key) -> bool:
     match path:
+        case ("egos", int()) | ("egos", int(), "id"):
+            return True
         case ("ego",) | ("ego", "id") | ("others", "named") | ("others", "named", int()) | ("metrics", int(), "other"):
             return True
     return False
@@ -96,7 +120,11 @@ class _Builder:
         model, problems = self._model, self._problems
         space = self._space()
         files, loop = self._files(), self._loop()
-        ego = self._ego(model.ego, files)
+        ego = self._ego(model.ego, files, ("ego",))
+        further = [self._ego(one, files, ("egos", k)) for k, one in enumerate(model.egos)]
+        if len({one.id for one in (model.ego, *model.egos)}) <= len(model.egos):
+            ids = ", ".join((model.ego.id, *(one.id for one in model.egos)))
+            problems.add(("egos",), f"vehicles under test must have different ids, but got {ids}")
         metrics = self._metrics()
         requirement = self._requirement(metrics)
         guided = guided_vehicles(model.actors, self._profiles, files, model.ego.id, problems)
@@ -109,7 +137,10 @@ class _Builder:
         named = tuple(dict.fromkeys((*model.others.named, *(n for m in model.metrics for n in actors_of(m)))))
         named = tuple(n for n in named if n != model.ego.id)
         simulation = problems.attempt(("step_length",), lambda: UserSimulation(
-            RecordingSettings(ego or EgoVehicle(model.ego.id), model.duration, model.others.within, named, model.wait),
+            RecordingSettings(
+                ego or EgoVehicle(model.ego.id), model.duration, model.others.within, named, model.wait,
+                tuple(one.further() for one in further if one is not None),
+            ),
             files, loop, self._folder, model.step_length, profiles=tuple(self._profiles.values()), participants=moved,
         ))  # fmt: skip
         problems.check()
@@ -215,24 +246,24 @@ class _Builder:
         loop: Loop = found if found is not None else step_until_over
         return loop
 
-    def _ego(self, entry: EgoEntry, files: SumoFiles | None) -> EgoVehicle | None:
+    def _ego(self, entry: EgoEntry, files: SumoFiles | None, path: Key) -> EgoVehicle | None:
         there = files is None or self._model.simulate is not None or files.vehicle(entry.id) is not None
         walks = files is not None and not there and person(files.templates, entry.id) is not None
         if walks and entry.kind is not None:
-            self._problems.add(("ego", "kind"), f"a person as the ego is moved by SUMO and has no kind, but got '{entry.kind}'")
+            self._problems.add((*path, "kind"), f"a person as the ego is moved by SUMO and has no kind, but got '{entry.kind}'")
         if files is not None and not there and not walks:
             names = files.names()
             known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "none"
             rule = f"the ego must be a vehicle, trip, flow or person of the files ({known})"
-            self._problems.add(("ego",), f"{rule}, but got '{entry.id}'{did_you_mean(entry.id, names)}")
+            self._problems.add(path, f"{rule}, but got '{entry.id}'{did_you_mean(entry.id, names)}")
         kind = entry.kind
         if kind is None:
             if entry.settings:
-                self._problems.add(("ego",), f"settings need a kind (a controller, or sumo), but got {', '.join(entry.settings)}")
+                self._problems.add(path, f"settings need a kind (a controller, or sumo), but got {', '.join(entry.settings)}")
             return EgoVehicle(entry.id, None, entry.set_speed, entry.lights, entry.may_leave, entry.delay)
         if ".py:" in kind:
             kind = str(self._folder / Path(kind).expanduser())
-        driver = self._problems.attempt(("ego",), lambda: Ego.of(kind, **entry.settings))
+        driver = self._problems.attempt(path, lambda: Ego.of(kind, **entry.settings))
         return EgoVehicle(entry.id, driver, entry.set_speed, entry.lights, entry.may_leave, entry.delay)
 
     def _metrics(self) -> tuple[Metric, ...]:
@@ -243,12 +274,18 @@ class _Builder:
             self._problems.add(("metrics",), "a scenario needs at least one metric, but has none")
         for k, entry in enumerate(entries):
             path = ("metrics", k) if k < len(self._model.metrics) else ("requirement", "stl")
-            metric = self._problems.attempt(path, partial(metric_of, entry, self._folder, self._model.ego.id))
-            if metric is not None and metric.name in made:
-                self._problems.add(path, f"metrics need different names (name: ...), but got '{metric.name}' twice")
-            elif metric is not None:
+            for metric in self._problems.attempt(path, partial(self._metrics_of, entry)) or ():
+                if metric.name in made:
+                    self._problems.add(path, f"metrics need different names (name: ...), but got '{metric.name}' twice")
                 made[metric.name] = metric
         return tuple(made.values())
+
+    def _metrics_of(self, entry: MetricEntry) -> tuple[Metric, ...]:
+        """Return the metrics of an entry: with several vehicles under test the worst one and that of each."""
+        egos = [self._model.ego.id, *(one.id for one in self._model.egos)]
+        if len(egos) == 1 or ".py:" in (entry.kind or ""):  # one's own metrics get the whole trace
+            return (metric_of(entry, self._folder, egos[0]),)
+        return metrics_of_several({ego: metric_of(entry, self._folder, ego) for ego in egos})
 
     def _requirement(self, metrics: tuple[Metric, ...]) -> Requirement | None:
         """Return the requirement, on a metric or on a formula that is one of them."""
@@ -259,7 +296,7 @@ class _Builder:
         if wanted.metric is None or wanted.critical is None:
             problems.add(("requirement",), "a requirement must have a metric and critical: [low, high]")
             return None
-        if wanted.metric not in names and len(names) == len(self._model.metrics):
+        if wanted.metric not in names and len(names) >= len(self._model.metrics):
             problems.add(("requirement", "metric"), must_be_one_of("a metric", wanted.metric, names))
         return Requirement(wanted.metric, *wanted.critical)
 

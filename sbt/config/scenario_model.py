@@ -186,6 +186,9 @@ class ScenarioModel(_Strict):
     constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = Field(default=(), description="Conditions on inputs.")
     features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel.")
     ego: Annotated[EgoEntry, _under("id")] = Field(description="The vehicle under test, or just its id.")
+    egos: Annotated[tuple[Annotated[EgoEntry, _under("id")], ...], Field(strict=False)] = Field(
+        default=(), description="Further vehicles under test: the worst counts. ego: [a, b] is short for ego: a, egos: [b]."
+    )
     actors: dict[str, ActorEntry] = Field(default={}, description="By id: who follows a profile.")
     recorded: Annotated[RecordedEntry, _under("file")] | None = Field(
         default=None, description="Recorded road users as traffic, or just the file."

@@ -50,6 +50,7 @@ class EgoVehicle:
             sets the speed (speed mode 32); SUMO changes lanes for the route unless the controller requests a lane.
         may_leave: arriving at the end of its route before the duration is over is not an error.
         delay: how much later than its `depart` it may enter the road (s); None: not at all.
+        type_id: of its vehicle type in SUMO, where another model of SUMO drives.
 
     Raises:
         InputError: the delay is negative or not finite.
@@ -61,10 +62,15 @@ class EgoVehicle:
     lights: bool = True
     may_leave: bool = False
     delay: float | None = None
+    type_id: str = EGO_TYPE
 
     def __post_init__(self) -> None:
         if self.delay is not None and not 0.0 <= self.delay < math.inf:
             raise InputError(f"ego.delay must be >= 0 s and finite, but got {self.delay}")
+
+    def further(self) -> EgoVehicle:
+        """Return the same vehicle as a further one under test, with a vehicle type of its own."""
+        return replace(self, type_id=f"{EGO_TYPE}_{self.id}")
 
     def with_driver(self, driver: Ego) -> EgoVehicle:
         """Return the same vehicle with another driver."""
@@ -75,7 +81,7 @@ class EgoVehicle:
         if self.driver is None or self.driver.kind != SUMO:
             return None
         settings = vtype_attributes(dict(self.driver.settings))
-        return '<vType id="{}" {}/>'.format(EGO_TYPE, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
+        return '<vType id="{}" {}/>'.format(self.type_id, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
 
     def take_over(self, sumo: Any, rng: np.random.Generator, *, walks: bool = False) -> ControlStep | None:
         """Give the ego its driver; to be called in the step in which it departs.
@@ -127,9 +133,9 @@ class EgoVehicle:
         for name in _COPIED:
             attribute = _ATTRIBUTE.get(name, name[0].lower() + name[1:])
             if attribute not in given:
-                getattr(sumo.vehicletype, f"set{name}")(EGO_TYPE, getattr(sumo.vehicle, f"get{name}")(self.id))
+                getattr(sumo.vehicletype, f"set{name}")(self.type_id, getattr(sumo.vehicle, f"get{name}")(self.id))
         factor = given.get("speedFactor", sumo.vehicle.getSpeedFactor(self.id))
-        sumo.vehicle.setType(self.id, EGO_TYPE)
+        sumo.vehicle.setType(self.id, self.type_id)
         sumo.vehicle.setSpeedFactor(self.id, float(factor))
 
 

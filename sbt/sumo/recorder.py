@@ -54,6 +54,7 @@ class RecordingSettings:
         within: radius around the ego in which other road users are recorded (m).
         named: vehicles or persons that are recorded at any distance.
         wait: longest simulated time from the ego's `depart` until it departs; from the beginning where it has none (s).
+        further: more vehicles under test (`sbt.sumo.several`).
 
     Raises:
         InputError: a time or radius is not positive.
@@ -64,6 +65,7 @@ class RecordingSettings:
     within: float = 100.0
     named: tuple[str, ...] = ()
     wait: float = 3600.0
+    further: tuple[EgoVehicle, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("duration", "within", "wait"):
@@ -93,6 +95,8 @@ class Recorder:
         self._appearances = AppearanceMonitor(sumo, self._ego, departures)
         self._departed = False
         self._walks: bool | None = None
+        self.began: int | None = None
+        """Number of the step in which the ego departed; None before."""
         self._dt = float(sumo.simulation.getDeltaT())
         self._surroundings = Surroundings(sumo, self._ego, settings.within, settings.named, self._dt)
         self._control: ControlStep | None = None
@@ -198,7 +202,7 @@ class Recorder:
 
     def _start_recording(self) -> None:
         """Subscribe to the surroundings of the ego, and give it its controller."""
-        self._departed = True
+        self._departed, self.began = True, self._steps
         self._surroundings.subscribe(walks=self._walks is True)
         self._control = self._settings.ego.take_over(self._sumo, self._rng, walks=self._walks is True)
 

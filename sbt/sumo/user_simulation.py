@@ -44,6 +44,7 @@ from sbt.sumo.messages import explained
 from sbt.sumo.phases import PHASES, Stopwatch
 from sbt.sumo.recorder import Recorder, RecordingSettings, RunEnded
 from sbt.sumo.session import scratch_folder, session
+from sbt.sumo.several import Recorders, further_recorders
 
 __all__ = ["Loop", "TraciProxy", "UserSimulation", "step_until_over"]
 
@@ -107,7 +108,9 @@ class UserSimulation:
             raise InputError(f"executor.isolation must be auto or fresh here, but got '{isolation}'")
         recording = self.recording
         if ego is not None:
-            recording = replace(recording, ego=recording.ego.with_driver(Ego.of(**ego)))
+            driver = Ego.of(**ego)
+            further = tuple(one.with_driver(driver) for one in recording.further)
+            recording = replace(recording, ego=recording.ego.with_driver(driver), further=further)
         return replace(self, recording=recording, step=self.step if step_length is None else step_length)
 
     def with_friction(self, low: float, high: float) -> UserSimulation:
@@ -237,7 +240,7 @@ class TraciProxy:
         self._files: SumoFiles | None = None
         self._time = 0.0
         self._module: Any = None
-        self._recorder: Recorder | None = None
+        self._recorder: Recorder | Recorders | None = None
         self._motions: tuple[Motion, ...] = ()
         self.simulation = _SimulationProxy(self)
         self.vehicle, self.person = _CommandProxy(self, "vehicle"), _CommandProxy(self, "person")
@@ -254,7 +257,7 @@ class TraciProxy:
         return getattr(self._module, name)
 
     @property
-    def recorder(self) -> Recorder:
+    def recorder(self) -> Recorder | Recorders:
         """The recorder of the run."""
         if self._recorder is None:
             why = started_another(self._user_simulation.loop)
@@ -276,10 +279,10 @@ class TraciProxy:
         """Fill the placeholders of the files, start SUMO with them, and begin to record."""
         simulation = self._user_simulation
         ego = simulation.recording.ego
-        vehicle_type = ego.vehicle_type()
-        if vehicle_type is not None:
+        vehicle_types = "".join(one.vehicle_type() or "" for one in (ego, *simulation.recording.further))
+        if vehicle_types:
             path = scratch_folder() / "ego.add.xml"
-            path.write_text(f"<additional>{vehicle_type}</additional>")
+            path.write_text(f"<additional>{vehicle_types}</additional>")
             files = replace(files, additional=(*files.additional, path))
         requested = requested_departures(files, self._values, ego.id)
         self._files = files
@@ -288,7 +291,9 @@ class TraciProxy:
         waiting = WaitingEgo(ego.id, ego.delay, simulation.recording.wait)
         departures = DepartureMonitor(self._module, waiting, requested, files, self._values)
         rng = stream(self._seed, "ego")
-        self._recorder = Recorder(self._module, simulation.recording, rng, departures, simulation.timeout)
+        first = Recorder(self._module, simulation.recording, rng, departures, simulation.timeout)
+        further = further_recorders(self._module, simulation.recording, files, self._values, self._seed)
+        self._recorder = Recorders(first, further) if further else first
         self._motions = tuple(p.begin(self._module, self._values) for p in simulation.participants)
         self._watch.enter(PHASES[1])
 

@@ -1,0 +1,100 @@
+"""Several vehicles under test in one run: each is watched, the worst counts, and its metric says which one it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_doors import check, files_of
+
+from sbt.errors import InputError, RunError
+from sbt.execution.spec import ScenarioSpec
+
+ROUTES = """<routes>
+<vType id="car" length="5" width="1.8" sigma="0" maxSpeed="60"/>
+<route id="ahead" edges="road"/>
+<vehicle id="av1" type="car" route="ahead" depart="0" departLane="0" departPos="100" departSpeed="20" insertionChecks="none"/>
+<vehicle id="slow" type="car" route="ahead" depart="0.5" departLane="1" departPos="${400 + gap}" departSpeed="15"
+    insertionChecks="none"/>
+<vehicle id="av2" type="car" route="ahead" depart="DEPART" departLane="1" departPos="400" departSpeed="20"
+    insertionChecks="none"/>
+</routes>"""
+SCENARIO = """
+sumo: {net: road.net.xml, routes: several.rou.xml}
+inputs: {gap: {min: 20, max: 60}, v: {profile: {knots: [0, 1]}, min: -6, max: 0}}
+ego: EGO
+others: {within: 50}
+actors: {slow: {acceleration: v}}
+duration: 6
+metrics: [ttc_min, collision, {stl: "G[0,5](gap > 5)", name: clear}]
+requirement: {metric: ttc_min, critical: [-.inf, 1.0]}
+"""
+
+
+def written(folder: Path, ego: str = "[av1, {id: av2, kind: acc_aeb}]", depart: str = "0.5") -> Path:
+    files_of("own_files", folder)
+    (folder / "several.rou.xml").write_text(ROUTES.replace("DEPART", depart))
+    (folder / "several.yaml").write_text(SCENARIO.replace("EGO", ego))
+    return folder / "several.yaml"
+
+
+@pytest.mark.sumo
+def test_the_worst_counts_and_is_named(tmp_path):
+    path = written(tmp_path)
+    scenario = ScenarioSpec(str(path)).resolve()
+    names = [m.name for m in scenario.metrics]
+    assert names == [f"{m}{ego}" for m in ("ttc_min", "collision", "clear") for ego in ("", "_av1", "_av2")]
+    trace = scenario.simulate(scenario.space.values({"gap": 20.0}), 0)
+    assert trace.actors[0] == "av1"
+    metrics = scenario.measure(trace)
+    assert metrics["ttc_min"] == metrics["ttc_min_av2"] < metrics["ttc_min_av1"]
+    assert metrics["clear"] == min(metrics["clear_av1"], metrics["clear_av2"])
+    assert metrics["collision"] == max(metrics["collision_av1"], metrics["collision_av2"])
+
+
+@pytest.mark.sumo
+def test_the_trace_is_that_of_both(tmp_path):
+    scenario = ScenarioSpec(str(written(tmp_path))).resolve()
+    trace = scenario.simulate(scenario.space.values({"gap": 45.0}), 0)
+    av1, av2, slow = (trace.actor(name) for name in ("av1", "av2", "slow"))
+    assert np.isfinite(av1.x).all()
+    assert np.isnan(av2.x[:5]).all()
+    assert np.isfinite(av2.x[5:]).all()
+    assert (float(av1.x[0]), float(av2.x[5])) == (97.5, 397.5)
+    assert np.isfinite(slow.x[5:]).all()  # near av2, and far from av1
+    assert np.nanmin(slow.x - av1.x) > 50
+
+
+@pytest.mark.sumo
+def test_a_contact_of_any_of_them_ends_the_run(tmp_path):
+    path = written(tmp_path, "[av1, {id: av2, kind: 'blind.py:Blind'}]")
+    (tmp_path / "blind.py").write_text(
+        "class Blind:\n    def __init__(self, rng, set_speed):\n        pass\n\n    def act(self, t, own, others):\n"
+        "        from sbt.sumo.actors import Action\n        return Action(speed=25.0)\n"
+    )
+    scenario = ScenarioSpec(str(path)).resolve()
+    trace = scenario.simulate(scenario.space.values({"gap": 20.0, "v_0": -6.0, "v_1": -6.0}), 0)
+    metrics = scenario.measure(trace)
+    assert (trace.ended, metrics["collision_av1"], metrics["collision_av2"], metrics["collision"]) == ("collision", 0, 1, 1)
+    assert trace.unconfirmed == ()
+
+
+@pytest.mark.sumo
+def test_all_of_them_must_depart_and_runs_repeat(tmp_path):
+    code, output = check(written(tmp_path))
+    assert code == 0, output
+    (tmp_path / "late").mkdir()
+    scenario = ScenarioSpec(str(written(tmp_path / "late", depart="50"))).resolve()
+    with pytest.raises(RunError, match="'av2' is under test and must depart while 'av1' is, but did not"):
+        scenario.simulate(scenario.space.values({}), 0)
+
+
+@pytest.mark.parametrize(
+    ("ego", "words"),
+    [("[av1, av3]", r"several\.yaml:4:12: egos\.0: the ego must be a vehicle.*'av3'"), ("[av1, av1]", "different ids"),
+     ("[av1, {id: av2, kind: nobody}]", r"several\.yaml:4:12: egos\.0: ")],
+)  # fmt: skip
+def test_mistakes_are_named(tmp_path, ego, words):
+    with pytest.raises(InputError, match=words):
+        ScenarioSpec(str(written(tmp_path, ego))).resolve()
