@@ -157,8 +157,9 @@ def _half_width(trace: Trace, opponent: int | None, moment: int, ratio: float) -
     if opponent is None or not np.isfinite(trace.x[moment, opponent]):
         return _NEAR if len(trace.actors) > 1 else _LEAST
     least = _LEAST if len(trace.actors) <= FEW else _LEAST_IN_TRAFFIC
+    scale = 0.4 if is_person(trace, 0) else 1.0  # a person would be lost in a view for cars
     dx, dy = (abs(float(v[moment, opponent] - v[moment, 0])) for v in (trace.x, trace.y))
-    return min(max(least, 0.7 * dx + 20.0, (0.7 * dy + 20.0) * min(ratio, 1.6)), _NEAR)
+    return min(max(scale * least, 0.7 * dx + 20.0 * scale, (0.7 * dy + 20.0 * scale) * min(ratio, 1.6)), _NEAR)
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
