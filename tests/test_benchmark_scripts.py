@@ -21,6 +21,7 @@ SMALLEST = {
     "slice_teeth.py": "--scenario following --points 2 --values 4",
     "step_length.py": "--scenario cut_in --points 16 --seeds 2 --reference 0.025",
     "throughput.py": "--scenario cut_in --runs 4 --repeats 1 --no-campaign",
+    "watcher.py": "--repeats 1 --vehicles 20",
     "warm_start.py": "{folder}/store --seeds 2 --batch 10 --batches 2",
     "boundary_table.py": "--problems testbed:borehole_1e-3:box --methods even --seeds 1 --reference 500 --store {folder}/table",
     "estimation.py": "--problems gayton_hat@200 --seeds 1 --table {folder}/table.jsonl",
