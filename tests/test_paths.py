@@ -98,7 +98,7 @@ def test_check_says_which_metric_invents_conflicts():
     assert worst_pair(trace, TTC_2D_MIN, "ego").value < 1.5
     found = worst_pair(trace, TTC_PATH_MIN, "ego")
     assert (found.value, found.other) == (5.0, "co_0")
-    assert found.clearance == pytest.approx(1.5 - 0.3, abs=0.25), "3.5 m less the widths of 2 m and what corners reach out"
+    assert found.clearance == pytest.approx(1.5 - 1.0, abs=0.25), "3.5 m less the widths of 2 m and what corners reach out"
     assert path_clearance(trace.actor("ego"), trace_of(inner, (inner[1], inner[0])).actor("co_0")) == 0.0, "crossing paths meet"
     scenario = LogicalScenario(
         "bend", ParameterSpace((Parameter("v", 0, 1),)), Requirement("ttc_path_min", high=1.5), lambda values, seed: trace,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.metrics.intervals import joint_intervals
-from sbt.metrics.paths import path_of
+from sbt.metrics.paths import HORIZON, path_of
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
@@ -15,8 +15,8 @@ __all__ = ["Worst", "path_clearance", "worst_pair"]
 
 _SPACING = 0.5
 """Distance of the points at which paths are compared (m)."""
-_SWEEP = 0.3
-"""What the corners of a rectangle reach beyond half its width in a bend (m)."""
+_SWEEP = 1.0
+"""What the corners of two cars reach beyond half their widths in tight turns (m)."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,13 @@ def path_clearance(a: ActorTrace, b: ActorTrace) -> float:
 
 
 def _points(actor: ActorTrace) -> np.ndarray:
-    """Return (n, 2) points along a path, from the rear at its beginning to the front at its end."""
+    """Return (n, 2) points along a path, from the rear at its beginning to where straight on leads after its end within 5 s."""
     x, y, heading = path_of(actor)
     half = 0.5 * actor.length
-    x = np.concatenate([[x[0] - half * np.cos(heading[0])], x, [x[-1] + half * np.cos(heading[-1])]])
-    y = np.concatenate([[y[0] - half * np.sin(heading[0])], y, [y[-1] + half * np.sin(heading[-1])]])
+    gone = actor.way is not None and len(actor.way) and np.isnan(actor.way[-1, 0])
+    on = half if gone else half + HORIZON * float(np.max(np.abs(actor.speed)))
+    x = np.concatenate([[x[0] - half * np.cos(heading[0])], x, [x[-1] + on * np.cos(heading[-1])]])
+    y = np.concatenate([[y[0] - half * np.sin(heading[0])], y, [y[-1] + on * np.sin(heading[-1])]])
     along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     at = np.arange(0.0, along[-1] + _SPACING, _SPACING)
     return np.stack([np.interp(at, along, x), np.interp(at, along, y)], axis=1)
