@@ -6,10 +6,12 @@ import html
 import itertools
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
+from studies import run_loaded
 
 import sbt
 from sbt.config.assemble import assemble
@@ -19,6 +21,7 @@ from sbt.estimators.choices import choice_scores, from_cube, log_normal, log_wid
 from sbt.estimators.importance import draw_systematic, plan_batch
 from sbt.estimators.mixture import Mixture, fit_mixture, wide_scales
 from sbt.estimators.surrogate import Coordinates
+from sbt.loop.stages import Shard
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.cube import Cube
 from sbt.problem.description import describe_scenario, rebuild_scenario, scenario_differences
@@ -33,6 +36,7 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun, Store
 from sbt.sumo.template import fill, template
+from sbt.workflows.merging import merge_shards
 
 KINDS = ("car", "truck", "bicycle", "bus")
 SHARES = {"car": 0.7, "truck": 0.2, "bicycle": 0.09, "bus": 0.01}
@@ -502,3 +506,19 @@ def test_falsification_finds_a_failure_of_one_choice_sooner_than_random_runs(tmp
     random = np.array([stream(seed, "random").geometric(share) for seed in range(20)])
     assert np.median(searched) < 0.6 * np.median(random)
     assert np.quantile(searched, 0.9) < 0.6 * math.log(0.1) / math.log(1 - share)
+
+
+def test_shards_of_a_campaign_with_choices_join_to_the_whole(tmp_path):
+    (tmp_path / "s.py").write_text(
+        "import sbt\n"
+        "SCENARIO = sbt.Scenario('s', inputs=[sbt.Parameter('v', 5, 25), sbt.Parameter('kind', choices=['car', 'truck', 'bus'])],"
+        " evaluate=lambda values, seed: {'m': values['v']}, requirement=sbt.Requirement('m', high=6.0))\n"
+    )
+    text = "campaign: coverage\nscenario: s.py:SCENARIO\nbudget: 13\nexecutor: {kind: serial}\nstore: "
+    stores = [
+        Path(run_loaded(parse(f"{text}{tmp_path / name}", folder=tmp_path), shard=shard)["store"])
+        for name, shard in {"whole": None, "one": Shard(1, 2), "two": Shard(2, 2)}.items()
+    ]
+    merge_shards(stores[1:], tmp_path / "merged", report=False)
+    rows = ["index", "x.v", "x.kind", "y.m", "seed"]
+    assert sbt.open(tmp_path / "merged").frame[rows].equals(sbt.open(tmp_path / "whole").frame[rows])

@@ -21,7 +21,7 @@ from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.seeds import run_seed
 from sbt.store.database import PlannedRun, Store
-from sbt.store.history import PLANNED, History, Rows
+from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.records import FitRecord, Iteration, to_json
 
 __all__ = [
@@ -288,7 +288,8 @@ def run_shard(
     """
     seconds = {"simulate": 0.0, "fit": 0.0, "propose": 0.0}
     start = time.perf_counter()
-    batches = _ahead(campaign, tuple(store.configuration["names"]))
+    known = store.history()
+    batches = _ahead(campaign, Rows(known.names, known.choices))
     total = sum(len(batch.runs) for _, batch in batches)
     if shard.of > total:
         raise InputError(f"there must be at most as many shards as runs, but got shard {shard} of {total} runs")
@@ -319,15 +320,14 @@ def check_shard(campaign: Campaign) -> None:
         )
 
 
-def _ahead(campaign: Campaign, names: tuple[str, ...]) -> list[tuple[str, Batch]]:
-    """Return all batches, with the name of their stage; the stages see every run without a result."""
-    rows = Rows(names)
+def _ahead(campaign: Campaign, rows: Rows) -> list[tuple[str, Batch]]:
+    """Return all batches, with the name of their stage; the stages see every run (in `rows`, none yet) without a result."""
     iterations: list[Iteration] = []
     batches: list[tuple[str, Batch]] = []
     for stage in campaign.stages:
         while stage.stop(log := Log(rows.history(), tuple(iterations), ())) is None:
             batch = _proposed(stage, log)
-            x = np.array([[run.inputs[name] for name in names] for run in batch.runs], dtype=np.float64)
+            x = as_numbers([[run.inputs[name] for name in rows.names] for run in batch.runs], rows.names, rows.choices)
             n = len(batch.runs)
             columns = {
                 "index": range(rows.count, rows.count + n), "stage": [run.stage for run in batch.runs],
