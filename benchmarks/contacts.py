@@ -23,7 +23,7 @@ from typing import Any
 import libsumo
 import street_traffic as street
 
-from sbt.errors import RunError
+from sbt import RunError
 from sbt.metrics.longitudinal import COLLISION
 from sbt.metrics.pairwise import in_traffic
 from sbt.problem.outcome import LISTED_ONLY

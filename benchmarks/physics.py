@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from sbt.errors import InputError, RunError
+import sbt
+from sbt import InputError, RunError
+from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.physics import LAWS, worst
-from sbt.plugins import load, names
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 
@@ -66,8 +67,8 @@ def main() -> None:
     parser.add_argument("--egos", default=",".join(EGOS), help="the other kinds")
     args = parser.parse_args()
     print("| scenario | ego | runs | without a breach | " + " | ".join(LAWS) + " |\n|---" + "|---" * (len(LAWS) + 3) + "|")
-    for name in args.names or names("scenarios"):
-        for kind, scenario in egos(load("scenarios", name), [e for e in args.egos.split(",") if e]).items():
+    for name in args.names or sbt.list("scenarios"):
+        for kind, scenario in egos(ScenarioSpec(name).resolve(), [e for e in args.egos.split(",") if e]).items():
             runs = args.runs if kind == "own" else args.others
             values, who, failed = measure(scenario, runs)
             limits = np.array([law.limit for law in LAWS.values()])

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from sbt.cli.campaign import Folder
 from sbt.cli.console import Exit, clean_stdout, fail, print_json
-
-if TYPE_CHECKING:
-    from sbt.store.records import Judgement
 
 __all__ = ["replay"]
 
@@ -35,7 +32,7 @@ def replay(
 ) -> None:
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
-        from sbt.workflows.judging import judge_run, stored_judgements, with_driver
+        from sbt.workflows.judging import judge_run, judgement_line, stored_judgements, with_driver
         from sbt.workflows.running import replay_run
         from sbt.workflows.showing import show_replay
 
@@ -61,17 +58,7 @@ def replay(
             print(f"  {name:<23} {value:.6g}")
         print("identical to the stored run" if same else "NOT identical to the stored run")
         if judgements:
-            print("\n".join(["with a reference driver in the place of ego:", *map(_line, judgements)]))
+            print("\n".join(["with a reference driver in the place of ego:", *map(judgement_line, judgements)]))
     if not same:
         now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
         raise fail(f"a replay must equal the stored run, but got {now}, not {stored}", Exit.INTERNAL)
-
-
-def _line(judgement: Judgement) -> str:
-    """Return what one driver made of the run."""
-    if judgement.avoided is None:
-        verdict = f"not applicable: {judgement.reason}"
-    else:
-        how = "" if judgement.avoided or not judgement.collision else ", collision"
-        verdict = f"{'avoided' if judgement.avoided else 'not avoided'}{how} ({judgement.metric:.6g})"
-    return f"  {judgement.driver:<23} {verdict}"

@@ -32,7 +32,16 @@ from sbt.workflows.study import Study
 if TYPE_CHECKING:
     from sbt.workflows.running import Replay
 
-__all__ = ["MOST_JUDGED", "in_words", "judge_campaign", "judge_run", "judge_runs", "stored_judgements", "with_driver"]
+__all__ = [
+    "MOST_JUDGED",
+    "in_words",
+    "judge_campaign",
+    "judge_run",
+    "judge_runs",
+    "judgement_line",
+    "stored_judgements",
+    "with_driver",
+]  # fmt: skip
 
 MOST_JUDGED = 10
 """Runs of a campaign that are judged: one a failure mode, or the deepest critical ones."""
@@ -119,6 +128,16 @@ def stored_judgements(folder: Path, run: int) -> tuple[Judgement, ...]:
     """Return what the store keeps of the judgements of a run; empty where it was not judged."""
     with Store.read(folder) as store:
         return tuple(each for each in store.judgements if each.run == run)
+
+
+def judgement_line(judgement: Judgement) -> str:
+    """Return what one driver made of the run."""
+    if judgement.avoided is None:
+        verdict = f"not applicable: {judgement.reason}"
+    else:
+        how = "" if judgement.avoided or not judgement.collision else ", collision"
+        verdict = f"{'avoided' if judgement.avoided else 'not avoided'}{how} ({judgement.metric:.6g})"
+    return f"  {judgement.driver:<23} {verdict}"
 
 
 def with_driver(again: Replay, driver: str) -> Replay:
