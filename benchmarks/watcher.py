@@ -31,8 +31,8 @@ def city(folder: Path, vehicles: int) -> tuple[Path, Path]:
     """Make a grid and vehicles that all depart at once."""
     net = street.grid(folder, number=9, length=150.0)
     (made,) = street.traffic(net, 1, float(vehicles), {"car": 1.0})
-    head, trips = re.sub(r'depart="[\d.]+"', 'depart="0.00"', made.read_text()).split("<trip", 1)
-    made.write_text(head + trips_with_ego("<trip" + trips))
+    head, trips = re.sub(r'depart="[\d.]+"', 'depart="0.00"', made.read_text()).split("<trip ", 1)
+    made.write_text(head + trips_with_ego("<trip " + trips))
     return net, made
 
 
