@@ -74,7 +74,7 @@ SCENARIO, REFUSED, BROKEN, UNSTEADY, ELSEWHERE = map(scenario, (margin, refused,
 """
 RESULT: dict[str, Any] = {
     "campaign": "boundary", "scenario": "plane", "store": "there", "runs": 10, "ok": 9, "failed": 1, "critical": 2,
-    "iterations": 2, "stopped": "budget", "seconds": {"simulate": 1.0, "fit": 0.0, "propose": 0.0},
+    "iterations": 2, "stopped": "budget", "unconfirmed": 0, "seconds": {"simulate": 1.0, "fit": 0.0, "propose": 0.0},
     "conclusion": {"critical_fraction": 0.2222222, "validation": {"log_likelihood": -1.25, "rmse": None}},
 }  # fmt: skip
 
@@ -309,7 +309,7 @@ def test_check_prints_one_json_object(folder: Path, name: str, ok: bool, code: i
     found = json.loads(done.stdout)
     assert (done.returncode, found["target"], found["ok"]) == (code, f"plane.py:{name}", ok)
     assert all(f["ok"] for f in found["findings"]) is ok
-    assert {"rule", "ok", "detail"} == set(found["findings"][0])
+    assert {"rule", "ok", "detail", "numbers"} == set(found["findings"][0])
 
 
 @pytest.mark.parametrize(
