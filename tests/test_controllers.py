@@ -56,7 +56,7 @@ def simulation(**settings: Any) -> SumoSimulation:
         (lambda: Ego.of("sumo", model="IDM", cc1=1.0), "but got 'cc1'; it belongs to W99"),
         (lambda: Ego.of("sumo", lane_change="LC2014"), "one of SUMO's LC2013, SL2015, DK2008, but got 'LC2014'"),
         (lambda: Ego.of("sumo", tau="near"), "ego.tau must be a finite number, but got 'near'"),
-        (lambda: Ego.of("sumo", tau={"low": 1.0}), "a value or a range such as {min: 0.5, max: 2.0}, but got"),
+        (lambda: Ego.of("sumo", tau={"low": 1.0}), "a value, a range such as {min: 0.5, max: 2.0}, or"),
         (lambda: Ego.of("sumo", tau={"min": 2.0, "max": 1.0}), "ego_tau"),
         (lambda: load("scenarios", "highway_merge").configured(ego={"kind": "sumo", "lane_change": "SL2015"}), "lateral-resol"),
         (lambda: TrafficStream("a", ("r",), 0, 10.0).draw(stream(1), 9000.0, 10.0, 90.0, 0.0), "carries"),

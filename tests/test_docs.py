@@ -227,7 +227,7 @@ def test_commands_fit_the_command_line(block: Block):
 @pytest.mark.parametrize("page", [p for p in PAGES if inline_commands(p)], ids=lambda path: path.stem)
 def test_commands_in_the_prose_fit_the_command_line(page: Path):
     for words in inline_commands(page):
-        plain = [{"N": "1"}.get(word, word) for word in (word.strip("[]") for word in words)]
+        plain = [{"N": "1", "RUN": "1"}.get(word, word) for word in (word.strip("[]") for word in words)]
         parsed(plain if len(plain) > 2 else [*plain, "--help"])  # two words: a verb that is only named
 
 

@@ -138,10 +138,10 @@ def test_acceleration_is_integrated_by_the_trapezoidal_rule():
     assert trace.acceleration[:100].min() == pytest.approx(-4.0)
 
 
-def test_two_at_the_same_place_are_a_collision_at_once_and_no_error():
+def test_two_at_the_same_place_are_an_impossible_start_and_no_collision():
     found = outcome(driving(car(), car("co")))
-    assert (found.status, found.metrics["collision"]) == (Status.OK, 1.0)
-    assert driving(car(), car("co"))({}, 0).ended == "collision"
+    assert (found.status, dict(found.metrics)) == (Status.INVALID, {})
+    assert "co" in found.reason
 
 
 @pytest.mark.parametrize(
