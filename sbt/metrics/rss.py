@@ -65,8 +65,8 @@ class Rss:
             if not (0 < value < np.inf or (value == 0 and not positive)):
                 raise InputError(f"rss.{entry.name} must be {'> 0' if positive else '>= 0'} and finite, but got {value}")
 
-    def same_direction(self, rear: Vector, front: Vector) -> Vector:
-        """Return the (t,) safe distance of road users in the same direction (m), from their speeds >= 0 (m/s)."""
+    def same_direction(self, rear: Vector | float, front: Vector | float) -> Vector:
+        """Return the (t,) safe distance of road users in the same direction (m), from speeds >= 0 (m/s), arrays or numbers."""
         fastest = rear + self.response * self.acceleration
         covered = rear * self.response + 0.5 * self.acceleration * self.response**2 + fastest**2 / (2 * self.braking)
         return np.maximum(covered - front**2 / (2 * self.hard_braking), 0.0)

@@ -14,11 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.metrics.rss import Rss
 from sbt.sumo.actors import Action, State
 from sbt.sumo.others_ahead import WANDERING, OthersAhead, Seen
 
@@ -164,10 +166,8 @@ class ResponsibilitySensitive:
 
     def braking_for(self, own: State, seen: Seen, already: bool) -> float:
         """Return full braking where both distances are unsafe."""
-        rt, limit = self.reaction_time, 2.0 * self.expected_braking
-        faster = own.speed + rt * self.accel
-        along = own.speed * rt + 0.5 * self.accel * rt**2 + faster**2 / limit - seen.speed**2 / limit
-        if seen.gap >= along:
+        rt = self.reaction_time
+        if seen.gap >= self._rules.same_direction(own.speed, seen.speed):
             return 0.0
         sideways, grown = abs(seen.approach), abs(seen.approach) + self.lateral_accel * rt
         across = self.lateral_margin + 0.5 * (sideways + grown) * rt + 0.5 * grown**2 / self.lateral_accel
@@ -176,8 +176,12 @@ class ResponsibilitySensitive:
     def distance(self, speed: float) -> float:
         """Return the gap that it keeps at a speed (m): safe also after the other has braked for the reaction time."""
         rt, b = self.reaction_time, self.expected_braking
-        faster, slower = speed + rt * self.accel, max(speed - rt * b, 0.0)
-        return speed * rt + 0.5 * (self.accel + b) * rt**2 + 0.5 * (faster**2 - slower**2) / b
+        return float(self._rules.same_direction(speed, max(speed - rt * b, 0.0))) + 0.5 * b * rt**2
+
+    @cached_property
+    def _rules(self) -> Rss:
+        """The parameters of its safe longitudinal distance."""
+        return Rss(self.reaction_time, self.accel, self.expected_braking, self.expected_braking)
 
 
 @dataclass(frozen=True)
