@@ -12,29 +12,25 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN, counted_batches
+from sbt.campaigns.known import Known, metamodel_of
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, PoolSummary
 from sbt.campaigns.settings import Settings
-from sbt.errors import InputError
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, log_normal, log_wide, to_cube
 from sbt.estimators.importance import BLIND, SHARES, Plan, draw_systematic, plan_batch
 from sbt.estimators.intervals import combine_estimates
 from sbt.estimators.mixture import Mixture, fit_mixture, particles, wide_scales
-from sbt.estimators.surrogate import Coordinates, LogProbability, fit_log_probability
+from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Batch, Log
-from sbt.metamodels.base import Metamodel
-from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.cube import Cube
 from sbt.samplers import portfolio
 from sbt.samplers.search import Search
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
-from sbt.store.history import History
 from sbt.store.records import Iteration
 
 __all__ = ["FEWEST_BATCHES", "SequentialStage"]
@@ -49,8 +45,6 @@ _PARTICLES = 800
 """Particles that the mixture is fitted to, per cloud."""
 _CANDIDATES = 6_000
 """Points that the particles are resampled from."""
-_PROBES = 9
-"""Points on the segment between two critical runs, at which P must stay above 0.5 for them to be one mode."""
 
 # When the search for modes ends.
 _SEARCH_BUDGET = 0.4
@@ -128,7 +122,7 @@ class SequentialStage:
         if log.iteration == 0 and (s.prior_runs is None or len(s.prior_runs.training) < 2):
             return self._initial(min(s.initial, s.budget))
         size = min(s.batch, s.budget - len(log.history))
-        known = _Known.of(log.history, self._coordinates, s)
+        known = Known.of(log.history, self._coordinates, s)
         log_probability = known.learn(stream(s.seed, "fit", log.iteration))
         modes = self._modes_while_searching(log, known, log_probability)
         if modes is not None:
@@ -157,7 +151,7 @@ class SequentialStage:
         densities = [None] * len(rows) if log_q is None else [float(q) for q in log_q]
         return tuple(PlannedRun(stage, space.named(row), density) for row, density in zip(rows, densities, strict=True))
 
-    def _modes_while_searching(self, log: Log, known: _Known, log_probability: LogProbability | None) -> int | None:
+    def _modes_while_searching(self, log: Log, known: Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
         It ends with 40 % of the budget, after two batches without a new mode, and where failures are common:
@@ -176,7 +170,7 @@ class SequentialStage:
         z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
         return log_probability is not None and float(np.exp(log_probability(z)[0]).mean()) > _COMMON
 
-    def _search_modes(self, known: _Known, iteration: int, n: int) -> Points:
+    def _search_modes(self, known: Known, iteration: int, n: int) -> Points:
         """Return n search picks (n, d): the falsification portfolio in the cube of the wide distribution, some spread evenly."""
         s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", iteration)
         even = round(_EVEN_SHARE * n)
@@ -194,7 +188,7 @@ class SequentialStage:
         """Return normal scores of points of the cube in which the wide distribution is uniform."""
         return from_cube(v, self._wide, self._choices)
 
-    def _drawn(self, log: Log, known: _Known, log_probability: LogProbability | None, size: int) -> Batch:
+    def _drawn(self, log: Log, known: Known, log_probability: LogProbability | None, size: int) -> Batch:
         """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         shares = BLIND if known.one_sided else SHARES
@@ -221,7 +215,7 @@ class SequentialStage:
         return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), proposal)
 
     def _pooled(
-        self, log_probability: LogProbability | None, known: _Known, shares: tuple[float, ...], rng: np.random.Generator
+        self, log_probability: LogProbability | None, known: Known, shares: tuple[float, ...], rng: np.random.Generator
     ) -> _Pool:
         """Return a fresh pool and how a batch would be drawn from it with this metamodel."""
         space = self.settings.scenario.space
@@ -237,7 +231,7 @@ class SequentialStage:
         plan = plan_batch(log_pi, log_not, log_w, over_wide, stratum, shares)
         return _Pool(mixture, z, x, plan, log_pi, log_not)
 
-    def _fallback(self, log: Log, known: _Known, error: float) -> LogProbability | None:
+    def _fallback(self, log: Log, known: Known, error: float) -> LogProbability | None:
         """Return an earlier metamodel to draw with, where the newest one has lost its precision for no reason.
 
         A fit can fail: hyperparameters of another mode of their posterior. That shows in an anticipated error ten times as
@@ -250,7 +244,7 @@ class SequentialStage:
         iteration, best = min(drawn[-_MEMORY:], key=lambda item: _error_of(item[1]))
         if error <= _LOST * _error_of(best):
             return None
-        before = _Known.of(log.history.where(log.history.iteration < iteration), self._coordinates, self.settings)
+        before = Known.of(log.history.where(log.history.iteration < iteration), self._coordinates, self.settings)
         log_probability = before.learn(stream(self.settings.seed, "fit", iteration))
         since = known.batch >= iteration
         if log_probability is None or not since.any():
@@ -259,7 +253,7 @@ class SequentialStage:
         surprised = len(met) > 0 and bool((np.exp(log_probability(met)[0]) < _SURPRISE).any())
         return None if surprised else log_probability
 
-    def _mixture(self, log_probability: LogProbability | None, known: _Known, rng: np.random.Generator) -> Mixture:
+    def _mixture(self, log_probability: LogProbability | None, known: Known, rng: np.random.Generator) -> Mixture:
         """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
         if log_probability is None or not known.critical.any():
             return Mixture(self._wide, choices=self._choices)
@@ -327,70 +321,3 @@ def _error_of(pool: PoolSummary) -> float:
 def _relative_error(anticipated: float, prior: float) -> float:
     """Return the anticipated coefficient of variation of one draw."""
     return math.sqrt(anticipated) / max(prior, 1e-300)
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """Runs to learn from: normal scores z, coordinates u, metric y, what is critical, the batch of each."""
-
-    z: Points
-    u: Points
-    y: Vector
-    critical: Mask
-    batch: Vector
-    coordinates: Coordinates
-    settings: Settings
-
-    @classmethod
-    def of(cls, history: History, coordinates: Coordinates, settings: Settings) -> _Known:
-        """Return what the history teaches, and what another campaign does."""
-        runs, space = history.training, settings.scenario.space
-        requirement = settings.scenario.requirement
-        x, y, batch = runs.x, runs.y(requirement.metric), runs.iteration
-        if settings.prior_runs is not None:
-            first = settings.prior_runs.training
-            x, y = np.vstack([first.x, x]), np.concatenate([first.y(requirement.metric), y])
-            batch = np.concatenate([np.full(len(first), -1), batch])
-        z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
-        return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings)
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether all runs are critical, or none is."""
-        return not self.critical.any() or bool(self.critical.all())
-
-    def modes(self, log_probability: LogProbability | None) -> int:
-        """Return the number of groups of critical runs that the metamodel's critical region does not connect."""
-        hits = self.z[self.critical]
-        if log_probability is None or len(hits) < 2:
-            return len(hits)
-        i, j = np.triu_indices(len(hits), 1)
-        for choice in choice_scores(self.settings.scenario.space):  # there is nothing between choices
-            alike = choice.cells(hits)[i] == choice.cells(hits)[j]
-            i, j = i[alike], j[alike]
-        if len(i) == 0:
-            return len(hits)
-        along = np.linspace(0.1, 0.9, _PROBES)[:, None, None]
-        probes = hits[i] * along + hits[j] * (1.0 - along)  # (probes, pairs, d)
-        inside = log_probability(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
-        joined = inside.all(axis=0)
-        graph = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(hits), len(hits)))
-        return int(connected_components(graph, directed=False)[0])
-
-    def learn(self, rng: np.random.Generator) -> LogProbability | None:
-        """Return the log_probability; None with too few runs."""
-        if len(self.y) < 2:
-            return None
-        interval = self.settings.scenario.requirement.critical
-        return fit_log_probability(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng)
-
-
-def metamodel_of(settings: Settings) -> Metamodel:
-    """Return the metamodel of a campaign that cannot do without.
-
-    Raises:
-        InputError: there is none.
-    """
-    if settings.learner is None:
-        raise InputError("the sequential estimator needs a metamodel, but got none")
-    return settings.learner.metamodel

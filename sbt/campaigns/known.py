@@ -1,0 +1,89 @@
+"""What an estimation knows when it chooses a batch: the runs to learn from, and what the metamodel makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sbt.campaigns.settings import Settings
+from sbt.errors import InputError
+from sbt.estimators.choices import choice_scores
+from sbt.estimators.surrogate import Coordinates, LogProbability, fit_log_probability
+from sbt.metamodels.base import Metamodel
+from sbt.problem.arrays import Mask, Points, Vector
+from sbt.store.history import History
+
+__all__ = ["Known", "metamodel_of"]
+
+_PROBES = 9
+"""Points on the segment between two critical runs, at which P must stay above 0.5 for them to be one mode."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Runs to learn from: normal scores z, coordinates u, metric y, what is critical, the batch of each."""
+
+    z: Points
+    u: Points
+    y: Vector
+    critical: Mask
+    batch: Vector
+    coordinates: Coordinates
+    settings: Settings
+
+    @classmethod
+    def of(cls, history: History, coordinates: Coordinates, settings: Settings) -> Known:
+        """Return what the history teaches, and what another campaign does."""
+        runs, space = history.training, settings.scenario.space
+        requirement = settings.scenario.requirement
+        x, y, batch = runs.x, runs.y(requirement.metric), runs.iteration
+        if settings.prior_runs is not None:
+            first = settings.prior_runs.training
+            x, y = np.vstack([first.x, x]), np.concatenate([first.y(requirement.metric), y])
+            batch = np.concatenate([np.full(len(first), -1), batch])
+        z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
+        return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings)
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether all runs are critical, or none is."""
+        return not self.critical.any() or bool(self.critical.all())
+
+    def modes(self, log_probability: LogProbability | None) -> int:
+        """Return the number of groups of critical runs that the metamodel's critical region does not connect."""
+        hits = self.z[self.critical]
+        if log_probability is None or len(hits) < 2:
+            return len(hits)
+        i, j = np.triu_indices(len(hits), 1)
+        for choice in choice_scores(self.settings.scenario.space):  # there is nothing between choices
+            alike = choice.cells(hits)[i] == choice.cells(hits)[j]
+            i, j = i[alike], j[alike]
+        if len(i) == 0:
+            return len(hits)
+        along = np.linspace(0.1, 0.9, _PROBES)[:, None, None]
+        probes = hits[i] * along + hits[j] * (1.0 - along)  # (probes, pairs, d)
+        inside = log_probability(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
+        joined = inside.all(axis=0)
+        graph = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(hits), len(hits)))
+        return int(connected_components(graph, directed=False)[0])
+
+    def learn(self, rng: np.random.Generator) -> LogProbability | None:
+        """Return the log_probability; None with too few runs."""
+        if len(self.y) < 2:
+            return None
+        interval = self.settings.scenario.requirement.critical
+        return fit_log_probability(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng)
+
+
+def metamodel_of(settings: Settings) -> Metamodel:
+    """Return the metamodel of a campaign that cannot do without.
+
+    Raises:
+        InputError: there is none.
+    """
+    if settings.learner is None:
+        raise InputError("the sequential estimator needs a metamodel, but got none")
+    return settings.learner.metamodel
