@@ -9,8 +9,9 @@ from typing import Any
 from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, drawn_shares
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
-from sbt.campaigns.sequential import FEWEST_BATCHES, SequentialStage
+from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.stopping import FEWEST_BATCHES
 from sbt.campaigns.wording import number, percent
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates, few_hits_bound

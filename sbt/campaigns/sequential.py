@@ -6,21 +6,19 @@ one. Up to a stopping time the draws only teach; from then on they count, with w
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from sbt.campaigns.counting import DRAWN, counted_batches
+from sbt.campaigns.counting import DRAWN
 from sbt.campaigns.known import Known, metamodel_of
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, PoolSummary
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.stopping import count_begins, is_precise, pools_of, relative_error, relative_error_of
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, log_normal, log_wide, to_cube
 from sbt.estimators.importance import BLIND, SHARES, Plan, draw_systematic, plan_batch
-from sbt.estimators.intervals import combine_estimates
 from sbt.estimators.mixture import Mixture, fit_mixture, particles, wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Batch, Log
@@ -31,9 +29,8 @@ from sbt.samplers.search import Search
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
-from sbt.store.records import Iteration
 
-__all__ = ["FEWEST_BATCHES", "SequentialStage"]
+__all__ = ["SequentialStage"]
 
 _SEARCH_STAGE, _LEARN_STAGE = "hunt", "learn"
 """Stages of runs that search for modes, and of draws that only teach."""
@@ -55,19 +52,6 @@ _EVEN_SHARE = 0.1
 """Of the search picks, those that are spread evenly: they do not depend on the metamodel."""
 _SEARCH_SHARE = (0.2, 0.1)
 """Of later batches, the share that still searches: before and after the count has begun."""
-
-# When the count begins.
-_LATEST = 0.6
-"""At the latest after this share of the budget: fewer batches would say little about their own spread."""
-_FEWEST_LEARNED = 3
-"""Batches that only teach, at least: stalling shows in three values."""
-_STALLED, _USABLE = 1.5, 0.5
-"""Learning has stalled where the anticipated coefficient of variation of three batches varies by less than the factor; it is
-usable below the value."""
-_TARGET = 0.02
-"""Anticipated coefficient of variation that is good enough where `stop.cov` sets none."""
-FEWEST_BATCHES = 4
-"""Batches that must count before their spread is taken for a measure of the error."""
 
 # When an earlier metamodel is preferred to the newest one.
 _LOST, _MEMORY, _SURPRISE = 10.0, 4, 0.01
@@ -100,17 +84,9 @@ class SequentialStage:
 
     def stop(self, log: Log) -> str | None:
         """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
-        s = self.settings
-        if log.iterations and len(log.history) >= s.budget:
+        if log.iterations and len(log.history) >= self.settings.budget:
             return "budget"
-        target = s.stop.get("cov")
-        counted = counted_batches(log, s)
-        if target is not None and len(counted) >= FEWEST_BATCHES:
-            found = combine_estimates(counted)
-            hits = sum(float(b.critical.sum()) for b in counted)
-            if hits >= 10 and found.value > 0 and found.std_error <= target * found.value:
-                return "cov"
-        return None
+        return "cov" if is_precise(log, self.settings) else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""
@@ -193,12 +169,12 @@ class SequentialStage:
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         shares = BLIND if known.one_sided else SHARES
         pool = self._pooled(log_probability, known, shares, rng)
-        fallback = self._fallback(log, known, _relative_error(pool.plan.anticipated, pool.plan.prior))
+        fallback = self._fallback(log, known, relative_error(pool.plan.anticipated, pool.plan.prior))
         if fallback is not None:
             pool = self._pooled(fallback, known, shares, rng)
         z, x, plan, log_pi, log_not = pool.z, pool.x, pool.plan, pool.log_pi, pool.log_not
         summary = PoolSummary(_POOL, plan.prior, plan.anticipated, len(pool.mixture.shares), fallback is not None)
-        counts = known.one_sided or self._counts(log, size)
+        counts = known.one_sided or count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
         searched = min(round(_SEARCH_SHARE[counts] * size), size - 1)
         n = size - searched
         picks = self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)
@@ -238,11 +214,11 @@ class SequentialStage:
         large as that of an earlier batch, although no critical run since then lay where that batch denied it. The estimate
         is unbiased with any metamodel that knows only earlier runs.
         """
-        drawn = [(batch.number, pool) for batch, pool in _pools(log) if not pool.fallback]
+        drawn = [(batch.number, pool) for batch, pool in pools_of(log) if not pool.fallback]
         if not drawn:
             return None
-        iteration, best = min(drawn[-_MEMORY:], key=lambda item: _error_of(item[1]))
-        if error <= _LOST * _error_of(best):
+        iteration, best = min(drawn[-_MEMORY:], key=lambda item: relative_error_of(item[1]))
+        if error <= _LOST * relative_error_of(best):
             return None
         before = Known.of(log.history.where(log.history.iteration < iteration), self._coordinates, self.settings)
         log_probability = before.learn(stream(self.settings.seed, "fit", iteration))
@@ -272,27 +248,6 @@ class SequentialStage:
         clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, boundary))
         return fit_mixture(clouds, self._wide, rng, choices=self._choices)
 
-    def _counts(self, log: Log, size: int) -> bool:
-        """Return whether this batch counts: from the stopping time on.
-
-        It looks only at earlier batches. Were it to look at this batch's pool, pools whose points are mostly
-        taken for critical would begin the count more often, and the estimate would be too high.
-        """
-        drawn = list(_pools(log))
-        if any(batch.read(EstimationProposal).counted is not None for batch, _ in drawn):
-            return True
-        s, spent = self.settings, len(log.history)
-        if spent + size > _LATEST * s.budget:
-            return True
-        if len(drawn) < _FEWEST_LEARNED:
-            return False
-        left = math.sqrt((1.0 - _SEARCH_SHARE[True]) * (s.budget - spent))
-        errors = [_error_of(pool) / left for _, pool in drawn[-3:]]
-        if max(errors) < _STALLED * min(errors) and errors[-1] < _USABLE:
-            return True  # learning no longer pays
-        target = s.stop.get("cov")
-        return errors[-1] <= (_TARGET if target is None else target)
-
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
@@ -304,20 +259,3 @@ class _Pool:
     plan: Plan
     log_pi: Vector
     log_not: Vector
-
-
-def _pools(log: Log) -> Iterator[tuple[Iteration, PoolSummary]]:
-    """Yield the batches that were drawn from a pool, with the pool."""
-    for batch in log.iterations:
-        pool = batch.read(EstimationProposal).pool
-        if pool is not None:
-            yield batch, pool
-
-
-def _error_of(pool: PoolSummary) -> float:
-    return _relative_error(pool.anticipated, pool.probability)
-
-
-def _relative_error(anticipated: float, prior: float) -> float:
-    """Return the anticipated coefficient of variation of one draw."""
-    return math.sqrt(anticipated) / max(prior, 1e-300)

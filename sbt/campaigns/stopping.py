@@ -1,0 +1,84 @@
+"""When the count of an estimation begins and when it ends: both look only at finished batches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from sbt.campaigns.counting import counted_batches
+from sbt.campaigns.records import EstimationProposal, PoolSummary
+from sbt.campaigns.settings import Settings
+from sbt.estimators.intervals import FEWEST_HITS, combine_estimates
+from sbt.loop.stages import Log
+from sbt.store.records import Iteration
+
+__all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative_error", "relative_error_of"]
+
+_LATEST = 0.6
+"""The count begins at the latest after this share of the budget: fewer batches would say little about their own spread."""
+_FEWEST_LEARNED = 3
+"""Batches that only teach, at least: stalling shows in three values."""
+_STALLED, _USABLE = 1.5, 0.5
+"""Learning has stalled where the anticipated coefficient of variation of three batches varies by less than the factor; it is
+usable below the value."""
+_TARGET = 0.02
+"""Anticipated coefficient of variation that is good enough where `stop.cov` sets none."""
+FEWEST_BATCHES = 4
+"""Batches that must count before their spread is taken for a measure of the error."""
+
+
+def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) -> bool:
+    """Return whether the next batch of this size counts: from the stopping time on.
+
+    It looks only at earlier batches. Were it to look at this batch's pool, pools whose points are mostly
+    taken for critical would begin the count more often, and the estimate would be too high.
+
+    Args:
+        log: of the campaign.
+        settings: of the campaign.
+        size: runs of the next batch.
+        drawn_share: share of the remaining runs that would count.
+    """
+    drawn = list(pools_of(log))
+    if any(batch.read(EstimationProposal).counted is not None for batch, _ in drawn):
+        return True
+    spent = len(log.history)
+    if spent + size > _LATEST * settings.budget:
+        return True
+    if len(drawn) < _FEWEST_LEARNED:
+        return False
+    left = math.sqrt(drawn_share * (settings.budget - spent))
+    errors = [relative_error_of(pool) / left for _, pool in drawn[-3:]]
+    if max(errors) < _STALLED * min(errors) and errors[-1] < _USABLE:
+        return True  # learning no longer pays
+    target = settings.stop.get("cov")
+    return errors[-1] <= (_TARGET if target is None else target)
+
+
+def is_precise(log: Log, settings: Settings) -> bool:
+    """Return whether the estimate has the coefficient of variation at which `stop.cov` ends the campaign."""
+    target = settings.stop.get("cov")
+    counted = counted_batches(log, settings)
+    if target is None or len(counted) < FEWEST_BATCHES:
+        return False
+    found = combine_estimates(counted)
+    hits = sum(float(b.critical.sum()) for b in counted)
+    return hits >= FEWEST_HITS and found.value > 0 and found.std_error <= target * found.value
+
+
+def pools_of(log: Log) -> Iterator[tuple[Iteration, PoolSummary]]:
+    """Yield the batches that were drawn from a pool, with the pool."""
+    for batch in log.iterations:
+        pool = batch.read(EstimationProposal).pool
+        if pool is not None:
+            yield batch, pool
+
+
+def relative_error_of(pool: PoolSummary) -> float:
+    """Return the anticipated coefficient of variation of one draw from this pool."""
+    return relative_error(pool.anticipated, pool.probability)
+
+
+def relative_error(anticipated: float, prior: float) -> float:
+    """Return the anticipated coefficient of variation of one draw."""
+    return math.sqrt(anticipated) / max(prior, 1e-300)
