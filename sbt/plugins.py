@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
 
-__all__ = ["KINDS", "OBJECT", "Objects", "Scope", "load", "names"]
+__all__ = ["KINDS", "OBJECT", "Objects", "Scope", "forget_changed", "kept", "load", "names", "noted"]
 
 OBJECT = "object:"
 """Before the name of an object that was given in Python, where a name is asked for."""
@@ -31,6 +31,42 @@ KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "contr
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
+_stamps: dict[Path, tuple[int, int]] = {}
+_forgetters: list[Callable[[], None]] = []
+
+
+def noted(path: Path) -> Path:
+    """Return the path of a user's file, and remember its state as what `kept` functions made of it belongs to that state."""
+    _stamps.setdefault(path, _stamp(path))
+    return path
+
+
+def kept(function: F) -> F:
+    """Keep what a function made of the user's files, once a process and arguments, until one of the files changes."""
+    cached: Any = cache(function)
+    _forgetters.append(cached.cache_clear)
+    return cast("F", cached)
+
+
+def forget_changed() -> None:
+    """Forget everything that was made of the user's files where one of them has changed since: files edited in a session.
+
+    Called where a command begins, not within one: a campaign runs what it began with.
+    """
+    if any(_stamp(path) != state for path, state in _stamps.items()):
+        _stamps.clear()
+        for forget in _forgetters:
+            forget()
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Return when a file was changed (ns) and its size (bytes); zeros where there is none."""
+    try:
+        state = path.stat()
+    except OSError:
+        return (0, 0)
+    return (state.st_mtime_ns, state.st_size)
 
 
 @dataclass(frozen=True)
@@ -97,9 +133,10 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
     return _guarded(entries[name].load, lambda _: f"{kind[:-1]} '{name}' cannot be imported", InputError)
 
 
-@cache
+@kept
 def _module(path: str) -> Any:
-    """Import one file under a name of its own, once a process."""
+    """Import one file under a name of its own, once a process while it stays as it is."""
+    noted(Path(path))
     name = f"sbt_user_{abs(hash(path)):x}_{Path(path).stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None or not Path(path).is_file():

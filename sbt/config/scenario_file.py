@@ -18,7 +18,7 @@ from sbt.config.scenario_model import EgoEntry, InputEntry, MetricEntry, Scenari
 from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
-from sbt.plugins import load
+from sbt.plugins import load, noted
 from sbt.problem.parameter import Parameter
 from sbt.problem.profile import KnotProfile, Profile
 from sbt.problem.requirement import Requirement
@@ -55,7 +55,7 @@ def from_file(name: str, folder: Path) -> LogicalScenario:
         ConfigError: everything that is wrong with it and with the files it names.
     """
     path = (folder / Path(name).expanduser()).resolve()
-    data, source, wrong = read_yaml(read_text(path), name)
+    data, source, wrong = read_yaml(read_text(noted(path)), name)
     problems = Problems(source)
     try:
         data, source = _with_one_ego(data, source)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from sbt.execution.carrying import delivered
 from sbt.execution.exchange import with_drivers
 from sbt.metrics.conflict_types import conflict_type
 from sbt.metrics.pairwise import in_traffic, without_overtaking
-from sbt.plugins import load
+from sbt.plugins import kept, load
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 
@@ -115,7 +115,7 @@ def _loaded(name: str, folder: Path, carried: bytes) -> LogicalScenario:
     return scenario
 
 
-@cache
+@kept
 def _resolved(spec: ScenarioSpec, ego: str | None) -> LogicalScenario:
     found = replace(spec, ego=None if ego is None else json.loads(ego)).resolve_at(lambda _, make: make())
     if found is None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import xml.parsers.expat
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 
+from sbt.plugins import kept
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import Template
 
@@ -66,7 +66,7 @@ def _elements_of(one: Template) -> list[Element]:
     return found
 
 
-@cache
+@kept
 def person(templates: tuple[Template, ...], name: str) -> Element | None:
     """Return the person of this id, None if there is none; looked for once per process."""
     of_files = (one for each in templates if each.root[0] != "net" for one in _elements_of(each))

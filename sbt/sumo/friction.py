@@ -12,11 +12,11 @@ import gzip
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from sbt.errors import RunError
+from sbt.plugins import kept
 from sbt.problem.outcome import Status
 from sbt.sumo.grip import Limits, limit_to_friction, set_limits
 from sbt.sumo.guided import Motion, Placed
@@ -29,7 +29,7 @@ _DRY = 1.0
 _CHUNK = 1 << 22
 
 
-@cache
+@kept
 def has_friction(net: Path) -> bool:
     """Return whether a network has lanes with a friction of their own; each file is looked at once per process."""
     with gzip.open(net) if net.suffix == ".gz" else net.open("rb") as file:

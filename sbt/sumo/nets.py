@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sbt.errors import InputError
+from sbt.plugins import kept, noted
 
 __all__ = ["Lane", "lanes", "net_file", "nets_folder"]
 
@@ -45,7 +46,7 @@ def nets_folder() -> Path:
     raise InputError(f"the built-in networks must be in {package / '_nets'}, but they are not: install the package again")
 
 
-@cache
+@kept
 def net_file(net: str) -> Path:
     """Return the file of a network, given by a built-in name or the path of a `.net.xml`.
 
@@ -56,7 +57,7 @@ def net_file(net: str) -> Path:
     if not path.is_file():
         known = ", ".join(sorted(p.name for p in nets_folder().iterdir() if p.is_dir()))
         raise InputError(f"a network must be one of {known}, or an existing .net.xml file, but got '{net}'")
-    _check_well_formed(path)
+    _check_well_formed(noted(path))
     return path.resolve()
 
 

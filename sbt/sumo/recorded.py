@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean
 from sbt.metrics.fcd import Recording
 from sbt.metrics.tracks import read_recording
+from sbt.plugins import kept, noted
 from sbt.problem.arrays import Vector
 from sbt.sumo.guided import Motion, Placed
 from sbt.sumo.session import unwrapped
@@ -64,14 +64,14 @@ class Track(NamedTuple):
         return self.kind == "person"
 
 
-@cache
+@kept
 def recorded_tracks(path: Path) -> tuple[Track, ...]:
     """Return the tracks of a recording, by the time of their beginning; each file is read once per process.
 
     Raises:
         InputError: it cannot be read.
     """
-    recording = read_recording(path)
+    recording = read_recording(noted(path))
     found = [track for k in range(len(recording.names)) for track in _tracks(recording, k)]
     return tuple(sorted(found, key=lambda track: (float(track.time[0]), track.name)))
 

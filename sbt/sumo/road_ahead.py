@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 import xml.etree.ElementTree as ET
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
+from sbt.plugins import kept
 from sbt.problem.arrays import Points, Vector
 from sbt.sumo.actors import Action, Controller, State
 from sbt.sumo.dynamics import next_speed
@@ -104,7 +104,7 @@ def on_road(driver: Controller | None, net: str, route: tuple[str, ...], lane: i
     return None if driver is None else _OnRoad(driver, _road(net, route, lane), position)
 
 
-@cache
+@kept
 def _road(net: str, route: tuple[str, ...], lane: int) -> RoadAhead:
     return RoadAhead(net, route, lane)
 

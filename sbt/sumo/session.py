@@ -25,6 +25,7 @@ from typing import Any, Protocol
 from xml.sax.saxutils import quoteattr
 
 from sbt.errors import RunError
+from sbt.plugins import kept
 from sbt.problem.outcome import Status
 from sbt.processes import scratch
 from sbt.sumo.actors import VehicleType
@@ -129,7 +130,7 @@ def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
     return str(path)
 
 
-@cache
+@kept
 def _replicas_file(net: str, replicas: int) -> str:
     """Write the replicated network once per process and return the file."""
     path = scratch_folder() / f"{replicas}-{hashlib.blake2b(net.encode(), digest_size=8).hexdigest()}.net.xml"
@@ -246,7 +247,7 @@ class Session:
         return "SUMO: " + "; ".join(dict.fromkeys([str(error).strip(), *self.messages()[-5:]]))
 
 
-@cache
+@kept
 def session() -> Session:
     """Return the simulation of this process."""
     return Session()

@@ -15,12 +15,13 @@ import re
 import xml.parsers.expat
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from xml.sax.saxutils import escape, quoteattr, unescape
 
 from sbt.errors import InputError, RunError
+from sbt.plugins import kept, noted
 from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
@@ -219,7 +220,7 @@ def _read(path: Path) -> bytes:
         raise InputError(f"a SUMO file must be readable, but {path} is not: {error}") from None
 
 
-@cache
+@kept
 def template(path: Path) -> Template:
     """Parse an XML file; each file is read once per process.
 
@@ -227,7 +228,7 @@ def template(path: Path) -> Template:
         InputError: it cannot be read, is not well-formed XML, declares a document type or entities, or has a
             placeholder that is not a formula; the message begins with file, line and column.
     """
-    data = _read(path)
+    data = _read(noted(path))
     if b"\0" in data[:64]:
         raise InputError(f"{path}: a SUMO file must be encoded byte by byte (UTF-8), but it has zero bytes")
     parser = xml.parsers.expat.ParserCreate()

@@ -75,6 +75,7 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
         InputError: anything in the configuration breaks a rule, or the store belongs to another configuration or scenario.
         StoreError: the store cannot be written.
     """
+    plugins.forget_changed()
     known = (*CampaignKeys.__annotations__, "campaign")
     for name in keys:
         if name not in known:
@@ -253,6 +254,7 @@ def simulate_scenario(
     Raises:
         InputError: there is no such scenario, or it does not take these inputs or choices.
     """
+    plugins.forget_changed()
     choice = {"kind": ego} if isinstance(ego, str) else ego
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError(f"seed must be a whole number >= 0, but got {seed!r}")
@@ -317,6 +319,7 @@ def check_target(target: LogicalScenario | str | Path, *, seed: int = 0, isolati
     Raises:
         InputError: it cannot be loaded.
     """
+    plugins.forget_changed()
     if not isinstance(target, LogicalScenario) and Path(target).suffix in (".yaml", ".yml") and not is_scenario(Path(target)):
         study = Study(load(target))
         return Checked(check_scenario(study.spec, seed, study.scenario))

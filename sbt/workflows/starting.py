@@ -12,11 +12,11 @@ from pathlib import Path
 from sbt.config.scenario_file import from_file
 from sbt.errors import InputError, RunError, did_you_mean
 from sbt.files import write_atomically
+from sbt.plugins import forget_changed
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.observing import Observed, Traffic, candidates, observe
 from sbt.sumo.own_ego import Suggestion, own_ego
 from sbt.sumo.suggesting import suggested
-from sbt.sumo.template import template
 
 __all__ = ["Written", "write_scenario"]
 
@@ -267,7 +267,7 @@ def _write(draft: _Draft, folder: Path, made: set[Path]) -> None:
         if path not in made and path.exists():
             raise InputError(f"FOLDER must not have a {path.name} yet, but '{folder}' has: choose another folder")
         made.add(write_atomically(path, text))
-    template.cache_clear()
+    forget_changed()
 
 
 def _tried(path: Path) -> _Trial:

@@ -10,7 +10,7 @@ from typing import Any
 
 from sbt.campaigns.settings import CampaignKind, Gate, Settings
 from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of, spec_of
-from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, resumed
+from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, read_text, resumed
 from sbt.config.model import Configuration
 from sbt.errors import InputError, PluginError
 from sbt.execution.dask import DaskExecutor
@@ -49,7 +49,15 @@ class Study:
 
     @classmethod
     def from_file(cls, path: str | Path, overrides: Sequence[str] = (), **more: Any) -> Study:
-        """Return the study of a configuration file; as `sbt.config.load.load`."""
+        """Return the study of a configuration file; as `sbt.config.load.load`.
+
+        Relative names start from its folder; in the resolved configuration of a store from where they were written.
+        """
+        place = Path(path)
+        if place.name == RESOLVED and Store.begun(place.parent):
+            with Store.read(place.parent) as store:
+                folder = Path(store.configuration["folder"])
+            return cls(parse(read_text(place), overrides, name=str(path), folder=folder, **more))
         return cls(load(path, overrides, **more))
 
     @classmethod
