@@ -9,7 +9,10 @@ from test_doors import files_of
 
 import sbt
 
-FUNCTION = "import sbt\nSCENARIO = sbt.Scenario('s', [sbt.Parameter('a', 0, 1, 'm')], sbt.Requirement('gap', high=0.0),\n    evaluate=lambda values, seed: {{'gap': {0}}})\n"
+FUNCTION = """import sbt
+SCENARIO = sbt.Scenario('s', [sbt.Parameter('a', 0, 1, 'm')], sbt.Requirement('gap', high=0.0),
+    evaluate=lambda values, seed: {{'gap': {0}}})
+"""
 
 
 def test_an_edited_python_file_is_run_as_it_stands(tmp_path):
