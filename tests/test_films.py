@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.metrics.fcd import read_fcd
+from sbt.metrics.fcd import Recording, read_fcd
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.planar import DISTANCE_MIN
 from sbt.problem.requirement import Requirement
@@ -81,6 +81,11 @@ def pixels(picture: np.ndarray, color: str) -> int:
     return int((np.abs(picture - wanted).max(axis=2) < 14).sum())
 
 
+def speeds(recording: Recording, name: str) -> np.ndarray:
+    k = recording.names.index(name)
+    return recording.speed[recording.start[k] : recording.start[k + 1]]
+
+
 def metric_of(scenario: LogicalScenario) -> Metric:
     return next(m for m in scenario.metrics if m.name == scenario.requirement.metric)
 
@@ -103,6 +108,12 @@ def test_a_film_follows_the_ego_on_its_lanes_and_files_hold_who_was_there(stored
     assert counts == stored.trace.present.sum(axis=1).tolist()
     scene = subprocess.run([program("sumo"), "-c", "scene.sumocfg", "--no-step-log"], cwd=out, capture_output=True, text=True)
     assert (scene.returncode, scene.stderr) == (0, "")
+    if stored.scenario.simulate.recording.ego.driver is not None:
+        return  # what the controller does is not in the files
+    plain = [program("sumo"), "-c", "run.sumocfg", "--no-warnings", "--end", "400", "--fcd-output", "plain.xml"]
+    subprocess.run(plain, cwd=out / "sumo", check=True, capture_output=True)
+    alone, with_us = (speeds(read_fcd(file), stored.trace.actors[0]) for file in (out / "sumo" / "plain.xml", out / "fcd.xml"))
+    np.testing.assert_allclose(alone[: len(with_us)], with_us, atol=0.011, err_msg="the files alone show the same run")
 
 
 @in_sumo

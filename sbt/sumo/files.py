@@ -7,6 +7,7 @@ output options are dropped.
 
 from __future__ import annotations
 
+import os
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
@@ -56,6 +57,15 @@ class Launch:
     def command(self, seed: int) -> list[str]:
         """Return SUMO's arguments without the program's name."""
         return [*self.arguments, "--seed", str(seed)]
+
+    def write(self, seed: int, path: Path) -> Path:
+        """Write the command line as a `.sumocfg`, and return its path; files below its folder are named relative to it."""
+        root, words = ET.Element("configuration"), self.command(seed)
+        for option, value in zip(words[::2], words[1::2], strict=True):
+            ET.SubElement(root, option.removeprefix("--"), value=value.replace(f"{path.parent}{os.sep}", ""))
+        ET.indent(root, "    ")
+        path.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+        return path
 
 
 @dataclass(frozen=True)

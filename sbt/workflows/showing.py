@@ -22,7 +22,8 @@ def show_replay(
         again: the run; it has a trace.
         gui: in sumo-gui, in real time.
         gif: an animated GIF from above, with the metric over time.
-        folder: network, trajectories (FCD, CSV), a scene for sumo-gui, and what the files' detectors measured.
+        folder: network, trajectories (FCD, CSV), a scene for sumo-gui, what the files' detectors measured,
+            and the run's own SUMO files.
         csv: the states over time.
 
     Returns:
@@ -45,9 +46,20 @@ def show_replay(
         if hasattr(scenario.simulate, "files_of_run"):
             session().close()
             collect_outputs(scratch_folder(), folder / "outputs")
+            _write_sumo_files(again, folder.resolve() / "sumo")
     if gif is not None:
         save_film(gif, states, scenario, f"{scenario.name}, run {record.index}: {_result(again)}", net_of_run(again))
     return not gui or run_in_gui(scenario.simulate, record.inputs, record.seed, program, ego=states.actors[0]).identical(states)
+
+
+def _write_sumo_files(again: Replay, folder: Path) -> None:
+    """Write the SUMO files of a run, placeholders filled, and a `run.sumocfg` that any SUMO reads.
+
+    What a controller or a loop does in the run is not in them; files without placeholders are named where they are.
+    """
+    simulate: Any = again.scenario.simulate
+    inputs, seed = again.record.inputs, again.record.seed
+    simulate.files_of_run(inputs, seed).launch(inputs, folder, simulate.step).write(seed, folder / "run.sumocfg")
 
 
 def _result(again: Replay) -> str:
