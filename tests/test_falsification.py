@@ -178,7 +178,7 @@ def test_where_nothing_is_found_only_the_space_filling_runs_bound(falsified: Run
         found = result["conclusion"]
         assert (found["first_critical_run"], found["critical_runs"], found["failure_modes"]) == (None, 0, [])
         stages = Counter(row[1] for row in rows(result))
-        assert stages == {"initial": 10, "search": 36, VALIDATION: 4}
+        assert stages == {"initial": 10, "search": 34, "repeat": 2, VALIDATION: 4}
         assert found["bound"]["space_filling_runs"] == 14
         assert found["bound"]["box_fraction"] == pytest.approx(1 - 0.05 ** (1 / 14))
         assert found["bound"]["box_fraction_random_runs"] == pytest.approx(1 - 0.05 ** (1 / 4))
@@ -186,7 +186,7 @@ def test_where_nothing_is_found_only_the_space_filling_runs_bound(falsified: Run
         assert "14 space-filling" in found["statement"]
     assert found["closest"]["margin"] == 3.0
     sobol = falsified("NOTHING", "sobol", validation={"share": 0})
-    assert Counter(row[1] for row in rows(sobol)) == {"initial": 10, "search": 36, "even": 4}
+    assert Counter(row[1] for row in rows(sobol)) == {"initial": 10, "search": 34, "repeat": 2, "even": 4}
     assert sobol["conclusion"]["bound"]["random_runs"] == 0
 
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.acquisitions import is_greedy
+from sbt.acquisitions import even, is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
+from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.wording import percent
 from sbt.errors import InputError
@@ -38,6 +39,7 @@ class BoundaryConclusion:
         chosen_because: and why.
         held_out_fraction: critical share of the held-out random runs, free of any model.
         failing_fraction: mean P(a run gives no metric); None: all runs gave one.
+        simulator_noise: what repeats with other seeds tell; None: recorded rows.
     """
 
     critical_fraction: float | None
@@ -48,6 +50,7 @@ class BoundaryConclusion:
     chosen_because: str | None = optional()
     held_out_fraction: CriticalShare | None = None
     failing_fraction: float | None = optional()
+    simulator_noise: SimulatorNoise | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -65,6 +68,8 @@ class BoundaryConclusion:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
         if self.weights is not None:
             found.append(f"The metamodel chose among its members: {self.chosen_because}.")
+        if self.simulator_noise is not None:
+            found += self.simulator_noise.sentences(facts.requirement.metric, facts.unit)
         return found
 
 
@@ -92,10 +97,11 @@ def recipe(settings: Settings) -> Campaign:
         r = fitted.record
         return BoundaryConclusion(
             r.critical_fraction, r.expected_misclassified, r.ambiguous_volume, r.validation, r.weights, r.chosen_because,
-            held_out, r.failing_fraction,
+            held_out, r.failing_fraction, stated_noise(log.history, settings.scenario),
         ), fitted  # fmt: skip
 
-    return Campaign((BatchStage("boundary", settings, _rule(settings)),), conclude)
+    stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even)
+    return Campaign((stage,), conclude)
 
 
 def _rule(settings: Settings) -> ChoiceRule:

@@ -9,6 +9,7 @@ from typing import Any
 from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, drawn_shares
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
+from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.stopping import FEWEST_BATCHES
@@ -58,6 +59,7 @@ class EstimationConclusion:
         counted: draws that count.
         exact_bound: where nothing was critical, the exact upper bound.
         gate: its verdict, where there is one.
+        simulator_noise: what repeats with other seeds tell; None: none were asked for.
     """
 
     probability: float | None
@@ -76,6 +78,7 @@ class EstimationConclusion:
     counted: int | None = optional()
     exact_bound: float | None = optional()
     gate: GateVerdict | None = optional()
+    simulator_noise: SimulatorNoise | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -84,15 +87,15 @@ class EstimationConclusion:
 
     def sentences(self, facts: Facts) -> list[str]:
         """Return the probability with its interval, or the bound where nothing was critical."""
-        del facts
+        noise = [] if self.simulator_noise is None else self.simulator_noise.sentences(facts.requirement.metric, facts.unit)
         verdict = [] if self.gate is None else [f"Gate: {self.gate.verdict}; {self.gate.statement}."]
         confidence = percent(self.confidence)
         if self.exact_bound is not None:
             bound = number(self.exact_bound)
             none = f"No critical run was drawn: with {confidence} confidence, the probability of one is at most {bound}."
-            return [none, *verdict]
+            return [none, *noise, *verdict]
         if self.probability is None:
-            return verdict
+            return [*noise, *verdict]
         found = [
             f"Probability of a critical run under the inputs' distribution: {number(self.probability)}"
             f" ({confidence} interval {number(self.low)} to {number(self.high)})."
@@ -104,7 +107,7 @@ class EstimationConclusion:
         missed = min(self.undetected_mass_bound, 1.0 - self.probability)
         holds = f"a critical region that no run has met holds at most {number(missed, 3)} more"
         found.append(f"With {confidence} confidence, {holds}.")
-        return [*found, *verdict]
+        return [*found, *noise, *verdict]
 
 
 Concluded = tuple[EstimationConclusion, Limits]
@@ -141,7 +144,9 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         if failed:
             warning = f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
             found = replace(found, warnings=(warning, *found.warnings))
-        return replace(found, gate=None if settings.gate is None else gate_verdict(limits, settings.gate)), None
+        noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
+        gate = None if settings.gate is None else gate_verdict(limits, settings.gate)
+        return replace(found, gate=gate, simulator_noise=noise), None
 
     return Campaign((stage,), conclude)
 
@@ -169,6 +174,7 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         exact_bound = limits.upper(_CONFIDENCE)
         warnings.append(_NOTHING)
     elif not seen.safe:
+        value = value if seen.failed_draws else 1.0
         limits = Limits(lambda c: 1.0 - few_hits_bound(seen.failed_draws, counted, c), lambda _: 1.0)
         warnings.append(
             "everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution"

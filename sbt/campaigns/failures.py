@@ -11,6 +11,7 @@ import numpy as np
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
+from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import plural
 from sbt.errors import InputError
@@ -21,7 +22,7 @@ from sbt.problem.plain import Json, Value
 from sbt.samplers.search import Search, fit_warped
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
-from sbt.store.records import Validation, to_json
+from sbt.store.records import Validation, optional, to_json
 
 __all__ = [
     "CONFIRM", "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs",
@@ -88,6 +89,7 @@ class FalsificationConclusion:
         closest: where nothing critical was found, the run nearest to the critical interval.
         statement: what follows from the runs, and no more.
         validation: scores of the metamodel on held-out runs; None without such runs.
+        simulator_noise: what repeats with other seeds tell; None: recorded rows.
     """
 
     first_critical_run: int | None
@@ -98,6 +100,7 @@ class FalsificationConclusion:
     closest: ClosestRun | None
     statement: str
     validation: Validation | None = None
+    simulator_noise: SimulatorNoise | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -115,6 +118,8 @@ class FalsificationConclusion:
                 f"The requirement is falsified: the first critical run is run {self.first_critical_run},"
                 f" after {plural(self.runs_to_first or 0, 'run')} of the search; {modes}."
             ))  # fmt: skip
+        if self.simulator_noise is not None:
+            said += self.simulator_noise.sentences(facts.requirement.metric, facts.unit)
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
         return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence()]
 
@@ -181,7 +186,7 @@ class FailureSearch:
         return FalsificationConclusion(
             None if first is None else int(searched.index[first]), None if first is None else first + 1, len(hits), tuple(modes),
             bound, None if len(hits) else _closest(searched, margin, scenario.requirement.metric),
-            _statement(searched, len(hits), modes, bound), validation,
+            _statement(searched, len(hits), modes, bound), validation, stated_noise(history, scenario),
         )  # fmt: skip
 
 

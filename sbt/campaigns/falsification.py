@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from sbt.acquisitions import is_greedy, log_scores
+from sbt.acquisitions import even, is_greedy, log_scores
 from sbt.campaigns.failures import CONFIRM, FailureSearch, FalsificationConclusion, confirmations, search_runs
 from sbt.campaigns.parts import held_out_runs, named_inputs
 from sbt.campaigns.records import SearchProposal
+from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
@@ -89,16 +90,23 @@ class SearchStage:
         last = log.last(SearchProposal)
         start = 0 if last is None else last.next_position
         if first:
-            even, at = self._even(size, start)
-            chosen = self._snapped([(_INITIAL, even)], runs)
+            filled, at = self._even(size, start)
+            chosen = self._snapped([(_INITIAL, filled)], runs)
             return Batch((*chosen, *held_out_runs(s, 0, s.reference)), SearchProposal("even", at))
         held_out = 0 if s.scenario.pool is not None else min(_share_of(s.holdout_fraction, spent, size), size - 1)
         filling = min(_share_of(max(_FILL_SHARE - s.holdout_fraction, 0.0), spent, size), size - 1 - held_out)
-        picks, criteria = self._guided(log, runs, size - held_out - filling)
-        even, at = self._even(filling, start)
-        chosen = self._snapped([(_SEARCH, picks), (_EVEN, even)], runs)
-        proposal = SearchProposal(s.method, at, criteria, filling, held_out)
-        return Batch((*chosen, *held_out_runs(s, number, held_out)), proposal)
+        again = repeats_wanted(runs, s.scenario, size - held_out - filling) if self._learns else ()
+        picks, criteria = self._guided(log, runs, size - held_out - filling - len(again))
+        filled, at = self._even(filling, start)
+        chosen = self._snapped([(_SEARCH, picks), (_EVEN, filled)], runs)
+        proposal = SearchProposal(s.method, at, criteria, filling, held_out, len(again) or None)
+        return Batch((*chosen, *again, *held_out_runs(s, number, held_out)), proposal)
+
+    @property
+    def _learns(self) -> bool:
+        """Whether a metamodel chooses: generations of CMA-ES are of one size, an even design asks for no results."""
+        s = self.failure_search.settings
+        return s.method != "cma_es" and s.acquisition is not even
 
     def _number(self, log: Log) -> int:
         """Return the number of the next batch of the search; confirmations in between do not count."""
@@ -119,6 +127,8 @@ class SearchStage:
         space, requirement = s.scenario.space, s.scenario.requirement
         u, y = np.clip(space.to_unit(runs.x), 0.0, 1.0), runs.y(requirement.metric)
         rng = stream(s.seed, "search", self._number(log))
+        if n == 0:
+            return np.empty((0, space.dimension)), {}
         if s.acquisition is not None:
             return self._scored(log, n), {}
         if s.method == "cma_es":

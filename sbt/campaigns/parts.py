@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from sbt.campaigns.choices import ChoiceRule, evenly
+from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import percent, plural
 from sbt.estimators.binomial import interval
@@ -63,11 +64,13 @@ class BatchStage:
         name: what its iterations are called in the store.
         settings: of the campaign.
         choose: the rule.
+        repeats: two early runs repeat inputs with other seeds, to learn whether the simulator is noisy.
     """
 
     name: str
     settings: Settings
     choose: ChoiceRule
+    repeats: bool = False
 
     def stop(self, log: Log) -> str | None:
         """Return why the stage is over: `budget`, `no rows left`, `stable` or `misclassified`; None: go on."""
@@ -102,11 +105,14 @@ class BatchStage:
         held_out = math.floor(s.holdout_fraction * (spent + size)) - math.floor(s.holdout_fraction * spent)
         held_out = min(held_out, size - 1) if size > 1 else 0
         fitted = s.learner.fit(log.history) if s.learner is not None and not first else None
-        found = (evenly if first else self.choose)(s, fitted, log, size - held_out)
+        again = () if first or not self.repeats else repeats_wanted(log.history, s.scenario, size - held_out)
+        n = size - held_out - len(again)
+        found = (evenly if first or n == 0 else self.choose)(s, fitted, log, n)
         stage = "initial" if first else self.name
         chosen = [PlannedRun(stage, named_inputs(s.scenario, row)) for row in found.x]
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
-        return Batch((*chosen, *random), replace(found.proposal, held_out=len(random)), fitted)
+        proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)
+        return Batch((*chosen, *again, *random), proposal, fitted)
 
 
 def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun]:

@@ -29,6 +29,7 @@ class BatchProposal:
         explored: of a mix, runs that searched for unknown critical regions: the first ones of the batch.
         filling, representative, greedy: of a mix, runs that fill the space, represent a_BI, or were chosen one by one.
         even: of a greedy batch, runs that fill the space because nothing else was left.
+        repeats: runs that repeat inputs with other seeds: the last ones of the batch before those held out.
     """
 
     method: str
@@ -42,6 +43,7 @@ class BatchProposal:
     representative: int | None = optional()
     greedy: int | None = optional()
     even: int | None = optional()
+    repeats: int | None = optional()
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class SearchProposal:
         criteria: how many runs each criterion of the method chose.
         even: runs that fill the space.
         held_out: random runs that only score the metamodel.
+        repeats: runs that repeat inputs with other seeds.
     """
 
     method: str
@@ -61,6 +64,7 @@ class SearchProposal:
     criteria: Mapping[str, int] = field(default_factory=dict)
     even: int = 0
     held_out: int = 0
+    repeats: int | None = optional()
 
 
 @dataclass(frozen=True)

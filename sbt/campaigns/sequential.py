@@ -6,7 +6,7 @@ one. Up to a stopping time the draws only teach; from then on they count, with w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from sbt.campaigns.counting import DRAWN
 from sbt.campaigns.known import Known, metamodel_of
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, PoolSummary
+from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.stopping import count_begins, is_precise, pools_of, relative_error, relative_error_of
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, log_normal, log_wide, to_cube
@@ -91,13 +92,15 @@ class SequentialStage:
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""
         with threadpool_limits(1):
-            return self._proposed(log)
+            s, left = self.settings, self.settings.budget - len(log.history)
+            again = repeats_wanted(log.history, s.scenario, left - 1)
+            batch = self._proposed(log, max(min(s.batch, left) - len(again), 1))
+            return replace(batch, runs=(*batch.runs, *again))
 
-    def _proposed(self, log: Log) -> Batch:
+    def _proposed(self, log: Log, size: int) -> Batch:
         s = self.settings
         if log.iteration == 0 and (s.prior_runs is None or len(s.prior_runs.training) < 2):
             return self._initial(min(s.initial, s.budget))
-        size = min(s.batch, s.budget - len(log.history))
         known = Known.of(log.history, self._coordinates, s)
         log_probability = known.learn(stream(s.seed, "fit", log.iteration))
         modes = self._modes_while_searching(log, known, log_probability)

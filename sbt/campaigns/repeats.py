@@ -1,0 +1,113 @@
+"""Is the simulator noisy? Runs that repeat inputs with other seeds, and what they tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbt.campaigns.wording import number, plural
+from sbt.problem.arrays import Points
+from sbt.problem.plain import Json
+from sbt.problem.scenario import LogicalScenario
+from sbt.store.database import PlannedRun
+from sbt.store.history import History
+from sbt.store.records import to_json
+
+__all__ = ["REPEAT", "SimulatorNoise", "equal_inputs", "repeats_wanted", "simulator_noise", "stated_noise"]
+
+REPEAT = "repeat"
+"""Stage of the early runs that repeat inputs with other seeds; metamodels learn from them."""
+_REPEATS = 2
+"""Early repeats: all that a deterministic simulator costs. A noisy one gives itself away by the first, unless the metric stands
+at an end of its range."""
+_ATTEMPTS = 4
+"""Most of them, where some fail."""
+_EQUAL = 1e-9
+"""Relative difference up to which two values of a metric are the same: the last digits of a sum are no noise."""
+
+
+@dataclass(frozen=True)
+class SimulatorNoise:
+    """What runs of equal inputs and different seeds tell of the simulator.
+
+    Attributes:
+        repeats: runs beyond the first one at the same inputs; only those that gave metrics count.
+        noisy: some metric differed; False: none did; None: nothing was repeated.
+        std: pooled standard deviation of the requirement's metric at equal inputs; None: nothing was repeated.
+    """
+
+    repeats: int
+    noisy: bool | None
+    std: float | None
+
+    def to_dict(self) -> Json:
+        """Return the JSON of the command line."""
+        found: Json = to_json(self)
+        return found
+
+    def sentences(self, metric: str, unit: str = "") -> list[str]:
+        """Return in words what is known; nothing where nothing was repeated."""
+        if self.noisy is None or self.std is None:
+            return []
+        again = f"{plural(self.repeats, 'run')} repeated inputs with other seeds"
+        if not self.noisy:
+            return [f"The simulator seems deterministic: {again} and gave the same metrics."]
+        spread = f"{number(self.std, 3)} {unit}".rstrip()
+        return [f"The simulator is noisy: where {again}, {metric} has a standard deviation of {spread}."]
+
+
+def equal_inputs(x: Points) -> NDArray[np.intp]:
+    """Return (n,) numbers from 0, the same for rows of x (n, d) that are equal."""
+    return np.unique(x, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def simulator_noise(history: History, metric: str) -> SimulatorNoise:
+    """Return what these runs tell of the simulator's noise, in the metric and in all others."""
+    runs = history.where(history.ok & (history.columns["level"] == 0))
+    if len(runs) < 2:
+        return SimulatorNoise(0, None, None)
+    group = equal_inputs(runs.x)
+    size = np.bincount(group)
+    repeats = int((size - 1).sum())
+    if repeats == 0:
+        return SimulatorNoise(0, None, None)
+    noisy = any(_differs(runs.y(name), group) for name in runs.metrics)
+    y = np.nan_to_num(runs.y(metric), posinf=np.nan, neginf=np.nan)
+    finite = np.isfinite(y)
+    count = np.bincount(group[finite], minlength=len(size))
+    mean = np.bincount(group[finite], y[finite], len(size)) / np.maximum(count, 1)
+    squares = float(((y[finite] - mean[group[finite]]) ** 2).sum())
+    return SimulatorNoise(repeats, noisy, float(np.sqrt(squares / max(int((count - 1).clip(0).sum()), 1))) if noisy else 0.0)
+
+
+def stated_noise(history: History, scenario: LogicalScenario) -> SimulatorNoise | None:
+    """Return what a conclusion says of the simulator's noise; None for recorded rows, which nothing simulates."""
+    return simulator_noise(history, scenario.requirement.metric) if scenario.pool is None else None
+
+
+def _differs(y: NDArray[np.float64], group: NDArray[np.intp]) -> bool:
+    """Say whether a metric (n,) has different values in one group; NaN is a value, and the same as NaN."""
+    first = y[np.unique(group, return_index=True)[1]][group]
+    return not np.isclose(y, first, rtol=_EQUAL, atol=1e-300, equal_nan=True).all()
+
+
+def repeats_wanted(history: History, scenario: LogicalScenario, most: int) -> tuple[PlannedRun, ...]:
+    """Return up to `most` runs that repeat inputs of earlier ones, until two repeats gave metrics.
+
+    Those with the smallest margin are repeated; values that other inputs gave too come last: there the metric stands at an end of
+    its range, and hides the noise. Recorded rows cannot be repeated.
+    """
+    runs = history.training
+    known = simulator_noise(history, scenario.requirement.metric).repeats
+    tried = int((history.stage == REPEAT).sum())
+    n = min(_REPEATS - known, _ATTEMPTS - tried, most)
+    if scenario.pool is not None or n <= 0 or len(runs) == 0:
+        return ()
+    y, margin = runs.y(scenario.requirement.metric), scenario.requirement.margins(runs)
+    times = np.unique(y, return_inverse=True, return_counts=True)
+    common = times[2][times[1].reshape(-1)] > 1
+    tried_at = {tuple(row) for row in history.x[history.stage == REPEAT]}
+    order = [k for k in np.lexsort((margin, common)) if tuple(runs.x[k]) not in tried_at]
+    return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in order[:n])

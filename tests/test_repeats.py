@@ -1,0 +1,85 @@
+"""Repeats with other seeds: every guided campaign learns whether its simulator is noisy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt.campaigns.repeats import REPEAT, repeats_wanted, simulator_noise
+from sbt.problem.outcome import Status
+from sbt.store.history import VALIDATION, History, Record
+from sbt.testbeds import analytic
+
+OK, FAILED = Status.OK, Status.FAILED
+
+
+def history(rows: list[tuple[float, float | None]], stage: str = "initial") -> History:
+    return History.of(("a",), [
+        Record(k, stage, 0, {"a": a}, k, str(FAILED if y is None else OK), {} if y is None else {"y": y, "other": a})
+        for k, (a, y) in enumerate(rows)
+    ])  # fmt: skip
+
+
+PLANE = analytic(lambda x: x[:, 0] - 0.1, inputs={"a": (0.0, 1.0)}, critical=(-np.inf, 0.0), name="plane")
+
+
+def test_the_noise_is_pooled_over_equal_inputs():
+    rng = np.random.default_rng(0)
+    a = np.repeat(np.linspace(0.0, 1.0, 400), 3)
+    found = simulator_noise(history(list(zip(a, 5.0 * a + 0.3 * rng.standard_normal(len(a)), strict=True))), "y")
+    assert (found.repeats, found.noisy) == (800, True)
+    assert found.std == pytest.approx(0.3, rel=0.08)
+    same = simulator_noise(history([(0.5, 1.0), (0.5, 1.0 + 1e-13), (0.7, 2.0), (0.5, None)]), "y")
+    assert (same.repeats, same.noisy, same.std) == (1, False, 0.0)
+    unknown = simulator_noise(history([(0.5, 1.0), (0.7, 2.0), (0.7, None)]), "y")
+    assert (unknown.repeats, unknown.noisy, unknown.std) == (0, None, None)
+
+
+def test_noise_in_another_metric_is_noise():
+    rows = history([(0.5, 3.0), (0.5, 3.0)])
+    assert not simulator_noise(rows, "y").noisy
+    rows.columns["y.other"][1] = 0.7
+    assert simulator_noise(rows, "y").noisy
+    assert simulator_noise(rows, "y").std == 0.0
+
+
+def test_the_smallest_margins_are_repeated_once_and_plateaus_last():
+    rows = [(0.9, 3.0), (0.1, -2.0), (0.8, -2.0), (0.2, 0.4), (0.4, None), (0.3, 0.2)]
+    wanted = repeats_wanted(history(rows), PLANE, 5)
+    assert [run.inputs["a"] for run in wanted] == [0.3, 0.2]
+    assert {run.stage for run in wanted} == {REPEAT}
+    assert len(repeats_wanted(history(rows), PLANE, 1)) == 1
+    assert repeats_wanted(history([*rows, (0.3, 0.2), (0.2, 0.5)]), PLANE, 5) == ()
+    assert [run.inputs["a"] for run in repeats_wanted(history([*rows, (0.3, 0.2)]), PLANE, 5)] == [0.2]
+    failed = history(rows).extended(history([(0.3, None), (0.2, None)], REPEAT))
+    assert [run.inputs["a"] for run in repeats_wanted(failed, PLANE, 5)] == [0.9, 0.1]
+    assert repeats_wanted(history(rows, VALIDATION), PLANE, 5) == ()
+
+
+@pytest.mark.parametrize(("campaign", "budget"), [("falsification", 14), ("boundary", 26), ("estimation", 26)])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_every_guided_campaign_learns_and_says_whether_the_simulator_is_noisy(
+    campaign: str, budget: int, noise: float, tmp_path: Path
+):
+    scenario = analytic(
+        lambda x: np.hypot(x[:, 0] - 0.3, x[:, 1] - 0.6) - 0.3, inputs={"a": (0.0, 1.0), "b": (0.0, 1.0)},
+        critical=(-np.inf, 0.0), name="disc", noise=noise,
+    )  # fmt: skip
+    result = sbt.run(
+        campaign=campaign, scenario=scenario, budget=budget, seed=1, executor="serial", store=tmp_path / "s", report=False,
+        metamodel="gp", **({"initial": 20} if campaign == "boundary" else {}),
+    )  # fmt: skip
+    found, rows = result.conclusion.simulator_noise, result.history
+    assert found.noisy == (noise > 0)
+    again = rows.where(rows.stage == REPEAT)
+    assert set(again.iteration.tolist()) == {1}
+    assert len(again) == 2  # all that it costs
+    assert {tuple(x) for x in again.x} <= {tuple(x) for x in rows.x[rows.iteration == 0]}
+    assert (rows.stage != "confirm").sum() <= budget
+    said = " ".join(result.conclusion.sentences(SimpleNamespace(history=rows, requirement=scenario.requirement, unit="m")))
+    assert ("The simulator is noisy: where" in said) == (noise > 0)
+    assert ("seems deterministic" in said) == (noise == 0)
