@@ -37,6 +37,7 @@ from sbt.problem.requirement import CriticalInterval
 __all__ = [
     "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "log_ambiguity_bound",
     "named_errors", "sample_paths", "simplest", "split_validation", "standardise", "with_target",
+    "without_repetitions",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -247,6 +248,25 @@ def check_rows(u: Points, y: Vector) -> tuple[Points, Vector]:
     if not (np.isfinite(points).all() and np.isfinite(values).all()):
         raise InputError("fit needs finite u and y, but got NaN or infinity")
     return points, values
+
+
+def without_repetitions(u: Points, y: Vector) -> tuple[Points, Vector]:
+    """Return the rows u (n, d) and y (n,) in order, each once where equal u always gave equal y; otherwise all of them.
+
+    A repetition of a deterministic run tells nothing, but two equal rows look like proof that there is nothing between
+    runs that a smooth function does not explain. Of a noisy metric every repetition counts.
+
+    >>> without_repetitions(np.array([[0.1], [0.2], [0.1]]), np.array([1.0, 2.0, 1.0]))[1].tolist()
+    [1.0, 2.0]
+    >>> without_repetitions(np.array([[0.1], [0.2], [0.1]]), np.array([1.0, 2.0, 3.0]))[1].tolist()
+    [1.0, 2.0, 3.0]
+    """
+    first = np.unique(u, axis=0, return_index=True)[1]
+    pairs = np.unique(np.column_stack([u, y]), axis=0)
+    if len(first) == len(u) or len(pairs) > len(first) or len(first) < 2:
+        return u, y
+    kept = np.sort(first)
+    return u[kept], y[kept]
 
 
 def standardise(y: Vector) -> tuple[Vector, float, float]:

@@ -21,7 +21,8 @@ __all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative_variance"]
 
 _CHUNK = 512  # points predicted at once: 2 MB a 500 rows
 _QUICK = 128  # points bounded at once: intermediate arrays stay in the cache
-_ROUNDED = 1e-6  # of a correlation in single precision: at most a dozen roundings of 6e-8
+_ROUNDED = {np.float32: 1e-6, np.float64: 2e-15}  # of a correlation: at most a dozen roundings
+_ROUGH = 1e-3  # error of the mean, relative to the std of y, up to which single precision will do
 _CANCELLED = 2e-15  # of a squared distance, relative to the squares that it is the difference of: a few roundings
 _LOG_CHI2 = 1.27036  # -E[log chi^2_1]: log of the mean of z^2 minus the mean of log z^2
 _CLIP = 6.9  # about log(1000): relative noise variances stay within [1e-3, 1e3]
@@ -82,13 +83,13 @@ class GaussianProcessPredictor:
             b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
             scaled = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)])
             shape = (min(_QUICK, len(u)), len(self.u))
-            room = np.empty(shape), np.empty(shape, np.float32), np.empty(shape, np.float32)
+            room = np.empty(shape), np.empty(shape, self._precision), np.empty(shape, self._precision)
             chunks = [self._quick(scaled[i : i + _QUICK], room) for i in range(0, max(len(u), 1), _QUICK)]
         quick, nearest = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
         rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # an upper bound of a small noise will do
         at = np.full(len(u), most) if rough or self.spread is None else self.spread(u)
         mean = self.shift + self.scale * quick
-        margin = self.scale * self._off * scale * float(np.abs(self.alpha).sum())  # error of the mean
+        margin = self.scale * self._off * self._total_weight  # error of the mean
         latent = scale * (1.0 - np.maximum(nearest - self._off, 0.0) ** 2 * scale / (scale + noise * most))
         sigma = 1.000001 * self.scale * np.sqrt(latent + noise * at)
         outside = np.maximum(np.maximum(critical.low - mean, mean - critical.high) - margin, 0.0)  # distance to M_c, at least
@@ -107,8 +108,9 @@ class GaussianProcessPredictor:
     def _quick(self, scaled: Points, room: tuple[Points, Any, Any]) -> tuple[Vector, Vector]:
         """Return (m,) means, standardised, and (m,) correlations with the nearest row, of scaled points (m, d + 2).
 
-        Correlations are in single precision, with an error of at most `_off`; sums are in double precision. All
-        is computed in `room`, three arrays (at least m, n): new ones for every chunk cost a sixth more time.
+        Correlations are in single precision where that will do (not where weights are large, as without noise), with an
+        error of at most `_off`; sums are in double precision. All is computed in `room`, three arrays (at least m, n):
+        new ones for every chunk cost a sixth more time.
         """
         across, weights = self._prepared
         squares, r, correlation = (part[: len(scaled)] for part in room)
@@ -117,17 +119,26 @@ class GaussianProcessPredictor:
         np.sqrt(r, out=r)
         np.exp(np.negative(r, out=correlation), out=correlation)
         if self.hyper.nu == 1.5:
-            r += np.float32(1.0)
+            r += 1.0
             correlation *= r
         elif self.hyper.nu == 2.5:
-            correlation *= r * r / np.float32(3.0) + r + np.float32(1.0)
+            correlation *= r * r / self._precision(3.0) + r + self._precision(1.0)
         nearest = correlation[np.arange(len(r)), correlation.argmax(axis=1)]  # quicker than max
         return self.centre + correlation @ weights, nearest.astype(np.float64)
 
     @cached_property
+    def _total_weight(self) -> float:
+        """What an error of 1 in every correlation would make of the mean, standardised."""
+        return self.hyper.outputscale * float(np.abs(self.alpha).sum())
+
+    @cached_property
+    def _precision(self) -> Any:
+        return np.float32 if _ROUNDED[np.float32] * self._total_weight <= _ROUGH else np.float64
+
+    @cached_property
     def _off(self) -> float:
         """Upper bound of the error of a correlation that `_quick` computes in the unit cube; nu 0.5 has a slope at distance 0."""
-        return _ROUNDED + (math.sqrt(2.0 * self._cancelled) if self.hyper.nu == 0.5 else 2.0 * self._cancelled)
+        return _ROUNDED[self._precision] + (math.sqrt(2.0 * self._cancelled) if self.hyper.nu == 0.5 else 2.0 * self._cancelled)
 
     @cached_property
     def _cancelled(self) -> float:
