@@ -250,6 +250,37 @@ def test_noise_is_found_where_it_is():
     assert 0.3 < prediction.noise[1] < 0.8
 
 
+def test_a_deterministic_metric_is_learned_without_noise_and_a_noisy_one_with_its_own():
+    smooth, noisy = rows(150), rows(150, noise=0.3)
+    exact = GaussianProcess(nu=2.5, input_noise=False).fit(*smooth, np.random.default_rng(0))
+    assert exact.hyper.noise < 1e-6
+    new, y = rows(400, seed=1)
+    assert np.sqrt(np.mean((exact(new).mu - y) ** 2)) < 0.005
+    wide = GaussianProcess(nu=2.5, input_noise=False).fit(*noisy, np.random.default_rng(0))
+    assert wide.scale * np.sqrt(wide.hyper.noise) == pytest.approx(0.3, rel=0.2)
+
+
+def test_repetitions_of_a_deterministic_run_teach_nothing():
+    u, y = rows(40)
+    y = np.where(u[:, 2] > 0.5, y + 1.0, y)  # a step: what a smooth process does not explain is noise to it
+    once = GaussianProcess(input_noise=False).fit(u, y, np.random.default_rng(0))
+    again = np.repeat(np.arange(40), 3)
+    more = GaussianProcess(input_noise=False).fit(u[again], y[again], np.random.default_rng(0))
+    assert more(u).mu == pytest.approx(once(u).mu, rel=1e-9)
+    assert more.hyper.noise > 1e-3
+
+
+@pytest.mark.parametrize("nu", [0.5, 2.5])
+def test_bounds_hold_where_weights_are_large(nu):
+    u, y = rows(300)
+    predict, interval = GaussianProcess(nu=nu, input_noise=False).fit(u, y, np.random.default_rng(0)), CriticalInterval(0.5, 0.52)
+    new, _ = rows(3000, seed=1)
+    low, high = predict.probability_bounds(new, interval)
+    p = predict(new).probability(interval)
+    assert ((low <= p) & (p <= high)).all()
+    assert (high < 0.01).mean() > 0.5 * (p < 0.01).mean()
+
+
 def test_process_learns_from_more_rows_than_it_is_tuned_on():
     u, y = rows(300, noise=0.05)
     asked, truth = rows(200, seed=5)
