@@ -75,7 +75,7 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
         scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
         lambda u: space.feasible(space.from_unit(u)), cube=space.cube,
     )  # fmt: skip
-    y = np.where(seen.ok, seen.y(scenario.requirement.metric), np.nan)
+    y = scenario.requirement.values(seen)
     u = np.clip(space.to_unit(seen.x), 0.0, 1.0)
     picks = propose(search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration)
     return space.from_unit(np.clip(picks.u, 1e-12, 1 - 1e-12))

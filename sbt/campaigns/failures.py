@@ -19,6 +19,7 @@ from sbt.estimators.binomial import upper
 from sbt.loop.stages import Facts
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Json, Value
+from sbt.problem.requirement import Requirement
 from sbt.samplers.search import Search, fit_warped
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
@@ -168,7 +169,7 @@ class FailureSearch:
         if len(ok) < 2:
             only = int(ok[0])
             return [Mode((only,), only, only, None)]
-        u, y = scenario.space.to_unit(history.x[ok]), history.y(scenario.requirement.metric)[ok]
+        u, y = scenario.space.to_unit(history.x[ok]), scenario.requirement.values(history)[ok]
         fitted = fit_warped(self.search, u, y, stream(self.settings.seed, "modes", len(history)))
         return modes_of(fitted, history, scenario)
 
@@ -180,12 +181,12 @@ class FailureSearch:
         modes = []
         for mode in self.modes(searched):
             again = history.where(confirmations(history, searched.x[mode.representative]))
-            modes.append(describe(mode, searched, scenario, again.y(scenario.requirement.metric)))
+            modes.append(describe(mode, searched, scenario, again))
         first = int(hits[0]) if len(hits) else None
         bound = None if len(hits) else SearchBound.of(searched)
         return FalsificationConclusion(
             None if first is None else int(searched.index[first]), None if first is None else first + 1, len(hits), tuple(modes),
-            bound, None if len(hits) else _closest(searched, margin, scenario.requirement.metric),
+            bound, None if len(hits) else _closest(searched, margin, scenario.requirement),
             _statement(searched, len(hits), modes, bound), validation, stated_noise(history, scenario),
         )  # fmt: skip
 
@@ -200,12 +201,12 @@ def confirmations(history: History, x: Vector) -> Mask:
     return (history.stage == CONFIRM) & (history.x == x).all(axis=1)
 
 
-def _closest(runs: History, margin: Vector, metric: str) -> ClosestRun | None:
+def _closest(runs: History, margin: Vector, requirement: Requirement) -> ClosestRun | None:
     """Return the run that came nearest to M_c."""
     if not np.isfinite(margin).any():
         return None
     k = int(np.nanargmin(margin))
-    return ClosestRun(int(runs.index[k]), runs.inputs(k), float(runs.y(metric)[k]), float(margin[k]))
+    return ClosestRun(int(runs.index[k]), runs.inputs(k), float(requirement.told(runs)[k]), float(margin[k]))
 
 
 def _statement(runs: History, hits: int, modes: list[FailureMode], bound: SearchBound | None) -> str:

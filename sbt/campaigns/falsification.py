@@ -125,7 +125,7 @@ class SearchStage:
         """Return n points by the configured method, and how many of them each criterion chose."""
         s, search = self.failure_search.settings, self.failure_search.search
         space, requirement = s.scenario.space, s.scenario.requirement
-        u, y = np.clip(space.to_unit(runs.x), 0.0, 1.0), runs.y(requirement.metric)
+        u, y = np.clip(space.to_unit(runs.x), 0.0, 1.0), requirement.values(runs)
         rng = stream(s.seed, "search", self._number(log))
         if n == 0:
             return np.empty((0, space.dimension)), {}

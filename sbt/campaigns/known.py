@@ -39,10 +39,10 @@ class Known:
         """Return what the history teaches, and what another campaign does."""
         runs, space = history.training, settings.scenario.space
         requirement = settings.scenario.requirement
-        x, y, batch = runs.x, runs.y(requirement.metric), runs.iteration
+        x, y, batch = runs.x, requirement.values(runs), runs.iteration
         if settings.prior_runs is not None:
             first = settings.prior_runs.training
-            x, y = np.vstack([first.x, x]), np.concatenate([first.y(requirement.metric), y])
+            x, y = np.vstack([first.x, x]), np.concatenate([requirement.values(first), y])
             batch = np.concatenate([np.full(len(first), -1), batch])
         z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
         return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings)

@@ -13,12 +13,13 @@ from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Value
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
 from sbt.store.records import Judgement, optional
 
-__all__ = ["FailureMode", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of"]
+__all__ = ["FailureMode", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of", "violations"]
 
 _PROBES = 9  # on the segment between two runs
 _MOST = 200  # critical runs that are compared with each other; further ones join the nearest
@@ -79,6 +80,7 @@ class FailureMode:
         most_likely: its run of largest density.
         nearest_safe: the uncritical run nearest to the representative; None: there is none.
         preventable: what the reference drivers made of the representative; None: they were not asked.
+        violates: of a combination, how many of its runs violate each requirement.
         unconfirmed: its critical runs with a contact that SUMO's own list does not confirm.
     """
 
@@ -94,6 +96,7 @@ class FailureMode:
     nearest_safe: NearestSafe | None
     preventable: tuple[Judgement, ...] | None = optional()
     unconfirmed: int = 0
+    violates: Mapping[str, int] | None = optional()
 
 
 def connected(fitted: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]:
@@ -136,7 +139,7 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -
         scenario: with the campaign's space and requirement.
     """
     critical = scenario.requirement.critical
-    y = history.y(scenario.requirement.metric)
+    y = scenario.requirement.values(history)
     hits = np.flatnonzero(scenario.requirement.critical_runs(history))
     if len(hits) == 0:
         return []
@@ -149,7 +152,7 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]
     log_p = scenario.space.log_density(history.x[hits])
-    uncritical = np.flatnonzero(np.isfinite(y) & ~critical.contains(y))
+    uncritical = np.flatnonzero(critical.known(y) & ~critical.contains(y))
     found = []
     for name in np.unique(label):
         rows = hits[label == name]
@@ -166,28 +169,37 @@ def _kind(history: History, choices: Points) -> Vector:
     return np.unique(told, axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
 
 
-def describe(mode: Mode, history: History, scenario: LogicalScenario, confirmed: Vector) -> FailureMode:
+def describe(mode: Mode, history: History, scenario: LogicalScenario, again: History) -> FailureMode:
     """Return what is said of a mode.
 
     Args:
         mode: rows of the history.
         history: the runs.
         scenario: with the campaign's space and requirement.
-        confirmed: (k,) metric of the representative's runs with fresh seeds, NaN where one failed.
+        again: the representative's runs with fresh seeds.
     """
-    metric, critical = scenario.requirement.metric, scenario.requirement.critical
-    y, at, likely = history.y(metric), mode.representative, mode.most_likely
+    requirement = scenario.requirement
+    y, at, likely = requirement.told(history), mode.representative, mode.most_likely
     inputs = history.inputs(at)
     conflict = history.y(CONFLICT_TYPE)[at]
     return FailureMode(
         int(history.index[at]), inputs, float(y[at]), len(mode.rows),
         describe_conflict_type(-1.0 if np.isnan(conflict) else float(conflict)),
         tuple(int(history.index[k]) for k in mode.rows),
-        float(critical.contains(confirmed).mean()) if len(confirmed) else None, len(confirmed),
+        float(requirement.critical_runs(again).mean()) if len(again) else None, len(again),
         RunPoint(int(history.index[likely]), history.inputs(likely), float(y[likely])),
         None if mode.safe is None else _nearest_safe(mode.safe, inputs, history, y),
         unconfirmed=int(history.unconfirmed[list(mode.rows)].sum()),
+        violates=violations(requirement, history.where(np.isin(np.arange(len(history)), mode.rows))),
     )  # fmt: skip
+
+
+def violations(requirement: Requirement, runs: History) -> dict[str, int] | None:
+    """Return how many of these runs violate each requirement of a combination, those that none violates left out; else None."""
+    if not requirement.combined:
+        return None
+    counts = {part.label: int(part.critical_runs(runs).sum()) for part in requirement.parts}
+    return {name: count for name, count in counts.items() if count}
 
 
 def _nearest_safe(row: int, inputs: Mapping[str, Value], history: History, y: Vector) -> NearestSafe:

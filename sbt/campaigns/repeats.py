@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sbt.campaigns.wording import number, plural
 from sbt.problem.arrays import Points
 from sbt.problem.plain import Json
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import PlannedRun
 from sbt.store.history import History
@@ -63,8 +64,8 @@ def equal_inputs(x: Points) -> NDArray[np.intp]:
     return np.unique(x, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def simulator_noise(history: History, metric: str) -> SimulatorNoise:
-    """Return what these runs tell of the simulator's noise, in the metric and in all others."""
+def simulator_noise(history: History, requirement: Requirement) -> SimulatorNoise:
+    """Return what these runs tell of the simulator's noise, in the requirement's metric and in all others."""
     runs = history.where(history.ok & (history.columns["level"] == 0))
     if len(runs) < 2:
         return SimulatorNoise(0, None, None)
@@ -74,7 +75,7 @@ def simulator_noise(history: History, metric: str) -> SimulatorNoise:
     if repeats == 0:
         return SimulatorNoise(0, None, None)
     noisy = any(_differs(runs.y(name), group) for name in runs.metrics)
-    y = np.nan_to_num(runs.y(metric), posinf=np.nan, neginf=np.nan)
+    y = np.nan_to_num(requirement.told(runs), posinf=np.nan, neginf=np.nan)
     finite = np.isfinite(y)
     count = np.bincount(group[finite], minlength=len(size))
     mean = np.bincount(group[finite], y[finite], len(size)) / np.maximum(count, 1)
@@ -84,7 +85,7 @@ def simulator_noise(history: History, metric: str) -> SimulatorNoise:
 
 def stated_noise(history: History, scenario: LogicalScenario) -> SimulatorNoise | None:
     """Return what a conclusion says of the simulator's noise; None for recorded rows, which nothing simulates."""
-    return simulator_noise(history, scenario.requirement.metric) if scenario.pool is None else None
+    return simulator_noise(history, scenario.requirement) if scenario.pool is None else None
 
 
 def _differs(y: NDArray[np.float64], group: NDArray[np.intp]) -> bool:
@@ -100,12 +101,12 @@ def repeats_wanted(history: History, scenario: LogicalScenario, most: int) -> tu
     its range, and hides the noise. Recorded rows cannot be repeated.
     """
     runs = history.training
-    known = simulator_noise(history, scenario.requirement.metric).repeats
+    known = simulator_noise(history, scenario.requirement).repeats
     tried = int((history.stage == REPEAT).sum())
     n = min(_REPEATS - known, _ATTEMPTS - tried, most)
     if scenario.pool is not None or n <= 0 or len(runs) == 0:
         return ()
-    y, margin = runs.y(scenario.requirement.metric), scenario.requirement.margins(runs)
+    y, margin = scenario.requirement.told(runs), scenario.requirement.margins(runs)
     times = np.unique(y, return_inverse=True, return_counts=True)
     common = times[2][times[1].reshape(-1)] > 1
     tried_at = {tuple(row) for row in history.x[history.stage == REPEAT]}

@@ -14,9 +14,11 @@ import numpy as np
 from scipy.special import ndtr
 
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, with_target
+from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.combination import CombinedInterval
 from sbt.problem.cube import Cube
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
@@ -71,8 +73,16 @@ def fit_log_probability(
 ) -> LogProbability:
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,).
 
+    Of a combination y is (n, q): each metric is learned by itself.
+
     Where a trend was found, the larger P of two fits: to the metric, and to what the trend leaves of it.
     """
+    if isinstance(critical, CombinedInterval):
+        parts = [
+            fit_log_probability(metamodel, coordinates, leaf, z[np.isfinite(column)], column[np.isfinite(column)], rng)
+            for leaf, column in zip(critical.leaves, y.T, strict=True)
+        ]
+        return lambda points: joined_log_probability(critical, [part(points) for part in parts])
     u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
     t, inside = warp.values(y), warp.interval(critical)
 

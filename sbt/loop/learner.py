@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors, with_target
+from sbt.loop.several import each_requirement, independence
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors
+from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.metamodels.success import log_success
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.combination import MARGIN
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
@@ -104,19 +107,22 @@ class Learner:
     def train(self, training: History) -> Predictor:
         """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""
         space, requirement = self.scenario.space, self.scenario.requirement
-        y = training.y(requirement.metric)
+        y = requirement.values(training)
         u = space.metamodel_inputs(space.to_unit(training.x))
-        metamodel = with_target(self.metamodel, requirement.critical) if self.target_aware else self.metamodel
+        metamodel = metamodel_for(self.metamodel, requirement.critical, target_aware=self.target_aware)
         with named_errors(self.metamodel, len(training)):
             return metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
 
     def unseen(self, history: History) -> tuple[Points, Vector]:
-        """Return x (n, d) and y (n,) that no metamodel learned from: held-out runs, or a table's rows not chosen."""
-        metric, pool = self.scenario.requirement.metric, self.scenario.pool
+        """Return x (n, d) and what is learned of runs, (n,) or (n, q), that no metamodel learned from.
+
+        They are held-out runs, or a table's rows not chosen.
+        """
+        requirement, pool = self.scenario.requirement, self.scenario.pool
         if pool is None:
-            return history.held_out.x, history.held_out.y(metric)
+            return history.held_out.x, requirement.values(history.held_out)
         left = ~pool.taken(history.x)
-        return pool.x[left], pool.metrics[metric][left]
+        return pool.x[left], requirement.values(pool)[left]
 
     def _record(
         self, predict: Predictor, predictor: Predictor, history: History, learned: int,
@@ -124,9 +130,11 @@ class Learner:
     ) -> FitRecord:  # fmt: skip
         """Return the scores of a fitted metamodel, and its classification of fixed points."""
         (x, y), critical = self.unseen(history), self.scenario.requirement.critical
-        found: Any = scores(chunked(predict, self.scenario.space.to_unit(x)), y, critical) if len(y) else None
+        unseen = chunked(predict, self.scenario.space.to_unit(x)) if len(y) else None
+        found: Any = None if unseen is None else self._scores(predictor, unseen, y)
         u = self._probe()
-        p = predict(u).probability(critical)
+        at_probe = predict(u)
+        p = at_probe.probability(critical)
         ok = None if success is None else np.exp(success(u))
         shares = [float(np.average(v, weights=ok)) for v in (p, np.minimum(p, 1.0 - p), (p > 0.05) & (p < 0.95))]
         comparison = getattr(getattr(predictor, "predictor", predictor), "comparison", None)  # also of a recalibrated one
@@ -134,8 +142,29 @@ class Learner:
             learned, shares[0], shares[1], shares[2],
             np.packbits(p > 0.5).tobytes().hex(), None if found is None else Validation(**found),
             None if comparison is None else dict(comparison.weights), None if comparison is None else comparison.reason,
-            failing_fraction=None if ok is None else float(1.0 - ok.mean()),
+            failing_fraction=None if ok is None else float(1.0 - ok.mean()), **self._several(predictor, at_probe, ok, unseen, y),
         )  # fmt: skip
+
+    def _scores(self, predictor: Predictor, unseen: Prediction, y: Vector) -> dict[str, Any]:
+        """Return the scores of a prediction of runs; of a combination (n, q) those of its margin."""
+        if not isinstance(predictor, JointPredictor):
+            return scores(unseen, y, self.scenario.requirement.critical)
+        margin = predictor.critical.margin(y)
+        known = np.isfinite(margin)
+        return scores(unseen.take(known), margin[known], MARGIN)
+
+    def _several(
+        self, predictor: Predictor, probe: Prediction, ok: Vector | None, unseen: Prediction | None, y: Vector
+    ) -> dict[str, Any]:
+        """Return what a record says of each requirement of a combination; nothing of a single one."""
+        if not isinstance(predictor, JointPredictor) or not isinstance(probe, JointPrediction):
+            return {}
+        parts = self.scenario.requirement.parts
+        seen = (unseen, y) if isinstance(unseen, JointPrediction) else None
+        return {
+            "requirements": each_requirement(predictor, parts, probe, ok, seen),
+            "independence": None if seen is None else independence(parts, *seen),
+        }
 
     def _probe(self) -> Points:
         """Return the feasible ones of 4,096 fixed points of the space."""
@@ -147,12 +176,7 @@ class Learner:
 def chunked(predict: Predictor, u: Points) -> Prediction:
     """Return the predictions at many points, a few thousand at a time."""
     parts = [predict(u[k : k + _CHUNK]) for k in range(0, len(u), _CHUNK)]
-    if len(parts) == 1:
-        return parts[0]
-    return Prediction(
-        np.concatenate([p.mean for p in parts], axis=1), np.concatenate([p.std for p in parts], axis=1), parts[0].weight,
-        np.concatenate([p.noise for p in parts]),
-    )  # fmt: skip
+    return parts[0] if len(parts) == 1 else parts[0].joined(parts[1:])
 
 
 def changed_share(before: str, after: str) -> float:

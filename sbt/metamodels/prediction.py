@@ -111,6 +111,16 @@ class Prediction:
         """Return the prediction at the points that `index` (integers, mask or slice) selects."""
         return Prediction(self.mean[:, index], self.std[:, index], self.weight, self.noise[index])
 
+    def widened(self, factor: float) -> Prediction:
+        """Return the prediction with every standard deviation of a component multiplied."""
+        return Prediction(self.mean, factor * self.std, self.weight, self.noise)
+
+    def joined(self, others: Sequence[Prediction]) -> Prediction:
+        """Return the prediction at these points and, behind them, at those of the others, which have the same weights."""
+        every = (self, *others)
+        mean, std = (np.concatenate([getattr(p, name) for p in every], axis=1) for name in ("mean", "std"))
+        return Prediction(mean, std, self.weight, np.concatenate([p.noise for p in every]))
+
     def log_density(self, y: Vector) -> Vector:
         """Return (n,) log density of the mixture at y (n,)."""
         return self._mix(_log_gauss(self._paired(y), self.mean, self.std))

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Points, Vector
+from sbt.problem.combination import CombinedInterval
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Warp"]
+__all__ = ["JointWarp", "Warp", "warp_around"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,52 @@ class Warp:
         """Return the warped y, shape kept."""
         return np.arcsinh((np.asarray(y) - self.edge) / self.scale)
 
+    def learned(self, y: Vector) -> Vector:
+        """Return what a metamodel learns: the warped y."""
+        return self.values(y)
+
     def interval(self, critical: CriticalInterval) -> CriticalInterval:
         """Return the interval in warped values; infinite ends stay."""
         low, high = self.values(np.array([critical.low, critical.high]))
         return CriticalInterval(float(low), float(high))
+
+
+@dataclass(frozen=True)
+class JointWarp:
+    """The warps of the metrics of a combination: warped, their margins have one unit, that of asinh.
+
+    Args:
+        parts: (q,) warps.
+        critical: of the metrics, warped.
+    """
+
+    parts: tuple[Warp, ...]
+    critical: CombinedInterval
+
+    @classmethod
+    def around_edges(cls, y: Points, critical: CombinedInterval) -> JointWarp:
+        """Return the warp of each metric of y (n, q) around the end of its interval."""
+        columns = [y[np.isfinite(y[:, k]), k] for k in range(y.shape[1])]
+        parts = tuple(Warp.around_edge(column, leaf) for column, leaf in zip(columns, critical.leaves, strict=True))
+        leaves = [warp.interval(leaf) for warp, leaf in zip(parts, critical.leaves, strict=True)]
+        return cls(parts, critical.with_leaves(leaves, (1.0,) * len(leaves)))
+
+    def values(self, y: Points) -> Vector:
+        """Return (n,) margins of the warped y (n, q), <= 0 where critical."""
+        return self.critical.margin(self.learned(y))
+
+    def learned(self, y: Points) -> Points:
+        """Return (n, q) warped values of each metric."""
+        return np.stack([warp.values(y[..., k]) for k, warp in enumerate(self.parts)], axis=-1)
+
+    def interval(self, critical: CriticalInterval) -> CriticalInterval:
+        """Return the combination in warped values."""
+        del critical  # it is the one that the warp was made around
+        return self.critical
+
+
+def warp_around(y: Vector, critical: CriticalInterval) -> Warp | JointWarp:
+    """Return the warp for values y (n,) of one metric, or (n, q) of the metrics of a combination."""
+    if isinstance(critical, CombinedInterval):
+        return JointWarp.around_edges(y, critical)
+    return Warp.around_edge(y, critical)

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 
 from sbt.errors import InputError
+from sbt.problem.combination import from_plain, to_plain
 from sbt.problem.distribution import Distribution
 from sbt.problem.expression import Expression
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Json, JsonMapping, Values
-from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -30,7 +30,7 @@ def describe_scenario(scenario: LogicalScenario) -> Json:
         "correlation": None if space.correlation is None else [list(row) for row in space.correlation],
         "constraints": [[text, isinstance(rule, Expression)] for text, rule in space.constraints],
         "features": [[name, rule.text if isinstance(rule, Expression) else None] for name, rule in space.features],
-        "requirement": {"metric": need.metric, "low": _ended(need.low), "high": _ended(need.high)},
+        "requirement": to_plain(need),
         "metrics": [{"name": m.name, "unit": m.unit, "direction": m.direction} for m in scenario.metrics]
         or [{"name": name, "unit": "", "direction": "low"} for name in scenario.metric_names],
         "recorded": scenario.pool is not None, "traced": scenario.simulate is not None,
@@ -87,8 +87,7 @@ def rebuild_scenario(data: JsonMapping) -> LogicalScenario:
     )  # fmt: skip
     need, absent = data["requirement"], _Absent(data["name"])
     metrics = tuple(Metric(m["name"], absent.measure, m["unit"], m["direction"]) for m in data["metrics"])
-    requirement = Requirement(need["metric"], float(need["low"]), float(need["high"]))
-    return LogicalScenario(data["name"], space, requirement, absent, metrics, data["description"])
+    return LogicalScenario(data["name"], space, from_plain(need), absent, metrics, data["description"])
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,10 @@ class CriticalInterval:
         if math.isinf(self.low) and math.isinf(self.high):
             raise InputError("a critical interval needs at least one finite end, but got [-inf, inf]")
 
+    def known(self, y: Vector) -> Mask:
+        """Return (n,) booleans: y tells whether the run is critical, and how far from it."""
+        return np.isfinite(y)
+
     def contains(self, y: Vector) -> Mask:
         """Return (n,) booleans: y in M_c. NaN is not contained."""
         return (np.asarray(y) >= self.low) & (np.asarray(y) <= self.high)
@@ -63,6 +67,7 @@ class Requirement:
     Args:
         metric: name of the safety metric.
         low, high: ends of the critical interval, in the unit of the metric; one of them may be infinite.
+        name: what it is called beside others; "": as the metric.
 
     Raises:
         InputError: no critical interval.
@@ -74,6 +79,7 @@ class Requirement:
     metric: str
     low: float = -math.inf
     high: float = math.inf
+    name: str = ""
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
@@ -88,13 +94,36 @@ class Requirement:
         """The critical interval M_c."""
         return CriticalInterval(self.low, self.high)
 
+    @property
+    def label(self) -> str:
+        """What it is called: its name, or else its metric."""
+        return self.name or self.metric
+
+    @property
+    def parts(self) -> tuple[Requirement, ...]:
+        """The requirements on one metric that it is made of: itself."""
+        return (self,)
+
+    @property
+    def combined(self) -> bool:
+        """Whether it is made of several."""
+        return False
+
+    def values(self, runs: Measured) -> Vector:
+        """Return what is learned of runs: (n,) the metric, NaN for a run without it; (n, q) of a combination of q."""
+        return runs.y(self.metric)
+
+    def told(self, runs: Measured) -> Vector:
+        """Return (n,) the one number that a run is told by: the metric, of a combination its margin; NaN where there is none."""
+        return runs.y(self.metric)
+
     def critical_runs(self, runs: Measured) -> Mask:
         """Return (n,) booleans: the run violates the requirement; False for a run without the metric."""
-        return self.critical.contains(runs.y(self.metric))
+        return self.critical.contains(self.values(runs))
 
     def margins(self, runs: Measured) -> Vector:
         """Return (n,) signed distances to M_c, <= 0 where critical; NaN for a run without the metric."""
-        return self.critical.margin(runs.y(self.metric))
+        return self.critical.margin(self.values(runs))
 
     def is_critical(self, metrics: Mapping[str, float]) -> bool:
         """Return whether the metrics of one run violate the requirement."""

@@ -140,6 +140,10 @@ class Pool:
     def _rows(self) -> dict[bytes, int]:
         return {row.tobytes(): k for k, row in enumerate(self.x)}
 
+    def y(self, metric: str) -> Vector:
+        """Return (n,) values of a metric."""
+        return self.metrics[metric]
+
     def row(self, x: Vector) -> int | None:
         """Return the index of the row with exactly these inputs, None where there is none."""
         return self._rows.get(np.ascontiguousarray(x, dtype=np.float64).tobytes())
@@ -225,7 +229,7 @@ class LogicalScenario:
         if (simulate is None) == (evaluate is None):
             raise InputError(f"scenario {name}: give either simulate or evaluate")
         if evaluate is not None:
-            metrics = _returned(name, metrics, tuple(metric_names) or (requirement.metric,))
+            metrics = _returned(name, metrics, tuple(metric_names) or tuple(part.metric for part in requirement.parts))
             metric_names = [m.name for m in metrics]
         values = {
             "name": name, "space": given if isinstance(given, ParameterSpace) else ParameterSpace(tuple(given)),
@@ -234,9 +238,10 @@ class LogicalScenario:
         }  # fmt: skip
         for key, value in values.items():
             object.__setattr__(self, key, value)
-        if requirement.metric not in self.measured:
-            known, hint = ", ".join(self.measured), did_you_mean(requirement.metric, self.measured)
-            raise InputError(f"requirement.metric must be one of {known}, but got '{requirement.metric}'{hint}")
+        for part in requirement.parts:
+            if part.metric not in self.measured:
+                known, hint = ", ".join(self.measured), did_you_mean(part.metric, self.measured)
+                raise InputError(f"requirement.metric must be one of {known}, but got '{part.metric}'{hint}")
 
     @property
     def measured(self) -> tuple[str, ...]:

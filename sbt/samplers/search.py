@@ -15,11 +15,13 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sample_paths, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sample_paths
+from sbt.metamodels.joint import metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.success import LogSuccess, log_success
-from sbt.metamodels.warp import Warp
+from sbt.metamodels.warp import JointWarp, Warp, warp_around
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.combination import MARGIN, CombinedInterval
 from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.problem.requirement import CriticalInterval
 
@@ -81,7 +83,7 @@ class WarpedModel:
     Args:
         predictor: of the warped metric, at the metamodel's inputs.
         columns: (n, d) unit-cube points to the metamodel's inputs.
-        warp: from the metric to the warped metric.
+        warp: from the metric to the warped metric, or from the metrics of a combination to its margin.
         critical: M_c, warped.
         metamodel: what was fitted; errors name it.
         n: rows it learned from.
@@ -90,7 +92,7 @@ class WarpedModel:
 
     predictor: Predictor
     columns: Callable[[Points], Points]
-    warp: Warp
+    warp: Warp | JointWarp
     critical: CriticalInterval
     metamodel: Metamodel
     n: int
@@ -104,9 +106,7 @@ class WarpedModel:
 
     def log_probability(self, u: Points, inflation: float = 1.0) -> Vector:
         """Return (n,) log P(a run gives a metric and is critical) at u, sigma multiplied by `inflation`."""
-        p = self(u)
-        wide = Prediction(p.mean, inflation * p.std, p.weight, p.noise)
-        return wide.log_probability(self.critical)[0] + self.log_success(u)
+        return self(u).widened(inflation).log_probability(self.critical)[0] + self.log_success(u)
 
     def log_success(self, u: Points) -> Vector:
         """Return (n,) log P(a run gives a metric) at u."""
@@ -134,11 +134,11 @@ def fit_warped(
     search: Search, u: Points, y: Vector, rng: np.random.Generator, success: LogSuccess | None = None
 ) -> WarpedModel:
     """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2; `success` is passed on."""
-    warp = Warp.around_edge(y, search.critical)
-    critical = warp.interval(search.critical)
-    inputs, warped = search.columns(u), warp.values(y)
+    warp = warp_around(y, search.critical)
+    inputs, target = search.columns(u), warp.interval(search.critical)
     with named_errors(search.metamodel, len(y)):
-        predictor = with_target(search.metamodel, critical).fit(inputs, warped, rng)
+        predictor = metamodel_for(search.metamodel, target).fit(inputs, warp.learned(y), rng)
+    critical = MARGIN if isinstance(target, CombinedInterval) else target
     return WarpedModel(predictor, search.columns, warp, critical, search.metamodel, len(y), success)
 
 
@@ -220,7 +220,7 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
         rng: the only source of randomness.
     """
     number = np.arange(len(u), dtype=np.float64) if batch is None else np.asarray(batch, dtype=np.float64)
-    ok = np.isfinite(y)
+    ok = search.critical.known(y)
     hit = ok & search.critical.contains(y)
     free = deflate(search, u[hit], rng, u.shape[1])
     at = search.cube.embedded

@@ -12,7 +12,9 @@ from typing import Any, TypeVar
 from sbt.errors import StoreError
 from sbt.problem.plain import Json, JsonMapping
 
-__all__ = ["FitRecord", "Iteration", "Judgement", "Validation", "from_json", "optional", "to_json"]
+__all__ = [
+    "FitRecord", "Independence", "Iteration", "Judgement", "RequirementFit", "Validation", "from_json", "optional", "to_json",
+]  # fmt: skip
 
 T = TypeVar("T")
 
@@ -97,6 +99,39 @@ class Validation:
 
 
 @dataclass(frozen=True)
+class RequirementFit:
+    """One requirement of a combination as its own metamodel sees it.
+
+    Attributes:
+        name: of the requirement.
+        critical_fraction: mean P(it is violated) over the points of `FitRecord`.
+        validation: scores of its metamodel on runs it had not seen, in the unit of its metric.
+        weights, chosen_because: as in `FitRecord`.
+    """
+
+    name: str
+    critical_fraction: float
+    validation: Validation | None = None
+    weights: Mapping[str, float] | None = optional()
+    chosen_because: str | None = optional()
+
+
+@dataclass(frozen=True)
+class Independence:
+    """Whether the metrics of a combination are independent given the inputs, as its P(critical) takes them to be.
+
+    Attributes:
+        between: the two requirements whose residuals correlate most.
+        correlation: of the ranks of their residuals on runs that no metamodel had seen; 0 where they are independent.
+        runs: of which it was taken.
+    """
+
+    between: tuple[str, str]
+    correlation: float
+    runs: int
+
+
+@dataclass(frozen=True)
 class FitRecord:
     """What the log keeps of a fitted metamodel.
 
@@ -111,6 +146,8 @@ class FitRecord:
         chosen_because: and why.
         fit_seconds, scoring_seconds: in benchmarks only.
         failing_fraction: mean P(a run gives no metric) over the points; None: all runs gave one.
+        requirements: of a combination, each of them; its own scores are those of the margin.
+        independence: of their metrics.
         runs, iteration: of the campaign when it was fitted.
     """
 
@@ -125,6 +162,8 @@ class FitRecord:
     fit_seconds: float | None = optional()
     scoring_seconds: float | None = optional()
     failing_fraction: float | None = optional()
+    requirements: tuple[RequirementFit, ...] | None = optional()
+    independence: Independence | None = optional()
     runs: int = 0
     iteration: int = 0
 
