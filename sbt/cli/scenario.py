@@ -66,7 +66,8 @@ def _print_run(run: Run) -> None:
         print(f"  {name:<24}{value:g} {units.get(name, '')}".rstrip())
     need = run.scenario.requirement
     verdict = "critical" if run.critical else "not critical"
-    print(f"{verdict} ({need.metric} critical in [{need.critical.low:g}, {need.critical.high:g}])")
+    each = "; ".join(f"{part.metric} critical in [{part.low:g}, {part.high:g}]" for part in need.parts)
+    print(f"{verdict} ({need.metric}: {each})" if need.combined else f"{verdict} ({each})")
     if run.unconfirmed:
         print(f"SUMO's own list differs: {run.unconfirmed}")
 

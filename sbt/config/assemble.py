@@ -15,6 +15,7 @@ from typing import TypeVar
 from sbt.acquisitions import Acquisition, even
 from sbt.config.load import Loaded
 from sbt.config.model import Choice
+from sbt.config.several import combined_requirement
 from sbt.config.source import Problems, must_be_one_of
 from sbt.config.space import configured_space
 from sbt.errors import InputError
@@ -118,6 +119,7 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
         config.scenario, str(loaded.folder.resolve()), ego, config.executor.isolation, config.simulation.step_length,
         config.requirement.stl, types, named, carried,
         friction=None if config.simulation.friction is None else (config.simulation.friction.min, config.simulation.friction.max),
+        formulas=config.requirement.formulas,
     )  # fmt: skip
 
 
@@ -140,10 +142,17 @@ def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
 
 
 def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) -> Requirement:
-    """Return the scenario's requirement with the configured metric and interval."""
+    """Return the scenario's requirement with the configured metric and interval, or the configured combination."""
     change, own = loaded.config.requirement, scenario.requirement
+    if change.combined is not None:
+        made = combined_requirement(change, scenario.measured, own, problems)
+        return own if made is None else made
     if change.stl is not None:
         return own if change.critical is None else Requirement(own.metric, *change.critical)
+    if own.combined and change.metric is None:
+        if change.critical is not None:
+            problems.add(("requirement", "critical"), f"it needs a metric: the scenario's own requirement is {own.metric}")
+        return own
     metric = own.metric if change.metric is None else change.metric
     if metric not in scenario.measured:
         problems.add(("requirement", "metric"), must_be_one_of("a metric", metric, scenario.measured))

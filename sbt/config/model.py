@@ -26,16 +26,16 @@ from pydantic import (
 )
 
 from sbt.config.kinds import kind_of
+from sbt.config.requirement_model import Interval, Name, RequirementChange, two_values
 from sbt.config.simulation_model import SimulationChoice
 from sbt.errors import did_you_mean
 from sbt.plugins import OBJECT
 from sbt.problem.expression import Expression
 from sbt.problem.plain import Json
-from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
     "EXECUTORS", "AcquisitionChoice", "Choice", "ChoicesGiven", "Configuration",
-    "CorrelationEntry", "ExecutorChoice", "GateChoice", "InputChange", "MetamodelChoice", "RequirementChange",
+    "CorrelationEntry", "ExecutorChoice", "GateChoice", "InputChange", "Interval", "MetamodelChoice", "Name", "RequirementChange",
     "SimulationChoice", "StopRules", "ValidationChoice", "WarmStart",
 ]  # fmt: skip
 
@@ -53,12 +53,6 @@ def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
         raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{did_you_mean(value, choices)}")
 
     return check
-
-
-def _two(value: Any) -> Any:
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise ValueError(f"must be a list of two values, but got {value!r}")
-    return value
 
 
 def _formula(*, condition: bool) -> Callable[[str], str]:
@@ -81,12 +75,6 @@ def _formula(*, condition: bool) -> Callable[[str], str]:
     return check
 
 
-def _not_blank(text: str) -> str:
-    if not text.strip():
-        raise ValueError("must not be empty")
-    return text
-
-
 def _campaign(name: str) -> str:
     kind_of(name)  # raises where there is none
     return name
@@ -94,44 +82,14 @@ def _campaign(name: str) -> str:
 
 CampaignName = Annotated[str, AfterValidator(_campaign)]
 ExecutorName = Annotated[str, AfterValidator(_one_of(EXECUTORS)), Field(json_schema_extra={"enum": [*EXECUTORS]})]
-Name = Annotated[str, AfterValidator(_not_blank)]
 Condition = Annotated[str, AfterValidator(_formula(condition=True))]
 Formula = Annotated[str, AfterValidator(_formula(condition=False))]
-Interval = Annotated[tuple[float, float], BeforeValidator(_two), Field(strict=False)]
 
 
 class _Strict(BaseModel):
     """Frozen; unknown keys are errors; a string is no number and a boolean no integer."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class RequirementChange(_Strict):
-    """Changes the scenario's own requirement."""
-
-    metric: Name | None = Field(default=None, description="Safety metric; null: the scenario's own.")
-    critical: Interval | None = Field(
-        default=None,
-        description="Critical values [low, high], closed; ends may be -.inf or .inf; null: the own.",
-    )
-    stl: Name | None = Field(
-        default=None, description="A formula such as G[0,20](gap > 2 and ttc > 1.5) instead of a metric; its robustness is "
-        "the metric stl, critical in [-.inf, 0].",
-    )  # fmt: skip
-
-    @field_validator("critical")
-    @classmethod
-    def _proper(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        if value is not None:
-            CriticalInterval(*value)
-        return value
-
-    @field_validator("stl")
-    @classmethod
-    def _instead_of_a_metric(cls, value: str | None, info: ValidationInfo) -> str | None:
-        if value is not None and info.data.get("metric") is not None:
-            raise ValueError(f"a requirement has a metric or a formula (stl), not both, but got metric {info.data['metric']}")
-        return value
 
 
 class Choice(_Strict):
@@ -191,7 +149,7 @@ class InputChange(_Strict):
 class CorrelationEntry(_Strict):
     """Correlation of two inputs' normal scores (Gaussian copula)."""
 
-    inputs: Annotated[tuple[Name, Name], BeforeValidator(_two), Field(strict=False)] = Field(description="Two inputs.")
+    inputs: Annotated[tuple[Name, Name], BeforeValidator(two_values), Field(strict=False)] = Field(description="Two inputs.")
     value: float = Field(gt=-1, lt=1, description="Correlation of their normal scores, between -1 and 1.")
 
 

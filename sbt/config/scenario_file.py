@@ -15,6 +15,7 @@ from sbt.config.own_metrics import actors_of, metric_of, metrics_of_several
 from sbt.config.profiles import guided_vehicles, profile_of
 from sbt.config.recorded import net_of_recording, recorded_traffic
 from sbt.config.scenario_model import EgoEntry, InputEntry, MetricEntry, ScenarioModel, SumoEntry
+from sbt.config.several import combined_requirement
 from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
@@ -268,12 +269,14 @@ class _Builder:
 
     def _metrics(self) -> tuple[Metric, ...]:
         made: dict[str, Metric] = {}
-        formula = self._model.requirement.stl
-        entries = [*self._model.metrics, *([] if formula is None else [MetricEntry.model_validate({"stl": formula})])]
+        need = self._model.requirement
+        formulas = need.formulas if need.stl is None else (("stl", need.stl),)
+        key: tuple[str, ...] = ("requirement",) if need.stl is None else ("requirement", "stl")
+        entries = [*self._model.metrics, *(MetricEntry.model_validate({"stl": text, "name": name}) for name, text in formulas)]
         if not entries:
             self._problems.add(("metrics",), "a scenario needs at least one metric, but has none")
         for k, entry in enumerate(entries):
-            path = ("metrics", k) if k < len(self._model.metrics) else ("requirement", "stl")
+            path = ("metrics", k) if k < len(self._model.metrics) else key
             for metric in self._problems.attempt(path, partial(self._metrics_of, entry)) or ():
                 if metric.name in made:
                     self._problems.add(path, f"metrics need different names (name: ...), but got '{metric.name}' twice")
@@ -291,6 +294,8 @@ class _Builder:
         """Return the requirement, on a metric or on a formula that is one of them."""
         wanted, problems = self._model.requirement, self._problems
         names = [m.name for m in metrics]
+        if wanted.combined is not None:
+            return combined_requirement(wanted, names, None, problems)
         if wanted.stl is not None:
             return Requirement("stl", *(wanted.critical or (-math.inf, 0.0)))
         if wanted.metric is None or wanted.critical is None:

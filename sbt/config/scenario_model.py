@@ -207,7 +207,7 @@ class ScenarioModel(_Strict):
     metrics: Annotated[tuple[Annotated[MetricEntry, _under("kind")], ...], Field(strict=False)] = Field(
         default=(), description="What is measured."
     )
-    requirement: RequirementChange = Field(description="{metric, critical} or {stl}.")
+    requirement: RequirementChange = Field(description="{metric, critical}, {stl}, or {any: [...]} or {all: [...]} of such.")
 
     @field_validator("simulate")
     @classmethod

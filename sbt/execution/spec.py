@@ -37,6 +37,7 @@ class ScenarioSpec:
         ego: the AV under test; None: the scenario's own.
         isolation: auto, fresh, reuse or replicas; scenarios without SUMO ignore it.
         step_length: simulation step (s); None: the scenario's own.
+        formulas: further formulas, the metric that measures each and its text; they change no requirement.
         friction: smallest and largest coefficient of friction of the roads, an input where they differ; None: the scenario's own.
         formula: of signal temporal logic, measured as the metric `stl` and required; None: the scenario's own requirement.
         conflict_type: measure how ego and the nearest other met as well, where runs have a trace.
@@ -58,6 +59,7 @@ class ScenarioSpec:
     carried: bytes = field(default=b"", repr=False)
     drivers: tuple[Mapping[str, Any], ...] = ()
     friction: tuple[float, float] | None = None
+    formulas: tuple[tuple[str, str], ...] = ()
 
     def resolve(self) -> LogicalScenario:
         """Return the scenario; loaded once per process and specification.
@@ -94,6 +96,8 @@ class ScenarioSpec:
             yield ("metrics", k), partial(_with_metric, name, Path(self.folder))
         if self.formula is not None:
             yield ("requirement", "stl"), partial(_requiring, formula=self.formula)
+        for metric, formula in self.formulas:
+            yield ("requirement",), partial(_with_formula, metric, formula)
         if self.conflict_type:
             yield ("campaign",), _with_conflict_type
         if self.ego is not None:
@@ -153,13 +157,17 @@ def _metric(name: str, folder: Path, scenario: LogicalScenario) -> Metric:
 
 def _requiring(scenario: LogicalScenario, formula: str) -> LogicalScenario:
     """Return the scenario with the robustness of a formula as a further metric, and <= 0 critical."""
+    return replace(_with_formula("stl", formula, scenario), requirement=Requirement("stl", high=0.0))
+
+
+def _with_formula(name: str, formula: str, scenario: LogicalScenario) -> LogicalScenario:
+    """Return the scenario with the robustness of a formula as a further metric of this name."""
     from sbt.metrics.stl import stl
 
     if scenario.simulate is None:
         raise InputError(f"a formula needs the trace of a run, but scenario {scenario.name} gives its metrics directly")
     roles = scenario.roles
-    metric = stl(formula, "stl", roles.ego, roles.other, roles.margin)
-    return replace(_measuring(scenario, metric), requirement=Requirement(metric.name, high=0.0))
+    return _measuring(scenario, stl(formula, name, roles.ego, roles.other, roles.margin))
 
 
 def _measuring(scenario: LogicalScenario, metric: Metric) -> LogicalScenario:

@@ -154,7 +154,7 @@ class CombinedRequirement(Requirement):
             rule = f"requirements are combined by {' or '.join(KINDS)}, and there must be at least one"
             raise InputError(f"{rule}, but got {self.how} of {len(self.items)}")
         object.__setattr__(self, "metric", f"{self.how}({', '.join(item.label for item in self.items)})")
-        for what, names in (("name", [p.label for p in self.parts]), ("metric", [p.metric for p in self.parts])):
+        for what, names in (("metric", [p.metric for p in self.parts]), ("name", [p.label for p in self.parts])):
             twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
             if twice is not None:
                 why = "" if what == "name" else ": its P(critical) is that of metrics that are independent of each other"
@@ -188,9 +188,15 @@ class CombinedRequirement(Requirement):
         judged = [item.is_critical(metrics) for item in self.items]
         return any(judged) if self.how == "any" else all(judged)
 
-    def violated(self, metrics: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the names of the requirements that the metrics of one run violate."""
-        return tuple(part.label for part in self.parts if part.is_critical(metrics))
+    @property
+    def told_as(self) -> str:
+        """What the number of `told` is called."""
+        return f"margin of {self.metric}"
+
+    def told_of(self, metrics: Mapping[str, float]) -> float:
+        """Return the margin of one run, every metric in its own unit: <= 0 where it is critical."""
+        plain = self.critical.with_leaves(self.critical.leaves, (1.0,) * len(self.parts))
+        return float(plain.margin(np.array([metrics[part.metric] for part in self.parts])))
 
 
 def any_of(*items: Requirement, name: str = "") -> CombinedRequirement:

@@ -45,7 +45,7 @@ class CriticalInterval:
         if not self.low <= self.high:
             raise InputError(f"a critical interval needs low <= high, but got [{self.low}, {self.high}]")
         if math.isinf(self.low) and math.isinf(self.high):
-            raise InputError("a critical interval needs at least one finite end, but got [-inf, inf]")
+            raise InputError(f"a critical interval needs at least one finite end, but got [{self.low}, {self.high}]")
 
     def known(self, y: Vector) -> Mask:
         """Return (n,) booleans: y tells whether the run is critical, and how far from it."""
@@ -116,6 +116,19 @@ class Requirement:
     def told(self, runs: Measured) -> Vector:
         """Return (n,) the one number that a run is told by: the metric, of a combination its margin; NaN where there is none."""
         return runs.y(self.metric)
+
+    @property
+    def told_as(self) -> str:
+        """What the number of `told` is called."""
+        return self.metric
+
+    def told_of(self, metrics: Mapping[str, float]) -> float:
+        """Return the number that one run is told by; of a combination its margin, every metric in its own unit."""
+        return metrics[self.metric]
+
+    def violated(self, metrics: Mapping[str, float]) -> tuple[str, ...]:
+        """Return the names of the requirements on one metric that the metrics of one run violate."""
+        return tuple(part.label for part in self.parts if part.is_critical(metrics))
 
     def critical_runs(self, runs: Measured) -> Mask:
         """Return (n,) booleans: the run violates the requirement; False for a run without the metric."""

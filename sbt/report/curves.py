@@ -15,7 +15,7 @@ from sbt.problem.arrays import Mask, Vector
 from sbt.problem.requirement import Requirement
 from sbt.report.axes import reach, shade
 from sbt.report.style import CRITICAL, MODEL, UNCRITICAL, label
-from sbt.store.history import History
+from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord
 
 if TYPE_CHECKING:
@@ -131,7 +131,10 @@ def plot_metric_histogram(history: History, requirement: Requirement, ax: Axes, 
     The middle 99 % of the values and the ends of the critical interval set the range; the outermost
     bins hold what lies beyond.
     """
-    chosen, held = history.training.y(requirement.metric), history.held_out.y(requirement.metric)
+    y = requirement.told(history)
+    held = y[history.ok & (history.stage == VALIDATION)]
+    chosen = y[history.ok & (history.stage != VALIDATION)]
+    chosen, held = chosen[np.isfinite(chosen)], held[np.isfinite(held)]
     low, high = reach(np.concatenate([chosen, held]), requirement.critical, middle=0.99)
     edges = np.linspace(low, high, 41).tolist()
     shade(requirement.critical, (low, high), ax, along="x")
@@ -146,7 +149,7 @@ def plot_metric_histogram(history: History, requirement: Requirement, ax: Axes, 
             linewidth=1.2,
             label=f"held-out runs: {len(held):,}",
         )
-    ax.set(xlabel=label(requirement.metric, unit), ylabel="number of runs", xlim=(low, high))
+    ax.set(xlabel=label(requirement.told_as, unit), ylabel="number of runs", xlim=(low, high))
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
     return ax
 

@@ -72,12 +72,12 @@ def plot_metric(
     column: int = 0,
 ) -> Axes:
     """Scatter the safety metric over one input, the critical interval shaded; failed runs on the floor."""
-    parameter, y = space.parameters[column], history.y(requirement.metric)
+    parameter, y = space.parameters[column], requirement.told(history)
     known = np.isfinite(y)
     floor, top = reach(y[known], requirement.critical)
     shade(requirement.critical, (floor, top), ax, along="y")
     _scatter(history, requirement, history.x[:, column], np.where(known, y, floor), ax)
-    ax.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(requirement.metric, unit))
+    ax.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(requirement.told_as, unit))
     ax.set(xlim=_limits(parameter, history.x[:, column]), ylim=padded(floor, top))
     whole_ticks(ax, parameter)
     return ax

@@ -213,13 +213,16 @@ def _counts(found: Findings) -> Iterator[Drawing]:
     """Yield the distribution of the metric and the critical runs found so far."""
     if not found.history.ok.any():
         return
-    figure = new_figure(5.4, 3.7)
-    curves.plot_metric_histogram(found.history, found.requirement, figure.subplots(), unit=found.unit)
-    caption = (
-        f"The safety metric; shaded where critical ({requirement_words(found.requirement, found.unit)}). Held-out runs are"
-        " random, the others were chosen. The outermost bins hold what lies beyond."
-    )
-    yield Drawing("metric", f"Distribution of {found.requirement.metric}", caption, to_svg(figure, "metric"))
+    for k, part in enumerate(found.requirement.parts):
+        unit = found.units.get(part.metric, found.unit)
+        figure = new_figure(5.4, 3.7)
+        curves.plot_metric_histogram(found.history, part, figure.subplots(), unit=unit)
+        caption = (
+            f"The safety metric; shaded where critical ({requirement_words(part, unit)}). Held-out runs are"
+            " random, the others were chosen. The outermost bins hold what lies beyond."
+        )
+        name = f"metric_{k + 1}" if k else "metric"
+        yield Drawing(name, f"Distribution of {part.metric}", caption, to_svg(figure, name))
     figure = new_figure(5.4, 3.7)
     curves.plot_progress(found.history, found.requirement, figure.subplots())
     caption = (

@@ -107,7 +107,7 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
     return [
         ("campaign", str(configuration.get("campaign", NOTHING)).removeprefix(OBJECT)),
         ("scenario", str(configuration.get("scenario", scenario.name)).removeprefix(OBJECT)),
-        ("critical if", requirement_words(found.requirement, found.unit)),
+        ("critical if", requirement_words(found.requirement, found.unit, found.units)),
         ("runs", runs + (f", {planned:,} planned" if planned else "")),
         ("seed", str(configuration.get("seed", NOTHING))),
         ("store", store.folder.name),

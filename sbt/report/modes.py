@@ -32,26 +32,34 @@ _NOTE = (
 
 def mode_table(found: Findings, space: ParameterSpace) -> Table:
     """Return one row a failure mode; no rows where the campaign found none or does not look for them."""
-    modes = _modes(found)
+    modes, several = _modes(found), found.requirement.combined
     rows, typed = [], any(mode.conflict for mode in modes)
     judged = any(mode.preventable for mode in modes)
     doubtful = any(mode.unconfirmed for mode in modes)
     for number_of, mode in enumerate(modes, 1):
         confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.confirmation_runs}"
         rows.append((
-            Cell.of(number_of), Cell.of(mode.representative), Cell.of(mode.metric), Cell.of(mode.size), Cell(confirmed),
+            Cell.of(number_of), Cell.of(mode.representative), Cell.of(mode.metric),
+            *((Cell(violated_words(mode)),) if several else ()), Cell.of(mode.size), Cell(confirmed),
             *(() if not doubtful else (Cell.of(mode.unconfirmed),)),
             *(() if not typed else (Cell(mode.conflict or NOTHING),)),
             *(Cell.of(mode.inputs[name]) for name in space.names), Cell(_change(mode, space)),
             *((Cell(describe_judgements(mode.preventable or ()) or NOTHING),) if judged else ()), Cell.of(mode.most_likely.run),
         ))  # fmt: skip
-    metric = found.requirement.metric
+    metric = found.requirement.told_as
     who = ("other road user",) if typed else ()
     evidence = ("contacts SUMO does not list",) if doubtful else ()
-    columns = ("mode", "representative", metric, "runs", "confirmed", *evidence, *who, *space.names, "what makes it safe",
+    which = ("violates",) if several else ()
+    columns = ("mode", "representative", metric, *which, "runs", "confirmed", *evidence, *who, *space.names, "what makes it safe",
                *(("avoided by",) if judged else ()), "most likely")  # fmt: skip
     note = _NOTE + (f" {KNOWN_LIMITS}" if judged else "")
     return Table(columns, tuple(rows), note if rows else "")
+
+
+def violated_words(mode: FailureMode) -> str:
+    """Return the requirements that a mode's runs violate, with how many of them where not all do."""
+    counts = mode.violates or {}
+    return ", ".join(name if n == mode.size else f"{name} ({n} of {mode.size})" for name, n in counts.items()) or NOTHING
 
 
 def _modes(found: Findings) -> Sequence[FailureMode]:
@@ -84,7 +92,7 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
     modes = _modes(found)
     if not modes:
         return
-    history, y = found.history, found.history.y(found.requirement.metric)
+    history, y = found.history, found.requirement.told(found.history)
     order = np.argsort(-weights, kind="stable")[:2]
     across = int(min(order))
     up = int(max(order)) if space.dimension > 1 else None
@@ -109,7 +117,7 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
             )  # fmt: skip
     names = [f"{p.name} ({p.unit})" if p.unit else p.name for p in space.parameters]
     ax.set_xlabel(names[across])
-    ax.set_ylabel(found.requirement.metric if up is None else names[up])
+    ax.set_ylabel(found.requirement.told_as if up is None else names[up])
     whole_ticks(ax, space.parameters[across], *(() if up is None else (space.parameters[up],)))
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     caption = "Critical runs by failure mode; star: representative; arrow: to the nearest run that is not critical."

@@ -97,7 +97,7 @@ def influence_from_runs(history: History, requirement: Requirement) -> Vector:
     runs = history.where(history.ok)
     if len(runs) < 2 * _BINS:
         return np.zeros(len(history.names))
-    margin = requirement.critical.margin(runs.y(requirement.metric))
+    margin = requirement.margins(runs)
     rank = np.searchsorted(np.sort(margin), margin).astype(np.float64)
     columns = ((runs.x[:, k], name in runs.choices) for k, name in enumerate(runs.names))
     return _relative(np.array([_explained(x, rank, choices=choices) for x, choices in columns]))

@@ -160,19 +160,22 @@ def critical_table(
         judged.setdefault(each.run, []).append(each)
     margin = requirement.margins(history)
     found = [int(k) for k in np.argsort(margin, kind="stable") if margin[k] <= 0]
-    metrics = sorted(history.metrics, key=lambda name: name != requirement.metric)
+    metrics = sorted(history.metrics, key=lambda name: name not in [part.metric for part in requirement.parts])
     rows = []
     for k in found[:_MOST]:
         record = history.record(k)
         rows.append((
-            Cell.of(record.index), Cell.of(float(margin[k])), *(Cell.of(record.inputs[name]) for name in history.names),
+            Cell.of(record.index), Cell.of(float(margin[k])),
+            *((Cell(", ".join(requirement.violated(record.metrics))),) if requirement.combined else ()),
+            *(Cell.of(record.inputs[name]) for name in history.names),
             *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
             *((Cell(describe_judgements(judged.get(record.index, ())) or NOTHING),) if judged else ()),
             Cell("command", code=simulate_command(reference, record)),
         ))  # fmt: skip
     rest = len(found) - len(rows)
     note = f"{rest:,} more critical runs are in the store: sumo-sbt export lists all." if rest else ""
-    columns = ("run", "margin", *history.names, *metrics, "seed", *(("avoided by",) if judged else ()), "again")
+    violates = ("violates",) if requirement.combined else ()
+    columns = ("run", "margin", *violates, *history.names, *metrics, "seed", *(("avoided by",) if judged else ()), "again")
     return Table(columns, tuple(rows), " ".join(filter(None, (note, KNOWN_LIMITS if judged and rows else ""))))
 
 

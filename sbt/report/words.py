@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.wording import number, percent
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Conclusion, Facts
+from sbt.problem.combination import CombinedRequirement
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
@@ -56,6 +57,7 @@ class Findings:
         validation: scores of the last metamodel on held-out runs; None where there is none.
         planned: runs without an outcome.
         direction: "low" where small values of the metric are bad, "high" where large ones are.
+        units: of every metric.
     """
 
     history: History
@@ -67,6 +69,7 @@ class Findings:
     validation: Validation | None
     planned: int
     direction: str = "low"
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, store: Store, scenario: LogicalScenario, conclusion: Conclusion | None) -> Findings:
@@ -76,6 +79,7 @@ class Findings:
         return cls(
             store.history(), scenario.requirement, scenario.unit, store.configuration, conclusion, store.conclusion or {},
             validation, store.counts.get(PLANNED, 0), scenario.direction,
+            {metric.name: metric.unit for metric in scenario.metrics},
         )  # fmt: skip
 
     @property
@@ -94,8 +98,13 @@ class Findings:
         return Facts(self.history, self.requirement, self.unit)
 
 
-def requirement_words(requirement: Requirement, unit: str) -> str:
-    """Return when a run is critical."""
+def requirement_words(requirement: Requirement, unit: str, units: Mapping[str, str] | None = None) -> str:
+    """Return when a run is critical; `units` by metric are those of a combination's."""
+    if isinstance(requirement, CombinedRequirement):
+        joint, units = " or " if requirement.how == "any" else " and ", units or {}
+        said = [requirement_words(item, units.get(item.metric, ""), units) for item in requirement.items]
+        nested = (isinstance(item, CombinedRequirement) for item in requirement.items)
+        return joint.join(f"({words})" if inner else words for words, inner in zip(said, nested, strict=True))
     low, high, name, tail = (
         requirement.critical.low,
         requirement.critical.high,
@@ -200,6 +209,8 @@ def _about_runs(found: Findings) -> list[str]:
 
 def _about_far_side(found: Findings) -> list[str]:
     """Return how many runs are worse than the bad end of the critical interval, and so count as uncritical."""
+    if found.requirement.combined:
+        return []
     y, critical, name = found.history.y(found.requirement.metric), found.requirement.critical, found.requirement.metric
     high = found.direction == "high"
     n, end = int((y > critical.high).sum() if high else (y < critical.low).sum()), critical.high if high else critical.low

@@ -296,8 +296,9 @@ class History:
         """Return a tidy frame, a row a run.
 
         Args:
-            requirement: gives the verdict: `critical` (nullable boolean, NA where a run has no metric) and `margin`
-                (in the metric's unit, <= 0 critical).
+            requirement: gives the verdict: `critical` (nullable boolean, NA where a run has no metric), `margin`
+                (in the metric's unit, <= 0 critical) and, of a combination, `violates`: the requirements that the run violates,
+                joined by "; ".
 
         Returns:
             Columns index, stage, iteration, x.<input> (categorical where it has choices), y.<metric>, critical, margin,
@@ -312,6 +313,8 @@ class History:
             margin = requirement.margins(self)
             data["critical"] = pd.arrays.BooleanArray(requirement.critical_runs(self), np.isnan(margin))
             data["margin"] = margin
+            if requirement.combined:
+                data["violates"] = violated_names(self, requirement)
         data["log_q"] = self.log_q
         for column in ("status", "reason", "seed", "collisions", "seconds", "versions"):
             data[column] = self.columns[column]
@@ -320,6 +323,12 @@ class History:
         data["warm_up"] = pd.arrays.IntegerArray(warm_up, warm_up < 0)
         data["unconfirmed"] = self.columns["unconfirmed"]
         return pd.DataFrame(data)
+
+
+def violated_names(history: History, requirement: Requirement) -> list[str]:
+    """Return for each run the names of the requirements of a combination that it violates, joined by "; "."""
+    masks = [part.critical_runs(history) for part in requirement.parts]
+    return ["; ".join(p.label for p, mask in zip(requirement.parts, masks, strict=True) if mask[k]) for k in range(len(history))]
 
 
 def as_numbers(rows: Sequence[Sequence[Value]], names: Sequence[str], choices: Mapping[str, tuple[str, ...]]) -> Points:

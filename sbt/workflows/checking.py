@@ -228,8 +228,11 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:
 
 
 def _sides(runs: list[_Run], scenario: LogicalScenario) -> Finding:
-    y = np.array([dict(run.metrics)[scenario.requirement.metric] for run in runs])
-    critical = int(scenario.requirement.critical.contains(y).sum())
-    low, high = scenario.requirement.critical.low, scenario.requirement.critical.high
-    detail = f"{critical} of {len(runs)} critical by {scenario.requirement.metric} in [{low:g}, {high:g}]"
+    need, metrics = scenario.requirement, [dict(run.metrics) for run in runs]
+    each = "; ".join(
+        f"{sum(part.is_critical(found) for found in metrics)} of {len(runs)} critical by {part.metric} in"
+        f" [{part.low:g}, {part.high:g}]" for part in need.parts
+    )  # fmt: skip
+    whole = f"{sum(need.is_critical(found) for found in metrics)} of {len(runs)} critical by {need.metric}: "
+    detail = (whole if need.combined else "") + each
     return Finding("for information: both sides of the requirement", ok=True, detail=detail)

@@ -31,9 +31,9 @@ def compared_times(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]
     if scenario.simulate is None or scenario.roles.other is not None:
         return
     traces = [trace for values, seed in jobs[:_RUNS] if (trace := _simulated(scenario, values, seed)) is not None]
-    need = scenario.requirement
-    known = need.metric in {metric.name for metric in _CANDIDATES} and math.isfinite(need.critical.high)
-    bound = need.critical.high if known else _USUAL
+    names = {metric.name for metric in _CANDIDATES}
+    bounds = (part.high for part in scenario.requirement.parts if part.metric in names and math.isfinite(part.high))
+    bound = next(bounds, _USUAL)
     for metric in _CANDIDATES if traces else ():
         worst = [worst_pair(trace, metric, scenario.roles.ego) for trace in traces]
         yield metric.name, _said(worst, bound)

@@ -192,9 +192,15 @@ class Run:
 
     @property
     def margin(self) -> float | None:
-        """Signed distance of the metric to the critical interval, <= 0 where critical; None where the run has no metric."""
+        """Signed distance of the metric to the critical interval, <= 0 where critical; None where the run has no metric.
+
+        Of several requirements the least (any) or largest (all), every metric in its own unit.
+        """
         need = self.scenario.requirement
-        return float(need.critical.margin(np.array(self.metrics[need.metric]))) if self.status == Status.OK else None
+        if self.status != Status.OK:
+            return None
+        told = need.told_of(self.metrics)
+        return told if need.combined else float(need.critical.margin(np.array(told)))
 
     @cached_property
     def trace(self) -> pd.DataFrame:

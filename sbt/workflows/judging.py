@@ -253,7 +253,7 @@ def _judgement(study: Study, run: int, driver: str, outcome: Outcome) -> Judgeme
         return Judgement(run, driver, None, reason=f"the run with it failed: {outcome.reason}")
     need = study.scenario.requirement
     avoided, collision = not need.is_critical(outcome.metrics), outcome.metrics[_COLLISION] > 0.0
-    return Judgement(run, driver, bool(avoided), bool(collision), float(outcome.metrics[need.metric]))
+    return Judgement(run, driver, bool(avoided), bool(collision), float(need.told_of(outcome.metrics)))
 
 
 def _deepest(study: Study, history: History) -> list[int]:

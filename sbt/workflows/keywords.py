@@ -10,6 +10,7 @@ import numpy as np
 
 from sbt.loop.stages import Progress
 from sbt.plugins import OBJECT
+from sbt.problem.combination import CombinedRequirement
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Json, JsonMapping
@@ -102,6 +103,14 @@ def _input(change: Any) -> Any:
     return _plain(change)
 
 
+def _requirement(given: Requirement, *, named: bool = False) -> Json:
+    """Return a requirement as a configuration has it; its name where it is one of several."""
+    name = {"name": given.name} if named and given.name else {}
+    if isinstance(given, CombinedRequirement):
+        return {given.how: [_requirement(item, named=True) for item in given.items], **name}
+    return {"metric": given.metric, "critical": [given.low, given.high], **name}
+
+
 def _distribution(given: Distribution) -> Json:
     return {"kind": given.kind, **dict(given.parameters)}
 
@@ -113,7 +122,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, Requirement):
-        return {"metric": value.metric, "critical": [value.low, value.high]}
+        return _requirement(value)
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return str(value) if isinstance(value, Path) else value

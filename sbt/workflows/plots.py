@@ -156,7 +156,7 @@ class Plots:
         figures.whole_ticks(drawn, parameter)
         if parameter.choices:
             drawn.set_xlim(-0.5, len(parameter.choices) - 0.5)
-        drawn.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(r.scenario.requirement.metric, r.scenario.unit))
+        drawn.set(xlabel=label(parameter.name, parameter.unit), ylabel=label(r.scenario.requirement.told_as, r.scenario.unit))
         drawn.set(ylim=padded(*ends))
         drawn.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
         return drawn

@@ -64,10 +64,11 @@ def _write_sumo_files(again: Replay, folder: Path) -> None:
 
 def _result(again: Replay) -> str:
     """Return the metric of a run in words, or why it has none."""
-    need = again.scenario.requirement.metric
-    unit = next(m.unit for m in again.scenario.metrics if m.name == need)
-    value = again.outcome.metrics.get(need)
-    return f"{again.outcome.status}, {again.outcome.reason}" if value is None else f"{need} = {value:.3g} {unit}"
+    units, values = {m.name: m.unit for m in again.scenario.metrics}, again.outcome.metrics
+    needs = [part.metric for part in again.scenario.requirement.parts]
+    if not set(needs) <= set(values):
+        return f"{again.outcome.status}, {again.outcome.reason}"
+    return ", ".join(f"{need} = {values[need]:.3g} {units[need]}" for need in needs)
 
 
 def shown_trace(again: Replay) -> Trace:
@@ -97,10 +98,15 @@ def net_of_run(again: Replay) -> Path | None:
 
 
 def save_film(file: Path, states: Trace, scenario: LogicalScenario, title: str, net: Path | None) -> None:
-    """Write a run as an animated GIF, with the lanes of its network and the metric of its requirement."""
+    """Write a run as an animated GIF, with the lanes of its network and the metric of its requirement.
+
+    Of several requirements it shows the first that the run violates, or else the first.
+    """
     from sbt.report.film import write_film
     from sbt.sumo.nets import lanes
 
-    need = scenario.requirement
-    metric = next(m for m in scenario.metrics if m.name == need.metric)
+    own = {m.name: m for m in scenario.metrics}
+    parts = scenario.requirement.parts
+    need = next((part for part in parts if part.is_critical({part.metric: own[part.metric].value(states)})), parts[0])
+    metric = own[need.metric]
     write_film(file, states, metric, need, lanes=() if net is None else lanes(str(net)), title=title)

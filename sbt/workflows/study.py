@@ -254,9 +254,9 @@ class Study:
             raise InputError("warm_start.store must have choices of the same inputs, but {} there, {} here".format(*named))
         history = history.recoded(choices)
         runs = history.where(self.scenario.space.feasible(history.x)) if len(history) else history
-        metric = self.scenario.requirement.metric
-        if len(runs) and metric not in runs.metrics and runs.ok.any():
-            raise InputError(f"warm_start.store must have measured {metric}, but {folder} did not")
+        for metric in (part.metric for part in self.scenario.requirement.parts):
+            if len(runs) and metric not in runs.metrics and runs.ok.any():
+                raise InputError(f"warm_start.store must have measured {metric}, but {folder} did not")
         return runs
 
     @property

@@ -1,0 +1,93 @@
+"""The keys of `requirement`, in a configuration and in a scenario of one's own: one metric, a formula, or several of them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from sbt.problem.combination import KINDS
+from sbt.problem.requirement import CriticalInterval
+
+__all__ = ["Interval", "Name", "RequirementChange", "RequirementItem", "two_values"]
+
+
+def two_values(value: Any) -> Any:
+    """Return a list of two values; refuse anything else."""
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise ValueError(f"must be a list of two values, but got {value!r}")
+    return value
+
+
+def _not_blank(text: str) -> str:
+    if not text.strip():
+        raise ValueError("must not be empty")
+    return text
+
+
+def _proper(value: tuple[float, float]) -> tuple[float, float]:
+    CriticalInterval(*value)
+    return value
+
+
+Name = Annotated[str, AfterValidator(_not_blank)]
+Interval = Annotated[tuple[float, float], BeforeValidator(two_values), Field(strict=False)]
+Critical = Annotated[tuple[float, float], BeforeValidator(two_values), AfterValidator(_proper), Field(strict=False)]
+
+
+class RequirementChange(BaseModel):
+    """Changes the scenario's own requirement."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    metric: Name | None = Field(default=None, description="Safety metric; null: the scenario's own.")
+    critical: Critical | None = Field(
+        default=None,
+        description="Critical values [low, high], closed; ends may be -.inf or .inf; null: the own.",
+    )
+    stl: Name | None = Field(
+        default=None, description="A formula such as G[0,20](gap > 2 and ttc > 1.5) instead of a metric; its robustness is "
+        "the metric stl, critical in [-.inf, 0].",
+    )  # fmt: skip
+    any: Annotated[tuple[RequirementItem, ...], Field(strict=False)] | None = Field(
+        default=None, description="Requirements, of which any one being violated is critical."
+    )
+    all: Annotated[tuple[RequirementItem, ...], Field(strict=False)] | None = Field(
+        default=None, description="Requirements that are critical only where all are violated in the same run."
+    )
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> RequirementChange:
+        """Refuse more than one of a metric, a formula and a combination, and a combination of nothing."""
+        given = [key for key in ("metric", "stl", *KINDS) if getattr(self, key) is not None]
+        if given == ["metric", "stl"]:
+            raise ValueError(f"a requirement has a metric or a formula (stl), not both, but got metric {self.metric}")
+        if len(given) > 1:
+            raise ValueError(f"a requirement has one of metric, stl, any and all, but got {' and '.join(given)}")
+        if given and given[0] in KINDS and self.critical is not None:
+            raise ValueError(f"critical belongs to each requirement of {given[0]}, but stands beside it")
+        if given and given[0] in KINDS and not getattr(self, given[0]):
+            raise ValueError(f"{given[0]} must list at least one requirement, but is empty")
+        return self
+
+    @property
+    def combined(self) -> tuple[str, tuple[RequirementItem, ...]] | None:
+        """How several are combined, and which; None where there is one."""
+        return next(((how, found) for how in KINDS if (found := getattr(self, how)) is not None), None)
+
+    @property
+    def formulas(self) -> tuple[tuple[str, str], ...]:
+        """The formulas of a combination: the metric that measures each, and the text."""
+        items = () if self.combined is None else self.combined[1]
+        return tuple(
+            pair for item in items for pair in (((item.name or "stl", item.stl),) if item.stl is not None else item.formulas)
+        )
+
+
+class RequirementItem(RequirementChange):
+    """One of several requirements."""
+
+    name: Name | None = Field(default=None, description="What it is called in results; default: its metric, of a formula stl.")
+
+
+RequirementChange.model_rebuild()

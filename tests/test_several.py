@@ -1,0 +1,150 @@
+"""Several requirements in one: what is critical, how far from it, and with which probability."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sbt.config.assemble import scenario_of
+from sbt.config.load import parse
+from sbt.errors import InputError
+from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.joint import JointMetamodel, JointPrediction, joined_log_probability
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.warp import JointWarp
+from sbt.problem.combination import MARGIN, CombinedInterval, all_of, any_of, from_plain, to_plain
+from sbt.problem.requirement import CriticalInterval, Requirement
+
+NEAR, FAST, BOTH_ENDS = Requirement("near", high=1.0), Requirement("fast", low=5.0), Requirement("mid", -1.0, 2.0, name="middle")
+NESTED = any_of(NEAR, all_of(FAST, BOTH_ENDS, name="inner"))
+
+
+class Runs:
+    """Runs by metric."""
+
+    def __init__(self, **metrics: list[float]):
+        self.metrics = {name: np.array(values) for name, values in metrics.items()}
+
+    def y(self, metric: str) -> np.ndarray:
+        """Return the values of a metric."""
+        return self.metrics[metric]
+
+
+def test_the_margin_says_what_is_critical_whatever_its_scale():
+    rng = np.random.default_rng(0)
+    runs = Runs(near=rng.normal(1, 2, 500), fast=rng.normal(4, 3, 500), mid=rng.normal(0, 1e6, 500))
+    expected = (runs.y("near") <= 1) | ((runs.y("fast") >= 5) & (runs.y("mid") >= -1) & (runs.y("mid") <= 2))
+    np.testing.assert_array_equal(NESTED.critical_runs(runs), expected)
+    np.testing.assert_array_equal(NESTED.margins(runs) <= 0, expected)
+    one = {name: float(runs.y(name)[7]) for name in runs.metrics}
+    assert NESTED.is_critical(one) == expected[7] == (NESTED.told_of(one) <= 0)
+    assert set(NESTED.violated(one)) <= {"near", "fast", "middle"}
+
+
+def test_a_later_run_does_not_move_the_margins_of_earlier_ones():
+    rng = np.random.default_rng(1)
+    y = np.column_stack([rng.normal(1, 2, 400), 1e4 * rng.normal(4, 3, 400)])
+    critical = any_of(NEAR, FAST).critical
+    np.testing.assert_array_equal(critical.margin(y)[:100], critical.margin(y[:100]))
+
+
+@pytest.mark.parametrize(("how", "near", "fast", "critical", "known"), [
+    ("any", 0.0, np.nan, True, True), ("any", 2.0, np.nan, False, False),
+    ("all", 0.0, np.nan, False, False), ("all", 2.0, np.nan, False, True),
+])  # fmt: skip
+def test_an_unknown_metric_leaves_unknown_only_what_it_decides(how, near, fast, critical, known):
+    runs, need = Runs(near=[near], fast=[fast]), (any_of if how == "any" else all_of)(NEAR, FAST)
+    assert need.critical_runs(runs)[0] == critical
+    assert np.isfinite(need.margins(runs)[0]) == known
+
+
+def test_plain_data_gives_the_same_requirement_back():
+    assert from_plain(to_plain(NESTED)) == NESTED
+    assert from_plain(to_plain(BOTH_ENDS)) == BOTH_ENDS
+
+
+def test_names_and_metrics_must_differ():
+    with pytest.raises(InputError, match="different metrics, but got 'near' twice"):
+        any_of(NEAR, Requirement("near", low=5.0, name="far"))
+    with pytest.raises(InputError, match="different names, but got 'near' twice"):
+        any_of(NEAR, Requirement("other", low=5.0, name="near"))
+    with pytest.raises(InputError, match="at least one"):
+        any_of()
+
+
+def _joint(n: int = 6) -> tuple[JointPrediction, CombinedInterval]:
+    rng = np.random.default_rng(3)
+    parts = [Prediction.gaussian(rng.normal(m, 1, n), rng.uniform(0.3, 2, n)) for m in (1.5, 4.0, 0.5)]
+    critical = NESTED.critical.with_leaves(NESTED.critical.leaves, (1.0, 2.0, 0.5))
+    return JointPrediction.of(parts, critical), critical
+
+
+def test_a_prediction_of_the_margin_is_that_of_independent_metrics():
+    prediction, critical = _joint()
+    rng = np.random.default_rng(4)
+    draws = np.stack([p.mu + p.sigma * rng.standard_normal((200_000, len(p))) for p in prediction.parts], axis=-1)
+    margin = critical.margin(draws)
+    np.testing.assert_allclose(prediction.probability(MARGIN), (margin <= 0).mean(axis=0), atol=5e-3)
+    middle = CriticalInterval(-0.4, 0.3)
+    np.testing.assert_allclose(prediction.probability(middle), ((margin >= -0.4) & (margin <= 0.3)).mean(axis=0), atol=5e-3)
+    scaled = any_of(NEAR, FAST).critical.with_leaves((NEAR.critical, FAST.critical), (1, 2))
+    two = JointPrediction.of(prediction.parts[:2], scaled)
+    drawn = np.minimum(draws[..., 0] - 1.0, (5.0 - draws[..., 1]) / 2.0)
+    np.testing.assert_allclose(two.mu, drawn.mean(axis=0), atol=1e-2)
+    np.testing.assert_allclose(two.sigma, drawn.std(axis=0), atol=1e-2)
+
+
+def test_probabilities_of_combinations_are_exact_in_the_tails():
+    log_p = np.array([-800.0, -1e-300])
+    pair = (log_p, np.log(-np.expm1(log_p)))
+    either = any_of(NEAR, FAST).critical
+    low, high = joined_log_probability(either, [pair, pair]), joined_log_probability(all_of(NEAR, FAST).critical, [pair, pair])
+    np.testing.assert_allclose(low[0][0], -800.0 + np.log(2.0), rtol=1e-12)
+    np.testing.assert_allclose(high[0][0], -1600.0, rtol=1e-12)
+    np.testing.assert_allclose(high[1][1], pair[1][1] + np.log(2.0), rtol=1e-12)
+
+
+def test_each_metric_has_a_metamodel_of_its_own():
+    rng = np.random.default_rng(5)
+    u = rng.random((60, 2))
+    y = np.column_stack([3.0 * u[:, 0], 10.0 * u[:, 1]])
+    y[5, 1] = np.nan
+    critical = any_of(NEAR, FAST).critical
+    predictor = JointMetamodel(GaussianProcess(), critical).fit(u, y, np.random.default_rng(0))
+    at = rng.random((200, 2))
+    truth = (3.0 * at[:, 0] <= 1.0) | (10.0 * at[:, 1] >= 5.0)
+    assert ((predictor(at).probability(MARGIN) > 0.5) == truth).mean() > 0.97
+    paths = predictor.sample_paths(at, 3, np.random.default_rng(1))
+    assert ((paths <= 0) == truth).mean() > 0.97
+    warp = JointWarp.around_edges(y, critical)
+    np.testing.assert_array_equal(warp.values(y[:5]) <= 0, critical.contains(y[:5]))
+
+
+BAD = {
+    "any: [{metric: ttc_mn, critical: [0, 1]}]": r"any.0.metric: a metric must be one of .*did you mean 'ttc_min'",
+    "any: []": "any must list at least one requirement",
+    "{any: [{metric: ttc_min}], all: [{metric: ttc_min}]}": "one of metric, stl, any and all, but got any and all",
+    "any: [{metric: ttc_min}, {metric: d_min, critical: [0, 1], name: ttc_min}]": "different names, but got 'ttc_min' twice",
+    "any: [{metric: ttc_min}, {metric: ttc_min, critical: [0, 1]}]": "different metrics, but got 'ttc_min' twice",
+    "any: [{metric: ttc_min, critical: [2, 1]}]": r"any.0.critical: a critical interval needs low <= high",
+    "all: [{metric: d_min}]": r"all.0: critical: \[low, high\] is required",
+    "{any: [{metric: ttc_min}], critical: [0, 1]}": "critical belongs to each requirement of any",
+}
+
+
+@pytest.mark.parametrize("keys", BAD)
+def test_bad_combinations_are_refused_where_they_stand(keys):
+    text = f"campaign: boundary\nscenario: cut_in\nrequirement: {keys if keys[0] == '{' else '{' + keys + '}'}\n"
+    with pytest.raises(InputError, match=BAD[keys]) as error:
+        scenario_of(parse(text))
+    assert "<text>:3:" in str(error.value)
+
+
+def test_formulas_and_metrics_combine():
+    need = scenario_of(parse(
+        "campaign: boundary\nscenario: cut_in\n"
+        "requirement: {any: [{metric: ttc_min}, {stl: 'G(gap > 2)', name: gap}, {all: [{stl: 'G(ttc > 1)'}, "
+        "{metric: d_min, critical: [-.inf, 3]}]}]}\n"
+    )).requirement  # fmt: skip
+    assert [part.metric for part in need.parts] == ["ttc_min", "gap", "stl", "d_min"]
+    assert need.metric == "any(ttc_min, gap, all(stl, d_min))"
