@@ -69,7 +69,7 @@ class BoundaryConclusion:
         if self.weights is not None:
             found.append(f"The metamodel chose among its members: {self.chosen_because}.")
         if self.simulator_noise is not None:
-            found += self.simulator_noise.sentences(facts.requirement.metric, facts.unit)
+            found += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         return found
 
 

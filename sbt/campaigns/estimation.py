@@ -87,7 +87,7 @@ class EstimationConclusion:
 
     def sentences(self, facts: Facts) -> list[str]:
         """Return the probability with its interval, or the bound where nothing was critical."""
-        noise = [] if self.simulator_noise is None else self.simulator_noise.sentences(facts.requirement.metric, facts.unit)
+        noise = [] if self.simulator_noise is None else self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         verdict = [] if self.gate is None else [f"Gate: {self.gate.verdict}; {self.gate.statement}."]
         confidence = percent(self.confidence)
         if self.exact_bound is not None:

@@ -120,7 +120,7 @@ class FalsificationConclusion:
                 f" after {plural(self.runs_to_first or 0, 'run')} of the search; {modes}."
             ))  # fmt: skip
         if self.simulator_noise is not None:
-            said += self.simulator_noise.sentences(facts.requirement.metric, facts.unit)
+            said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
         return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence()]
 
