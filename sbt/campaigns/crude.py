@@ -16,9 +16,10 @@ from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 
-__all__ = ["MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of"]
+__all__ = ["NOMINAL", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of"]
 
-_NOMINAL = "monte_carlo"
+NOMINAL = "monte_carlo"
+"""Stage of runs that were drawn from the inputs' distribution."""
 _REPEATS = 5  # independent runs of subset simulation: their spread is the error
 _FEWEST_HITS = 10  # before the coefficient of variation is believed: its own error is a sixth then
 _FEWEST_BATCHES = 4  # likewise
@@ -29,7 +30,7 @@ class MonteCarloStage:
     """Independent draws from the distribution of the inputs."""
 
     settings: Settings
-    name: str = _NOMINAL
+    name: str = NOMINAL
 
     def stop(self, log: Log) -> str | None:
         """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
@@ -47,7 +48,7 @@ class MonteCarloStage:
         s, space = self.settings, self.settings.scenario.space
         size = min(s.batch if log.iterations else s.initial, s.budget - len(log.history))
         x = space.sample(size, stream(s.seed, "monte_carlo", log.iteration))
-        return Batch(_runs(space, x, _NOMINAL, space.log_density(x)), EstimationProposal(COUNT, "monte_carlo"))
+        return Batch(_runs(space, x, NOMINAL, space.log_density(x)), EstimationProposal(COUNT, "monte_carlo"))
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def _runs(space: ParameterSpace, x: Points, stage: str, log_q: Vector | None) ->
     return tuple(PlannedRun(stage, space.named(row), None if log_q is None else float(log_q[k])) for k, row in enumerate(x))
 
 
-def nominal_proportion(log: Log, settings: Settings, stage: str = _NOMINAL) -> Proportion:
+def nominal_proportion(log: Log, settings: Settings, stage: str = NOMINAL) -> Proportion:
     """Return the hits among the runs of a stage that were drawn from the inputs' distribution."""
     runs = log.history.where(log.history.stage == stage)
     hits = int(settings.scenario.requirement.critical_runs(runs).sum())

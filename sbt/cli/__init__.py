@@ -12,6 +12,7 @@ from sbt.cli.benchmark import benchmark
 from sbt.cli.compare import compare
 from sbt.cli.compare_ego import compare_ego
 from sbt.cli.console import process, verb
+from sbt.cli.estimate_again import estimate_again
 from sbt.cli.new import new
 from sbt.cli.predict import predict
 from sbt.cli.replay import replay
@@ -33,6 +34,7 @@ for _verb in (
     campaign.report,
     campaign.export,
     predict,
+    estimate_again,
     replay,
 ):
     app.command()(verb(_verb))

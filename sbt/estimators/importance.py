@@ -19,7 +19,7 @@ import numpy as np
 
 from sbt.problem.arrays import Vector
 
-__all__ = ["SHARES", "Draws", "Plan", "draw_systematic", "plan_batch"]
+__all__ = ["SHARES", "Draws", "Plan", "draw_systematic", "plan_batch", "stratified_variance"]
 
 SHARES = (0.63, 0.20, 0.05, 0.12)
 """Shares of the draws in proportion to the metamodel's uncertainty, to the nominal distribution, to the pool and to the
@@ -109,7 +109,7 @@ def plan_batch(
             variance = float((w**2 * pi * np.exp(log_not) / np.where(alive, r, 1.0)).sum())
         else:
             variance = second - mean**2
-        pool_variance = _stratified_variance(n * w * pi, stratum)
+        pool_variance = stratified_variance(n * w * pi, stratum)
         plans.append(Plan(
             name, r, pi if name == "difference" else np.zeros(n), w, mean if name == "difference" else 0.0, mean,
             max(variance, 0.0), pool_variance, shares[1], nominal,
@@ -127,7 +127,7 @@ def _normalised(log_value: Vector, alive: Vector) -> Vector:
     return np.asarray(value / value.sum())
 
 
-def _stratified_variance(values: Vector, stratum: Vector) -> float:
+def stratified_variance(values: Vector, stratum: Vector) -> float:
     """Return the variance of the mean of values whose numbers in each stratum were fixed."""
     n, total = len(values), 0.0
     for s in np.unique(stratum):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
+from sbt.campaigns.asking import Sensitivity
 from sbt.campaigns.wording import NOTHING, number
 from sbt.files import write_atomically
 from sbt.loop.stages import Conclusion
@@ -17,7 +18,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.report.gallery import Drawing, draw
 from sbt.report.modes import mode_table
 from sbt.report.projection import Predict, influence_from_runs, influence_on_probability
-from sbt.report.tables import contact_table, critical_table, failed_table, input_table, iteration_table
+from sbt.report.tables import contact_table, critical_table, failed_table, input_table, iteration_table, sensitivity_table
 from sbt.report.words import SCORES, Findings, conclusion_sentences, requirement_words, warnings_for
 from sbt.store.database import Store
 
@@ -27,8 +28,9 @@ REPORT = "report.html"
 
 
 def write_report(
-    store: Store, scenario: LogicalScenario, predict: Predict | None, conclusion: Conclusion | None, *, folder: Path | None = None
-) -> Path:
+    store: Store, scenario: LogicalScenario, predict: Predict | None, conclusion: Conclusion | None, *,
+    folder: Path | None = None, sensitivity: Sequence[Sensitivity] = (),
+) -> Path:  # fmt: skip
     """Write `report.html` and `figures/*.svg`; works at any moment of a campaign, and gives the same bytes twice.
 
     Args:
@@ -37,6 +39,7 @@ def write_report(
         predict: the last metamodel as a function of (n, d) points of the unit cube; None: no metamodel.
         conclusion: what the campaign found; None while it goes on.
         folder: where to write; None: the store's folder.
+        sensitivity: of an estimated probability to the parameters of the distributions.
 
     Returns:
         The path of the page.
@@ -59,6 +62,7 @@ def write_report(
         "scores": _scores(found),
         "drawings": [_inline(drawing) for drawing in drawings],
         "modes": mode_table(found, scenario.space),
+        "sensitivity": sensitivity_table(sensitivity),
         "inputs": input_table(scenario, weights),
         "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement),
         "critical": critical_table(found.history, scenario.requirement, reference, store.judgements),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sbt.campaigns.asking import Sensitivity
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
 from sbt.plugins import OBJECT
@@ -30,6 +31,7 @@ __all__ = [
     "failed_table",
     "input_table",
     "iteration_table",
+    "sensitivity_table",
     "simulate_command",
 ]
 
@@ -99,6 +101,22 @@ def _input(parameter: Parameter) -> tuple[Cell, ...]:
         Cell(distribution_words(parameter)),
         Cell(parameter.description),
     )
+
+
+def sensitivity_table(rows: Sequence[Sensitivity]) -> Table:
+    """Return what each parameter of the distributions does to the probability P, that which matters most first."""
+    columns = ("input", "parameter", "value", "dP / dvalue", "std. error", "elasticity", "change", "P, raised", "P, lowered")
+    cells = tuple(
+        (Cell(each.input), Cell(each.parameter), Cell.of(each.value), Cell.of(each.derivative, 3), Cell.of(each.std_error, 2),
+         Cell.of(each.elasticity, 3), Cell.of(each.change, 3), Cell.of(each.raised, 3), Cell.of(each.lowered, 3))
+        for each in rows
+    )  # fmt: skip
+    note = (
+        "P is only as right as the distributions. Each line changes one number of them by 10 % (a mean of 0: by 10 % of the "
+        "standard deviation), by weights of the same runs; elasticity: relative change of P for a relative change of the "
+        "number; ends of ranges are not in the table. Other distributions: sumo-sbt estimate-again."
+    )
+    return Table(columns, cells, note)
 
 
 def iteration_table(

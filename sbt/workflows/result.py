@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.preventable import with_judgements
 from sbt.campaigns.wording import plural
 from sbt.errors import InputError, StoreError
@@ -23,8 +24,10 @@ from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import History
 from sbt.store.records import FitRecord, Judgement
+from sbt.workflows.asking import Answer, estimate_again
 from sbt.workflows.exporting import export_store
 from sbt.workflows.judging import judge_run, with_driver
+from sbt.workflows.keywords import as_data
 from sbt.workflows.plots import Plots
 from sbt.workflows.running import Replay, rebuild_report, replay_run
 from sbt.workflows.showing import net_of_run, save_film, shown_trace
@@ -155,11 +158,44 @@ class Result(Generic[C]):
 
         from sbt.workflows.prediction import inputs_from, predict_inputs  # all metamodels, and so torch
 
-        table = predict_inputs(
-            self.store, lambda space: inputs_from(inputs, space), device=device, objects=self.objects
-        )
+        table = predict_inputs(self.store, lambda space: inputs_from(inputs, space), device=device, objects=self.objects)
         columns = {{"mu": "mean", "sigma": "std"}.get(name, name): values for name, values in table.columns.items()}
         return pd.DataFrame(columns, index=inputs.index if isinstance(inputs, pd.DataFrame) else None)
+
+    def estimate(
+        self, inputs: Any = None, *, critical: Sequence[float] | None = None, metric: str | None = None
+    ) -> EstimationConclusion:
+        """Return the probability under other distributions, or of another requirement, from the runs that are there.
+
+        Args:
+            inputs: changes to the campaign's inputs, as the key of a configuration; None: its own distributions.
+            critical: interval (low, high) of critical values; None: the campaign's.
+            metric: one that the runs measured; None: the campaign's.
+
+        Raises:
+            InputError: the runs cannot tell: no known densities, none where the distributions have mass, unknown inputs.
+        """
+        return self._asked(inputs, critical, metric).conclusion
+
+    def sensitivity(
+        self, inputs: Any = None, *, critical: Sequence[float] | None = None, metric: str | None = None
+    ) -> pd.DataFrame:
+        """Return how the probability P depends on each parameter of the distributions; arguments as `estimate`.
+
+        Returns:
+            A row a parameter: input, parameter, value, derivative, std_error, elasticity, change, raised, lowered (P with the
+            parameter larger and smaller by `change`).
+        """
+        import pandas as pd
+
+        return pd.DataFrame([vars(each) for each in self._asked(inputs, critical, metric).sensitivity])
+
+    def _asked(self, inputs: Any, critical: Sequence[float] | None, metric: str | None) -> Answer:
+        given, _ = as_data({"inputs": inputs or {}})
+        if critical is not None and len(critical) != 2:
+            raise InputError(f"critical must be an interval (low, high), but got {critical!r}")
+        interval = None if critical is None else (float(critical[0]), float(critical[1]))
+        return estimate_again(self.store, given["inputs"], critical=interval, metric=metric, objects=self.objects)
 
     def replay(self, run: int) -> Replay:
         """Execute a stored run again, and make sure that it is the same to the last bit.

@@ -15,7 +15,7 @@ from sbt.execution.protocol import Executor
 from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
-from sbt.loop.stages import Conclusion, Finished, Progress, Shard, check_shard, run_shard, run_stages
+from sbt.loop.stages import Conclusion, Finished, Log, Progress, Shard, check_shard, run_shard, run_stages
 from sbt.plugins import OBJECT, Objects
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Job, Outcome
@@ -24,6 +24,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import Record
+from sbt.workflows.asking import sensitivities_in
 from sbt.workflows.judging import judge_campaign
 from sbt.workflows.study import RESOLVED, Study
 
@@ -171,7 +172,10 @@ def rebuild_report(folder: Path, *, objects: Objects | None = None) -> Path:
 def _report(store: Store, study: Study, conclusion: Conclusion | None, fitted: FittedMetamodel | None) -> Path:
     from sbt.report.html import write_report
 
-    return write_report(store, study.scenario, None if fitted is None else fitted.predict, conclusion)
+    log = Log(store.history(), tuple(store.iterations()), ())
+    told = sensitivities_in(study, log) if getattr(conclusion, "probability", None) else ()
+    predict = None if fitted is None else fitted.predict
+    return write_report(store, study.scenario, predict, conclusion, sensitivity=told)
 
 
 @dataclass(frozen=True, eq=False)

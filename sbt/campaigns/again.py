@@ -1,0 +1,205 @@
+"""An estimation asked again without runs: other distributions, another requirement, and what the answer depends on.
+
+The counted draws have known densities, so they count under every distribution that has no mass where the campaign's has none.
+A metamodel that knows only the runs before a batch is the control variate of its draws, as in the campaign itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from sbt.campaigns.counting import DRAWN
+from sbt.campaigns.crude import NOMINAL
+from sbt.campaigns.known import Known
+from sbt.campaigns.records import EstimationProposal
+from sbt.campaigns.settings import Settings
+from sbt.errors import InputError
+from sbt.estimators.choices import choice_scores, log_normal
+from sbt.estimators.mixture import Mixture, fit_mixture, particles, wide_scales
+from sbt.estimators.reweighting import Predicted, ReusedBatch, effective_size
+from sbt.estimators.surrogate import Coordinates, LogProbability
+from sbt.loop.stages import Log
+from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.space import ParameterSpace
+from sbt.seeds import stream
+from sbt.store.history import History
+
+__all__ = ["FLOOR", "Reused", "reused"]
+
+Rows = NDArray[np.intp]
+
+FLOOR = 3.0
+"""Smallest effective sample size with which runs say anything of other distributions."""
+_KEPT = 0.5
+"""Of the effective sample size under the campaign's own distribution: enough, where that is small itself."""
+_POOL, _PARTICLES, _CANDIDATES = 10_000, 800, 6_000
+"""Sizes of the campaign's own pools."""
+_FITS = 5
+"""Metamodels at most: a batch takes the newest one that knows none of its draws."""
+_FAR = 30.0
+"""Normal score beyond which there is nothing to propose."""
+_RATIOS = 2**13
+"""Draws from the new distribution, which tell how much less of the old one there is."""
+_SCORES = np.linspace(-6.0, 6.0, 4001)
+"""Normal scores of an input where the old distribution must have mass: 2e-9 lies beyond."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reused:
+    """The counted draws of an estimation, weighted for another distribution of the inputs.
+
+    Attributes:
+        space: the inputs with that distribution.
+        batches: of draws; one batch where they all come from the campaign's distribution.
+        failed: (n,) of every draw in their order: the run failed; it counts as safe in the batches.
+        nominal: (n,) share of each draw in proportion to the campaign's distribution.
+        ratio: (m,) new over old density at draws from the new one.
+        crude: the draws come from the campaign's distribution itself.
+        critical, safe: runs of the whole campaign where the new distribution has mass.
+        least: effective sample size below which the draws say nothing.
+    """
+
+    space: ParameterSpace
+    batches: tuple[ReusedBatch, ...]
+    failed: Mask
+    nominal: Vector
+    ratio: Vector
+    crude: bool
+    critical: int
+    safe: int
+    least: float
+
+
+def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
+    """Return the counted draws of a campaign, with weights for the distribution of `space`.
+
+    Args:
+        log: of the campaign.
+        settings: of the campaign, its scenario with the requirement that is asked for.
+        space: the same inputs with the distribution that is asked for.
+
+    Raises:
+        InputError: no draw has a known density, the new distribution has mass where the old has none, or the runs did not
+            measure the metric.
+    """
+    _check(log, settings, space)
+    history, old, hits = log.history, settings.scenario.space, settings.scenario.requirement.critical_runs(log.history)
+    x = space.sample(_RATIOS, stream(settings.seed, "ratio"))
+    crude = NOMINAL in history.stage
+    draws = [_Draws(-1, np.flatnonzero(history.stage == NOMINAL), 1.0)] if crude else [*_counted(log)]
+    every, reached = np.concatenate([d.rows for d in draws]), np.isfinite(space.log_density(history.x))
+    least = _least(history.where(np.isin(np.arange(len(history)), every)), old, space)
+    predicted: list[tuple[Vector, Predicted | None]] = [(np.zeros(len(every)), None)]
+    if not crude:
+        with threadpool_limits(1):
+            predicted = [*_predicted(log, settings, space, draws)]
+    return Reused(
+        space, tuple(_batch(history, space, hits, d.rows, g, pool) for d, (g, pool) in zip(draws, predicted, strict=True)),
+        ~history.ok[every], np.concatenate([np.full(len(d.rows), d.nominal) for d in draws]),
+        np.exp(space.log_density(x) - old.log_density(x)), crude,
+        int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
+        least,
+    )  # fmt: skip
+
+
+def _least(drawn: History, old: ParameterSpace, space: ParameterSpace) -> float:
+    """Return the effective sample size below which draws say nothing; refuse less."""
+    worth, own = (effective_size(np.exp(each.log_density(drawn.x) - drawn.log_q)) for each in (space, old))
+    least = min(FLOOR, _KEPT * own)
+    if worth < least:
+        rule = f"the runs must be worth at least {least:.2g} draws from the distributions asked for (effective sample size)"
+        advice = "run a campaign with these distributions, with warm_start to learn from this one"
+        raise InputError(f"{rule}, but are worth {worth:.2g}: {advice}")
+    return least
+
+
+def _batch(
+    history: History, space: ParameterSpace, hits: Mask, rows: Rows, control_variate: Vector, pool: Predicted | None
+) -> ReusedBatch:
+    """Return the draws in these rows, weighted by the new density over that which they were drawn with."""
+    x = history.x[rows]
+    weight = np.exp(space.log_density(x) - history.log_q[rows])
+    return ReusedBatch(x, weight, control_variate, hits[rows].astype(np.float64), pool)
+
+
+@dataclass(frozen=True, eq=False)
+class _Draws:
+    """A batch that counts: its number, its rows in the log, the share drawn in proportion to the campaign's distribution."""
+
+    number: int
+    rows: Rows
+    nominal: float
+
+
+def _counted(log: Log) -> Iterator[_Draws]:
+    """Yield every complete batch that counts."""
+    history = log.history
+    for batch in log.iterations if DRAWN in history.stage else ():
+        draws = batch.read(EstimationProposal).counted
+        rows = np.flatnonzero((history.stage == DRAWN) & (history.iteration == batch.number))
+        if draws is not None and len(rows) == len(draws.coefficient):
+            yield _Draws(batch.number, rows, draws.nominal)
+
+
+def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
+    """Refuse what cannot be answered from these runs."""
+    history, metric = log.history, settings.scenario.requirement.metric
+    if NOMINAL not in history.stage and next(_counted(log), None) is None:
+        rule = "only draws with known densities can be counted again, but this campaign has none that count"
+        raise InputError(f"{rule}: run an estimation with acquisition.kind difference or monte_carlo")
+    if metric not in history.metrics and history.ok.any():
+        raise InputError(f"a metric must be one that the runs measured ({', '.join(history.metrics)}), but got '{metric}'")
+    for old, new in zip(settings.scenario.space.parameters, space.parameters, strict=True):
+        x = np.arange(len(new.choices), dtype=np.float64) if new.choices else new.from_normal(_SCORES)
+        outside = x[~np.isfinite(old.log_density(x))]
+        if len(outside):
+            rule = f"input {new.name} must stay where the campaign drew it, in {old.range}"
+            raise InputError(f"{rule}, but is to reach {outside.min():.6g} to {outside.max():.6g}: run a campaign there")
+
+
+def _predicted(
+    log: Log, settings: Settings, space: ParameterSpace, draws: list[_Draws]
+) -> Iterator[tuple[Vector, Predicted | None]]:
+    """Yield P(critical) at the draws of each batch, by a metamodel of earlier runs only, and over a pool of its own."""
+    old, history = settings.scenario.space, log.history
+    step = -(-len(draws) // _FITS)
+    for k, batch in enumerate(draws):
+        if k % step == 0:
+            known = Known.of(history.where(history.iteration < batch.number), Coordinates(old), settings)
+            learned = None if settings.learner is None else known.learn(stream(settings.seed, "fit", batch.number))
+            if learned is not None:
+                mixture = _mixture(learned, known, old, space, stream(settings.seed, "again", batch.number))
+        if learned is None:
+            yield np.zeros(len(batch.rows)), None
+            continue
+        z, stratum = mixture.sample(_POOL, stream(settings.seed, "again pool", batch.number))
+        x = space.from_normal(z)
+        log_w = log_normal(z) - mixture.log_density(z)
+        if space.constraints:
+            log_w = np.where(space.feasible(x), log_w - np.log(space.feasible_mass), -np.inf)
+        at_draws, at_pool = (np.exp(learned(old.to_normal(points))[0]) for points in (history.x[batch.rows], x))
+        yield at_draws, Predicted(x, np.exp(log_w) / _POOL, at_pool, stratum)
+
+
+def _mixture(
+    learned: LogProbability, known: Known, old: ParameterSpace, space: ParameterSpace, rng: np.random.Generator
+) -> Mixture:
+    """Return a proposal for points that the metamodel takes for critical, in proportion to the new distribution."""
+    choices = choice_scores(space)
+    blank = Mixture(wide_scales(Coordinates(space).bounded), choices=choices)
+    hits = old.from_normal(known.z[known.critical])
+    hits = space.to_normal(hits[np.isfinite(space.log_density(hits))])
+    hits = hits[(np.abs(hits) < _FAR).all(axis=1)]
+    if not len(hits):
+        return blank
+
+    def mass(z: Points) -> Vector:
+        return log_normal(z) + learned(old.to_normal(space.from_normal(z)))[0]
+
+    z, log_q = blank.sample_near(_CANDIDATES, hits, rng)
+    return fit_mixture((particles(mass, z, log_q, _PARTICLES, rng),), blank.wide, rng, choices=choices)

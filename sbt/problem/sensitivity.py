@@ -1,0 +1,162 @@
+"""The numbers by which the distribution of the inputs is given, one by one: their scores, and densities with one changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sbt.errors import InputError
+from sbt.problem.arrays import Points, Vector
+from sbt.problem.distribution import Distribution
+from sbt.problem.parameter import Parameter
+from sbt.problem.space import ParameterSpace
+
+__all__ = ["SpaceParameter", "space_parameters"]
+
+LogDensity = Callable[[Points], Vector]
+
+_STEP = 1e-4
+"""Of a central difference of the log density, relative to the scale of the parameter: its error is about 1e-8."""
+_TENTH = 0.1
+_EVEN = 2**14
+_COVERED = 0.02
+"""By which the mean of a density ratio may miss 1 under the density below: beyond, the one above has mass elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceParameter:
+    """A number by which the distribution p of the inputs is given.
+
+    Args:
+        space: with all of them as they are.
+        input: whose; of a correlation, both inputs, joined by a comma.
+        name: such as mean; of the probability of a choice, the choice; or "correlation".
+        value: as it is.
+        scale: |value| or the standard deviation of the input, whichever is smaller, but not 0.
+        density: a value to the factor of log p that depends on it, constraints aside; raises InputError where there is none.
+    """
+
+    space: ParameterSpace
+    input: str
+    name: str
+    value: float
+    scale: float
+    density: Callable[[float], LogDensity]
+
+    @property
+    def tenth(self) -> float:
+        """10 % of the value, or of the standard deviation of the input where the value is 0."""
+        return _TENTH * (abs(self.value) or self.scale)
+
+    def score(self, x: Points) -> Vector:
+        """Return (n,) d log p(x) / d value; 0 where p ends.
+
+        With constraints, p is the density given them; their mass depends on the value too: its part is the mean score.
+        """
+        score = self._slope(x)
+        return score - float(self._slope(self._even).mean()) if self.space.constraints else score
+
+    def ratio(self, x: Points, value: float) -> Vector | None:
+        """Return (n,) p(x) with another value over p(x); None where there is no such p, or it has mass where p has none."""
+        try:
+            new, old = self.density(value), self.density(self.value)
+        except InputError:
+            return None
+
+        def free(at: Points) -> Vector:
+            with np.errstate(invalid="ignore", over="ignore"):
+                found = np.exp(new(at) - old(at))
+            return np.where(np.isfinite(found), found, 0.0)
+
+        mass = float(free(self._even).mean())
+        if self.space.constraints:
+            return free(x) / mass
+        return free(x) if abs(mass - 1.0) <= _COVERED else None
+
+    def _slope(self, x: Points) -> Vector:
+        ends = []
+        for step in (-_STEP * self.scale, _STEP * self.scale):
+            try:
+                ends.append((step, self.density(self.value + step)))
+            except InputError:  # at the end of what is possible: a difference to one side
+                ends.append((0.0, self.density(self.value)))
+        (below, first), (above, last) = ends
+        with np.errstate(invalid="ignore"):
+            slope = (last(x) - first(x)) / (above - below)
+        return np.where(np.isfinite(slope), slope, 0.0)
+
+    @cached_property
+    def _even(self) -> Points:
+        """Points that follow p, from a Sobol sequence."""
+        from scipy.special import ndtri
+        from scipy.stats import qmc
+
+        u = qmc.Sobol(self.space.dimension, scramble=True, rng=0).random(_EVEN)
+        x = self.space.from_normal(ndtri(np.clip(u, 1e-12, 1.0 - 1e-12)))
+        return x[self.space.feasible(x)] if self.space.constraints else x
+
+
+def space_parameters(space: ParameterSpace) -> Iterator[SpaceParameter]:
+    """Yield every number by which the distribution of the inputs is given, but the ends of ranges."""
+    for k, p in enumerate(space.parameters):
+        if p.choices:
+            for choice, share in zip(p.choices, p.shares.tolist(), strict=True):
+                yield SpaceParameter(space, p.name, choice, share, min(share, 1.0 - share), _chosen(space, k, choice))
+        elif p.truncated is not None and p.distribution is not None:
+            std = _std(p)
+            for name, value in p.distribution.parameters:
+                if isinstance(value, int | float):
+                    scale = min(abs(value), std) or std
+                    yield SpaceParameter(space, p.name, name, float(value), scale, _distributed(space, k, p.distribution, name))
+    matrix = np.eye(space.dimension) if space.correlation is None else np.asarray(space.correlation)
+    for i, j in zip(*np.nonzero(np.tril(matrix, -1)), strict=True):
+        pair, value = f"{space.names[j]}, {space.names[i]}", float(matrix[i, j])
+        yield SpaceParameter(space, pair, "correlation", value, min(abs(value), 1.0 - abs(value)), _correlated(space, i, j))
+
+
+def _std(parameter: Parameter) -> float:
+    """Return about the standard deviation of an input: half of the way between its normal scores -1 and 1."""
+    low, high = parameter.from_normal(np.array([-1.0, 1.0]))
+    return 0.5 * float(high - low) or 1.0
+
+
+def _factor(space: ParameterSpace, k: int, parameter: Parameter) -> LogDensity:
+    """Return the part of log p that depends on the distribution of an input."""
+    if space.correlation is None:
+        return lambda x: parameter.log_density(x[:, k])
+    rows = [*space.parameters[:k], parameter, *space.parameters[k + 1 :]]
+    return replace(space, parameters=tuple(rows), constraints=(), features=()).log_density
+
+
+def _distributed(space: ParameterSpace, k: int, old: Distribution, name: str) -> Callable[[float], LogDensity]:
+    def density(value: float) -> LogDensity:
+        new = Distribution.of(old.kind, **{**dict(old.parameters), name: value})
+        return _factor(space, k, replace(space.parameters[k], distribution=new))
+
+    return density
+
+
+def _chosen(space: ParameterSpace, k: int, choice: str) -> Callable[[float], LogDensity]:
+    p = space.parameters[k]
+    at = p.choices.index(choice)
+
+    def density(share: float) -> LogDensity:
+        """The other choices keep their proportions."""
+        rest = p.shares * (1.0 - share) / (1.0 - p.shares[at])
+        rest[at] = share
+        return _factor(space, k, replace(p, probabilities=tuple(rest.tolist())))
+
+    return density
+
+
+def _correlated(space: ParameterSpace, i: int, j: int) -> Callable[[float], LogDensity]:
+    def density(value: float) -> LogDensity:
+        matrix = np.array(space.correlation)
+        matrix[i, j] = matrix[j, i] = value
+        correlation = tuple(map(tuple, matrix.tolist()))
+        return replace(space, correlation=correlation, constraints=(), features=()).log_density
+
+    return density

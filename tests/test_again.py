@@ -1,0 +1,163 @@
+"""An estimation asked again: right under other distributions and requirements, refused where its runs cannot tell."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+from typer.testing import CliRunner
+
+import sbt
+from sbt.cli import app
+from sbt.estimators.intervals import few_hits_bound
+from sbt.estimators.reweighting import WeightedShare, defended_bound
+from sbt.problem.sensitivity import space_parameters
+
+ROOT2 = np.sqrt(2.0)
+
+
+def linear(mean: float = 0.0, std: float = 1.0, beta: float = 3.5) -> float:
+    """Return P(x1 + x2 >= beta sqrt(2)), x1 normal with these, x2 standard normal."""
+    return float(norm.sf((beta - mean / ROOT2) / np.sqrt((1.0 + std**2) / 2.0)))
+
+
+@pytest.fixture(scope="module")
+def estimated(tmp_path_factory: pytest.TempPathFactory) -> sbt.Result:
+    folder = tmp_path_factory.mktemp("again") / "store"
+    keys: dict[str, Any] = {"budget": 140, "initial": 14, "batch": 14, "stop": {"cov": None}, "executor": "serial"}
+    return sbt.run(campaign="estimation", scenario="testbed:linear_d2", seed=1, store=folder, report=False, **keys)
+
+
+@pytest.fixture(scope="module")
+def crude(tmp_path_factory: pytest.TempPathFactory) -> sbt.Result:
+    """Draws from the distribution itself: P(0.2 x + kind > 1.2), kind 0.3 or 1."""
+    scenario = sbt.Scenario(
+        "crude",
+        inputs=[sbt.Parameter("x", -4, 4, "", sbt.Normal(0.0, 1.0)), sbt.Parameter("kind", choices={"car": 0.7, "truck": 0.3})],
+        evaluate=lambda values, seed: {"y": 0.2 * values["x"] + (1.0 if values["kind"] == "truck" else 0.3)},
+        requirement=sbt.Requirement("y", low=1.2),
+    )
+    folder = tmp_path_factory.mktemp("crude") / "store"
+    return sbt.run(
+        campaign="estimation", scenario=scenario, acquisition="monte_carlo", budget=4000, stop={"cov": None}, store=folder,
+        executor="serial", report=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("mean", "std"), [(0.0, 1.0), (0.7, 1.0), (0.0, 1.4), (-0.5, 0.8)])
+def test_other_distributions(estimated, mean, std):
+    found = estimated.estimate({"x1": sbt.Normal(mean, std)})
+    assert found.low <= linear(mean, std) <= found.high
+    assert found.probability == pytest.approx(linear(mean, std), rel=0.15)
+
+
+def test_another_threshold(estimated):
+    found = estimated.estimate(critical=(-np.inf, 0.1))
+    assert found.low <= linear(beta=3.4) <= found.high
+    none = estimated.estimate(critical=(-90.0, -80.0))
+    assert (none.probability, none.low, none.exact_bound) == (0.0, 0.0, none.exact_bound)
+    assert none.exact_bound is not None
+
+
+def test_sensitivities_are_derivatives(estimated):
+    """Against the closed form: dP/dmean and dP/dstd of each input."""
+    found = estimated.sensitivity().set_index(["input", "parameter"])
+    step = 1e-4
+    by_mean = (linear(step) - linear(-step)) / (2 * step)
+    by_std = (linear(std=1 + step) - linear(std=1 - step)) / (2 * step)
+    for name in ("x1", "x2"):
+        for parameter, truth in (("mean", by_mean), ("std", by_std)):
+            row = found.loc[(name, parameter)]
+            assert abs(row["derivative"] - truth) <= 4 * row["std_error"] + 0.05 * truth
+    assert found.loc[("x1", "std")]["elasticity"] == pytest.approx(by_std / linear(), rel=0.2)
+    assert found.loc[("x1", "std")]["raised"] == pytest.approx(linear(std=1.1), rel=0.2)
+
+
+def test_draws_from_the_distribution_itself(crude):
+    found = crude.estimate({"x": sbt.Normal(0.5, 1.0), "kind": {"choices": {"car": 0.2, "truck": 0.8}}})
+    truth = 0.8 * norm.sf(0.5) + 0.2 * norm.sf(4.0)  # x > 1 of a truck, x > 4.5 of a car
+    assert found.low <= truth <= found.high
+    shares = crude.sensitivity().set_index(["input", "parameter"])
+    row = shares.loc[("kind", "truck")]
+    assert row["derivative"] == pytest.approx(norm.sf(1.0), abs=4 * row["std_error"])
+    row = shares.loc[("x", "mean")]
+    assert row["derivative"] == pytest.approx(0.3 * norm.pdf(1.0), abs=4 * row["std_error"])
+
+
+def test_what_the_runs_cannot_tell_is_refused(estimated, crude, tmp_path):
+    with pytest.raises(sbt.InputError, match="effective sample size"):
+        estimated.estimate({"x1": sbt.Normal(9.0, 0.2)})
+    with pytest.raises(sbt.InputError, match="must stay where the campaign drew it"):
+        crude.estimate({"x": {"max": 6.0}})
+    with pytest.raises(sbt.InputError, match=r"an input must be one of x1, x2, but got 'x3'.*constant"):
+        estimated.estimate({"x3": sbt.Normal(0, 1)})
+    with pytest.raises(sbt.InputError, match=r"one that the runs measured \(y\)|must be one of y"):
+        estimated.estimate(metric="ttc", critical=(0.0, 1.0))
+    other = sbt.run(
+        campaign="falsification", scenario="testbed:linear_d2", budget=10, store=tmp_path / "f", executor="serial", report=False
+    )
+    with pytest.raises(sbt.InputError, match="known densities"):
+        other.estimate()
+
+
+def test_the_command(estimated, tmp_path):
+    store, database = str(estimated.store), Path(estimated.store) / "campaign.sqlite"
+    before = hashlib.sha256(database.read_bytes()).hexdigest()
+    given = tmp_path / "other.yaml"
+    given.write_text("inputs:\n  x1: {distribution: {kind: normal, mean: 0.7, std: 1}}\n")
+    result = CliRunner().invoke(app, ["estimate-again", store, "--inputs", str(given), "--critical=-inf,0", "--json"])
+    found = json.loads(result.stdout)
+    assert found["low"] <= linear(0.7) <= found["high"]
+    assert {"input", "elasticity", "raised"} <= set(found["sensitivity"][0])
+    given.write_text("x1: {distribution: {kind: normal, mean: 0.7}}\n")
+    result = CliRunner().invoke(app, ["estimate-again", store, "--inputs", str(given)])
+    assert (result.exit_code, f"{given}:1:20: inputs.x1.distribution" in result.stderr) == (2, True)
+    assert hashlib.sha256(database.read_bytes()).hexdigest() == before
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"distribution": sbt.Normal(1.0, 0.5)}, {"distribution": sbt.LogNormal(1.0, 0.5)},
+        {"distribution": sbt.Normal(2.0, 1.0), "kind": "integer"},
+    ],
+    ids=("normal", "lognormal", "integer"),
+)  # fmt: skip
+def test_scores_are_derivatives_of_expectations(given):
+    """d E[x] / d parameter = E[x score] and E[score] = 0: truncated, correlated and constrained too."""
+    a, b = sbt.Parameter("a", 0, 4, "", **given), sbt.Parameter("b", 0, 3, "", sbt.Normal(1.0, 1.0))
+    space = sbt.ParameterSpace(
+        (a, b), correlation=((1.0, 0.4), (0.4, 1.0)), constraints=(("a + b < 5", lambda v: v["a"] + v["b"] < 5),)
+    )
+    x = space.sample(50_000, np.random.default_rng(1))
+    for each in space_parameters(space):
+        score, step = each.score(x), 0.02 * each.scale
+        assert abs(score.mean()) < 5 * score.std() / np.sqrt(len(x)) + 1e-3 * score.std()
+        ratios = [each.ratio(x, each.value + side * step) for side in (1.0, -1.0)]
+        assert all(r is not None for r in ratios)
+        moved = [float((r * x[:, 0]).mean() / r.mean()) for r in ratios if r is not None]
+        assert float(((x[:, 0] - x[:, 0].mean()) * score).mean()) == pytest.approx(
+            (moved[0] - moved[1]) / (2 * step), rel=0.05, abs=1e-2
+        )
+
+
+def test_the_bound_is_that_of_the_campaign_under_its_own_distribution():
+    nominal = np.full(50, 0.2)
+    assert defended_bound(2, nominal, np.ones(100), 0.95) == pytest.approx(few_hits_bound(2, nominal, 0.95))
+    assert defended_bound(2, nominal, np.full(100, 3.0), 0.95) == pytest.approx(min(3 * few_hits_bound(2, nominal, 0.95), 1.0))
+
+
+def test_weighted_shares_cover():
+    """Draws from N(0, 1), asked for N(1, 1): P(x > 1) = 0.5 with few draws, 400 times."""
+    rng, covered = np.random.default_rng(3), 0
+    for _ in range(400):
+        x = rng.standard_normal(300)
+        share = WeightedShare(norm.pdf(x, 1.0) / norm.pdf(x), (x > 1.0).astype(float))
+        covered += share.lower(0.975) <= 0.5 <= share.upper(0.975)
+    assert covered >= 376
+    assert WeightedShare(np.ones(100), np.zeros(100)).upper(0.95) == pytest.approx(-np.log(0.05) / 100)
