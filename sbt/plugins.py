@@ -19,7 +19,7 @@ from typing import Any, TypeVar, cast
 from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
 
-__all__ = ["KINDS", "OBJECT", "Objects", "Scope", "forget_changed", "kept", "load", "names", "noted"]
+__all__ = ["KINDS", "OBJECT", "Objects", "Scope", "forget_changed", "kept", "load", "names", "newer", "noted"]
 
 OBJECT = "object:"
 """Before the name of an object that was given in Python, where a name is asked for."""
@@ -58,6 +58,12 @@ def forget_changed() -> None:
         _stamps.clear()
         for forget in _forgetters:
             forget()
+
+
+def newer(file: Path) -> list[Path]:
+    """Return the user's files, of those that this process has read, that were changed later than a file."""
+    state = _stamp(file)
+    return sorted(path for path in _stamps if _stamp(path) > state)
 
 
 def _stamp(path: Path) -> tuple[int, int]:

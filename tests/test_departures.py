@@ -156,7 +156,7 @@ def test_an_ego_that_may_wait_does_as_long_as_it_may(case):
 
 
 @pytest.mark.sumo
-@pytest.mark.parametrize(("depart", "step"), [("0.05", "0.1"), ("0.1", "0.1"), ("0.25", "0.1"), ("1.01", "0.5"), ("0.3", "0.05")])
+@pytest.mark.parametrize(("depart", "step"), [("0.05", "0.1"), ("0.1", "0.1"), ("0.25", "0.1"), ("1.01", "0.5"), ("0.3", "0.05"), *((f"1.{k:05d}", "0.1") for k in (40, 50, 90, 96, 100, 9949, 9951))])
 def test_rounding_to_a_step_is_no_delay(case, depart, step):
     assert case(car("ego", "${p}", depart=depart, speed="5", more=""), step_length=step)[0] == "ok"
 

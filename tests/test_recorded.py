@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sbt.errors import InputError
+from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.fcd import read_fcd
 from sbt.metrics.tracks import read_meta, read_recording
+from sbt.problem.outcome import Status
 from sbt.sumo.recorded import recorded_tracks
 from sbt.sumo.recorded_net import extent, motorway
 
@@ -173,6 +174,16 @@ def test_a_contact_with_one_of_them_ends_the_run_and_sumo_lists_it(tmp_path):
     assert trace.ended == "collision"
     assert trace.reported[0].startswith("av>4")
     assert trace.unconfirmed == ()
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize(
+    ("begin", "words"), [("4.5", "must last as long as the run"), ("500", "ends at 5 s"), ("-9", "must have begun")]
+)
+def test_a_run_outside_the_recording_is_invalid(tmp_path, begin, words):
+    with pytest.raises(RunError, match=words) as error:
+        traced(tmp_path, begin=f"${{{begin} + t}}", place=10, speed=5, t=0)
+    assert error.value.status == Status.INVALID
 
 
 @pytest.mark.sumo

@@ -94,6 +94,9 @@ def test_what_is_exported_is_the_run(stored: dict[str, Run], tmp_path: Path):
     names = {path.name for path in out.iterdir()}
     assert names == {"trace.csv", "fcd.xml", "street.net.xml", "scene.add.xml", "scene.sumocfg"}
     assert (out / "trace.csv").read_bytes() == (tmp_path / "t.csv").read_bytes()
+    nowhere = CliRunner().invoke(app, ["replay", str(folder), "1", "--gif", str(tmp_path / "nowhere" / "a.gif")])
+    assert nowhere.exit_code == 2
+    assert "must be in a folder that is there" in nowhere.output
     recording = read_fcd(out / "fcd.xml")
     assert sorted(recording.names) == sorted(trace.actors)
     assert sorted(recording.length.tolist()) == sorted(trace.length.tolist())

@@ -35,6 +35,7 @@ def replay(
         from sbt.workflows.judging import judge_run, judgement_line, stored_judgements, with_driver
         from sbt.workflows.running import replay_run
         from sbt.workflows.showing import show_replay
+        from sbt.workflows.study import changed_since
 
         again = replay_run(folder, run)
         asked = None if driver is None else [driver]
@@ -49,6 +50,7 @@ def replay(
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),
             "metrics": dict(outcome.metrics), "identical": same, "reason": outcome.reason,
             "ended": states.ended if states is not None else "",
+            **({"unconfirmed": outcome.unconfirmed} if outcome.unconfirmed else {}),
             **({"preventable": [vars(each) for each in judgements]} if judgements else {}),
         })  # fmt: skip
     else:
@@ -56,9 +58,11 @@ def replay(
         print(f"run {record.index}, seed {record.seed}: {outcome.status}{ended}")
         for name, value in outcome.metrics.items():
             print(f"  {name:<23} {value:.6g}")
+        if outcome.unconfirmed:
+            print(f"  doubtful: {outcome.unconfirmed}")
         print("identical to the stored run" if same else "NOT identical to the stored run")
         if judgements:
             print("\n".join(["with a reference driver in the place of ego:", *map(judgement_line, judgements)]))
     if not same:
         now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
-        raise fail(f"a replay must equal the stored run, but got {now}, not {stored}", Exit.INTERNAL)
+        raise fail(f"a replay must equal the stored run, but got {now}, not {stored}{changed_since(folder)}", Exit.INTERNAL)

@@ -20,12 +20,14 @@ METRIC_NAME = "conflict_type"
 """Name of the metric."""
 _SIDES = ("ahead of ego", "left of ego", "behind ego", "right of ego")
 _COURSES = ("same direction", "crossing from the right", "oncoming", "crossing from the left")
+_STANDING, _STANDS = 16, 0.1
+"""Added where the ego stands, slower than this (m/s): who was hit at rest did not hit."""
 _NOBODY = -1
 """Value if there is no other road user within 1 km."""
 
 
 def conflict_type(ego: str = "ego") -> Metric:
-    """Return the metric `conflict_type`: 4 side + course at the smallest distance; -1 with nobody within 1 km.
+    """Return the metric `conflict_type`: 4 side + course at the smallest distance, + 16 where ego stands; -1: nobody within 1 km.
 
     Side: 0 ahead, 1 left, 2 behind, 3 right of the ego's rectangle, by the side that the other is farther away from.
     Course: heading of the other relative to the ego's; 0 the same, 1 turned left by 45 to 135 degrees (it comes from
@@ -51,7 +53,7 @@ def conflict_type(ego: str = "ego") -> Metric:
 
     return Metric(
         METRIC_NAME, function, "", "low", _NOBODY,
-        "side of ego and course of the nearest other, when nearest: 4 side + course, -1 nobody",
+        "side of ego and course of the nearest other, when nearest: 4 side + course, + 16 where ego stands, -1 nobody",
     )  # fmt: skip
 
 
@@ -73,16 +75,17 @@ def _code(ego: ActorTrace, other: ActorTrace, k: int) -> int:
     outside_across = abs(across) - 0.5 * (ego.width + s * other.length + c * other.width)
     lengthwise = 0 if along >= 0 else 2
     side = lengthwise if outside_along >= outside_across else 1 if across > 0 else 3
-    return 4 * side + round(turned / (0.5 * math.pi)) % 4
+    return 4 * side + round(turned / (0.5 * math.pi)) % 4 + (_STANDING if abs(ego.speed[k]) < _STANDS else 0)
 
 
 def describe_conflict_type(code: float) -> str:
     """Return a conflict type as text; "" for nobody.
 
-    >>> describe_conflict_type(0.0), describe_conflict_type(13.0), describe_conflict_type(-1.0)
-    ('ahead of ego, same direction', 'right of ego, crossing from the right', '')
+    >>> describe_conflict_type(0.0), describe_conflict_type(29.0), describe_conflict_type(-1.0)
+    ('ahead of ego, same direction', 'right of ego, crossing from the right, ego stands', '')
     """
-    return "" if code < 0 else f"{_SIDES[int(code) // 4]}, {_COURSES[int(code) % 4]}"
+    standing, kind = divmod(int(code), _STANDING)
+    return "" if code < 0 else f"{_SIDES[kind // 4]}, {_COURSES[kind % 4]}{', ego stands' if standing else ''}"
 
 
 CONFLICT_TYPE = conflict_type()

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.metrics.geometry import contact_share, part_pairs
+from sbt.metrics.geometry import contact_share, part_pairs, rectangle_distance
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import first_contact
 from sbt.problem.arrays import Vector
@@ -21,7 +21,11 @@ __all__ = ["HORIZON", "path_of", "ttc_on_paths"]
 HORIZON = 5.0
 """Time to collision of road users that do not interact, and the largest value reported (s)."""
 _STEP = 0.2
-"""Step of the prediction (s); in between, centres move on straight lines and contacts are found exactly."""
+"""Step of the prediction (s); in between, centres move on straight lines, with the headings at its end."""
+_SPLIT, _FINEST = 8, 0.01
+"""A step in which rectangles that turn would touch, but do not at that time, is divided by so much, down to this (s)."""
+_TOUCH = 0.02
+"""Rectangles touch where they are so close at the time of their contact (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +68,46 @@ def _predict_contacts(a: ActorTrace, b: ActorTrace, times: Vector) -> None:
         moved = np.hypot(np.diff(dx, axis=1), np.diff(dy, axis=1))
         rows, steps = np.nonzero(np.hypot(dx[:, 1:], dy[:, 1:]) <= reach + moved)  # circumscribed circles first
         share = contact_share(_states(a, p, rows, steps + 1), _states(b, q, rows, steps + 1), dx[rows, steps], dy[rows, steps])
-        np.minimum.at(times, near[rows], _STEP * (steps + share))
+        hit = np.flatnonzero(share <= 1.0)
+        found = _confirmed(a, b, near[rows[hit]], _STEP * steps[hit], share[hit], _STEP)
+        np.minimum.at(times, near[rows[hit]], found)
+
+
+def _confirmed(a: ActorTrace, b: ActorTrace, rows: np.ndarray, start: Vector, share: np.ndarray, length: float) -> Vector:
+    """Return the (n,) times of contacts that were found in steps of the prediction (s after the instants), inf for none.
+
+    A step knows one heading, so that the tail of a truck that turns may seem to touch what it passes; such steps are divided.
+
+    Args:
+        a, b: the actors.
+        rows: (n,) instants from which is predicted.
+        start: (n,) begin of the steps (s after the instants).
+        share: (n,) of the step that passes until the contact.
+        length: of the steps (s).
+    """
+    found: Vector = start + share * length
+    at = found[:, None]
+    distance = rectangle_distance(*(_states(c, _predict(c, rows, at), np.arange(len(rows)), 0) for c in (a, b)))
+    apart = np.flatnonzero(distance > _TOUCH)
+    if len(apart) == 0:
+        return found
+    found[apart] = np.inf
+    if length > _FINEST:
+        fine = length / _SPLIT
+        begins = (start[apart, None] + fine * np.arange(_SPLIT)).ravel()
+        inner, ends = np.repeat(rows[apart], _SPLIT), np.stack([begins, begins + fine], axis=1)
+        p, q = _predict(a, inner, ends), _predict(b, inner, ends)
+        every = np.arange(len(inner))
+        shares = contact_share(_states(a, p, every, 1), _states(b, q, every, 1), (q.x - p.x)[:, 0], (q.y - p.y)[:, 0])
+        hit = np.flatnonzero(shares <= 1.0)
+        times = np.full(len(inner), np.inf)
+        times[hit] = _confirmed(a, b, inner[hit], begins[hit], shares[hit], fine)
+        found[apart] = times.reshape(-1, _SPLIT).min(axis=1)
+    return found
 
 
 def _predict(actor: ActorTrace, rows: np.ndarray, after: Vector) -> _Prediction:
-    """Return the prediction for the times `after` (s) each of the instants `rows`; NaN once it has left the road."""
+    """Return the prediction for the times `after` (s), (k,) or (n, k), each of the n instants `rows`; NaN once it has left."""
     x, y, heading = path_of(actor)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     travelled = way[rows, None] + actor.speed[rows, None] * after
@@ -91,7 +130,7 @@ def path_of(actor: ActorTrace) -> tuple[Vector, Vector, Vector]:
     return x, y, np.unwrap(heading)
 
 
-def _states(actor: ActorTrace, prediction: _Prediction, rows: np.ndarray, steps: np.ndarray) -> ActorTrace:
+def _states(actor: ActorTrace, prediction: _Prediction, rows: np.ndarray, steps: np.ndarray | int) -> ActorTrace:
     """Return the predicted states at the given rows and steps, one after another."""
     still = np.zeros(len(rows))
     x, y, heading = (field[rows, steps] for field in (prediction.x, prediction.y, prediction.heading))

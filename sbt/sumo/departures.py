@@ -26,7 +26,7 @@ from sbt.sumo.waiting import why_held_back
 __all__ = ["DepartureMonitor", "RequestedDeparture", "WaitingEgo", "number_or_none", "requested_departures"]
 
 _TOLERANCE = 1e-3
-"""Difference that is accepted (s, m, m/s): SUMO counts time in milliseconds."""
+"""Difference that is accepted (m, m/s)."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,11 @@ def number_or_none(value: Any) -> float | None:
         return None
 
 
+def _milliseconds(time: float) -> int:
+    """Return a time (s) as SUMO counts it; its own rounding, so that what it takes for the next step is so here."""
+    return int(time * 1000.0 + math.copysign(0.5, time))
+
+
 class DepartureMonitor:
     """Compares each vehicle in the step in which it departs, or should.
 
@@ -156,7 +161,7 @@ class DepartureMonitor:
         for name in sorted(departed.intersection(self._requested)):
             self._compare(name, self._requested.pop(name), dt)
         simulated = float(self._sumo.simulation.getTime()) - dt
-        while self._due and self._due[0][0] <= simulated + _TOLERANCE:
+        while self._due and _milliseconds(self._due[0][0]) <= _milliseconds(simulated):
             at, name = heapq.heappop(self._due)
             if at == self._deadline(name):
                 self._refuse(name)
@@ -180,9 +185,9 @@ class DepartureMonitor:
         if now - begin > self._ego.wait:
             self._refuse(name)
 
-    def _deadline(self, name: str) -> float:
+    def _deadline(self, name: str, requested: RequestedDeparture | None = None) -> float:
         """Return until when a vehicle must have departed (s); inf where that is not known, or nothing is expected."""
-        requested = self._requested.get(name)
+        requested = self._requested.get(name) if requested is None else requested
         if requested is None or requested.depart is None or requested.of_flow:
             return math.inf
         return requested.depart + self._allowed(name)
@@ -222,7 +227,7 @@ class DepartureMonitor:
 
     def _when(self, name: str, requested: RequestedDeparture) -> str:
         """Return until when a vehicle must depart, as text."""
-        if self._deadline(name) < math.inf:
+        if self._deadline(name, requested) < math.inf:
             delay = self._allowed(name)
             return f" at t = {requested.depart:g} s" if not delay else f" within {delay:g} s of t = {requested.depart:g} s"
         limit = self._ego.wait if self._ego.delay is None else self._ego.delay
@@ -234,8 +239,7 @@ class DepartureMonitor:
             return
         vehicle = self._sumo.vehicle
         departure = vehicle.getDeparture(name)
-        late = 0.0 if requested.depart is None or requested.of_flow else departure - requested.depart - self._allowed(name)
-        if late > dt - _TOLERANCE:
+        if self._deadline(name, requested) < math.inf and self._late(departure, self._deadline(name, requested), dt):
             rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
             raise RunError(Status.INVALID, f"{rule}, but SUMO inserted it at t = {departure:g} s")
         lane = vehicle.getLaneID(name)
@@ -256,10 +260,15 @@ class DepartureMonitor:
                     f"but SUMO inserted it with {actual:g}{unit}: {remedy}",
                 )
 
+    @staticmethod
+    def _late(departure: float, deadline: float, dt: float) -> bool:
+        """Return whether a departure (s) is a step (s) or more behind its deadline (s)."""
+        return _milliseconds(departure) - _milliseconds(deadline) >= _milliseconds(dt)
+
     def _compare_person(self, name: str, requested: RequestedDeparture, dt: float) -> None:
         """Compare time and position of a person in the step in which it begins to walk."""
         departure = float(self._sumo.simulation.getTime()) - dt
-        if requested.depart is not None and departure - requested.depart > dt - _TOLERANCE:
+        if requested.depart is not None and self._late(departure, requested.depart, dt):
             rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
             raise RunError(Status.INVALID, f"{rule}, but SUMO inserted it at t = {departure:g} s")
         domain = self._sumo.person

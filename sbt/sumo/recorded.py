@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sbt.errors import InputError, did_you_mean
+from sbt.errors import InputError, RunError, did_you_mean
 from sbt.metrics.fcd import Recording
 from sbt.metrics.tracks import read_recording
 from sbt.plugins import kept, noted
 from sbt.problem.arrays import Vector
+from sbt.problem.outcome import Status
 from sbt.sumo.guided import Motion, Placed
 from sbt.sumo.session import unwrapped
 from sbt.sumo.template import fill
@@ -34,6 +35,8 @@ _GAP = 1.5
 _TELEPORT = 150.0
 """A road user whose position changes faster was teleported (m/s); its track is interrupted there."""
 _SLACK = 1e-6
+_UNRECORDED = 1.0
+"""A run may begin so long before a recording, and end so long after it (s)."""
 _WAITING_TIME = 1e6
 _SHAPES = {
     "truck": "truck", "truck_bus": "truck", "bus": "bus", "bicycle": "bicycle", "motorcycle": "motorcycle", "van": "delivery",
@@ -64,16 +67,22 @@ class Track(NamedTuple):
         return self.kind == "person"
 
 
-@kept
 def recorded_tracks(path: Path) -> tuple[Track, ...]:
     """Return the tracks of a recording, by the time of their beginning; each file is read once per process.
 
     Raises:
         InputError: it cannot be read.
     """
+    return _recorded(path)[0]
+
+
+@kept
+def _recorded(path: Path) -> tuple[tuple[Track, ...], _Span]:
+    """Return the tracks of a recording, and its span."""
     recording = read_recording(noted(path))
     found = [track for k in range(len(recording.names)) for track in _tracks(recording, k)]
-    return tuple(sorted(found, key=lambda track: (float(track.time[0]), track.name)))
+    span = _Span(path, float(recording.time[0]), float(recording.time[-1]))
+    return tuple(sorted(found, key=lambda track: (float(track.time[0]), track.name))), span
 
 
 def _tracks(recording: Recording, k: int) -> list[Track]:
@@ -125,7 +134,30 @@ class RecordedTraffic:
         """Return what moves the road users in one run."""
         left_out = {name for track in recorded_tracks(self.path) for name in self.without if track.name.partition("#")[0] == name}
         tracks = [t for t in recorded_tracks(self.path) if t.name.partition("#")[0] not in left_out]
-        return _Replay(sumo, tracks, float(fill(self.at_zero, values)), self.offset)
+        return _Replay(sumo, tracks, float(fill(self.at_zero, values)), self.offset, _recorded(self.path)[1])
+
+
+class _Span(NamedTuple):
+    """From when to when there is a recording (s)."""
+
+    path: Path
+    first: float
+    last: float
+
+    def check(self, now: float) -> None:
+        """Refuse a time (s) that was not recorded: an empty road there would say nothing of the vehicle under test.
+
+        Raises:
+            RunError: the recording has not begun, or is over.
+        """
+        if now < self.first - _UNRECORDED:
+            rule = f"recorded: {self.path.name} must have begun when the ego departs, but it begins at {self.first:g} s"
+            raise RunError(Status.INVALID, f"{rule} of its time, and the run is at {now:g} s: change begin (recorded) or depart")
+        if now > self.last + _UNRECORDED:
+            rule = f"recorded: {self.path.name} must last as long as the run, but it ends at {self.last:g} s"
+            raise RunError(
+                Status.INVALID, f"{rule} of its time, and the run is at {now:g} s: change begin (recorded), depart or duration"
+            )  # fmt: skip
 
 
 class _Moving(NamedTuple):
@@ -139,8 +171,8 @@ class _Moving(NamedTuple):
 class _Replay:
     """Moves recorded road users during one run."""
 
-    def __init__(self, sumo: Any, tracks: list[Track], at_zero: float, offset: tuple[float, float]):
-        self._sumo, self._at_zero, self._offset = sumo, at_zero, offset
+    def __init__(self, sumo: Any, tracks: list[Track], at_zero: float, offset: tuple[float, float], span: _Span):
+        self._span, self._sumo, self._at_zero, self._offset = span, sumo, at_zero, offset
         self._dt = float(sumo.simulation.getDeltaT())
         self._waiting = deque(tracks)
         self._moving: dict[str, _Moving] = {}
@@ -156,6 +188,8 @@ class _Replay:
     def before_step(self, t: float | None) -> None:
         """Move everybody to where they were at the end of the step."""
         now = self._sumo.simulation.getTime() + self._at_zero
+        if t is not None:
+            self._span.check(now)
         while self._waiting and self._waiting[0].time[0] <= now + _SLACK:
             track = self._waiting.popleft()
             if track.time[-1] >= now - _SLACK:

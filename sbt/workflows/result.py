@@ -31,7 +31,7 @@ from sbt.workflows.keywords import as_data
 from sbt.workflows.plots import Plots
 from sbt.workflows.running import Replay, rebuild_report, replay_run
 from sbt.workflows.showing import net_of_run, save_film, shown_trace
-from sbt.workflows.study import Study
+from sbt.workflows.study import Study, changed_since
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -210,7 +210,8 @@ class Result(Generic[C]):
         again = replay_run(self.store, run, objects=self.objects)
         if not again.identical:
             now, stored = f"{again.outcome.status} {dict(again.outcome.metrics)}", dict(again.record.metrics)
-            raise StoreError(f"a replay must equal the stored run {run}, but got {now}, not {again.record.status} {stored}")
+            rule = f"a replay must equal the stored run {run}, but got {now}, not {again.record.status} {stored}"
+            raise StoreError(rule + changed_since(self.store))
         return again
 
     def trace(self, run: int) -> pd.DataFrame:

@@ -26,7 +26,7 @@ from sbt.store.database import Store
 from sbt.store.history import Record
 from sbt.workflows.asking import sensitivities_in
 from sbt.workflows.judging import judge_campaign
-from sbt.workflows.study import RESOLVED, Study
+from sbt.workflows.study import RESOLVED, Study, changed_since
 
 __all__ = ["Replay", "Summary", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
 
@@ -135,8 +135,9 @@ def _check_code(store: Store, study: Study, executor: Executor) -> None:
         record = next(each for each in records if each.index == outcome.index)
         if dict(outcome.metrics) != dict(record.metrics):
             now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics)
-            rule = f"code must give the runs of {store.folder} again to go on there, but run {record.index} now gives {now}"
-            raise InputError(f"{rule}, not {stored}; choose another store for changed code")
+            rule = f"code and files must give the runs of {store.folder} again to go on there, but run {record.index} now gives {now}"
+            remedy = "choose another store for what has changed"
+            raise InputError(f"{rule}, not {stored}{changed_since(store.folder)}; {remedy}")
 
 
 def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> None:

@@ -39,16 +39,19 @@ def show_replay(
 
     scenario, record, states = again.scenario, again.record, shown_trace(again)
     program = gui_program() if gui else ""
-    if csv is not None:
-        write_csv(csv, states)
-    if folder is not None:
-        write_folder(folder, states, net_of_run(again))
-        if hasattr(scenario.simulate, "files_of_run"):
-            session().close()
-            collect_outputs(scratch_folder(), folder / "outputs")
-            _write_sumo_files(again, folder.resolve() / "sumo")
-    if gif is not None:
-        save_film(gif, states, scenario, f"{scenario.name}, run {record.index}: {_result(again)}", net_of_run(again))
+    try:
+        if csv is not None:
+            write_csv(csv, states)
+        if folder is not None:
+            write_folder(folder, states, net_of_run(again))
+            if hasattr(scenario.simulate, "files_of_run"):
+                session().close()
+                collect_outputs(scratch_folder(), folder / "outputs")
+                _write_sumo_files(again, folder.resolve() / "sumo")
+        if gif is not None:
+            save_film(gif, states, scenario, f"{scenario.name}, run {record.index}: {_result(again)}", net_of_run(again))
+    except OSError as error:
+        raise InputError(f"a place to write to must be in a folder that is there, but {error.filename}: {error.strerror}") from None
     return not gui or run_in_gui(scenario.simulate, record.inputs, record.seed, program, ego=states.actors[0]).identical(states)
 
 

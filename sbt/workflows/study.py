@@ -19,17 +19,23 @@ from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
 from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.stages import Campaign, Conclusion, Shard
-from sbt.plugins import Objects, Scope
+from sbt.plugins import Objects, Scope, newer
 from sbt.problem.description import describe_scenario, is_complete, rebuild_scenario
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History
 
-__all__ = ["RESOLVED", "Study"]
+__all__ = ["RESOLVED", "Study", "changed_since"]
 
 RESOLVED = "config.resolved.yaml"
 """The configuration with its defaults, in a store's folder."""
+
+
+def changed_since(folder: Path) -> str:
+    """Return in words which of the scenario's files were changed after the campaign in a folder last began; "" for none."""
+    names = [str(path) for path in newer(folder / RESOLVED)]
+    return f"; changed since: {', '.join(names)}" if names else ""
 
 
 @dataclass(frozen=True, eq=False)
