@@ -248,7 +248,8 @@ def test_the_conflict_type_is_side_and_course_wherever_north_is(side, course, of
     xs, ys, headings = np.moveaxis(np.stack([before, now, np.full_like(now, np.nan)]), 2, 0).copy()
     still = np.zeros_like(xs)
     sizes = np.full(3, 2.0), np.full(3, 2.0)  # as wide as long: bearings alone decide
-    trace = Trace(np.arange(3.0), ("ego", "co", "far"), xs, ys, headings, still, still, *sizes)
-    assert conflict_type()(trace) == 4 * side + course
+    standing = Trace(np.arange(3.0), ("ego", "co", "far"), xs, ys, headings, still, still, *sizes)
+    trace = replace(standing, speed=still + 1.0)
+    assert conflict_type()(trace) == conflict_type()(standing) - 16 == 4 * side + course
     assert conflict_type("nobody")(trace) == 4 * side + course
     assert conflict_type()(replace(trace, x=np.where([True, False, False], xs, np.nan))) == -1

@@ -12,7 +12,7 @@ from own_scenarios import make, program, tools
 
 from sbt.config.scenario_file import from_file
 from sbt.metrics.closeness import path_clearance, worst_pair
-from sbt.metrics.geometry import select_instants
+from sbt.metrics.geometry import rectangle_distance, select_instants
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.paths import path_of, ttc_on_paths
@@ -147,3 +147,26 @@ def test_ways_are_those_that_are_driven(tmp_path: Path):
     assert max(off) < 1.0, f"{off} m: where a car turns round"
     assert max(apart) < 0.05
 
+
+
+@pytest.mark.parametrize("gap", [-0.3, -0.05, 0.07, 0.2, 1.0])
+def test_the_tail_of_what_turns_touches_only_what_it_hits(gap):
+    """A long rectangle turns past a standing car: a contact is predicted exactly where there will be one, and for that time."""
+    turn = 0.8 * np.arange(0.0, 2.5, 0.05)
+    x, y = 10.0 * np.cos(turn), 10.0 * np.sin(turn)
+    outer = np.hypot(10.0 + 1.25, 4.0)  # of the corner of the truck that reaches farthest out
+    far = outer + gap + 1.0
+    at = 0.8 * 1.5
+    ones = np.ones_like(turn)
+    xs, ys = np.stack([far * np.cos(at) * ones, x], 1), np.stack([far * np.sin(at) * ones, y], 1)
+    headings, speeds = np.stack([at * ones, turn], 1) + 0.5 * np.pi, np.stack([0 * ones, 8.0 * ones], 1)
+    sizes = np.array([4.0, 8.0]), np.array([2.0, 2.5])
+    trace = Trace(np.arange(0.0, 2.5, 0.05), ("ego", "truck"), xs, ys, headings, speeds, 0 * speeds, *sizes)
+    distance = rectangle_distance(trace.actor("ego"), trace.actor("truck"))
+    touched = np.flatnonzero(distance == 0.0)
+    times = ttc_on_paths(trace, "ego", "truck")[trace.time < 1.0]
+    if len(touched):
+        assert times + trace.time[: len(times)] == pytest.approx(trace.time[touched[0]], abs=0.06)
+    else:
+        assert distance.min() > 0.0
+        assert (times > 1.4).all(), "what comes after the recording goes straight on"

@@ -96,14 +96,21 @@ def check(
 ) -> None:
     """Check a scenario: its corners run, and one seed gives one trace, in every process and at every isolation level."""
     with clean_stdout():
-        from sbt.workflows.front import check_target
+        from sbt.workflows.front import Checked, findings_in
 
         _check_choices(None, None, isolation)
-        checked = check_target(target, seed=seed, isolation=isolation)
+        coming, found = findings_in(target, seed=seed, isolation=isolation), []
+    while True:
+        with clean_stdout():
+            finding = next(coming, None)
+        if finding is None:
+            break
+        found.append(finding)
+        if not as_json:
+            print(finding, flush=True)
+    checked = Checked(tuple(found))
     if as_json:
         print_json({"target": target, **checked.to_dict()})
-    else:
-        print(checked)
     if not checked.ok:
         broken = sum(not finding.ok for finding in checked.findings)
         raise fail(f"{target}: {broken} of {len(checked.findings)} rules are broken", Exit.INPUT)

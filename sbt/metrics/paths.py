@@ -6,11 +6,11 @@ assumed to follow their own recorded paths, and then the lanes of their routes; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.metrics.geometry import contact_share, part_pairs, rectangle_distance
+from sbt.metrics.geometry import contact_share, part_pairs
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import first_contact
 from sbt.problem.arrays import Vector
@@ -22,10 +22,10 @@ HORIZON = 5.0
 """Time to collision of road users that do not interact, and the largest value reported (s)."""
 _STEP = 0.2
 """Step of the prediction (s); in between, centres move on straight lines, with the headings at its end."""
-_SPLIT, _FINEST = 8, 0.01
-"""A step in which rectangles that turn would touch, but do not at that time, is divided by so much, down to this (s)."""
-_TOUCH = 0.02
-"""Rectangles touch where they are so close at the time of their contact (m)."""
+_TURNED = 0.02
+"""A step in which a corner moves by more than this because its rectangle turns (m) is divided ..."""
+_SPLIT, _FINEST = 4, 0.02
+"""... by so much, down to this (s): else the tail of a truck that turns seems to touch what it passes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,43 +67,40 @@ def _predict_contacts(a: ActorTrace, b: ActorTrace, times: Vector) -> None:
         dx, dy = q.x - p.x, q.y - p.y  # (t, k)
         moved = np.hypot(np.diff(dx, axis=1), np.diff(dy, axis=1))
         rows, steps = np.nonzero(np.hypot(dx[:, 1:], dy[:, 1:]) <= reach + moved)  # circumscribed circles first
-        share = contact_share(_states(a, p, rows, steps + 1), _states(b, q, rows, steps + 1), dx[rows, steps], dy[rows, steps])
-        hit = np.flatnonzero(share <= 1.0)
-        found = _confirmed(a, b, near[rows[hit]], _STEP * steps[hit], share[hit], _STEP)
-        np.minimum.at(times, near[rows[hit]], found)
+        np.minimum.at(times, near[rows], _contact_times(a, b, near[rows], _STEP * steps, _STEP))
 
 
-def _confirmed(a: ActorTrace, b: ActorTrace, rows: np.ndarray, start: Vector, share: np.ndarray, length: float) -> Vector:
-    """Return the (n,) times of contacts that were found in steps of the prediction (s after the instants), inf for none.
-
-    A step knows one heading, so that the tail of a truck that turns may seem to touch what it passes; such steps are divided.
+def _contact_times(a: ActorTrace, b: ActorTrace, rows: np.ndarray, start: np.ndarray, length: float) -> Vector:
+    """Return the (n,) times at which the rectangles touch in steps of the prediction (s after the instants), inf where not.
 
     Args:
-        a, b: the actors.
+        a: one actor.
+        b: the other.
         rows: (n,) instants from which is predicted.
         start: (n,) begin of the steps (s after the instants).
-        share: (n,) of the step that passes until the contact.
         length: of the steps (s).
     """
-    found: Vector = start + share * length
-    at = found[:, None]
-    distance = rectangle_distance(*(_states(c, _predict(c, rows, at), np.arange(len(rows)), 0) for c in (a, b)))
-    apart = np.flatnonzero(distance > _TOUCH)
-    if len(apart) == 0:
-        return found
-    found[apart] = np.inf
-    if length > _FINEST:
+    p, q = (_predict(actor, rows, np.stack([start, start + length], axis=1)) for actor in (a, b))
+    dx, dy = (q.x - p.x)[:, 0], (q.y - p.y)[:, 0]
+    every = np.arange(len(rows))
+    ends = _states(a, p, every, 1), _states(b, q, every, 1)
+    times: Vector = start + length * contact_share(*ends, dx, dy)
+    turned = np.zeros(len(rows))
+    for actor, predicted in ((a, p), (b, q)):
+        corner = 0.5 * np.hypot(actor.length, actor.width)
+        turned = np.fmax(turned, np.abs(np.diff(predicted.heading, axis=1)[:, 0]) * corner)
+    if length <= _FINEST or not (turned > _TURNED).any():
+        return times
+    wide = 2.0 * float(turned[turned > _TURNED].max())  # whatever is between the headings lies within
+    larger = [replace(end, length=end.length + wide, width=end.width + wide) for end in ends]
+    inside = np.flatnonzero((turned > _TURNED) & np.isfinite(contact_share(larger[0], larger[1], dx, dy)))
+    times[turned > _TURNED] = np.inf
+    if len(inside):
         fine = length / _SPLIT
-        begins = (start[apart, None] + fine * np.arange(_SPLIT)).ravel()
-        inner, ends = np.repeat(rows[apart], _SPLIT), np.stack([begins, begins + fine], axis=1)
-        p, q = _predict(a, inner, ends), _predict(b, inner, ends)
-        every = np.arange(len(inner))
-        shares = contact_share(_states(a, p, every, 1), _states(b, q, every, 1), (q.x - p.x)[:, 0], (q.y - p.y)[:, 0])
-        hit = np.flatnonzero(shares <= 1.0)
-        times = np.full(len(inner), np.inf)
-        times[hit] = _confirmed(a, b, inner[hit], begins[hit], shares[hit], fine)
-        found[apart] = times.reshape(-1, _SPLIT).min(axis=1)
-    return found
+        begins = (start[inside, None] + fine * np.arange(_SPLIT)).ravel()
+        finer = _contact_times(a, b, np.repeat(rows[inside], _SPLIT), begins, fine)
+        times[inside] = finer.reshape(-1, _SPLIT).min(axis=1)
+    return times
 
 
 def _predict(actor: ActorTrace, rows: np.ndarray, after: Vector) -> _Prediction:
@@ -130,8 +127,8 @@ def path_of(actor: ActorTrace) -> tuple[Vector, Vector, Vector]:
     return x, y, np.unwrap(heading)
 
 
-def _states(actor: ActorTrace, prediction: _Prediction, rows: np.ndarray, steps: np.ndarray | int) -> ActorTrace:
-    """Return the predicted states at the given rows and steps, one after another."""
+def _states(actor: ActorTrace, prediction: _Prediction, rows: np.ndarray, step: int) -> ActorTrace:
+    """Return the predicted states at the given rows and step, one after another."""
     still = np.zeros(len(rows))
-    x, y, heading = (field[rows, steps] for field in (prediction.x, prediction.y, prediction.heading))
+    x, y, heading = (field[rows, step] for field in (prediction.x, prediction.y, prediction.heading))
     return ActorTrace(x, y, heading, still, still, actor.length, actor.width)

@@ -16,3 +16,8 @@ class Finding:
     ok: bool
     detail: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        """Return a line: whether the rule holds, or that it only informs."""
+        mark = "note" if self.rule.startswith("for information") else "ok  "
+        return f"{mark if self.ok else 'FAIL'}  {self.rule}: {self.detail}"

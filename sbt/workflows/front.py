@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +27,7 @@ from sbt.problem.plain import Json, Value, written
 from sbt.problem.scenario import LogicalScenario, Metric, metric_from
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
-from sbt.workflows.checking import Finding, check_scenario
+from sbt.workflows.checking import Finding, findings_of
 from sbt.workflows.keywords import CampaignKeys, Setting, as_data
 from sbt.workflows.result import Result
 from sbt.workflows.running import run_study
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sbt.campaigns.estimation import EstimationConclusion
     from sbt.campaigns.failures import FalsificationConclusion
 
-__all__ = ["Checked", "Run", "check_target", "installed", "open_result", "run_campaign", "simulate_scenario"]
+__all__ = ["Checked", "Run", "check_target", "findings_in", "installed", "open_result", "run_campaign", "simulate_scenario"]
 
 
 @overload
@@ -311,7 +311,7 @@ class Checked:
 
     def __repr__(self) -> str:
         """Return a line a rule."""
-        return "\n".join(f"{'ok  ' if f.ok else 'FAIL'}  {f.rule}: {f.detail}" for f in self.findings)
+        return "\n".join(map(str, self.findings))
 
 
 def check_target(target: LogicalScenario | str | Path, *, seed: int = 0, isolation: str = "auto") -> Checked:
@@ -325,11 +325,16 @@ def check_target(target: LogicalScenario | str | Path, *, seed: int = 0, isolati
     Raises:
         InputError: it cannot be loaded.
     """
+    return Checked(tuple(findings_in(target, seed=seed, isolation=isolation)))
+
+
+def findings_in(target: LogicalScenario | str | Path, *, seed: int, isolation: str) -> Iterator[Finding]:
+    """Yield what `check_target` finds, each finding as soon as it is known."""
     plugins.forget_changed()
     if not isinstance(target, LogicalScenario) and Path(target).suffix in (".yaml", ".yml") and not is_scenario(Path(target)):
         study = Study(load(target))
-        return Checked(check_scenario(study.spec, seed, study.scenario))
-    return Checked(check_scenario(_spec(target, isolation), seed))
+        return findings_of(study.spec, seed, study.scenario)
+    return findings_of(_spec(target, isolation), seed)
 
 
 _WRITTEN = {"table": "table:FOLDER", "testbed": "testbed:NAME", "yaml": "FOLDER/scenario.yaml"}

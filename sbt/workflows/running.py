@@ -135,7 +135,7 @@ def _check_code(store: Store, study: Study, executor: Executor) -> None:
         record = next(each for each in records if each.index == outcome.index)
         if dict(outcome.metrics) != dict(record.metrics):
             now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics)
-            rule = f"code and files must give the runs of {store.folder} again to go on there, but run {record.index} now gives {now}"
+            rule = f"code and files must give the runs of {store.folder} again to go on, but run {record.index} now gives {now}"
             remedy = "choose another store for what has changed"
             raise InputError(f"{rule}, not {stored}{changed_since(store.folder)}; {remedy}")
 

@@ -51,7 +51,8 @@ def show_replay(
         if gif is not None:
             save_film(gif, states, scenario, f"{scenario.name}, run {record.index}: {_result(again)}", net_of_run(again))
     except OSError as error:
-        raise InputError(f"a place to write to must be in a folder that is there, but {error.filename}: {error.strerror}") from None
+        rule = "a place to write to must be in a folder that is there"
+        raise InputError(f"{rule}, but {error.filename}: {error.strerror}") from None
     return not gui or run_in_gui(scenario.simulate, record.inputs, record.seed, program, ego=states.actors[0]).identical(states)
 
 
