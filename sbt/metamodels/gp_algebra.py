@@ -18,8 +18,8 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector
 
 __all__ = [
-    "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "like", "matern", "native", "placed",
-    "solve", "solve_right", "squared_columns", "triangular",
+    "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "inverse_diagonal", "like", "matern", "native",
+    "placed", "solve", "solve_right", "squared_columns", "triangular",
 ]  # fmt: skip
 
 Matrix = Any
@@ -107,6 +107,13 @@ def solve(factor: Matrix, z: Vector) -> Solved:
     log_det = 2.0 * float(np.log(host(diagonal(factor))).sum())
     fit = float((right - centre) @ alpha)
     return Solved(inverse, alpha, -0.5 * (fit + log_det + len(z) * math.log(2.0 * math.pi)))
+
+
+def inverse_diagonal(factor: Matrix) -> Vector:
+    """Return the (n,) diagonal of the inverse of the covariance whose factor this is."""
+    if isinstance(factor, torch.Tensor):
+        return host(torch.cholesky_inverse(factor).diagonal())
+    return np.asarray(np.diag(lapack.dpotri(factor, lower=1)[0]))
 
 
 def solve_right(factor: Matrix, right: Points) -> Points:

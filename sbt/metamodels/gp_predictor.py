@@ -11,7 +11,17 @@ import numpy as np
 from scipy.special import ndtr
 
 from sbt.metamodels.extra_trees import ForestPredictor
-from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, host, like, placed, squared_columns, triangular
+from sbt.metamodels.gp_algebra import (
+    Hyperparameters,
+    Matrix,
+    cholesky,
+    host,
+    inverse_diagonal,
+    like,
+    placed,
+    squared_columns,
+    triangular,
+)
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import device_of, single_threaded
 from sbt.problem.arrays import Points, Vector
@@ -70,6 +80,21 @@ class GaussianProcessPredictor:
             weight=np.full(k, 1.0 / k),
             noise=common * (self.scale * np.sqrt(noise)),
         )
+
+    def leave_one_out(self, y: Vector) -> Prediction:
+        """Return the prediction of each row's y (n,) from all other rows, the hyperparameters kept; cubic in n.
+
+        Source:
+            Rasmussen & Williams (2006), eqs. (5.10)-(5.12).
+        """
+        with single_threaded():
+            variance = 1.0 / inverse_diagonal(self._placed[1])
+        relative = self.spread(self.u) if self.spread is not None else np.ones(len(y))
+        mean, k = y - self.scale * self.alpha * variance, len(self.widths)
+        return Prediction(
+            mean=np.repeat(mean[None], k, axis=0), std=self.widths[:, None] * (self.scale * np.sqrt(variance)),
+            weight=np.full(k, 1.0 / k), noise=self.scale * np.sqrt(self.hyper.noise * relative),
+        )  # fmt: skip
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) lower and (n,) upper bounds of P(y in M_c), from the mean and a bound of the variance.

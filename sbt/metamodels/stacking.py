@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from sbt.metamodels.base import Metamodel
 from sbt.metamodels.prediction import Prediction
@@ -13,9 +15,10 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Bins", "held_out_scores", "is_surely_better", "mixture_score", "stacking_weights"]
+__all__ = ["Bins", "cell_shares", "held_out_scores", "is_surely_better", "mixture_score", "stacking_weights"]
 
 _SURE = 3.0  # standard errors: with two, mixtures were taken that lost on whole campaigns (docs/boundary.md)
+_PROBES = 4096  # points that tell which part of the space a row stands for
 _ROUNDS, _MOVED = 500, 1e-6  # of expectation maximisation: at most, and the change of a weight at which it ends
 
 
@@ -64,25 +67,43 @@ class Bins:
 
 
 def held_out_scores(
-    models: Iterable[Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator, bins: Bins | None
-) -> Points:
-    """Return (k, n) log scores of each row under k models fitted to the other folds: of its bin, or its log density."""
+    models: Iterable[Metamodel], u: Points, y: Vector, folds: int, rng: np.random.Generator, bins: Bins | None,
+    rows: int | None = None,
+) -> tuple[Points, NDArray[np.intp]]:  # fmt: skip
+    """Return (k, m) log scores of rows under k models fitted to the other folds, of their bin or log density, and (m,) the rows.
+
+    All rows are scored, or as many folds of them as hold at least `rows`.
+    """
     fold, compared = rng.permutation(len(y)) % folds, list(models)
-    score = np.empty((len(compared), len(y)))
+    score = np.full((len(compared), len(y)), np.nan)
     for i in range(folds):
+        if rows is not None and int((fold < i).sum()) >= rows:
+            break
         out = fold == i
         for row, model in zip(score, compared, strict=True):
             prediction = model.fit(u[~out], y[~out], rng)(u[out])
             row[out] = prediction.log_density(y[out]) if bins is None else bins.log_score(prediction, y[out])
-    return score
+    scored = np.flatnonzero(~np.isnan(score).any(axis=0))
+    return score[:, scored], scored
 
 
-def stacking_weights(log_score: Points, prior: float) -> Vector:
+def cell_shares(u: Points, rng: np.random.Generator) -> Vector:
+    """Return (n,) the share of the unit cube that is nearest to each row u (n, d): where rows crowd, one counts less.
+
+    >>> cell_shares(np.array([[0.1], [0.12], [0.9]]), np.random.default_rng(0)).round(1).tolist()
+    [0.1, 0.4, 0.5]
+    """
+    nearest = cKDTree(u).query(rng.random((_PROBES, u.shape[1])))[1]
+    return np.asarray(np.bincount(nearest, minlength=len(u)) / _PROBES)
+
+
+def stacking_weights(log_score: Points, prior: float, counts: Vector | None = None) -> Vector:
     """Return the (k,) weights of the mixture of largest likelihood, by expectation maximisation.
 
     Args:
         log_score: (k, n) of each row under each model; -inf where a model excludes what happened.
         prior: weight of equal weights, in rows.
+        counts: (n,) how often each row counts, >= 0, n in all; None: once.
 
     Source:
         Yao et al. (2018), Using stacking to average Bayesian predictive distributions.
@@ -94,9 +115,10 @@ def stacking_weights(log_score: Points, prior: float) -> Vector:
     log_score = np.maximum(log_score, -1e300)
     density = np.exp(log_score - log_score.max(axis=0))
     n, weights = log_score.shape[1], np.full(k, 1.0 / k)
+    times = np.ones(n) if counts is None else counts
     for _ in range(_ROUNDS):
         joint = weights[:, None] * density
-        new = ((joint / joint.sum(axis=0)).sum(axis=1) + prior / k) / (n + prior)
+        new = ((joint / joint.sum(axis=0)) @ times + prior / k) / (n + prior)
         moved, weights = np.abs(new - weights).max(), new
         if moved < _MOVED:
             break
@@ -109,11 +131,17 @@ def mixture_score(log_score: Points, weights: Vector) -> Vector:
         return np.asarray(np.logaddexp.reduce(log_score + np.log(weights)[:, None], axis=0))
 
 
-def is_surely_better(log_score: Points, weights: Vector) -> bool:
+def is_surely_better(log_score: Points, weights: Vector, shares: Vector | None = None) -> bool:
     """Return whether the mixture is better than the first of the k models by three standard errors of (k, n) scores.
+
+    Args:
+        log_score: (k, n) of each row under each model.
+        weights: (k,) of the mixture.
+        shares: (n,) of the space that each row stands for (see `cell_shares`); there, too, the mixture has to be better.
 
     >>> is_surely_better(np.log([[0.5, 0.5, 0.5, 0.5], [0.8, 0.7, 0.8, 0.7]]), np.array([0.0, 1.0]))
     True
     """
     gain = mixture_score(log_score, weights) - log_score[0]
-    return float(gain.mean()) > _SURE * float(gain.std()) / len(gain) ** 0.5
+    surely = float(gain.mean()) > _SURE * float(gain.std()) / len(gain) ** 0.5
+    return surely and (shares is None or float(shares @ gain) > 0.0)
