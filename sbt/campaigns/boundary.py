@@ -14,6 +14,7 @@ from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.wording import percent
 from sbt.errors import InputError
+from sbt.estimators.binomial import interval
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
 from sbt.problem.arrays import Points
@@ -64,12 +65,28 @@ class BoundaryConclusion:
         if self.critical_fraction is not None:
             where = "the parameter space" if self.failing_fraction is None else "what gives a metric"
             found.append(f"The metamodel takes {percent(self.critical_fraction)} of {where} to be critical.")
+            found += self._disagreement(measured)
         if self.failing_fraction is not None:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
         if self.weights is not None:
             found.append(f"The metamodel chose among its members: {self.chosen_because}.")
         if self.simulator_noise is not None:
             found += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
+        return found
+
+    def _disagreement(self, measured: CriticalShare) -> list[str]:
+        """Return where the held-out runs deny what the metamodel states; nothing where they do not."""
+        found = []
+        share, scores = self.critical_fraction, self.validation
+        if share is not None and not measured.low <= share <= measured.high:
+            found.append("The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more.")
+        if scores is not None and scores.error_rate is not None and self.expected_misclassified is not None:
+            least = float(interval(round(scores.error_rate * scores.n), scores.n)[0])
+            if self.expected_misclassified < least:
+                found.append(
+                    f"The metamodel is too sure: it expects {percent(self.expected_misclassified)} on the wrong side, but of the "
+                    f"held-out runs {percent(scores.error_rate)} were (at least {percent(least)} with 97.5 % confidence)."
+                )
         return found
 
 
@@ -121,7 +138,8 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
         raise InputError("boundary points need a metamodel and two finished runs, but there are none")
     predictor = settings.learner.train(history.finished)
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
-    u = SobolSequence(space.dimension, settings.seed).points(0, 8192)
+    sequence = SobolSequence(space.dimension, settings.seed)
+    u = sequence.admissible(lambda v: space.feasible(space.from_unit(v)), 8192, 2048)
     group = np.unique(space.cube.cells(u), axis=0, return_inverse=True)[1].reshape(-1)  # there is nothing between choices
     alike = space.cube.snapped(u)
     found = np.concatenate([
