@@ -264,7 +264,10 @@ def test_exploration_ends_when_it_found_nothing_new_for_a_fifth_of_the_budget():
     nothing = log_of([(0, NEVER)] + [(2, NEVER)] * 9)
     assert fruitless_runs(with_budget(40), nothing) == 0  # as long as nothing critical is known, nothing else is worth more
     assert should_explore(with_budget(40), rare, nothing)
-    assert not should_explore(with_budget(40), common, nothing)
+    assert should_explore(with_budget(40), common, nothing)  # none of the runs that fill the space was critical
+    seen = log_of([(0, [(0.1 * k, -1.0 if k < 3 else 1.0) for k in range(10)]), (2, NEVER)])
+    assert not should_explore(with_budget(40), common, seen)
+    assert not should_explore(with_budget(40), rare, seen)  # three of ten: they deny it
     before = [(0, NEVER), (2, HIT)]
     spent = [fruitless_runs(with_budget(40), log_of(before + [(2, NEVER)] * n)) for n in range(6)]
     assert spent == [0, 2, 4, 6, 8, 10]

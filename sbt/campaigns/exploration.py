@@ -11,16 +11,17 @@ from scipy.spatial.distance import cdist
 
 from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.settings import Settings
+from sbt.estimators.binomial import interval
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.metamodels.base import simplest
-from sbt.problem.arrays import Points
+from sbt.problem.arrays import Mask, Points
 from sbt.samplers.portfolio import propose
 from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION
 
-__all__ = ["EXPLORATION_SHARE", "explore", "fruitless_runs", "should_explore"]
+__all__ = ["EXPLORATION_SHARE", "explore", "fruitless_runs", "should_explore", "space_filling"]
 
 EXPLORATION_SHARE = 0.5
 """Share of a batch that explores."""
@@ -31,11 +32,27 @@ _PATIENCE = 0.2  # of the budget: exploratory runs without a new region that end
 def should_explore(settings: Settings, fitted: FittedMetamodel, log: Log) -> bool:
     """Return whether the next batch explores: critical runs seem rare, and the exploration still finds new regions.
 
-    Rare: the mean P(critical) is below 1 %. Exploration ends when runs worth 20 % of the budget have found no new
-    region. Recorded tables are never explored.
+    Rare: at most 1 % of the runs that fill the space were critical, or the mean P(critical) is below 1 % and they do not
+    deny it. A metamodel of few runs may take ten times too much of the space to be critical; the runs know. Exploration ends
+    when runs worth 20 % of the budget have found no new region. Recorded tables are never explored.
     """
-    rare = fitted.record.critical_fraction < _RARE and settings.scenario.pool is None
-    return rare and fruitless_runs(settings, log) < _PATIENCE * settings.budget
+    if settings.scenario.pool is not None:
+        return False
+    runs = log.history.where(space_filling(log))
+    n, hits = int(runs.ok.sum()), int(settings.scenario.requirement.critical_runs(runs).sum())
+    believed = fitted.record.critical_fraction < _RARE and float(interval(hits, n)[0]) <= _RARE
+    return (hits <= _RARE * n or believed) and fruitless_runs(settings, log) < _PATIENCE * settings.budget
+
+
+def space_filling(log: Log) -> Mask:
+    """Return (n,) the runs that no metamodel chose: the first batch, held-out runs, and what filled the space in a batch."""
+    history = log.history
+    mask = (history.stage == VALIDATION) | (history.iteration == 0)
+    for k, batch in enumerate(log.iterations):
+        proposal = batch.read(BatchProposal)
+        first = proposal.explored or 0
+        mask[np.flatnonzero(history.iteration == k)[first : first + (proposal.filling or 0)]] = True
+    return mask
 
 
 def fruitless_runs(settings: Settings, log: Log) -> int:
