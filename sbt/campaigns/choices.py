@@ -30,6 +30,7 @@ from sbt.seeds import stream
 __all__ = ["ChoiceRule", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 
 _MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to particles: about a second with a GP
+_MOST_EVEN = 2**23  # where none is scored: 8,000 runs of a space of which constraints leave a thousandth
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
@@ -177,6 +178,7 @@ def _draw(
     sobol = SobolSequence(scenario.space.dimension, settings.seed)
     begin = _position(log) if start is None else start
     bound = fitted.log_ambiguity_bound if fitted is not None and acquisition is boundary else None
+    most = _MOST_EVEN if acquisition is even or fitted is None else most
     draw = rejection(
         score, sobol, n, start=begin, seed=settings.seed, label=label, max_candidates=max(most, n),
         accept_filter=_admissible(settings), bound=bound, fill=False,
@@ -205,7 +207,7 @@ def _particles(
 
     found = smc(
         inside, settings.scenario.space.dimension, rng, particles=max(1024, 2 * n), start=max(4096, 2 * n), bound=bound,
-        cube=settings.scenario.space.cube,
+        cube=settings.scenario.space.cube, uniform=_feasible(settings),
     )  # fmt: skip
     if found is None:
         return draw
@@ -214,6 +216,11 @@ def _particles(
         return draw
     picks = rng.choice(distinct, n, replace=False)
     return RoiDraw(found.u[picks], draw.positions, draw.next_position, draw.candidates, "smc", draw.acceptance)
+
+
+def _feasible(settings: Settings) -> Points | None:
+    """Return uniform feasible points where there are constraints: of a narrow space, others would find next to none."""
+    return settings.learner.probe if settings.learner is not None and settings.scenario.space.constraints else None
 
 
 def _rows(settings: Settings, log: Log, taken: Points | None) -> PoolSequence:
@@ -247,5 +254,7 @@ def _greedy(
     def snap(v: Points) -> Points:  # integers are what will be run
         return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
 
-    u, looked = propose_greedily(score, there, n, scale, rng, snap=snap, admissible=admissible, cube=space.cube)
+    u, looked = propose_greedily(
+        score, there, n, scale, rng, snap=snap, admissible=admissible, cube=space.cube, uniform=_feasible(settings)
+    )
     return space.from_unit(u), looked

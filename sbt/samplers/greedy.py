@@ -37,6 +37,7 @@ def propose_greedily(
     snap: Callable[[Points], Points] = lambda u: u,
     admissible: Callable[[Points], Mask] | None = None,
     cube: Cube = CONTINUOUS,
+    uniform: Points | None = None,
 ) -> tuple[Points, int]:
     """Return (<= n, d) points of the highest scores that lie apart, and the number of candidates scored.
 
@@ -49,12 +50,19 @@ def propose_greedily(
         snap: points to those that will be run (integers); distances and constraints are those of the latter.
         admissible: (m, d) points -> (m,) booleans; None: all are.
         cube: which coordinates take single values.
+        uniform: (k, d) uniform admissible candidates; None: drawn by the rng.
     """
-    u, value = refine_diverse(score, rng.random((_CANDIDATES, existing.shape[1])), scale, rng, cube)
+    first = rng.random((_CANDIDATES, existing.shape[1])) if uniform is None else uniform
+    u, value = refine_diverse(score if admissible is None else _within(score, admissible, snap), first, scale, rng, cube)
     u = snap(u)
-    if admissible is not None:
-        value = np.where(admissible(u), value, -np.inf)
     return u[select_diverse(cube.embedded(u), value, cube.embedded(existing), n, cube.spread(scale))], len(u)
+
+
+def _within(
+    score: Callable[[Points], Vector], admissible: Callable[[Points], Mask], snap: Callable[[Points], Points]
+) -> Callable[[Points], Vector]:
+    """Return the score, -inf where what would be run is not admissible."""
+    return lambda u: np.where(admissible(snap(u)), score(u), -np.inf)
 
 
 def influence_on_mean(predict: Callable[[Points], Prediction], dimension: int, rng: np.random.Generator) -> Vector:

@@ -39,7 +39,7 @@ _CANDIDATES = 1500  # uniform ones; with them a proposal of ten takes 0.06 s at 
 _STEPS = (0.1, 0.03)  # standard deviations of the steps from the best candidates, in the unit cube, round by round
 _BEST, _CHILDREN = 30, 10  # candidates that are refined in a round, steps from each
 _MOVED = 0.3  # share of the coordinates that a step changes: others stay, which pays where few inputs matter
-_FILL_ROUNDS = 100  # of at least 100 uniform points each
+_MOST_TRIES, _MOST_AT_ONCE = 2**18, 2**14  # to find admissible points: 260 where a thousandth is feasible
 
 
 @dataclass(frozen=True)
@@ -230,21 +230,26 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
 
     def admissible(points: Points) -> Mask:
         left = search.feasible(points) & free(at(points))
-        return left if success is None else left & np.isfinite(success(search.columns(points)))
+        if success is not None and left.any():  # it costs a prediction
+            left[left] = np.isfinite(success(search.columns(points[left])))
+        return left
 
     return SearchData(u[left], y[left], number[left], flank, admissible, u[~ok], number[~ok], success)
 
 
 def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:
-    """Return (n, d) uniform admissible points; what 10,000 tries do not find is uniform in the cube."""
-    found = np.empty((0, d))
-    for _ in range(_FILL_ROUNDS):
-        u = rng.random((max(100, n), d))
+    """Return (n, d) uniform admissible points, of at most 260,000 tries.
+
+    Where fewer are found they come again; where none is (all is deflated), points are uniform in the cube.
+    """
+    found, tries, size = np.empty((0, d)), 0, max(100, n)
+    while len(found) < n and tries < _MOST_TRIES:
+        u = rng.random((size, d))
         found = np.vstack([found, u[admissible(u)]])
-        if len(found) >= n:
-            break
-    missing = n - len(found)
-    return np.vstack([found, rng.random((missing, d))]) if missing > 0 else found[:n]
+        tries, size = tries + size, min(2 * size, _MOST_AT_ONCE)
+    if len(found) == 0:
+        return rng.random((n, d))
+    return found[:n] if len(found) >= n else np.vstack([found, found[rng.integers(0, len(found), n - len(found))]])
 
 
 def refine_best(

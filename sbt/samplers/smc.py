@@ -47,7 +47,7 @@ class SmcDraw:
 
 def smc(
     score: Callable[[Points], Vector], dimension: int, rng: np.random.Generator, *, particles: int = 1024, start: int = 4096,
-    bound: Callable[[Points], Vector] | None = None, cube: Cube = CONTINUOUS,
+    bound: Callable[[Points], Vector] | None = None, cube: Cube = CONTINUOUS, uniform: Points | None = None,
 ) -> SmcDraw | None:  # fmt: skip
     """Draw particles with a density proportional to exp(score(u)) on the unit cube.
 
@@ -59,6 +59,8 @@ def smc(
         start: uniform points the first level is resampled from, at least as many.
         bound: quick upper bounds of the scores: a move that they rule out is rejected without its score.
         cube: which coordinates take single values.
+        uniform: (m, d) points to begin with, uniform in the part of the cube outside of which the score is -inf; `log_mean`
+            is then that of this part. None: `start` points of the cube.
 
     Returns:
         The particles; None where no uniform point has a score above -inf.
@@ -72,7 +74,7 @@ def smc(
     """
     if not 2 <= particles <= start:
         raise InputError(f"smc needs 2 <= particles <= start, but got particles = {particles}, start = {start}")
-    u = rng.random((start, dimension))
+    u = rng.random((start, dimension)) if uniform is None else uniform
     log_score = _checked(score, u)
     if np.isneginf(log_score).all():
         return None

@@ -6,6 +6,7 @@ between the old ones. A position never changes its point, however the sequence i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.problem.arrays import Points
+from sbt.problem.arrays import Mask, Points
 from sbt.seeds import stream
 
 if TYPE_CHECKING:
@@ -84,6 +85,16 @@ class SobolSequence:
             first = engine.random(1)  # alone: SciPy warns of a first block that is no power of two
             rest = engine.random(stop - 1) if stop > 1 else np.empty((0, self.dimension))
             return np.concatenate([first, rest]) + _HALF_CELL
+
+    def admissible(self, accept: Callable[[Points], Mask], n: int, least: int, most: int = 2**22) -> Points:
+        """Return the admissible ones of the first n points; of as many more, up to `most`, as it takes to have `least`."""
+        found, at, size = np.empty((0, self.dimension)), 0, n
+        while at < most and (at == 0 or len(found) < least):
+            u = self.points(at, at + size)
+            kept = u[accept(u)]
+            found = np.concatenate([found, kept[: max(least - len(found), 0)] if at else kept])
+            at, size = at + size, min(2 * size, 2**18)
+        return found
 
 
 @lru_cache(maxsize=8)
