@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 
 import sbt
 from sbt.cli import app
-from sbt.estimators.intervals import few_hits_bound
-from sbt.estimators.reweighting import WeightedShare, defended_bound
+from sbt.estimators.reweighting import WeightedShare, defended_bound, few_hits_bound
 from sbt.problem.sensitivity import space_parameters
 
 ROOT2 = np.sqrt(2.0)

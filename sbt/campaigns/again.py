@@ -91,7 +91,8 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
     history, old, hits = log.history, settings.scenario.space, settings.scenario.requirement.critical_runs(log.history)
     x = space.sample(_RATIOS, stream(settings.seed, "ratio"))
     crude = NOMINAL in history.stage
-    draws = [_Draws(-1, np.flatnonzero(history.stage == NOMINAL), 1.0)] if crude else [*_counted(log)]
+    plain = np.flatnonzero(history.stage == NOMINAL)
+    draws = [_Draws(-1, plain, len(plain))] if crude else [*_counted(log)]
     every, reached = np.concatenate([d.rows for d in draws]), np.isfinite(space.log_density(history.x))
     least = _least(history.where(np.isin(np.arange(len(history)), every)), old, space)
     predicted: list[tuple[Vector, Predicted | None]] = [(np.zeros(len(every)), None)]
@@ -100,7 +101,7 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
             predicted = [*_predicted(log, settings, space, draws)]
     return Reused(
         space, tuple(_batch(history, space, hits, d.rows, g, pool) for d, (g, pool) in zip(draws, predicted, strict=True)),
-        ~history.ok[every], np.concatenate([np.full(len(d.rows), d.nominal) for d in draws]),
+        ~history.ok[every], np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws]),
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         least,
@@ -129,21 +130,22 @@ def _batch(
 
 @dataclass(frozen=True, eq=False)
 class _Draws:
-    """A batch that counts: its number, its rows in the log, the share drawn in proportion to the campaign's distribution."""
+    """A batch that counts: its number, its rows in the log, how many of them, the first, follow the campaign's distribution."""
 
     number: int
     rows: Rows
-    nominal: float
+    nominal: int
 
 
 def _counted(log: Log) -> Iterator[_Draws]:
     """Yield every complete batch that counts."""
     history = log.history
     for batch in log.iterations if DRAWN in history.stage else ():
-        draws = batch.read(EstimationProposal).counted
+        proposal = batch.read(EstimationProposal)
+        draws, nominal = proposal.counted, proposal.nominal
         rows = np.flatnonzero((history.stage == DRAWN) & (history.iteration == batch.number))
         if draws is not None and len(rows) == len(draws.coefficient):
-            yield _Draws(batch.number, rows, draws.nominal)
+            yield _Draws(batch.number, rows, 0 if nominal is None else len(nominal.pi))
 
 
 def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:

@@ -171,6 +171,6 @@ def _tilted_batches(found: Reused, tilt: Vector) -> list[CountedBatch]:
 def _combined(found: Reused, batches: list[CountedBatch]) -> tuple[float, float]:
     """Return the estimate of all batches and its standard error."""
     if found.crude:
-        return batches[0].value, batches[0].variance ** 0.5
+        return batches[0].value, float((batches[0].errors ** 2).sum() + batches[0].pool_variance) ** 0.5
     combined = combine_estimates(batches)
     return combined.value, combined.std_error

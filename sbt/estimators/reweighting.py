@@ -17,12 +17,13 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from sbt.estimators.importance import stratified_variance
-from sbt.estimators.intervals import CountedBatch, few_hits_bound
+from sbt.estimators.intervals import CountedBatch
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["Predicted", "ReusedBatch", "WeightedShare", "defended_bound", "effective_size"]
+__all__ = ["Predicted", "ReusedBatch", "WeightedShare", "defended_bound", "effective_size", "few_hits_bound"]
 
 _TAIL = 1e-300
+_BISECTIONS = 60  # of [0, 1]: to the last bit
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +141,35 @@ def defended_bound(hits: int, nominal: Vector, ratio: Vector, confidence: float)
     beyond = np.array([float((ratio > c).mean()) for c in at])
     best = int(np.argmin(at * few_hits_bound(0, nominal, confidence) + beyond))
     return min(float(at[best]) * few_hits_bound(hits, nominal, confidence) + float(beyond[best]), 1.0)
+
+
+def few_hits_bound(hits: int, nominal: Vector, confidence: float) -> float:
+    """Return the upper limit of a probability P after few hits among draws that each meet it with probability s P or more.
+
+    It is the P at which `hits` or fewer are only just credible, whatever the rest of the proposal follows.
+
+    Args:
+        hits: critical draws.
+        nominal: (n,) s, the share of each draw that is in proportion to the distribution.
+        confidence: of the limit.
+    """
+    if len(nominal) == 0 or hits >= len(nominal):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        p = 0.5 * (low + high)
+        low, high = (p, high) if _at_most(hits, nominal * p) > 1.0 - confidence else (low, p)
+    return high
+
+
+def _at_most(hits: int, chances: Vector) -> float:
+    """Return the probability of at most `hits` successes in independent trials with these chances."""
+    mass = np.zeros(hits + 1)
+    mass[0] = 1.0
+    for chance in chances:
+        mass[1:] = mass[1:] * (1.0 - chance) + mass[:-1] * chance
+        mass[0] *= 1.0 - chance
+    return float(mass.sum())
 
 
 def effective_size(weight: Vector) -> float:

@@ -32,6 +32,7 @@ _CORNERS_UP_TO = 4
 """With more inputs than this, every input goes to its ends alone instead of all 2^d corners."""
 _FEW_INVALID = 0.25
 """Largest share of the centre and corners that may be invalid."""
+_INSTANTLY = "; SUMO changes lanes within a step unless its option lanechange.duration is set (such as 3 s)"
 _WARNINGS = 3
 """Most warnings of the simulator that are shown."""
 _RUN_DEADLINE = 60.0
@@ -239,6 +240,8 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:
     share = f"{sum(bool(run.breaches) for run in runs)} of {len(runs)} runs"
     first = {breach.partition(" must")[0]: (breach, values) for breach, values in broken[::-1]}
     detail = "; ".join(f"{breach} ({written(values)})" for breach, values in first.values())
+    if any(name.startswith(("sideways", "lateral")) for name in first):
+        detail += _INSTANTLY
     return [Finding("for information: laws of motion are broken", ok=True, detail=f"in {share}: {detail}")]
 
 
