@@ -42,7 +42,7 @@ def test_a_known_probability(tmp_path):
     assert found["probability"] == pytest.approx(p, rel=0.15)
     assert found["low"] <= p <= found["high"]
     assert found["hits"] >= 10
-    assert any("no interval can see" in w for w in found["warnings"])  # 2e-3 is below what 50 draws can exclude
+    assert found["undetected_mass_bound"] < 0.4  # 3 over the draws from the inputs' distribution, those that only teach too
 
 
 @pytest.mark.slow

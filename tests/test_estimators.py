@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
+from scipy.special import gammaincinv, ndtr
 from scipy.stats import binomtest
 
 from sbt.estimators.binomial import interval, lower, upper
 from sbt.estimators.choices import log_normal
 from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch
-from sbt.estimators.intervals import CountedBatch, combine_estimates, few_hits_bound
+from sbt.estimators.intervals import CountedBatch, combine_estimates
 from sbt.estimators.mixture import Mixture, Normals, fit_mixture, particles, wide_scales
 from sbt.estimators.monte_carlo import Proportion
 from sbt.estimators.subset import SubsetRun, combine_repeats
@@ -42,9 +41,7 @@ def replicate(predict, rng, *, form=None, n=20, shares=SHARES):
     z, stratum = H.sample(300, rng)
     log_h = H.log_density(z)
     log_pi, log_not = predict(z)
-    plan = plan_batch(log_pi, log_not, log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum, shares)
-    if form == "meta":
-        plan = replace(plan, form="meta", prior=0.0, control_variate=np.zeros(len(z)))
+    plan = plan_batch(log_pi, log_not, log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum, shares, form)
     draws = draw_systematic(plan, n, log_pi, rng)
     critical = (z[draws.rows, 0] > 2.0).astype(float)
     return CountedBatch(plan.prior, plan.anticipated, plan.pool_variance, draws.coefficient, draws.control_variate, critical)
@@ -118,22 +115,81 @@ def test_weights_of_batches_look_at_no_result():
     assert combine_estimates([wild, calm]).value == pytest.approx(c @ [0.5, 0.1])
 
 
-def test_the_interval_believes_the_larger_variance():
-    alike = [batch([0.5] * 4 + [0.5]) for _ in range(5)]
-    assert combine_estimates(alike).std_error == pytest.approx(0.0, abs=1e-12)
-    assert combine_estimates([batch([0.5] * 5, anticipated=1.0) for _ in range(5)]).std_error > 0.1  # anticipated
-    apart = [batch([v] * 5) for v in (0.1, 0.9, 0.2, 0.8)]
-    assert combine_estimates(apart).std_error > 0.1  # between the batches
-    c = combine_estimates(apart)
+def test_the_interval_takes_what_the_metamodel_anticipates_until_outcomes_speak():
+    alike = combine_estimates([batch([0.5] * 5) for _ in range(5)])
+    assert alike.std_error == pytest.approx(0.0, abs=1e-12)
+    few = combine_estimates([batch([0.5] * 5, anticipated=1.0) for _ in range(5)])
+    many = combine_estimates([batch([0.5] * 50, anticipated=10.0) for _ in range(5)])  # the same variance of a batch
+    assert few.own > many.own > 0.0
+    assert few.own < math.sqrt(1.0 / 25)  # 25 calm outcomes count for more than what was anticipated
+    doubtful = combine_estimates([batch([0.0, 1.0] * 10, anticipated=0.01) for _ in range(5)])
+    assert doubtful.own == pytest.approx(math.sqrt(0.25 / 95 * 1.02), rel=0.03)  # a variance that was met is believed
+
+
+def test_the_interval_takes_the_variance_between_batches_too():
+    c = combine_estimates([batch([v] * 5) for v in (0.1, 0.9, 0.2, 0.8)])
+    assert c.std_error == c.between > 0.1
     assert c.limit(0.975, side=-1) < c.limit(0.9, side=-1) < c.value < c.limit(0.9, side=1) < c.limit(0.975, side=1)
 
 
-@pytest.mark.parametrize("hits", [0, 1, 7])
-def test_few_hits_bound_is_the_binomial_one_where_all_draws_are_nominal(hits):
-    assert few_hits_bound(hits, np.ones(50), 0.95) == pytest.approx(upper(hits, 50, 0.95), rel=1e-6)
-    assert few_hits_bound(hits, np.full(50, 0.5), 0.95) > upper(hits, 50, 0.95)
-    assert few_hits_bound(0, np.full(300, 0.05), 0.95) == pytest.approx(3.0 / 15.0, rel=0.02)  # 3 / n_p
-    assert few_hits_bound(hits, np.empty(0), 0.95) == 1.0
+def test_a_variance_that_one_error_decides_has_one_observation():
+    calm = combine_estimates([batch([0.0, 1.0] * 10) for _ in range(5)])
+    wild = combine_estimates([batch([0.0] * 20) for _ in range(4)] + [batch([0.0] * 19 + [8.0])])
+    assert calm.freedom > 40.0
+    assert wild.freedom == 1.0
+
+
+@pytest.mark.parametrize("hits", [1, 4, 9])
+def test_with_few_hits_the_interval_is_also_that_of_their_number(hits):
+    found = combine_estimates([batch([1.0] * hits + [0.0] * (1000 - hits))])
+    low, high = (found.limit(0.975, side=side, few=True) for side in (-1, 1))
+    assert low <= gammaincinv(hits, 0.025) / 1000
+    assert high >= gammaincinv(hits + 1, 0.975) / 1000
+    safe = combine_estimates([batch([0.0] * hits + [1.0] * (1000 - hits))])
+    mirrored = [1.0 - safe.limit(0.975, side=side, few=True) for side in (1, -1)]
+    assert mirrored == pytest.approx([low, high], abs=1e-9)
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_intervals_cover_with_a_wrong_metamodel_and_optional_stopping(stop):
+    """The metamodel denies most of the failures: corrections are rare and large. 95 % is meant, 0.91 is 2.6 errors below."""
+    rng, covered, halves, values = stream(10, "coverage"), [], [], []
+    for _ in range(200):
+        batches = [replicate(wrong, rng, n=13) for _ in range(4)]
+        found = combine_estimates(batches)
+        while stop and len(batches) < 8 and found.std_error > 0.3 * abs(found.value):
+            batches.append(replicate(wrong, rng, n=13))
+            found = combine_estimates(batches)
+        low, high = found.limit(0.975, side=-1), found.limit(0.975, side=1)
+        covered.append(low <= TRUTH <= high)
+        halves.append(0.5 * (high - low))
+        values.append(found.value)
+    assert np.mean(covered) >= 0.91
+    assert np.median(halves) < 2.0 * 1.96 * np.std(values)
+
+
+def test_the_nominal_draws_are_the_first_and_their_share_is_exact():
+    rng = stream(11, "nominal")
+    z, stratum = H.sample(300, rng)
+    log_h = H.log_density(z)
+    plan = plan_batch(*wrong(z), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
+    drawn = [draw_systematic(plan, 13, z[:, 0], rng) for _ in range(2000)]
+    counts = np.array([d.nominal for d in drawn])
+    assert set(counts) == {2, 3}
+    assert counts.mean() == pytest.approx(13 * SHARES[1], abs=0.05)
+    first = np.concatenate([d.rows[: d.nominal] for d in drawn])
+    expected = float(plan.nominal_probability @ (z[:, 0] > 1.0))
+    assert (z[first, 0] > 1.0).mean() == pytest.approx(expected, abs=0.02)  # as in the inputs' distribution
+
+
+def test_meta_is_says_what_the_metamodel_predicts():
+    """Its own first sum is zero: taken for the prediction, it would look infinitely imprecise."""
+    z, stratum = H.sample(300, stream(12, "meta"))
+    log_h = H.log_density(z)
+    known = (*wrong(z), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
+    meta, difference = (plan_batch(*known, form=form) for form in ("meta", "difference"))
+    assert (meta.prior, difference.prior) == (0.0, difference.predicted)
+    assert meta.predicted == difference.predicted > 0.0
 
 
 @pytest.mark.parametrize("n", [1, 20, 3000])

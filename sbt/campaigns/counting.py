@@ -10,14 +10,17 @@ import numpy as np
 from sbt.campaigns.records import CountedDraws, EstimationProposal, PoolSummary
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
+from sbt.estimators import binomial
 from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
-from sbt.problem.arrays import Vector
+from sbt.store.records import Iteration
 
-__all__ = ["DRAWN", "Seen", "counted_batches", "counted_iterations", "drawn_shares"]
+__all__ = ["DRAWN", "LEARNED", "Seen", "counted_batches", "counted_iterations"]
 
 DRAWN = "estimation"
 """Stage of runs that were drawn with a known density."""
+LEARNED = "learn"
+"""Stage of draws that only teach."""
 _DENIED = 0.01
 """P(critical) below which a critical draw is a surprise to the metamodel."""
 
@@ -31,45 +34,51 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
     history = log.history
     critical = settings.scenario.requirement.critical_runs(history) | (failed_critical & ~history.ok)
     found, drawn = [], history.stage == DRAWN
-    for iteration, pool, draws in _counted(log):
-        rows = np.flatnonzero(drawn & (history.iteration == iteration))
+    for batch, pool, draws in _counted(log):
+        rows = np.flatnonzero(drawn & (history.iteration == batch.number))
         if len(rows) < len(draws.coefficient):
             continue  # a batch counts only when it is complete
         if np.isnan(history.log_q[rows]).any():
             raise InputError("an estimate needs runs with a known proposal density, but a counted run has none")
+        prior = pool.probability if batch.read(EstimationProposal).method == "difference" else 0.0
         found.append(CountedBatch(
-            pool.probability, pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
+            prior, pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
             critical[rows].astype(np.float64),
         ))  # fmt: skip
     return found
 
 
-def _counted(log: Log) -> Iterator[tuple[int, PoolSummary, CountedDraws]]:
-    """Yield number, pool and draws of the batches that count."""
+def _counted(log: Log) -> Iterator[tuple[Iteration, PoolSummary, CountedDraws]]:
+    """Yield the batches that count, with their pool and draws."""
     for batch in log.iterations:
         proposal = batch.read(EstimationProposal)
         if proposal.counted is not None and proposal.pool is not None:
-            yield batch.number, proposal.pool, proposal.counted
-
-
-def drawn_shares(log: Log) -> Vector:
-    """Return the share in proportion to the inputs' distribution of every counted draw, in their order."""
-    shares = [np.full(len(draws.coefficient), draws.nominal) for _, _, draws in _counted(log)]
-    return np.concatenate(shares) if shares else np.empty(0)
+            yield batch, proposal.pool, proposal.counted
 
 
 def counted_iterations(log: Log) -> list[int]:
     """Return the numbers of the batches that count."""
-    return [number for number, _, _ in _counted(log)]
+    return [batch.number for batch, _, _ in _counted(log)]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What all runs met: critical and safe ones, failed draws, and draws that surprised the metamodel."""
+    """What all runs met, and what the draws in proportion to the inputs' distribution met.
+
+    Attributes:
+        critical, safe: runs of any kind.
+        draws: in proportion to the inputs' distribution, those that only teach among them: independent of each other, with
+            any metamodel.
+        hits: critical ones of these draws.
+        failed: failed ones of these draws.
+        surprises: critical ones of these draws to which the metamodel gave next to no probability.
+    """
 
     critical: int
     safe: int
-    failed_draws: int
+    draws: int
+    hits: int
+    failed: int
     surprises: int
 
     @classmethod
@@ -77,9 +86,20 @@ class Seen:
         """Count the runs of a log."""
         history = log.history
         critical = settings.scenario.requirement.critical_runs(history)
-        surprises = 0
-        for iteration, _, draws in _counted(log):
-            rows = (history.stage == DRAWN) & (history.iteration == iteration)
-            surprises += int((critical[rows] & (np.array(draws.pi) < _DENIED)).sum())
-        failed = int((~history.ok & (history.stage == DRAWN)).sum())
-        return cls(int(critical.sum()), int((history.ok & ~critical).sum()), failed, surprises)
+        drawn = np.isin(history.stage, (DRAWN, LEARNED))
+        rows, pi = [np.empty(0, dtype=np.intp)], [np.empty(0)]
+        for batch in log.iterations:
+            nominal = batch.read(EstimationProposal).nominal
+            if nominal is not None:
+                first = np.flatnonzero(drawn & (history.iteration == batch.number))[: len(nominal.pi)]
+                rows.append(first)
+                pi.append(np.array(nominal.pi)[: len(first)])
+        mine, denied = np.concatenate(rows), np.concatenate(pi) < _DENIED
+        return cls(
+            int(critical.sum()), int((history.ok & ~critical).sum()), len(mine), int(critical[mine].sum()),
+            int((~history.ok[mine]).sum()), int((critical[mine] & denied).sum()),
+        )  # fmt: skip
+
+    def most(self, hits: int, confidence: float) -> float:
+        """Return the exact upper limit of the probability of what these draws met so many times."""
+        return float(binomial.upper(hits, self.draws, confidence)) if self.draws else 1.0

@@ -6,16 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, drawn_shares
+from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.stopping import FEWEST_BATCHES
-from sbt.campaigns.wording import number, percent
+from sbt.campaigns.wording import number, percent, plural
 from sbt.errors import InputError
-from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates, few_hits_bound
+from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
 from sbt.estimators.subset import combine_repeats
 from sbt.loop.stages import Campaign, Facts, Log, Stage
 from sbt.problem.plain import Json
@@ -165,40 +165,42 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         return _uncounted(log, settings)
     low, high, seen = combine_estimates(safe), combine_estimates(critical), Seen.of(log, settings)
     hits, misses = _hits(safe), sum(len(b.critical) for b in critical) - _hits(critical)
-    counted = drawn_shares(log)
-    undetected = few_hits_bound(seen.surprises, counted, _CONFIDENCE)
     value, exact_bound = _clipped(low.value), None
     limits, warnings = Limits(lambda c: low.limit(c, side=-1), lambda c: high.limit(c, side=1)), []
     if not seen.critical:
-        limits, value = _nothing_critical(log, seen), 0.0
+        limits, value = _nothing_critical(seen), 0.0
         exact_bound = limits.upper(_CONFIDENCE)
         warnings.append(_NOTHING)
     elif not seen.safe:
-        value = value if seen.failed_draws else 1.0
-        limits = Limits(lambda c: 1.0 - few_hits_bound(seen.failed_draws, counted, c), lambda _: 1.0)
+        value = 1.0 if log.history.ok.all() else value
+        limits = Limits(lambda c: 1.0 - seen.most(seen.failed, c), lambda _: 1.0)
         warnings.append(
             "everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution"
         )
-    elif hits < FEWEST_HITS:
-        limits = Limits(lambda _: 0.0, lambda c: few_hits_bound(_hits(critical), counted, c))
-        warnings.append(f"only {hits} counted draws were critical, fewer than {FEWEST_HITS}: only an upper bound is given")
-    elif misses < FEWEST_HITS:
-        limits = Limits(lambda c: 1.0 - few_hits_bound(misses, counted, c), lambda _: 1.0)
-        warnings.append(f"only {misses} counted draws were safe, fewer than {FEWEST_HITS}: only a lower bound is given")
+    elif hits == 0:
+        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), seen.most(seen.hits + seen.failed, c)))
+        warnings.append("no counted draw was critical: only an upper bound is given")
+    elif misses == 0:
+        limits = Limits(lambda c: min(low.limit(c, side=-1), 1.0 - seen.most(seen.draws - seen.hits, c)), lambda _: 1.0)
+        warnings.append("no counted draw was safe: only a lower bound is given")
+    elif min(hits, misses) < FEWEST_HITS:
+        limits = Limits(lambda c: low.limit(c, side=-1, few=True), lambda c: high.limit(c, side=1, few=True))
+        met = f"{hits} counted draws were critical" if hits < FEWEST_HITS else f"{misses} counted draws were safe"
+        warnings.append(f"only {met}, fewer than {FEWEST_HITS}: the interval is that of so small a number")
     if len(safe) < FEWEST_BATCHES:
         counts = "1 batch counts" if len(safe) == 1 else f"{len(safe)} batches count"
         warnings.append(f"only {counts}, fewer than {FEWEST_BATCHES}: their spread says little")
-    if low.largest_share > _HEAVY and 0.0 < value < 1.0:
-        warnings.append(f"one draw carries {low.largest_share:.0%} of the weight")
-    if undetected > value:
+    if low.largest_term > _HEAVY * value > 0.0:
+        warnings.append(f"one draw moves the estimate by {low.largest_term / value:.0%}")
+    if seen.surprises:
         warnings.append(
-            "no interval can see a critical region that no run has met: such a region may hold up to "
-            f"{undetected:.2g} (95 %), more than the estimate"
-        )  # fmt: skip
+            f"{plural(seen.surprises, 'draw')} from the inputs' distribution met a critical region that the metamodel had denied"
+        )
     return _conclusion(
         value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,
         effective_sample_size=low.effective_sample_size, failed_as_critical=max(_clipped(high.value), value),
-        undetected_mass_bound=undetected, warnings=tuple(warnings), largest_weight_share=low.largest_share,
+        undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
+        largest_weight_share=low.largest_share,
         convergence=_convergence(log, safe, critical),
         counted=int(sum(len(b.critical) for b in safe)), exact_bound=exact_bound,
     ), limits  # fmt: skip
@@ -222,13 +224,13 @@ def _uncounted(log: Log, settings: Settings) -> Concluded:
     if seen.critical:
         limits = Limits(lambda _: 0.0, lambda _: 1.0)
         return _conclusion(None, limits, warnings=(few,)), limits
-    limits = _nothing_critical(log, seen)
+    limits = _nothing_critical(seen)
     return _conclusion(None, limits, warnings=(few, _NOTHING), exact_bound=limits.upper(_CONFIDENCE)), limits
 
 
-def _nothing_critical(log: Log, seen: Seen) -> Limits:
+def _nothing_critical(seen: Seen) -> Limits:
     """Return the exact bound while no run was critical; failed draws might have been."""
-    return Limits(lambda _: 0.0, lambda c: few_hits_bound(seen.failed_draws, drawn_shares(log), c))
+    return Limits(lambda _: 0.0, lambda c: seen.most(seen.failed, c))
 
 
 def _from_nominal(log: Log, settings: Settings) -> Concluded:
@@ -288,6 +290,7 @@ def _hits(batches: list[CountedBatch]) -> int:
 
 ESTIMATION = CampaignKind(
     "probability of a critical scenario under the inputs' distribution", recipe, EstimationConclusion, acquisition="auto",
+    most_initial=15, batch=15,
     methods=("auto", "difference", "monte_carlo", "subset"), stop={"cov": 0.1}, metamodel_free=("monte_carlo", "subset"),
     takes_gate=True,
 )  # fmt: skip

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from sbt.store.records import optional
 
 __all__ = [
-    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "PoolSummary", "SearchProposal",
+    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "NominalDraws", "PoolSummary",
+    "SearchProposal",
 ]  # fmt: skip
 
 EXPLORE, LEARN, COUNT = "explore", "learn", "count"
@@ -92,16 +93,25 @@ class CountedDraws:
 
     Attributes:
         pool_variance: variance of the pool's mean.
-        nominal: share of the draws in proportion to the inputs' distribution.
         coefficient: of each draw in the estimate: density ratio over the number of draws.
         control_variate: of each draw, P(critical) that the pool's mean accounts for.
         pi: of each draw, the metamodel's P(critical).
     """
 
     pool_variance: float
-    nominal: float
     coefficient: tuple[float, ...]
     control_variate: tuple[float, ...]
+    pi: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class NominalDraws:
+    """Draws of a batch that were made in proportion to the inputs' distribution, whether the batch counts or only teaches.
+
+    Attributes:
+        pi: of each, the metamodel's P(critical); they are the first runs of the batch.
+    """
+
     pi: tuple[float, ...]
 
 
@@ -111,10 +121,11 @@ class EstimationProposal:
 
     Attributes:
         phase: initial, explore (search for modes), learn (draws that only teach), count or subset.
-        method: sobol, explore, uncertainty, difference, meta_is, monte_carlo or subset.
+        method: sobol, explore, uncertainty, difference, meta, monte_carlo or subset.
         modes: failure modes that were known, in the phase of exploration.
         pool: what the draws came from.
         counted: the draws that count.
+        nominal: the draws in proportion to the inputs' distribution.
     """
 
     phase: str
@@ -122,3 +133,4 @@ class EstimationProposal:
     modes: int | None = optional()
     pool: PoolSummary | None = optional()
     counted: CountedDraws | None = optional()
+    nominal: NominalDraws | None = optional()

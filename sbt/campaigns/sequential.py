@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from sbt.campaigns.counting import DRAWN
+from sbt.campaigns.counting import DRAWN, LEARNED
 from sbt.campaigns.known import Known, metamodel_of
-from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, PoolSummary
+from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, NominalDraws, PoolSummary
 from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.stopping import count_begins, is_precise, pools_of, relative_error, relative_error_of
@@ -33,12 +33,15 @@ from sbt.store.database import PlannedRun
 
 __all__ = ["SequentialStage"]
 
-_SEARCH_STAGE, _LEARN_STAGE = "hunt", "learn"
-"""Stages of runs that search for modes, and of draws that only teach."""
+_SEARCH_STAGE = "hunt"
+"""Stage of runs that search for modes."""
 
 # Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/estimation.md).
 _POOL = 10_000
 """Points of a pool: its own variance is a hundredth of what 100 draws leave."""
+_PILOT = 2_500
+"""Points of the pool that decides the form of the estimator and whether the newest metamodel is drawn with: a pool that is
+counted must not decide that itself, as it would choose what its own points happen to flatter."""
 _PARTICLES = 800
 """Particles that the mixture is fitted to, per cloud."""
 _CANDIDATES = 6_000
@@ -47,6 +50,8 @@ _CANDIDATES = 6_000
 # When the search for modes ends.
 _SEARCH_BUDGET = 0.4
 """Largest share of the budget that it takes."""
+_QUIET = 3
+"""Batches without a new mode after which it ends."""
 _COMMON = 0.02
 """P(critical) under the inputs' distribution above which draws from it meet every region that counts."""
 _EVEN_SHARE = 0.1
@@ -133,14 +138,14 @@ class SequentialStage:
     def _modes_while_searching(self, log: Log, known: Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
-        It ends with 40 % of the budget, after two batches without a new mode, and where failures are common:
+        It ends with 40 % of the budget, after three batches without a new mode, and where failures are common:
         draws from the inputs' distribution meet every region that counts.
         """
         proposals = [batch.read(EstimationProposal) for batch in log.iterations]
         if len(log.history) >= _SEARCH_BUDGET * self.settings.budget or any(p.phase in (LEARN, COUNT) for p in proposals):
             return None
         modes = [p.modes or 0 for p in proposals if p.phase == EXPLORE] + [known.modes(log_probability)]
-        if modes[-1] > 0 and len(modes) >= 3 and modes[-1] <= modes[-3]:
+        if modes[-1] > 0 and len(modes) > _QUIET and modes[-1] <= modes[-1 - _QUIET]:
             return None
         return None if modes[-1] > 0 and self._common(log_probability, log.iteration) else modes[-1]
 
@@ -171,35 +176,40 @@ class SequentialStage:
         """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         shares = BLIND if known.one_sided else SHARES
-        pool = self._pooled(log_probability, known, shares, rng)
-        fallback = self._fallback(log, known, relative_error(pool.plan.anticipated, pool.plan.prior))
+        mixture = self._mixture(log_probability, known, rng)
+        pilot = self._pooled(log_probability, mixture, shares, _PILOT, rng).plan
+        fallback = self._fallback(log, known, relative_error(pilot.anticipated, pilot.predicted))
         if fallback is not None:
-            pool = self._pooled(fallback, known, shares, rng)
-        z, x, plan, log_pi, log_not = pool.z, pool.x, pool.plan, pool.log_pi, pool.log_not
-        summary = PoolSummary(_POOL, plan.prior, plan.anticipated, len(pool.mixture.shares), fallback is not None)
+            log_probability, mixture = fallback, self._mixture(fallback, known, rng)
+            pilot = self._pooled(log_probability, mixture, shares, _PILOT, rng).plan
+        pool = self._pooled(log_probability, mixture, shares, _POOL, rng, form=pilot.form)
+        plan, log_pi = pool.plan, pool.log_pi
+        summary = PoolSummary(_POOL, plan.predicted, plan.anticipated, len(mixture.shares), fallback is not None)
         counts = known.one_sided or count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
-        searched = min(round(_SEARCH_SHARE[counts] * size), size - 1)
+        searched = 0 if self._common(log_probability, log.iteration) else min(round(_SEARCH_SHARE[counts] * size), size - 1)
         n = size - searched
         picks = self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)
+        draws = draw_systematic(plan, n, log_pi - pool.log_not, rng)
+        pi = tuple(np.exp(log_pi[draws.rows]).tolist())
+        nominal = NominalDraws(pi[: draws.nominal])
+        z = pool.z[draws.rows]
         if not counts:
-            rows = draw_systematic(plan, n, log_pi - log_not, rng).rows
-            return Batch((*self._runs(z[rows], _LEARN_STAGE), *picks), EstimationProposal(LEARN, "uncertainty", pool=summary))
-        draws = draw_systematic(plan, n, log_pi - log_not, rng)
-        log_q = s.scenario.space.log_density(x[draws.rows]) - np.log(draws.coefficient)
+            proposal = EstimationProposal(LEARN, "uncertainty", pool=summary, nominal=nominal)
+            return Batch((*self._runs(z, LEARNED), *picks), proposal)
+        log_q = s.scenario.space.log_density(pool.x[draws.rows]) - np.log(draws.coefficient)
         counted = CountedDraws(
-            plan.pool_variance, plan.nominal, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()),
-            tuple(np.exp(log_pi[draws.rows]).tolist()),
+            plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi
         )  # fmt: skip
-        proposal = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted)
-        return Batch((*self._runs(z[draws.rows], DRAWN, log_q), *picks), proposal)
+        proposal = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted, nominal=nominal)
+        return Batch((*self._runs(z, DRAWN, log_q), *picks), proposal)
 
     def _pooled(
-        self, log_probability: LogProbability | None, known: Known, shares: tuple[float, ...], rng: np.random.Generator
+        self, log_probability: LogProbability | None, mixture: Mixture, shares: tuple[float, ...], n: int,
+        rng: np.random.Generator, form: str | None = None,
     ) -> _Pool:
-        """Return a fresh pool and how a batch would be drawn from it with this metamodel."""
+        """Return a fresh pool of n points of a mixture, and how a batch would be drawn from it with this metamodel."""
         space = self.settings.scenario.space
-        mixture = self._mixture(log_probability, known, rng)
-        z, stratum = mixture.sample(_POOL, rng)
+        z, stratum = mixture.sample(n, rng)
         x = space.from_normal(z)
         log_w = log_normal(z) - mixture.log_density(z)
         if space.constraints:
@@ -207,8 +217,7 @@ class SequentialStage:
         over_wide = log_wide(z, self._wide, self._choices) - mixture.log_density(z)
         unsure = np.full(len(z), np.log(0.5))
         log_pi, log_not = (unsure, unsure) if log_probability is None else log_probability(z)
-        plan = plan_batch(log_pi, log_not, log_w, over_wide, stratum, shares)
-        return _Pool(mixture, z, x, plan, log_pi, log_not)
+        return _Pool(z, x, plan_batch(log_pi, log_not, log_w, over_wide, stratum, shares, form), log_pi, log_not)
 
     def _fallback(self, log: Log, known: Known, error: float) -> LogProbability | None:
         """Return an earlier metamodel to draw with, where the newest one has lost its precision for no reason.
@@ -256,7 +265,6 @@ class SequentialStage:
 class _Pool:
     """A pool: points z (N, d) and x (N, d), how a batch is drawn from it, and what the metamodel says there."""
 
-    mixture: Mixture
     z: Points
     x: Points
     plan: Plan

@@ -17,9 +17,9 @@ __all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative
 _LATEST = 0.6
 """The count begins at the latest after this share of the budget: fewer batches would say little about their own spread."""
 _FEWEST_LEARNED = 3
-"""Batches that only teach, at least: stalling shows in three values."""
-_STALLED, _USABLE = 1.5, 0.5
-"""Learning has stalled where the anticipated coefficient of variation of three batches varies by less than the factor; it is
+"""Batches that only teach, at least."""
+_VALUES, _STALLED, _USABLE = 4, 1.5, 0.5
+"""Learning has stalled where the anticipated coefficient of variation of so many batches varies by less than the factor; it is
 usable below the value."""
 _TARGET = 0.02
 """Anticipated coefficient of variation that is good enough where `stop.cov` sets none."""
@@ -48,8 +48,8 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
     if len(drawn) < _FEWEST_LEARNED:
         return False
     left = math.sqrt(drawn_share * (settings.budget - spent))
-    errors = [relative_error_of(pool) / left for _, pool in drawn[-3:]]
-    if max(errors) < _STALLED * min(errors) and errors[-1] < _USABLE:
+    errors = [relative_error_of(pool) / left for _, pool in drawn[-_VALUES:]]
+    if len(errors) == _VALUES and max(errors) < _STALLED * min(errors) and errors[-1] < _USABLE:
         return True  # learning no longer pays
     target = settings.stop.get("cov")
     return errors[-1] <= (_TARGET if target is None else target)

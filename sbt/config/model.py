@@ -214,12 +214,18 @@ class ExecutorChoice(_Strict):
 
 
 def _tenth(data: Json) -> int:
-    most = kind_of(data["campaign"]).most_initial or data["budget"]
+    most = (_learns(data) and kind_of(data["campaign"]).most_initial) or data["budget"]
     return int(min(max(10, data["budget"] // 10), data["budget"], most))
 
 
 def _batch(data: Json) -> int:
-    return kind_of(data["campaign"]).batch or int(data["initial"])
+    return (_learns(data) and kind_of(data["campaign"]).batch) or int(data["initial"])
+
+
+def _learns(data: Json) -> bool:
+    """Return whether a metamodel looks at the results between batches: without one, small batches serve nothing."""
+    chosen = data.get("acquisition")  # absent where it is not valid
+    return chosen is None or chosen.kind not in kind_of(data["campaign"]).metamodel_free
 
 
 def _store(data: Json) -> str:
@@ -274,23 +280,24 @@ class Configuration(_Strict):
     simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates; default: the scenario's.")
     seed: int = Field(default=0, ge=0, description="Seed of everything random in the campaign.")
     budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
+    acquisition: AcquisitionChoice = Field(
+        default_factory=_acquisition,
+        description="How runs are chosen; default: that of the campaign.",
+    )
     initial: int = Field(
         default_factory=_tenth, ge=1,
-        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10, falsification: at most 10.",
+        description="Evenly distributed runs before the first fit; default: budget / 10, at least 10; at most 10 in a "
+        "falsification and 15 in an estimation with a metamodel.",
     )  # fmt: skip
     batch: int = Field(
         default_factory=_batch,
         ge=1,
-        description="Runs per iteration; default: as many as initial, falsification: 10.",
+        description="Runs per iteration; default: as many as initial; falsification 10, estimation with a metamodel 15.",
     )
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
         default_factory=_metamodel,
         description="What learns the safety metric; default: that of the campaign.",
-    )
-    acquisition: AcquisitionChoice = Field(
-        default_factory=_acquisition,
-        description="How runs are chosen; default: that of the campaign.",
     )
     stop: StopRules = Field(
         default_factory=StopRules, validate_default=True, description="When to stop before the budget is used up."
