@@ -23,6 +23,8 @@ _VALUES, _STALLED, _USABLE = 4, 1.5, 0.5
 usable below the value."""
 _TARGET = 0.02
 """Anticipated coefficient of variation that is good enough where `stop.cov` sets none."""
+_WIDEST = 3.0
+"""Half width of the 95 % interval over the coefficient of variation that ends a campaign, at most: 1.96 with normal errors."""
 FEWEST_BATCHES = 4
 """Batches that must count before their spread is taken for a measure of the error."""
 
@@ -56,14 +58,18 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
 
 
 def is_precise(log: Log, settings: Settings) -> bool:
-    """Return whether the estimate has the coefficient of variation at which `stop.cov` ends the campaign."""
+    """Return whether the estimate has the coefficient of variation at which `stop.cov` ends the campaign.
+
+    The interval must be narrow as well: where one large error decides the variance, its coefficient says little.
+    """
     target = settings.stop.get("cov")
     counted = counted_batches(log, settings)
     if target is None or len(counted) < FEWEST_BATCHES:
         return False
     found = combine_estimates(counted)
     hits = sum(float(b.critical.sum()) for b in counted)
-    return hits >= FEWEST_HITS and found.value > 0 and found.std_error <= target * found.value
+    half = 0.5 * (found.limit(0.975, side=1) - found.limit(0.975, side=-1))
+    return hits >= FEWEST_HITS and found.std_error <= target * found.value and half <= _WIDEST * target * found.value
 
 
 def pools_of(log: Log) -> Iterator[tuple[Iteration, PoolSummary]]:
