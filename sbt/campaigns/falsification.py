@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from sbt.acquisitions import even, is_greedy, log_scores
+from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.failures import CONFIRM, FailureSearch, FalsificationConclusion, confirmations, search_runs
 from sbt.campaigns.parts import held_out_runs, named_inputs
 from sbt.campaigns.records import SearchProposal
@@ -80,7 +81,7 @@ class SearchStage:
             return "budget"
         if s.scenario.pool is not None and len(runs) >= len(s.scenario.pool.x):
             return "no rows left"
-        return None
+        return ALL_RUN if log.iterations and all_run(s.scenario, runs) else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch, the run of largest P(critical) first."""
@@ -93,7 +94,8 @@ class SearchStage:
             filled, at = self._even(size, start)
             chosen = self._snapped([(_INITIAL, filled)], runs)
             return Batch((*chosen, *held_out_runs(s, 0, s.reference)), SearchProposal("even", at))
-        held_out = 0 if s.scenario.pool is not None else min(_share_of(s.holdout_fraction, spent, size), size - 1)
+        none = s.scenario.pool is not None or few(s.scenario, runs, s.budget)
+        held_out = 0 if none else min(_share_of(s.holdout_fraction, spent, size), size - 1)
         filling = min(_share_of(max(_FILL_SHARE - s.holdout_fraction, 0.0), spent, size), size - 1 - held_out)
         again = repeats_wanted(runs, s.scenario, size - held_out - filling) if self._learns else ()
         picks, criteria = self._guided(log, runs, size - held_out - filling - len(again))
@@ -184,12 +186,19 @@ class SearchStage:
         u, _ = propose_greedily(score, existing, n, scale, rng, snap=snap, admissible=feasible, cube=space.cube)
         return np.concatenate([u, fill_uniformly(feasible, n - len(u), space.dimension, rng)])
 
+    def _without_repetition(self, rows: list[tuple[str, Vector]], runs: History) -> list[PlannedRun]:
+        """Return the runs of points, each by its stage; of few combinations, each but once."""
+        scenario = self.failure_search.settings.scenario
+        x = scenario.space.from_unit(np.array([u for _, u in rows]).reshape(-1, scenario.space.dimension))
+        x = without_repetition(scenario, runs, x)
+        return [PlannedRun(stage, named_inputs(scenario, row)) for (stage, _), row in zip(rows, x, strict=False)]
+
     def _snapped(self, parts: list[tuple[str, Points]], runs: History) -> list[PlannedRun]:
         """Return the runs of each part by its stage; where rows are recorded, the nearest one not taken yet."""
         scenario = self.failure_search.settings.scenario
         rows = [(stage, point) for stage, points in parts for point in points]
         if scenario.pool is None:
-            return [PlannedRun(stage, named_inputs(scenario, scenario.space.from_unit(u[None])[0])) for stage, u in rows]
+            return self._without_repetition(rows, runs)
         left = np.flatnonzero(~scenario.pool.taken(runs.x))
         at = scenario.space.cube.embedded
         recorded = at(np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0))

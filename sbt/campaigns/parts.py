@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from sbt.campaigns.choices import ChoiceRule, evenly
+from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import percent, plural
@@ -73,12 +74,14 @@ class BatchStage:
     repeats: bool = False
 
     def stop(self, log: Log) -> str | None:
-        """Return why the stage is over: `budget`, `no rows left`, `stable` or `misclassified`; None: go on."""
+        """Return why the stage is over: `budget`, `no rows left`, `all combinations`, `stable` or `misclassified`."""
         s = self.settings
         if log.iterations and len(log.history) - s.reference >= s.budget:
             return "budget"
         if s.scenario.pool is not None and len(log.history) >= len(s.scenario.pool.x):
             return "no rows left"
+        if log.iterations and self.repeats and all_run(s.scenario, log.history):
+            return ALL_RUN
         chose = [fit for fit in log.fits if fit.iteration < log.iteration]  # a concluding fit chose no batch
         stable = s.stop.get("stable")
         if stable is not None and len(chose) >= 3:
@@ -104,12 +107,14 @@ class BatchStage:
         size = min(s.initial if first else s.batch, s.budget - spent)
         held_out = math.floor(s.holdout_fraction * (spent + size)) - math.floor(s.holdout_fraction * spent)
         held_out = min(held_out, size - 1) if size > 1 else 0
+        held_out = 0 if self.repeats and few(s.scenario, log.history, s.budget) else held_out
         fitted = s.learner.fit(log.history) if s.learner is not None and not first else None
         again = () if first or not self.repeats else repeats_wanted(log.history, s.scenario, size - held_out)
         n = size - held_out - len(again)
         found = (evenly if first or n == 0 else self.choose)(s, fitted, log, n)
         stage = "initial" if first else self.name
-        chosen = [PlannedRun(stage, named_inputs(s.scenario, row)) for row in found.x]
+        x = without_repetition(s.scenario, log.history, found.x) if self.repeats else found.x
+        chosen = [PlannedRun(stage, named_inputs(s.scenario, row)) for row in x]
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)
         return Batch((*chosen, *again, *random), proposal, fitted)

@@ -47,6 +47,18 @@ class Cube:
         """Return (n, w + c) positions of the whole numbers and choices at points u (n, d); zeros where there are none."""
         return np.column_stack([np.zeros(len(u)), *(_cell(u[:, k], n) for k, n in (*self.whole, *self.nominal))])
 
+    def combinations(self, dimension: int, most: int) -> Points | None:
+        """Return all points (m, d) that can be run; None where a coordinate is continuous, or there are more than `most`.
+
+        >>> Cube(whole=((0, 2),), nominal=((1, 2),)).combinations(2, 10).tolist()
+        [[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]]
+        """
+        counts = dict((*self.whole, *self.nominal))
+        if len(counts) < dimension or math.prod(counts.values()) > most:
+            return None
+        ends = [(np.arange(counts[k]) + 0.5) / counts[k] for k in range(dimension)]
+        return np.stack([axis.ravel() for axis in np.meshgrid(*ends, indexing="ij")], axis=1)
+
     def snapped(self, u: Points) -> Points:
         """Return the points (n, d) that are run in place of u: single values at the middle of their interval."""
         if self.continuous:
