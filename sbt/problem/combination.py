@@ -177,7 +177,7 @@ class CombinedRequirement(Requirement):
 
     def values(self, runs: Measured) -> Points:
         """Return (n, q) the metrics of runs, NaN where a run has none."""
-        return np.column_stack([runs.y(part.metric) for part in self.parts])
+        return np.column_stack([part.values(runs) for part in self.parts])
 
     def told(self, runs: Measured) -> Vector:
         """Return (n,) margins of runs."""

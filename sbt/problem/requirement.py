@@ -13,7 +13,10 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.problem.arrays import Mask, Vector
 
-__all__ = ["CriticalInterval", "Measured", "Requirement"]
+__all__ = ["CriticalInterval", "Measured", "Requirement", "within_scale"]
+
+
+_BEYOND = 0.1  # of the range of finite values: far enough to be told from them, near enough to leave them their scale
 
 
 class Measured(Protocol):
@@ -58,6 +61,23 @@ class CriticalInterval:
     def margin(self, y: Vector) -> Vector:
         """Return (n,) the signed distance of y to M_c, <= 0 where critical, in the unit of y; NaN stays NaN."""
         return np.maximum(self.low - np.asarray(y), np.asarray(y) - self.high)
+
+
+def within_scale(y: Vector, critical: CriticalInterval) -> Vector:
+    """Return (n,) metrics with inf and -inf a tenth of the range beyond all that is finite, values and ends of M_c.
+
+    A metric without a value, such as the time to a collision that never comes, lies at an end of its scale: a run of which
+    something is known. Which runs are critical does not change.
+
+    >>> within_scale(np.array([1.0, 3.0, np.inf, np.nan]), CriticalInterval(high=2.0)).tolist()
+    [1.0, 3.0, 3.2, nan]
+    """
+    if not np.isinf(y).any():
+        return y
+    known = np.array([*y[np.isfinite(y)], *(end for end in (critical.low, critical.high) if math.isfinite(end))])
+    low, high = float(known.min()), float(known.max())
+    room = _BEYOND * (high - low) or 1.0
+    return np.where(np.isposinf(y), high + room, np.where(np.isneginf(y), low - room, y))
 
 
 @dataclass(frozen=True)
@@ -110,12 +130,15 @@ class Requirement:
         return False
 
     def values(self, runs: Measured) -> Vector:
-        """Return what is learned of runs: (n,) the metric, NaN for a run without it; (n, q) of a combination of q."""
-        return runs.y(self.metric)
+        """Return what is learned of runs: (n,) the metric, NaN for a run without it; (n, q) of a combination of q.
+
+        Infinities are ends of the scale: see `within_scale`.
+        """
+        return within_scale(runs.y(self.metric), self.critical)
 
     def told(self, runs: Measured) -> Vector:
         """Return (n,) the one number that a run is told by: the metric, of a combination its margin; NaN where there is none."""
-        return runs.y(self.metric)
+        return self.values(runs)
 
     @property
     def told_as(self) -> str:

@@ -90,7 +90,7 @@ class Metric:
 
     Args:
         name: as written in requirements and in the store (`y.<name>`).
-        function: trace to a finite number; None: a scenario without traces gives it itself.
+        function: trace to a number, inf or -inf at an end of its scale; None: a scenario without traces gives it itself.
         unit: "" for a pure number or a flag.
         direction: "low" where small values are critical, "high" where large ones are.
         without: the value where there was no interaction to measure.
@@ -115,11 +115,11 @@ class Metric:
         """Return the metric of a trace.
 
         Raises:
-            RunError: the value is not finite.
+            RunError: the value is no number.
         """
         value = self.value(trace)
-        if not math.isfinite(value):
-            raise RunError(Status.FAILED, f"metric {self.name} must be finite, but got {value}")
+        if math.isnan(value):
+            raise RunError(Status.FAILED, f"metric {self.name} must be finite, inf or -inf, but got {value}")
         return value
 
     def value(self, trace: Trace) -> float:
@@ -385,6 +385,6 @@ def _finite(name: str, value: Any) -> float:
         number = None
     if number is None:
         raise RunError(Status.FAILED, f"metric {name} must be one number, but got {value!r}")
-    if not math.isfinite(number):
-        raise RunError(Status.FAILED, f"metric {name} must be finite, but got {number}")
+    if math.isnan(number):
+        raise RunError(Status.FAILED, f"metric {name} must be finite, inf or -inf, but got {number}")
     return number

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import sqlite3
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -273,7 +274,7 @@ class Store:
         waits = now - self._waited >= _TOGETHER
         self._waited = now if waits else self._waited
         row = (
-            str(outcome.status), _dump(dict(outcome.metrics)), outcome.reason, float(outcome.seconds), outcome.collisions,
+            str(outcome.status), _dump_metrics(outcome.metrics), outcome.reason, float(outcome.seconds), outcome.collisions,
             outcome.unconfirmed, versions,
         )  # fmt: skip
         with self._transaction(waits=waits):
@@ -372,6 +373,16 @@ def _checksum(*parts: Any) -> int:
 
 def _dump(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"), allow_nan=False)
+
+
+def _dump_metrics(metrics: Mapping[str, float]) -> str:
+    """Return metrics as JSON, in which infinity is a number too large for a float: every reader takes it for infinity."""
+    pairs = (f"{json.dumps(name)}:{_number(value)}" for name, value in metrics.items())
+    return "{" + ",".join(pairs) + "}"
+
+
+def _number(value: float) -> str:
+    return _dump(value) if math.isfinite(value) else ("-1e999" if value < 0 else "1e999")
 
 
 @contextmanager

@@ -174,10 +174,10 @@ def _all_ok(runs: list[_Run], points: Sequence[Values]) -> Finding:
 
 
 def _finite(runs: list[_Run], scenario: LogicalScenario) -> Finding:
-    """Return whether every run gives every declared metric, finite."""
+    """Return whether every run gives every declared metric: a number, or an end of its scale."""
     for run in (r for r in runs if not r.problem):
         metrics = dict(run.metrics)
-        missing = [name for name in scenario.measured if not math.isfinite(metrics.get(name, math.nan))]
+        missing = [name for name in scenario.measured if math.isnan(metrics.get(name, math.nan))]
         if missing:
             return Finding("metrics are finite", ok=False, detail=f"no finite {', '.join(missing)}, but got {metrics}")
     return Finding("metrics are finite", ok=True, detail=", ".join(scenario.measured))
