@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         Beta,
         Campaign,
         CampaignKind,
+        CombinedRequirement,
         CriticalInterval,
         Distribution,
         Empirical,
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
         Uniform,
         Weibull,
         acquisitions,
+        all_of,
+        any_of,
         campaigns,
         check,
         list,
@@ -69,6 +72,7 @@ _FROM = {
     "sbt.errors": ("InputError", "PluginError", "RunError", "SbtError", "StoreError"),
     "sbt.loop.stages": ("Batch", "Campaign", "Log", "Progress"),
     "sbt.metamodels.prediction": ("Prediction",),
+    "sbt.problem.combination": ("CombinedRequirement", "all_of", "any_of"),
     "sbt.problem.distribution": (
         "Beta", "Distribution", "Empirical", "Exponential", "Gumbel", "LogNormal", "Normal", "SciPy", "Triangular", "Uniform",
         "Weibull",
@@ -92,7 +96,7 @@ _NAMES = {name.split()[-1]: (module, name.split()[0]) for module, names in _FROM
 
 __all__ = [  # noqa: RUF022  (by use)
     "run", "open", "simulate", "list", "check", "Scenario", "Parameter", "ParameterSpace", "Requirement", "CriticalInterval",
-    "Metric", "Roles", "Trace", "Distribution", "Uniform", "Normal", "LogNormal", "Exponential", "Gumbel", "Weibull", "Beta",
+    "any_of", "all_of", "CombinedRequirement", "Metric", "Roles", "Trace", "Distribution", "Uniform", "Normal", "LogNormal", "Exponential", "Gumbel", "Weibull", "Beta",
     "Triangular", "SciPy", "Empirical", "KnotProfile", "RecordedProfile", "Prediction", "Result", "Run", "Film", "Progress",
     "CampaignKind", "Campaign", "Batch", "Log", "PlannedRun", "SbtError", "InputError", "PluginError", "RunError", "StoreError",
     "acquisitions", "campaigns", "metamodels", "metrics", "testing", "__version__",

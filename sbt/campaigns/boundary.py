@@ -9,6 +9,7 @@ import numpy as np
 
 from sbt.acquisitions import even, is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
+from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -22,7 +23,7 @@ from sbt.problem.plain import Json
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
 from sbt.store.history import VALIDATION, History
-from sbt.store.records import Validation, optional, to_json
+from sbt.store.records import Independence, RequirementFit, Validation, optional, to_json
 
 __all__ = ["BOUNDARY", "BoundaryConclusion", "boundary_points", "recipe"]
 
@@ -41,6 +42,9 @@ class BoundaryConclusion:
         held_out_fraction: critical share of the held-out random runs, free of any model.
         failing_fraction: mean P(a run gives no metric); None: all runs gave one.
         simulator_noise: what repeats with other seeds tell; None: recorded rows.
+        requirements: of a combination, each as its own metamodel sees it.
+        held_out_fractions: of a combination, the share of the held-out runs that violates each requirement.
+        independence: of the metrics of a combination, given the inputs.
     """
 
     critical_fraction: float | None
@@ -52,6 +56,9 @@ class BoundaryConclusion:
     held_out_fraction: CriticalShare | None = None
     failing_fraction: float | None = optional()
     simulator_noise: SimulatorNoise | None = optional()
+    requirements: tuple[RequirementFit, ...] | None = optional()
+    held_out_fractions: Mapping[str, CriticalShare] | None = optional()
+    independence: Independence | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -61,10 +68,11 @@ class BoundaryConclusion:
     def sentences(self, facts: Facts) -> list[str]:
         """Return what was found in words: as measured, then as the metamodel sees it."""
         measured = self.held_out_fraction if self.held_out_fraction is not None else share_among_held_out(facts)
-        found = measured.sentence()
+        found = [*measured.sentence(), *shares_words(self.held_out_fractions)]
         if self.critical_fraction is not None:
             where = "the parameter space" if self.failing_fraction is None else "what gives a metric"
             found.append(f"The metamodel takes {percent(self.critical_fraction)} of {where} to be critical.")
+        found += [*fits_words(self.requirements), *independence_words(self.independence)]
             found += self._disagreement(measured)
         if self.failing_fraction is not None:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
@@ -109,12 +117,13 @@ def recipe(settings: Settings) -> Campaign:
     def conclude(log: Log) -> tuple[BoundaryConclusion, FittedMetamodel | None]:
         fitted = learner.fit(log.history)
         held_out = critical_share(log.history.where(log.history.stage == VALIDATION), settings.scenario)
+        each = each_share(log.history.where(log.history.stage == VALIDATION), settings.scenario.requirement)
         if fitted is None:
-            return BoundaryConclusion(None, None, None, None, held_out_fraction=held_out), None
+            return BoundaryConclusion(None, None, None, None, held_out_fraction=held_out, held_out_fractions=each), None
         r = fitted.record
         return BoundaryConclusion(
             r.critical_fraction, r.expected_misclassified, r.ambiguous_volume, r.validation, r.weights, r.chosen_because,
-            held_out, r.failing_fraction, stated_noise(log.history, settings.scenario),
+            held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
         ), fitted  # fmt: skip
 
     stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even)

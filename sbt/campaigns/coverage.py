@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sbt.campaigns.choices import evenly
+from sbt.campaigns.each import each_share, shares_words
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.loop.learner import FittedMetamodel
@@ -26,6 +28,7 @@ class CoverageConclusion:
         confidence: of the interval.
         counted: runs.
         validation: scores of the metamodel on held-out runs, where one is configured.
+        requirements: of a combination, the share that violates each.
     """
 
     critical_fraction: float | None
@@ -34,6 +37,7 @@ class CoverageConclusion:
     confidence: float = 0.95
     counted: int = 0
     validation: Validation | None = optional()
+    requirements: Mapping[str, CriticalShare] | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -43,7 +47,8 @@ class CoverageConclusion:
     def sentences(self, facts: Facts) -> list[str]:
         """Return what was found in words."""
         del facts
-        return CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted).sentence()
+        whole = CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted)
+        return [*whole.sentence(), *shares_words(self.requirements)]
 
 
 def recipe(settings: Settings) -> Campaign:
@@ -53,7 +58,10 @@ def recipe(settings: Settings) -> Campaign:
         fitted = settings.learner.fit(log.history) if settings.learner is not None else None
         share = critical_share(log.history, settings.scenario)
         validation = None if fitted is None else fitted.record.validation
-        found = CoverageConclusion(share.critical_fraction, share.low, share.high, share.confidence, share.counted, validation)
+        found = CoverageConclusion(
+            share.critical_fraction, share.low, share.high, share.confidence, share.counted, validation,
+            each_share(log.history, settings.scenario.requirement),
+        )  # fmt: skip
         return found, fitted
 
     return Campaign((BatchStage("even", settings, evenly),), conclude, depends=None)

@@ -12,14 +12,17 @@ from sbt.estimators.monte_carlo import Proportion
 from sbt.estimators.subset import SubsetRun
 from sbt.loop.stages import Batch, Log
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 
-__all__ = ["NOMINAL", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of"]
+__all__ = ["NOMINAL", "NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of"]
 
 NOMINAL = "monte_carlo"
 """Stage of runs that were drawn from the inputs' distribution."""
+NOMINAL_STAGES = (NOMINAL, "subset level 0")
+"""Stages of runs that are drawn from the inputs' distribution, whatever the results."""
 _REPEATS = 5  # independent runs of subset simulation: their spread is the error
 _FEWEST_HITS = 10  # before the coefficient of variation is believed: its own error is a sixth then
 _FEWEST_BATCHES = 4  # likewise
@@ -112,8 +115,10 @@ def _runs(space: ParameterSpace, x: Points, stage: str, log_q: Vector | None) ->
     return tuple(PlannedRun(stage, space.named(row), None if log_q is None else float(log_q[k])) for k, row in enumerate(x))
 
 
-def nominal_proportion(log: Log, settings: Settings, stage: str = NOMINAL) -> Proportion:
-    """Return the hits among the runs of a stage that were drawn from the inputs' distribution."""
+def nominal_proportion(
+    log: Log, settings: Settings, stage: str = NOMINAL, requirement: Requirement | None = None
+) -> Proportion:  # fmt: skip
+    """Return the hits among the runs of a stage that were drawn from the inputs' distribution; None: of the campaign's own."""
     runs = log.history.where(log.history.stage == stage)
-    hits = int(settings.scenario.requirement.critical_runs(runs).sum())
+    hits = int((requirement or settings.scenario.requirement).critical_runs(runs).sum())
     return Proportion(len(runs), hits, int((~runs.ok).sum()))

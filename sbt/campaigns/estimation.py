@@ -8,6 +8,7 @@ from typing import Any
 
 from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of
+from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
@@ -60,6 +61,7 @@ class EstimationConclusion:
         exact_bound: where nothing was critical, the exact upper bound.
         gate: its verdict, where there is one.
         simulator_noise: what repeats with other seeds tell; None: none were asked for.
+        requirements: of a combination, the probability of each requirement, from the same draws.
     """
 
     probability: float | None
@@ -79,6 +81,7 @@ class EstimationConclusion:
     exact_bound: float | None = optional()
     gate: GateVerdict | None = optional()
     simulator_noise: SimulatorNoise | None = optional()
+    requirements: tuple[RequirementEstimate, ...] | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -88,6 +91,7 @@ class EstimationConclusion:
     def sentences(self, facts: Facts) -> list[str]:
         """Return the probability with its interval, or the bound where nothing was critical."""
         noise = [] if self.simulator_noise is None else self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
+        noise = [*estimates_words(self.requirements, self.confidence), *noise]
         verdict = [] if self.gate is None else [f"Gate: {self.gate.verdict}; {self.gate.statement}."]
         confidence = percent(self.confidence)
         if self.exact_bound is not None:
@@ -146,7 +150,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
             found = replace(found, warnings=(warning, *found.warnings))
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
         gate = None if settings.gate is None else gate_verdict(limits, settings.gate)
-        return replace(found, gate=gate, simulator_noise=noise), None
+        return replace(found, gate=gate, simulator_noise=noise, requirements=each_estimate(log, settings)), None
 
     return Campaign((stage,), conclude)
 

@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of
+from sbt.campaigns.each import independence_words, violations_words
+from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
@@ -23,7 +24,7 @@ from sbt.problem.requirement import Requirement
 from sbt.samplers.search import Search, fit_warped
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
-from sbt.store.records import Validation, optional, to_json
+from sbt.store.records import FitRecord, Independence, Validation, optional, to_json
 
 __all__ = [
     "CONFIRM", "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs",
@@ -91,6 +92,8 @@ class FalsificationConclusion:
         statement: what follows from the runs, and no more.
         validation: scores of the metamodel on held-out runs; None without such runs.
         simulator_noise: what repeats with other seeds tell; None: recorded rows.
+        violates: of a combination, how many critical runs violate each requirement.
+        independence: of the metrics of a combination, given the inputs.
     """
 
     first_critical_run: int | None
@@ -102,6 +105,8 @@ class FalsificationConclusion:
     statement: str
     validation: Validation | None = None
     simulator_noise: SimulatorNoise | None = optional()
+    violates: Mapping[str, int] | None = optional()
+    independence: Independence | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -121,6 +126,7 @@ class FalsificationConclusion:
             ))  # fmt: skip
         if self.simulator_noise is not None:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
+        said += [*violations_words(self.violates), *independence_words(self.independence)]
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
         return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence()]
 
@@ -173,7 +179,7 @@ class FailureSearch:
         fitted = fit_warped(self.search, u, y, stream(self.settings.seed, "modes", len(history)))
         return modes_of(fitted, history, scenario)
 
-    def conclusion(self, history: History, validation: Validation | None) -> FalsificationConclusion:
+    def conclusion(self, history: History, fit: FitRecord | None) -> FalsificationConclusion:
         """Return what was found."""
         searched, scenario = search_runs(history), self.settings.scenario
         margin = self.margin(searched)
@@ -187,7 +193,9 @@ class FailureSearch:
         return FalsificationConclusion(
             None if first is None else int(searched.index[first]), None if first is None else first + 1, len(hits), tuple(modes),
             bound, None if len(hits) else _closest(searched, margin, scenario.requirement),
-            _statement(searched, len(hits), modes, bound), validation, stated_noise(history, scenario),
+            _statement(searched, len(hits), modes, bound), None if fit is None else fit.validation,
+            stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
+            None if fit is None else fit.independence,
         )  # fmt: skip
 
 

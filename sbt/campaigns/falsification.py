@@ -56,7 +56,7 @@ def recipe(settings: Settings) -> Campaign:
 
     def conclude(log: Log) -> tuple[FalsificationConclusion, FittedMetamodel | None]:
         fitted = learner.fit(log.history)
-        return failures.conclusion(log.history, None if fitted is None else fitted.record.validation), fitted
+        return failures.conclusion(log.history, None if fitted is None else fitted.record), fitted
 
     return Campaign((SearchStage(failures), ConfirmStage(failures)), conclude)
 

@@ -18,6 +18,7 @@ from sbt.loop.learner import changed_share
 from sbt.loop.stages import Batch, Facts, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Value
+from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
@@ -25,7 +26,7 @@ from sbt.store.database import PlannedRun
 from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord
 
-__all__ = ["BatchStage", "CriticalShare", "critical_share", "held_out_runs", "named_inputs", "share_among_held_out"]
+__all__ = ["BatchStage", "CriticalShare", "critical_share", "held_out_runs", "named_inputs", "share_among_held_out", "share_of"]
 
 
 @dataclass(frozen=True)
@@ -153,11 +154,16 @@ def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, Value]:
 
 
 def critical_share(history: History, scenario: LogicalScenario) -> CriticalShare:
+    """Return the share of critical runs of an even or random design with its 95 % interval, as `share_of`."""
+    return share_of(history, scenario.requirement)
+
+
+def share_of(history: History, requirement: Requirement) -> CriticalShare:
     """Return the share of critical runs of an even or random design with its 95 % interval.
 
     For Sobol points the interval is that of random ones, which is wider than it needs to be.
     """
-    hits, n, failed = int(scenario.requirement.critical_runs(history).sum()), len(history), int((~history.ok).sum())
+    hits, n, failed = int(requirement.critical_runs(history).sum()), len(history), int((~history.ok).sum())
     ok = n - failed
     low, high = float(interval(hits, n)[0]), float(interval(hits + failed, n)[1])
     return CriticalShare(hits / ok if ok else None, low, high, 0.95, n)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from sbt.store.records import optional
 
 __all__ = [
-    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "NominalDraws", "PoolSummary",
-    "SearchProposal",
+    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "NominalDraws", "PartDraws",
+    "PoolSummary", "SearchProposal",
 ]  # fmt: skip
 
 EXPLORE, LEARN, COUNT = "explore", "learn", "count"
@@ -88,6 +88,23 @@ class PoolSummary:
 
 
 @dataclass(frozen=True)
+class PartDraws:
+    """What the metamodel of one requirement of a combination states of counted draws.
+
+    Attributes:
+        probability: mean P(it is violated) over the pool, under the inputs' distribution.
+        anticipated: variance of one draw that it anticipates.
+        pool_variance: variance of the pool's mean.
+        pi: of each draw, P(it is violated).
+    """
+
+    probability: float
+    anticipated: float
+    pool_variance: float
+    pi: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class CountedDraws:
     """Draws with known density, which the estimate counts.
 
@@ -96,12 +113,14 @@ class CountedDraws:
         coefficient: of each draw in the estimate: density ratio over the number of draws.
         control_variate: of each draw, P(critical) that the pool's mean accounts for.
         pi: of each draw, the metamodel's P(critical).
+        parts: of a combination, the same of each requirement.
     """
 
     pool_variance: float
     coefficient: tuple[float, ...]
     control_variate: tuple[float, ...]
     pi: tuple[float, ...]
+    parts: tuple[PartDraws, ...] | None = optional()
 
 
 @dataclass(frozen=True)

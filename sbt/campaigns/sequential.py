@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN, LEARNED
+from sbt.campaigns.each import part_draws
 from sbt.campaigns.known import Known, metamodel_of
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, NominalDraws, PoolSummary
 from sbt.campaigns.repeats import repeats_wanted
@@ -21,6 +22,7 @@ from sbt.campaigns.stopping import count_begins, is_precise, pools_of, relative_
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, log_normal, log_wide, to_cube
 from sbt.estimators.importance import BLIND, SHARES, Plan, draw_systematic, plan_batch
 from sbt.estimators.mixture import Mixture, fit_mixture, particles, wide_scales
+from sbt.estimators.parts import parts_of_pool
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Batch, Log
 from sbt.problem.arrays import Points, Vector
@@ -198,7 +200,8 @@ class SequentialStage:
             return Batch((*self._runs(z, LEARNED), *picks), proposal)
         log_q = s.scenario.space.log_density(pool.x[draws.rows]) - np.log(draws.coefficient)
         counted = CountedDraws(
-            plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi
+            plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi,
+            part_draws(parts_of_pool(log_probability, pool.z, plan, pool.stratum), draws.rows),
         )  # fmt: skip
         proposal = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted, nominal=nominal)
         return Batch((*self._runs(z, DRAWN, log_q), *picks), proposal)
@@ -217,7 +220,8 @@ class SequentialStage:
         over_wide = log_wide(z, self._wide, self._choices) - mixture.log_density(z)
         unsure = np.full(len(z), np.log(0.5))
         log_pi, log_not = (unsure, unsure) if log_probability is None else log_probability(z)
-        return _Pool(z, x, plan_batch(log_pi, log_not, log_w, over_wide, stratum, shares, form), log_pi, log_not)
+        plan = plan_batch(log_pi, log_not, log_w, over_wide, stratum, shares, form)
+        return _Pool(z, x, plan, log_pi, log_not, stratum)
 
     def _fallback(self, log: Log, known: Known, error: float) -> LogProbability | None:
         """Return an earlier metamodel to draw with, where the newest one has lost its precision for no reason.
@@ -270,3 +274,4 @@ class _Pool:
     plan: Plan
     log_pi: Vector
     log_not: Vector
+    stratum: Vector

@@ -23,7 +23,7 @@ from sbt.problem.cube import Cube
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["Coordinates", "LogProbability", "fit_log_probability"]
+__all__ = ["Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability"]
 
 LogProbability = Callable[[Points], tuple[Vector, Vector]]
 """(n, d) normal scores to (n,) log P(critical) and (n,) log P(uncritical)."""
@@ -68,6 +68,23 @@ class Coordinates:
         return np.column_stack([own, self.space.metamodel_inputs(u)[:, own.shape[1] :]])
 
 
+@dataclass(frozen=True)
+class JointLogProbability:
+    """P(critical) of a combination from those of its metrics.
+
+    Args:
+        critical: which combination.
+        parts: (q,) P(critical) of each metric.
+    """
+
+    critical: CombinedInterval
+    parts: tuple[LogProbability, ...]
+
+    def __call__(self, points: Points) -> tuple[Vector, Vector]:
+        """Return (n,) log P(critical) and (n,) log P(uncritical)."""
+        return joined_log_probability(self.critical, [part(points) for part in self.parts])
+
+
 def fit_log_probability(
     metamodel: Metamodel, coordinates: Coordinates, critical: CriticalInterval, z: Points, y: Vector, rng: np.random.Generator
 ) -> LogProbability:
@@ -82,7 +99,7 @@ def fit_log_probability(
             fit_log_probability(metamodel, coordinates, leaf, z[np.isfinite(column)], column[np.isfinite(column)], rng)
             for leaf, column in zip(critical.leaves, y.T, strict=True)
         ]
-        return lambda points: joined_log_probability(critical, [part(points) for part in parts])
+        return JointLogProbability(critical, tuple(parts))
     u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
     t, inside = warp.values(y), warp.interval(critical)
 

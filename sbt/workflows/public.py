@@ -8,6 +8,7 @@ from sbt.campaigns.settings import CampaignKind
 from sbt.errors import InputError, PluginError, RunError, SbtError, StoreError
 from sbt.loop.stages import Batch, Campaign, Log, Progress
 from sbt.metamodels.prediction import Prediction
+from sbt.problem.combination import CombinedRequirement, all_of, any_of
 from sbt.problem.distribution import (
     Beta,
     Distribution,
@@ -42,6 +43,7 @@ __all__ = [
     "Beta",
     "Campaign",
     "CampaignKind",
+    "CombinedRequirement",
     "CriticalInterval",
     "Distribution",
     "Empirical",
@@ -75,6 +77,8 @@ __all__ = [
     "Uniform",
     "Weibull",
     "acquisitions",
+    "all_of",
+    "any_of",
     "campaigns",
     "check",
     "list",
