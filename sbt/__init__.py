@@ -96,8 +96,9 @@ _NAMES = {name.split()[-1]: (module, name.split()[0]) for module, names in _FROM
 
 __all__ = [  # noqa: RUF022  (by use)
     "run", "open", "simulate", "list", "check", "Scenario", "Parameter", "ParameterSpace", "Requirement", "CriticalInterval",
-    "any_of", "all_of", "CombinedRequirement", "Metric", "Roles", "Trace", "Distribution", "Uniform", "Normal", "LogNormal", "Exponential", "Gumbel", "Weibull", "Beta",
-    "Triangular", "SciPy", "Empirical", "KnotProfile", "RecordedProfile", "Prediction", "Result", "Run", "Film", "Progress",
+    "any_of", "all_of", "CombinedRequirement", "Metric", "Roles", "Trace", "Distribution", "Uniform", "Normal", "LogNormal",
+    "Exponential", "Gumbel", "Weibull", "Beta", "Triangular", "SciPy",
+    "Empirical", "KnotProfile", "RecordedProfile", "Prediction", "Result", "Run", "Film", "Progress",
     "CampaignKind", "Campaign", "Batch", "Log", "PlannedRun", "SbtError", "InputError", "PluginError", "RunError", "StoreError",
     "acquisitions", "campaigns", "metamodels", "metrics", "testing", "__version__",
 ]  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import sbt
 from sbt.config.assemble import scenario_of
 from sbt.config.load import parse
 from sbt.errors import InputError
@@ -148,3 +149,66 @@ def test_formulas_and_metrics_combine():
     )).requirement  # fmt: skip
     assert [part.metric for part in need.parts] == ["ttc_min", "gap", "stl", "d_min"]
     assert need.metric == "any(ttc_min, gap, all(stl, d_min))"
+
+
+EITHER = any_of(Requirement("left", high=-1.8), Requirement("right", low=2.2, name="high"))
+
+
+def _campaign(tmp_path, kind: str, budget: int, need: Requirement = EITHER, name: str = "store", **keys) -> sbt.Result:
+    scenario = sbt.Scenario(
+        "two", [sbt.Parameter(n, -5.0, 5.0, "", sbt.Normal(0.0, 1.0)) for n in "ab"], need, metrics=["left", "right"],
+        evaluate=lambda values, seed: {"left": values["a"] + 0.1 * values["b"], "right": values["b"] - 0.2 * values["a"]},
+    )  # fmt: skip
+    return sbt.run(
+        campaign=kind, scenario=scenario, budget=budget, store=tmp_path / name, executor="serial", report=kind == "falsification",
+        **keys,
+    )  # fmt: skip
+
+
+def test_a_falsification_finds_both_and_says_which(tmp_path):
+    result = _campaign(tmp_path, "falsification", 40)
+    found = result.conclusion
+    assert {name for mode in found.failure_modes for name in mode.violates} == {"left", "high"}
+    frame, history = result.frame, result.history
+    names = {"left": history.y("left") <= -1.8, "high": history.y("right") >= 2.2}
+    written = [{name for name, mask in names.items() if mask[k]} for k in range(len(history))]
+    assert [set(filter(None, text.split("; "))) for text in frame["violates"]] == written
+    np.testing.assert_array_equal(frame["margin"] <= 0, frame["critical"])
+    assert sum(found.violates.values()) >= found.critical_runs
+    page = (tmp_path / "store" / "report.html").read_text()
+    assert "left ≤ -1.8 or right ≥ 2.2" in page
+    assert ">violates</th>" in page
+    result.plot.runs()
+
+
+def test_boundary_and_coverage_tell_the_share_of_each(tmp_path):
+    _campaign(tmp_path, "boundary", 20, initial=10, batch=10)
+    result = _campaign(tmp_path, "boundary", 40, initial=10, batch=10)
+    whole = _campaign(tmp_path, "boundary", 40, name="whole", initial=10, batch=10)
+    np.testing.assert_array_equal(result.history.x, whole.history.x)  # resumed: as if never interrupted
+    np.testing.assert_array_equal(result.frame["margin"], whole.frame["margin"])
+    shares = {one.name: one.critical_fraction for one in result.conclusion.requirements}
+    assert shares == pytest.approx({"left": 0.32, "high": 0.28}, abs=0.02)
+    assert result.conclusion.critical_fraction == pytest.approx(0.32 + 0.28 - 0.11, abs=0.03)
+    assert set(result.conclusion.held_out_fractions) == {"left", "high"}
+    found = result.predict({"a": [-3.0, 0.0], "b": 0.0})
+    np.testing.assert_allclose(found["p_critical.left"], [1.0, 0.0], atol=1e-3)
+    np.testing.assert_array_equal(result.predict({"a": [-3.0, 0.0], "b": 0.0}), found)  # from the file beside the store
+    even = _campaign(tmp_path, "coverage", 64, name="even").conclusion
+    assert even.requirements["left"].critical_fraction == pytest.approx(0.32, abs=0.05)
+
+
+@pytest.mark.parametrize("how", ["auto", "monte_carlo"])
+def test_an_estimation_tells_the_probability_of_each_from_the_same_draws(tmp_path, how):
+    a, b = np.random.default_rng(0).standard_normal((2, 2_000_000))
+    truth = {"left": (a + 0.1 * b <= -1.8), "high": (b - 0.2 * a >= 2.2)}
+    budget = 90 if how == "auto" else 2000
+    found = _campaign(tmp_path, "estimation", budget, acquisition=how, stop={"cov": None}).conclusion
+    union = (truth["left"] | truth["high"]).mean()
+    assert found.low < union < found.high
+    assert [one.name for one in found.requirements] == ["left", "high"]
+    for one in found.requirements:
+        assert one.low < truth[one.name].mean() < one.high
+        assert one.probability <= found.probability * 1.05
+    if how == "auto":
+        assert found.probability == pytest.approx(union, rel=0.1)

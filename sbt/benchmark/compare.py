@@ -70,7 +70,8 @@ def compare(
         listener: called after every cell.
 
     Raises:
-        InputError: not a falsification, an unknown sampler, recorded rows, or a library that is not installed.
+        InputError: not a falsification, an unknown sampler, recorded rows, a combined requirement, or a library that is not
+            installed.
     """
     config = loaded.config
     if config.campaign != "falsification":
@@ -78,6 +79,8 @@ def compare(
     for name in samplers:
         if name not in SAMPLERS:
             raise InputError(f"a sampler must be one of {', '.join(SAMPLERS)}, but got '{name}'")
+    if scenario_of(loaded).requirement.combined:
+        raise InputError(f"compare needs a requirement on one metric, but got {scenario_of(loaded).requirement.metric}")
     if scenario_of(loaded).pool is not None:
         raise InputError("compare needs a scenario that can be simulated, but got recorded rows")
     folder.mkdir(parents=True, exist_ok=True)

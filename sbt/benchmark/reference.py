@@ -68,8 +68,13 @@ def make_reference(loaded: Loaded, workers: int, progress: Callable[[Progress], 
 
     Returns:
         The folder of their store; None for a recorded table, whose rows are their own reference.
+
+    Raises:
+        InputError: a combined requirement.
     """
     config, parts = loaded.config, assemble(loaded)
+    if parts.scenario.requirement.combined:
+        raise InputError(f"a benchmark needs requirements on one metric, but got {parts.scenario.requirement.metric}")
     if parts.scenario.pool is not None:
         return None
     folder = Path(config.store)

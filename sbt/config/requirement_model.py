@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -25,6 +26,12 @@ def _not_blank(text: str) -> str:
     return text
 
 
+def _open_ends(value: Any) -> Any:
+    """Return an interval with infinite ends for those that are null."""
+    ends = two_values(value)
+    return tuple(end if given is None else given for given, end in zip(ends, (-math.inf, math.inf), strict=True))
+
+
 def _proper(value: tuple[float, float]) -> tuple[float, float]:
     CriticalInterval(*value)
     return value
@@ -32,7 +39,7 @@ def _proper(value: tuple[float, float]) -> tuple[float, float]:
 
 Name = Annotated[str, AfterValidator(_not_blank)]
 Interval = Annotated[tuple[float, float], BeforeValidator(two_values), Field(strict=False)]
-Critical = Annotated[tuple[float, float], BeforeValidator(two_values), AfterValidator(_proper), Field(strict=False)]
+Critical = Annotated[tuple[float, float], BeforeValidator(_open_ends), AfterValidator(_proper), Field(strict=False)]
 
 
 class RequirementChange(BaseModel):
@@ -43,7 +50,7 @@ class RequirementChange(BaseModel):
     metric: Name | None = Field(default=None, description="Safety metric; null: the scenario's own.")
     critical: Critical | None = Field(
         default=None,
-        description="Critical values [low, high], closed; ends may be -.inf or .inf; null: the own.",
+        description="Critical values [low, high], closed; an end may be null, -.inf or .inf; null: the own.",
     )
     stl: Name | None = Field(
         default=None, description="A formula such as G[0,20](gap > 2 and ttc > 1.5) instead of a metric; its robustness is "

@@ -16,7 +16,7 @@ from sbt.store.records import Independence, RequirementFit, Validation
 
 __all__ = ["each_requirement", "independence"]
 
-_FEWEST = 4  # runs that a correlation is taken of
+_FEWEST = 8  # runs that a correlation is taken of
 
 
 def each_requirement(
@@ -51,7 +51,7 @@ def each_requirement(
 def independence(parts: Sequence[Requirement], prediction: JointPrediction, y: Points) -> Independence | None:
     """Return the pair of requirements whose residuals correlate most, on runs (m, q) that nothing learned from.
 
-    None with fewer than four runs that have both.
+    None with fewer than eight runs that have both.
     """
     residuals = [(y[:, k] - part.mu) / part.sigma for k, part in enumerate(prediction.parts)]
     found: list[Independence] = []

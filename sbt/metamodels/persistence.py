@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,9 +24,11 @@ from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
 from sbt.metamodels import deep_ensemble as ensemble
 from sbt.metamodels import extra_trees as et
-from sbt.metamodels import gp_algebra, gp_predictor, recalibrated, sparse
+from sbt.metamodels import gp_algebra, gp_predictor, joint, recalibrated, sparse
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
+from sbt.problem.combination import CombinedInterval
+from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["FORMAT", "load", "read_info", "save"]
 
@@ -41,9 +44,12 @@ _KINDS: dict[str, Any] = {
         bnn.BayesianNetworkPredictor,
         ensemble.EnsemblePredictor,
         et.ForestPredictor,
+        CombinedInterval,
+        CriticalInterval,
         gp_algebra.Hyperparameters,
         gp_predictor.GaussianProcessPredictor,
         gp_predictor.NoiseSpread,
+        joint.JointPredictor,
         recalibrated.RecalibratedPredictor,
         sparse.SparseLayer,
         sparse.SparseMixture,
@@ -133,6 +139,8 @@ def _open(path: Path | str) -> tuple[dict[str, Any], zipfile.ZipFile]:
 
 def _encode(value: Any, arrays: list[NDArray[Any]]) -> Any:
     """Return JSON for a value; its arrays are appended to `arrays`."""
+    if isinstance(value, float) and math.isinf(value):
+        return {"infinite": value > 0}
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
@@ -161,6 +169,8 @@ def _decode(value: Any, file: zipfile.ZipFile, device: str | None) -> Any:
         return value
     if "array" in value:
         return np.load(io.BytesIO(file.read(f"{int(value['array'])}.npy")), allow_pickle=False)
+    if "infinite" in value:
+        return math.inf if value["infinite"] else -math.inf
     if "tuple" in value:
         return tuple(_decode(v, file, device) for v in value["tuple"])
     if "map" in value:

@@ -20,6 +20,7 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor
+from sbt.metamodels.joint import JointPrediction
 from sbt.metamodels.persistence import load, read_info, save
 from sbt.plugins import Objects
 from sbt.problem.arrays import Points, Vector
@@ -45,7 +46,8 @@ class Table:
     Attributes:
         space: the inputs.
         x: (n, d) their numbers.
-        columns: (n,) mu, sigma, epistemic, noise (unit of the metric) and p_critical.
+        columns: (n,) mu, sigma, epistemic, noise (unit of the metric) and p_critical; of a combination those of its margin, and
+            p_critical.NAME for each requirement.
         metric: the safety metric.
         metamodel: kind, as configured.
         learned: runs that it learned from.
@@ -122,10 +124,13 @@ def predict_inputs(
     parts = []
     for k in range(0, len(u), _CHUNK):
         p = predictor(u[k : k + _CHUNK])
-        parts.append([p.mu, p.sigma, p.epistemic, p.noise, p.probability(requirement.critical)])
-    names = ("mu", "sigma", "epistemic", "noise", "p_critical")
+        each = p.parts if isinstance(p, JointPrediction) else ()
+        single = [one.probability(need.critical) for one, need in zip(each, requirement.parts, strict=False)]
+        parts.append([p.mu, p.sigma, p.epistemic, p.noise, p.probability(requirement.critical), *single])
+    each_of = requirement.parts if requirement.combined else ()
+    names = ("mu", "sigma", "epistemic", "noise", "p_critical", *(f"p_critical.{part.label}" for part in each_of))
     columns = dict(zip(names, np.concatenate(parts, axis=1), strict=True)) if parts else {n: np.empty(0) for n in names}
-    return Table(space, x, columns, requirement.metric, choice.kind, len(training), source, ignored)
+    return Table(space, x, columns, requirement.told_as, choice.kind, len(training), source, ignored)
 
 
 def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, ...]]:
