@@ -150,12 +150,13 @@ def _counted(log: Log) -> Iterator[_Draws]:
 
 def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
     """Refuse what cannot be answered from these runs."""
-    history, metric = log.history, settings.scenario.requirement.metric
+    history = log.history
     if NOMINAL not in history.stage and next(_counted(log), None) is None:
         rule = "only draws with known densities can be counted again, but this campaign has none that count"
         raise InputError(f"{rule}: run an estimation with acquisition.kind difference or monte_carlo")
-    if metric not in history.metrics and history.ok.any():
-        raise InputError(f"a metric must be one that the runs measured ({', '.join(history.metrics)}), but got '{metric}'")
+    for metric in (part.metric for part in settings.scenario.requirement.parts):
+        if metric not in history.metrics and history.ok.any():
+            raise InputError(f"a metric must be one that the runs measured ({', '.join(history.metrics)}), but got '{metric}'")
     for old, new in zip(settings.scenario.space.parameters, space.parameters, strict=True):
         x = np.arange(len(new.choices), dtype=np.float64) if new.choices else new.from_normal(_SCORES)
         outside = x[~np.isfinite(old.log_density(x))]

@@ -72,8 +72,8 @@ class BoundaryConclusion:
         if self.critical_fraction is not None:
             where = "the parameter space" if self.failing_fraction is None else "what gives a metric"
             found.append(f"The metamodel takes {percent(self.critical_fraction)} of {where} to be critical.")
-        found += [*fits_words(self.requirements), *independence_words(self.independence)]
             found += self._disagreement(measured)
+        found += [*fits_words(self.requirements), *independence_words(self.independence)]
         if self.failing_fraction is not None:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
         if self.weights is not None:

@@ -56,7 +56,9 @@ def _interval(text: str) -> tuple[float, float]:
 def _lines(found: Answer) -> list[str]:
     """Return the answer for people."""
     requirement, answer = found.requirement, found.conclusion
-    lines = [f"{found.store}: {requirement.metric} in [{requirement.low:g}, {requirement.high:g}], {answer.counted} draws count"]
+    asked = ", ".join(f"{part.metric} in [{part.low:g}, {part.high:g}]" for part in requirement.parts)
+    asked = f"{requirement.metric}: {asked}" if requirement.combined else asked
+    lines = [f"{found.store}: {asked}, {answer.counted} draws count"]
     lines += [f"  {sentence}" for sentence in found.sentences()]
     lines += [f"  warning: {warning}" for warning in answer.warnings]
     return [*lines, *sensitivity_lines([vars(each) for each in found.sensitivity])]

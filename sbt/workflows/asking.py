@@ -13,6 +13,7 @@ from sbt.config.asked import asked_space
 from sbt.errors import InputError
 from sbt.loop.stages import Facts, Log
 from sbt.plugins import Objects
+from sbt.problem.combination import to_plain
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
@@ -49,6 +50,7 @@ class Answer:
     def to_dict(self) -> Json:
         """Return what `estimate-again --json` prints."""
         asked = {"metric": self.requirement.metric, "critical": to_json([self.requirement.low, self.requirement.high])}
+        asked = to_plain(self.requirement) if self.requirement.combined else asked
         found: Json = {"store": str(self.store), "requirement": asked, **self.conclusion.to_dict()}
         return {**found, "sensitivity": to_json(self.sensitivity)}
 
@@ -103,4 +105,6 @@ def _requirement(old: Requirement, metric: str | None, critical: tuple[float, fl
         raise InputError(f"another metric needs its critical interval (critical), but got only the metric '{metric}'")
     if critical is None:
         return old
+    if metric is None and old.combined:
+        raise InputError(f"a critical interval needs its metric (metric), as the campaign's requirement is {old.metric}")
     return Requirement(old.metric if metric is None else metric, *critical)
