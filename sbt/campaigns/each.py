@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.campaigns.counting import DRAWN, counted_batches, counted_iterations
+from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations
 from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion
 from sbt.campaigns.parts import CriticalShare, share_of
 from sbt.campaigns.records import EstimationProposal, PartDraws
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import number, percent
-from sbt.estimators.intervals import CountedBatch, combine_estimates
+from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
 from sbt.estimators.parts import PartOfPool
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Vector
@@ -86,16 +86,24 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
         if not safe:
             return None
         low, high = combine_estimates(safe), combine_estimates(critical)
-        hits = int(sum(batch.critical.sum() for batch in safe))
-        found.append(RequirementEstimate(
-            part.label, min(max(low.value, 0.0), 1.0), low.limit(tail, side=-1), high.limit(tail, side=1), hits
-        ))  # fmt: skip
+        hits, misses = (int(sum((batch.critical == side).sum() for batch in safe)) for side in (1.0, 0.0))
+        few, value = min(hits, misses) < FEWEST_HITS, min(max(low.value, 0.0), 1.0)
+        if min(hits, misses) == 0:  # no variance is known: the draws from the inputs' distribution bound it
+            ends = _bounds(part, log, settings, tail)
+        else:
+            ends = low.limit(tail, side=-1, few=few), high.limit(tail, side=1, few=few)
+        found.append(RequirementEstimate(part.label, value, min(ends[0], value), max(ends[1], value), hits))
     return tuple(found)
 
 
-def _batches_of(
-    k: int, part: Requirement, log: Log, settings: Settings, *, failed_critical: bool
-) -> list[CountedBatch]:  # fmt: skip
+def _bounds(part: Requirement, log: Log, settings: Settings, confidence: float) -> tuple[float, float]:
+    """Return the exact limits of the probability of one requirement by the draws in proportion to the inputs' distribution."""
+    seen = Seen.of(log, replace(settings, scenario=replace(settings.scenario, requirement=part)))
+    safe = seen.draws - seen.hits - seen.failed
+    return 1.0 - seen.most(safe + seen.failed, confidence), seen.most(seen.hits + seen.failed, confidence)
+
+
+def _batches_of(k: int, part: Requirement, log: Log, settings: Settings, *, failed_critical: bool) -> list[CountedBatch]:
     """Return the counted batches with the outcomes, and the metamodel's statements, of the k-th requirement."""
     history = log.history
     critical = part.critical_runs(history) | (failed_critical & ~history.ok)
