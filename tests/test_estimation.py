@@ -143,11 +143,19 @@ def test_crude_monte_carlo(campaign: Run):
 
 
 def test_subset_simulation_with_repeats(tmp_path):
-    """`auto` with 25 inputs; the truth is 2.5e-3, which 5 x 200 points a level meet about."""
-    found = on_testbed("hartmann6_in_25", tmp_path, budget=2500)
+    """25 inputs; the truth is 2.5e-3, which 5 x 200 points a level meet about."""
+    found = on_testbed("hartmann6_in_25", tmp_path, budget=2500, acquisition={"kind": "subset"})
     conclusion = found["conclusion"]
     assert found["stopped"] == "converged"
     assert conclusion["low"] <= truth("hartmann6_in_25").probability <= conclusion["high"] < 0.05
+
+
+def test_many_inputs_are_estimated_where_they_matter(tmp_path):
+    """Crude Monte Carlo would meet no critical run; subset simulation errs by far more than half with 240 runs."""
+    p = truth("linear_d30").probability
+    found = on_testbed("linear_d30", tmp_path, budget=240, stop={"cov": None})["conclusion"]
+    assert found["probability"] == pytest.approx(p, rel=0.1)
+    assert found["low"] <= p <= found["high"]
 
 
 def test_subset_simulation_says_when_it_was_too_short(tmp_path):

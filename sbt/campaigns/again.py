@@ -20,7 +20,7 @@ from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores, log_normal
-from sbt.estimators.mixture import Mixture, fit_mixture, particles, wide_scales
+from sbt.estimators.mixture import Mixture, Near, fit_mixture, particles, wide_scales
 from sbt.estimators.reweighting import Predicted, ReusedBatch, effective_size
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Log
@@ -204,5 +204,5 @@ def _mixture(
     def mass(z: Points) -> Vector:
         return log_normal(z) + learned(old.to_normal(space.from_normal(z)))[0]
 
-    z, log_q = blank.sample_near(_CANDIDATES, hits, rng)
-    return fit_mixture((particles(mass, z, log_q, _PARTICLES, rng),), blank.wide, rng, choices=choices)
+    cloud = particles(mass, Near(blank, hits), _PARTICLES, rng, _CANDIDATES)
+    return fit_mixture((cloud,), blank.wide, rng, choices=choices)

@@ -16,6 +16,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
+from sbt.store.records import Iteration
 
 __all__ = ["NOMINAL", "NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of"]
 
@@ -63,8 +64,8 @@ class SubsetStage:
 
     def stop(self, log: Log) -> str | None:
         """Return `converged` where every repeat has finished, `budget` where the next step does not fit in it."""
-        if not log.iterations:
-            return None
+        if not any(_is_step(batch) for batch in log.iterations):
+            return "budget" if len(log.history) >= self.settings.budget else None
         repeats = repeats_of(log, self.settings)
         if all(r.finished for r in repeats):
             return "converged"
@@ -88,12 +89,15 @@ class SubsetStage:
 def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:
     """Return where the repeats stand, replayed from the log: their draws belong to the seed, the metrics are there."""
     requirement, space = settings.scenario.requirement, settings.scenario.space
-    level = max(settings.budget // (4 * _REPEATS) // 10, 2) * 10
-    if settings.budget < _REPEATS * level:
-        level = max(settings.budget // _REPEATS, 1)
+    steps = [batch for batch in log.iterations if _is_step(batch)]
+    before = log.history.iteration < (steps[0].number if steps else log.iteration)
+    budget = max(settings.budget - int(before.sum()), 1)  # other runs may have come first
+    level = max(budget // (4 * _REPEATS) // 10, 2) * 10
+    if budget < _REPEATS * level:
+        level = max(budget // _REPEATS, 1)
     repeats = [SubsetRun(level, space.dimension) for _ in range(_REPEATS)]
     margin = requirement.margins(log.history)
-    for batch in log.iterations:
+    for batch in steps:
         rows, start = np.flatnonzero(log.history.iteration == batch.number), 0
         for k, repeat in enumerate(repeats):
             if not repeat.finished:
@@ -101,6 +105,10 @@ def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:
                 outcomes = _outcomes(margin[rows[start : start + len(z)]], z, space)
                 repeats[k], start = repeat.tell(z, outcomes), start + len(z)
     return repeats
+
+
+def _is_step(batch: Iteration) -> bool:
+    return batch.read(EstimationProposal).method == "subset"
 
 
 def _outcomes(margin: Vector, z: Points, space: ParameterSpace) -> Vector:

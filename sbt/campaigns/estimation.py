@@ -10,6 +10,7 @@ from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
+from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -128,8 +129,9 @@ def recipe(settings: Settings) -> Campaign:
     if settings.scenario.pool is not None:
         raise InputError("estimation needs a scenario that can be run anywhere, but recorded rows have no proposal density")
     method = settings.method
-    if method == "auto":
-        method = "subset" if settings.scenario.space.dimension >= _HIGH_DIMENSION else "difference"
+    if method == "auto" and settings.scenario.space.dimension >= _HIGH_DIMENSION:
+        return _campaign(settings, ManyInputsStage(settings), _from_either)
+    method = "difference" if method == "auto" else method
     if method == "monte_carlo":
         cov = settings.stop.get("cov")
         depends = None if cov is None else f"stop.cov = {cov:g} ends it where the results say (null: the whole budget is run)"
@@ -249,6 +251,11 @@ def _from_nominal(log: Log, settings: Settings) -> Concluded:
         failed_as_safe=share.value, failed_as_critical=(share.hits + share.failed) / max(share.n, 1),
         undetected_mass_bound=1.0 - (1.0 - _CONFIDENCE) ** (1.0 / max(share.n, 1)), counted=share.n, **rest,
     ), limits  # fmt: skip
+
+
+def _from_either(log: Log, settings: Settings) -> Concluded:
+    """Return what subset simulation says where it was taken, else the draws in the subspace."""
+    return _from_repeats(log, settings) if took_subset(log) else _from_batches(log, settings)
 
 
 def _from_repeats(log: Log, settings: Settings) -> Concluded:

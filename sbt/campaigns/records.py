@@ -145,6 +145,7 @@ class EstimationProposal:
         pool: what the draws came from.
         counted: the draws that count.
         nominal: the draws in proportion to the inputs' distribution.
+        axes: of many inputs, those that the subspace of the draws holds beside its direction.
     """
 
     phase: str
@@ -153,3 +154,4 @@ class EstimationProposal:
     pool: PoolSummary | None = optional()
     counted: CountedDraws | None = optional()
     nominal: NominalDraws | None = optional()
+    axes: tuple[int, ...] | None = optional()

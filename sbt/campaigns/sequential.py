@@ -12,17 +12,16 @@ from functools import cached_property
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from sbt.campaigns.counting import DRAWN, LEARNED
-from sbt.campaigns.each import part_draws
+from sbt.campaigns.counting import DRAWN
 from sbt.campaigns.known import Known, metamodel_of
-from sbt.campaigns.records import COUNT, EXPLORE, LEARN, CountedDraws, EstimationProposal, NominalDraws, PoolSummary
+from sbt.campaigns.pools import Frame, Proposal, draw_batch, draw_pool, fit_proposal, planned
+from sbt.campaigns.records import COUNT, EXPLORE, LEARN, EstimationProposal
 from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
-from sbt.campaigns.stopping import count_begins, is_precise, pools_of, relative_error, relative_error_of
-from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, log_normal, log_wide, to_cube
-from sbt.estimators.importance import BLIND, SHARES, Plan, draw_systematic, plan_batch
-from sbt.estimators.mixture import Mixture, fit_mixture, particles, wide_scales
-from sbt.estimators.parts import parts_of_pool
+from sbt.campaigns.stopping import count_begins, is_precise, relative_error, steadier
+from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, to_cube
+from sbt.estimators.importance import BLIND, SHARES
+from sbt.estimators.mixture import wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Batch, Log
 from sbt.problem.arrays import Points, Vector
@@ -38,17 +37,6 @@ __all__ = ["SequentialStage"]
 _SEARCH_STAGE = "hunt"
 """Stage of runs that search for modes."""
 
-# Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/estimation.md).
-_POOL = 10_000
-"""Points of a pool: its own variance is a hundredth of what 100 draws leave."""
-_PILOT = 2_500
-"""Points of the pool that decides the form of the estimator and whether the newest metamodel is drawn with: a pool that is
-counted must not decide that itself, as it would choose what its own points happen to flatter."""
-_PARTICLES = 800
-"""Particles that the mixture is fitted to, per cloud."""
-_CANDIDATES = 6_000
-"""Points that the particles are resampled from."""
-
 # When the search for modes ends.
 _SEARCH_BUDGET = 0.4
 """Largest share of the budget that it takes."""
@@ -61,10 +49,8 @@ _EVEN_SHARE = 0.1
 _SEARCH_SHARE = (0.2, 0.1)
 """Of later batches, the share that still searches: before and after the count has begun."""
 
-# When an earlier metamodel is preferred to the newest one.
-_LOST, _MEMORY, _SURPRISE = 10.0, 4, 0.01
-"""Loss of precision by this factor against one of so many batches before, although no critical run since then lay where that
-metamodel's P was below the value."""
+_SURPRISE = 0.01
+"""P of an earlier metamodel below which a critical run since then refutes it."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +75,10 @@ class SequentialStage:
     @cached_property
     def _wide(self) -> Vector:
         return wide_scales(self._coordinates.bounded)
+
+    @cached_property
+    def _frame(self) -> Frame:
+        return Frame(self._wide, self._choices)
 
     def stop(self, log: Log) -> str | None:
         """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
@@ -131,11 +121,8 @@ class SequentialStage:
             z[bad] = space.to_normal(space.sample(int(bad.sum()), stream(self.settings.seed, "feasible", iteration)))
         return z
 
-    def _runs(self, z: Points, stage: str, log_q: Vector | None = None) -> tuple[PlannedRun, ...]:
-        space = self.settings.scenario.space
-        rows = space.from_normal(z)
-        densities = [None] * len(rows) if log_q is None else [float(q) for q in log_q]
-        return tuple(PlannedRun(stage, space.named(row), density) for row, density in zip(rows, densities, strict=True))
+    def _runs(self, z: Points, stage: str) -> tuple[PlannedRun, ...]:
+        return planned(self.settings.scenario.space, z, stage)
 
     def _modes_while_searching(self, log: Log, known: Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
@@ -178,63 +165,32 @@ class SequentialStage:
         """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         shares = BLIND if known.one_sided else SHARES
-        mixture = self._mixture(log_probability, known, rng)
-        pilot = self._pooled(log_probability, mixture, shares, _PILOT, rng).plan
-        fallback = self._fallback(log, known, relative_error(pilot.anticipated, pilot.predicted))
+        proposal = self._proposal(log_probability, known, shares, rng)
+        fallback = self._fallback(log, known, relative_error(proposal.pilot.anticipated, proposal.pilot.predicted))
         if fallback is not None:
-            log_probability, mixture = fallback, self._mixture(fallback, known, rng)
-            pilot = self._pooled(log_probability, mixture, shares, _PILOT, rng).plan
-        pool = self._pooled(log_probability, mixture, shares, _POOL, rng, form=pilot.form)
-        plan, log_pi = pool.plan, pool.log_pi
-        summary = PoolSummary(_POOL, plan.predicted, plan.anticipated, len(mixture.shares), fallback is not None)
+            proposal = self._proposal(fallback, known, shares, rng)
+        pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng)
         counts = known.one_sided or count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
-        searched = 0 if self._common(log_probability, log.iteration) else min(round(_SEARCH_SHARE[counts] * size), size - 1)
-        n = size - searched
-        picks = self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)
-        draws = draw_systematic(plan, n, log_pi - pool.log_not, rng)
-        pi = tuple(np.exp(log_pi[draws.rows]).tolist())
-        nominal = NominalDraws(pi[: draws.nominal])
-        z = pool.z[draws.rows]
-        if not counts:
-            proposal = EstimationProposal(LEARN, "uncertainty", pool=summary, nominal=nominal)
-            return Batch((*self._runs(z, LEARNED), *picks), proposal)
-        log_q = s.scenario.space.log_density(pool.x[draws.rows]) - np.log(draws.coefficient)
-        counted = CountedDraws(
-            plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi,
-            part_draws(parts_of_pool(log_probability, pool.z, plan, pool.stratum), draws.rows),
-        )  # fmt: skip
-        proposal = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted, nominal=nominal)
-        return Batch((*self._runs(z, DRAWN, log_q), *picks), proposal)
+        common = self._common(log_probability, log.iteration)
+        searched = 0 if common else min(round(_SEARCH_SHARE[counts] * size), size - 1)
+        runs, kept = draw_batch(s.scenario.space, pool, size - searched, rng, counts=counts, fallback=fallback is not None)
+        return Batch((*runs, *self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)), kept)
 
-    def _pooled(
-        self, log_probability: LogProbability | None, mixture: Mixture, shares: tuple[float, ...], n: int,
-        rng: np.random.Generator, form: str | None = None,
-    ) -> _Pool:
-        """Return a fresh pool of n points of a mixture, and how a batch would be drawn from it with this metamodel."""
-        space = self.settings.scenario.space
-        z, stratum = mixture.sample(n, rng)
-        x = space.from_normal(z)
-        log_w = log_normal(z) - mixture.log_density(z)
-        if space.constraints:
-            log_w = np.where(space.feasible(x), log_w - np.log(space.feasible_mass), -np.inf)
-        over_wide = log_wide(z, self._wide, self._choices) - mixture.log_density(z)
-        unsure = np.full(len(z), np.log(0.5))
-        log_pi, log_not = (unsure, unsure) if log_probability is None else log_probability(z)
-        plan = plan_batch(log_pi, log_not, log_w, over_wide, stratum, shares, form)
-        return _Pool(z, x, plan, log_pi, log_not, stratum)
+    def _proposal(
+        self, log_probability: LogProbability | None, known: Known, shares: tuple[float, ...], rng: np.random.Generator
+    ) -> Proposal:
+        """Return what a pool is drawn with, by this metamodel."""
+        hits = known.z[known.critical] if known.critical.any() else None
+        return fit_proposal(self.settings.scenario.space, self._frame, log_probability, hits, shares, rng)
 
     def _fallback(self, log: Log, known: Known, error: float) -> LogProbability | None:
         """Return an earlier metamodel to draw with, where the newest one has lost its precision for no reason.
 
-        A fit can fail: hyperparameters of another mode of their posterior. That shows in an anticipated error ten times as
-        large as that of an earlier batch, although no critical run since then lay where that batch denied it. The estimate
-        is unbiased with any metamodel that knows only earlier runs.
+        It is used where no critical run since then lay where that metamodel denied it. The estimate is unbiased with any
+        metamodel that knows only earlier runs.
         """
-        drawn = [(batch.number, pool) for batch, pool in pools_of(log) if not pool.fallback]
-        if not drawn:
-            return None
-        iteration, best = min(drawn[-_MEMORY:], key=lambda item: relative_error_of(item[1]))
-        if error <= _LOST * relative_error_of(best):
+        iteration = steadier(log, error)
+        if iteration is None:
             return None
         before = Known.of(log.history.where(log.history.iteration < iteration), self._coordinates, self.settings)
         log_probability = before.learn(stream(self.settings.seed, "fit", iteration))
@@ -244,34 +200,3 @@ class SequentialStage:
         met = known.z[since & known.critical]
         surprised = len(met) > 0 and bool((np.exp(log_probability(met)[0]) < _SURPRISE).any())
         return None if surprised else log_probability
-
-    def _mixture(self, log_probability: LogProbability | None, known: Known, rng: np.random.Generator) -> Mixture:
-        """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
-        if log_probability is None or not known.critical.any():
-            return Mixture(self._wide, choices=self._choices)
-        z, log_q = Mixture(self._wide, choices=self._choices).sample_near(_CANDIDATES, known.z[known.critical], rng)
-
-        at_start = log_probability(z)  # both clouds begin there
-
-        def mass(points: Points) -> Vector:
-            log_pi, _ = at_start if points is z else log_probability(points)
-            return log_normal(points) + log_pi
-
-        def boundary(points: Points) -> Vector:
-            log_pi, log_not = at_start if points is z else log_probability(points)
-            return log_normal(points) + 0.5 * (log_pi + log_not)
-
-        clouds = tuple(particles(target, z, log_q, _PARTICLES, rng) for target in (mass, boundary))
-        return fit_mixture(clouds, self._wide, rng, choices=self._choices)
-
-
-@dataclass(frozen=True, eq=False)
-class _Pool:
-    """A pool: points z (N, d) and x (N, d), how a batch is drawn from it, and what the metamodel says there."""
-
-    z: Points
-    x: Points
-    plan: Plan
-    log_pi: Vector
-    log_not: Vector
-    stratum: Vector

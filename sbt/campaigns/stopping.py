@@ -12,7 +12,7 @@ from sbt.estimators.intervals import FEWEST_HITS, combine_estimates
 from sbt.loop.stages import Log
 from sbt.store.records import Iteration
 
-__all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative_error", "relative_error_of"]
+__all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative_error", "relative_error_of", "steadier"]
 
 _LATEST = 0.6
 """The count begins at the latest after this share of the budget: fewer batches would say little about their own spread."""
@@ -27,6 +27,11 @@ _WIDEST = 3.0
 """Half width of the 95 % interval over the coefficient of variation that ends a campaign, at most: 1.96 with normal errors."""
 FEWEST_BATCHES = 4
 """Batches that must count before their spread is taken for a measure of the error."""
+
+
+_LOST, _MEMORY, _EXACT = 10.0, 4, 0.01
+"""An earlier metamodel is preferred to the newest one after a loss of precision by this factor against one of so many batches
+before, of which the anticipated coefficient of variation of one draw is taken for at least the last value."""
 
 
 def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) -> bool:
@@ -70,6 +75,19 @@ def is_precise(log: Log, settings: Settings) -> bool:
     hits = sum(float(b.critical.sum()) for b in counted)
     half = 0.5 * (found.limit(0.975, side=1) - found.limit(0.975, side=-1))
     return hits >= FEWEST_HITS and found.std_error <= target * found.value and half <= _WIDEST * target * found.value
+
+
+def steadier(log: Log, error: float) -> int | None:
+    """Return the batch whose metamodel was far more precise than this anticipated error of one draw; None without one.
+
+    A fit can fail: hyperparameters of another mode of their posterior. That shows in an anticipated error ten times as
+    large as that of one of the last batches.
+    """
+    drawn = [(batch.number, pool) for batch, pool in pools_of(log) if not pool.fallback]
+    if not drawn:
+        return None
+    iteration, best = min(drawn[-_MEMORY:], key=lambda item: relative_error_of(item[1]))
+    return iteration if error > _LOST * max(relative_error_of(best), _EXACT) else None
 
 
 def pools_of(log: Log) -> Iterator[tuple[Iteration, PoolSummary]]:

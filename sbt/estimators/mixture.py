@@ -11,13 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.spatial.distance import cdist
 from scipy.special import gammainccinv, logsumexp
 
+from sbt.errors import InputError
 from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["Mixture", "Normals", "fit_mixture", "log_normal", "particles", "wide_scales"]
+__all__ = ["Mixture", "Near", "Normals", "effective_size", "fit_mixture", "log_normal", "particles", "reweighted", "wide_scales"]
 
 LogTarget = Callable[[Points], Vector]
 _TAIL = 1e-4  # probability of chi^2 beyond the wide component's radius
@@ -28,7 +31,9 @@ _LABELLED, _ELSEWHERE = 0.9, 0.1  # of a particle belongs to its nearest centre 
 _PRIOR_SHAPE = 0.05  # of the covariance of all particles: the prior of each normal's
 _STEPS = 25  # most of the expectation maximisation, which ends earlier where the likelihood stands still
 _NEAR, _NEAR_SHARE = 0.3, 0.25  # standard deviation of candidates around known critical points, and their share
-_MOVES = 8  # Metropolis steps of a particle: resampled duplicates have moved apart
+_MOVES, _MOVES_BETWEEN = 6, 3  # Metropolis steps at the end and at each power: resampled duplicates have moved apart
+_FEWEST_DISTINCT = 0.25  # effective sample size of reweighted points, relative to their number
+_LEVELS, _KEPT = 15, 0.5  # most powers; share of the effective sample size that a power keeps
 _STEP, _LONGER, _SHORTER, _ACCEPTANCE = 0.6, 1.3, 0.7, 0.3  # of a Metropolis step: first length, factors, acceptance to reach
 
 
@@ -136,50 +141,125 @@ class Mixture:
             z[:, choice.column] = choice.scores(cells, rng.random(n))
         return z
 
-    def sample_near(self, n: int, centres: Points, rng: np.random.Generator) -> tuple[Points, Vector]:
-        """Return n candidates from this mixture and from around `centres` (k, d), with (n,) log density."""
-        near = round(_NEAR_SHARE * n)
-        around = centres[rng.integers(len(centres), size=near)] + _NEAR * rng.standard_normal((near, centres.shape[1]))
-        z = np.concatenate([self.sample(n - near, rng)[0], around])
-        kernel = np.array([log_normal(z - centre, _NEAR) for centre in centres])  # (k, n)
-        log_near = logsumexp(kernel, axis=0) - math.log(len(centres))
-        return z, np.logaddexp(self.log_density(z) + math.log(1.0 - _NEAR_SHARE), log_near + math.log(_NEAR_SHARE))
+
+@dataclass(frozen=True, eq=False)
+class Near:
+    """A mixture and normals around known critical points `centres` (k, d): where particles begin."""
+
+    mixture: Mixture
+    centres: Points
+
+    @property
+    def _share(self) -> float:
+        return _NEAR_SHARE if len(self.centres) else 0.0
+
+    def sample(self, n: int, rng: np.random.Generator) -> Points:
+        """Return n points."""
+        near = round(self._share * n)
+        parts = [self.mixture.sample(n - near, rng)[0]]
+        if near:
+            centres = self.centres[rng.integers(len(self.centres), size=near)]
+            parts.append(centres + _NEAR * rng.standard_normal((near, self.centres.shape[1])))
+        return np.concatenate(parts)
+
+    def log_density(self, z: Points) -> Vector:
+        """Return (n,) log density at z (n, d)."""
+        log_mixture = self.mixture.log_density(z)
+        if not len(self.centres):
+            return log_mixture
+        d = z.shape[1]
+        kernel = -0.5 * cdist(z, self.centres, "sqeuclidean") / _NEAR**2  # (n, k)
+        norm = math.log(len(self.centres)) + d * math.log(_NEAR) + 0.5 * d * math.log(2.0 * math.pi)
+        log_near = logsumexp(kernel, axis=1) - norm
+        return np.logaddexp(log_mixture + math.log(1.0 - self._share), log_near + math.log(self._share))
 
 
-def particles(target: LogTarget, start: Points, log_start: Vector, n: int, rng: np.random.Generator) -> Points:
-    """Return (n, d) particles that approximately follow exp(target): resampled, then moved by Metropolis steps.
+def particles(target: LogTarget, start: Near, n: int, rng: np.random.Generator, candidates: int = 4000) -> Points:
+    """Return (n, d) particles that approximately follow exp(target); none where the target is 0 at all candidates.
+
+    Candidates are resampled, and the particles moved by Metropolis steps, along start^(1 - t) exp(target)^t: t grows as
+    far as half of the particles keep their weight, so that a target far from the start, or sharp in many inputs, is met
+    by many distinct particles.
 
     Args:
         target: (m, d) points to (m,) log density, not normalised; -inf is allowed.
-        start: (m, d) candidates from any density.
-        log_start: (m,) log density of the candidates.
+        start: where the candidates come from.
         n: particles.
         rng: the only source of randomness.
+        candidates: how many points the particles are first chosen from.
+
+    Source:
+        Del Moral, Doucet and Jasra (2006), doi 10.1111/j.1467-9868.2006.00553.x.
     """
-    value = target(start)
-    log_w = np.where(np.isfinite(value), value - log_start, -np.inf)
-    if not np.isfinite(log_w).any():
-        return np.empty((0, start.shape[1]))
-    for power in (0.5, 1.0):  # tempered: many distinct candidates before the particles are moved
-        weight = np.exp(power * (log_w - log_w.max()))
-        weight /= weight.sum()
-        if power == 0.5 and 1.0 / float((weight**2).sum()) < 2 * n:
-            continue
-        break
-    edges = np.cumsum(weight)
-    rows = np.minimum(np.searchsorted(edges, (np.arange(n) + rng.random()) / n * edges[-1]), len(start) - 1)
-    z, log_z = start[rows].copy(), value[rows].copy()
-    step = _STEP
-    for _ in range(_MOVES):
-        spread = z.std(axis=0) + 0.1
-        a, b = rng.permutation(n), rng.permutation(n)
-        jump = np.where(rng.random((n, 1)) < 0.5, 0.5 * (z[a] - z[b]), spread * rng.standard_normal(z.shape))
-        new = z + step * jump * rng.random((n, 1)) * 2.0 / math.sqrt(z.shape[1])
-        log_new = target(new)
-        accept = np.log(rng.random(n)) < log_new - log_z
-        z[accept], log_z[accept] = new[accept], log_new[accept]
-        step *= _LONGER if accept.mean() > _ACCEPTANCE else _SHORTER
+    z = start.sample(candidates, rng)
+    log_start, value = start.log_density(z), target(z)
+    if not np.isfinite(value).any():
+        return np.empty((0, z.shape[1]))
+    temper, step, wanted = 0.0, _STEP, float(min(2 * n, candidates // 2))
+    for level in range(_LEVELS):
+        log_w = np.where(np.isfinite(value), value - log_start, -np.inf)
+        grown = _tempered(log_w, 1.0 - temper, wanted) if level < _LEVELS - 1 else 1.0 - temper
+        rows = _resampled(grown * log_w, n, rng)
+        z, log_start, value = z[rows].copy(), log_start[rows].copy(), value[rows].copy()
+        temper, wanted = temper + grown, _KEPT * n
+        done = temper >= 1.0 - 1e-9
+        for _ in range(_MOVES if done else _MOVES_BETWEEN):
+            spread = z.std(axis=0) + 0.1
+            a, b = rng.permutation(n), rng.permutation(n)
+            jump = np.where(rng.random((n, 1)) < 0.5, 0.5 * (z[a] - z[b]), spread * rng.standard_normal(z.shape))
+            new = z + step * jump * rng.random((n, 1)) * 2.0 / math.sqrt(z.shape[1])
+            new_value, new_start = target(new), log_start if done else start.log_density(new)
+            log_new = new_value if done else (1.0 - temper) * new_start + temper * new_value
+            log_old = value if done else (1.0 - temper) * log_start + temper * value
+            accept = np.log(rng.random(n)) < log_new - log_old
+            z[accept], value[accept], log_start[accept] = new[accept], new_value[accept], new_start[accept]
+            step *= _LONGER if accept.mean() > _ACCEPTANCE else _SHORTER
+        if done:
+            break
     return z
+
+
+def reweighted(log_target: Vector, log_density: Vector, most: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return rows of points with this log density (m,), chosen so that they follow the target (m,), tempered if need be.
+
+    A power of the weights below 1 keeps the effective sample size at a quarter of `most` or more; there are at most twice as
+    many rows, since copies of a few points would pass for structure. None where the target is 0 everywhere.
+    """
+    log_w = np.where(np.isfinite(log_target), log_target - log_density, -np.inf)
+    if not np.isfinite(log_w).any():
+        return np.empty(0, dtype=np.intp)
+    log_w = _tempered(log_w, 1.0, _FEWEST_DISTINCT * most) * log_w
+    return _resampled(log_w, min(most, int(2.0 * effective_size(log_w)) + 1), rng)
+
+
+def effective_size(log_w: Vector) -> float:
+    """Return the effective number of points with these log weights (n,); 0 where all weights are 0."""
+    top = float(log_w.max())
+    if not np.isfinite(top):
+        return 0.0
+    w = np.exp(log_w - top)
+    return float(w.sum() ** 2 / (w**2).sum())
+
+
+def _resampled(log_w: Vector, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return n rows, each in proportion to its weight (m,), systematically."""
+    edges = np.cumsum(np.exp(log_w - log_w.max()))
+    return np.minimum(np.searchsorted(edges, (np.arange(n) + rng.random()) / n * edges[-1]), len(edges) - 1)
+
+
+def _tempered(log_w: Vector, most: float, wanted: float) -> float:
+    """Return the largest power <= most of the weights at which their effective sample size is at least `wanted`."""
+
+    def size(power: float) -> float:
+        return effective_size(power * log_w)
+
+    if size(most) >= wanted:
+        return most
+    low, high = 0.0, most
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if size(middle) >= wanted else (low, middle)
+    return max(low, 1e-3 * most)
 
 
 def fit_mixture(
@@ -228,13 +308,18 @@ def _em(z: Points, taken: tuple[Points, ...], rng: np.random.Generator) -> Norma
     """Return the normals (and masses of choices) of best BIC among a few numbers of components."""
     n, d = z.shape
     free = 1 + d + d * (d + 1) / 2 + sum(t.shape[1] - 1 for t in taken)
-    found = [_em_of(z, taken, k, rng) for k in _COMPONENTS if k == 1 or n >= _ROWS * k * (d + len(taken))]
-
-    def bic(fit: tuple[Normals, float]) -> float:
-        normals, log_likelihood = fit
-        return -2.0 * log_likelihood + len(normals.weight) * free * math.log(n)
-
-    return min(found, key=bic)[0]
+    best, best_bic = None, math.inf
+    for k in _COMPONENTS:
+        if best is not None and n < _ROWS * k * (d + len(taken)):
+            break
+        normals, log_likelihood = _em_of(z, taken, k, rng)
+        bic = -2.0 * log_likelihood + len(normals.weight) * free * math.log(n)
+        if best is not None and bic >= best_bic:
+            break  # more normals pay less and less
+        best, best_bic = normals, bic
+    if best is None:
+        raise InputError(f"a mixture needs particles, but got {n}")
+    return best
 
 
 def _em_of(z: Points, taken: tuple[Points, ...], k: int, rng: np.random.Generator) -> tuple[Normals, float]:

@@ -8,9 +8,10 @@ without trend limits its confidence where it only extrapolates.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, with_target
@@ -31,6 +32,9 @@ LogProbability = Callable[[Points], tuple[Vector, Vector]]
 _REACH = 5.0  # normal scores from -5 to 5 are the unit interval: 6e-7 of the distribution lies beyond
 _QUANTILE = 0.5  # of the distances to the edge: the scale of the warp; a smaller one becomes a step as runs gather there
 _LEAST_R2 = 0.5  # leave-one-out R2 from which on a trend is taken: it explains more than it leaves
+_FEWEST_SCORED = 16  # runs from which on forms are compared
+_HELD_OUT, _MOST_SCORED = 3, 150  # one run in so many scores the forms, of at most so many
+_SURE = 1.0  # gain in mean log density (nats a run) of a trend from which on it is trusted alone
 _RIDGES = (1e-6, 1e-4, 1e-2, 1.0)  # penalties relative to the number of rows
 
 
@@ -85,48 +89,114 @@ class JointLogProbability:
         return joined_log_probability(self.critical, [part(points) for part in self.parts])
 
 
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """In which form the metric is learned: warped or as it is, whole or what a trend leaves of it.
+
+    Args:
+        values: (n,) what is learned, the trend included.
+        interval: M_c in its unit.
+        log_slope: (n,) log of its derivative by the metric.
+        trend: at the metamodel's inputs; None: the whole metric is learned.
+        noise: smallest variance of the noise, in its unit.
+    """
+
+    values: Vector
+    interval: CriticalInterval
+    log_slope: Vector
+    trend: Callable[[Points], Vector] | None = None
+    noise: float = 0.0
+
+    def fit(self, metamodel: Metamodel, u: Points, rows: NDArray[np.intp], rng: np.random.Generator) -> Predictor:
+        """Return the predictor of the values, learned from some rows of u (n, d)."""
+        values = self.values if self.trend is None else self.values - self.trend(u)
+        target = with_target(metamodel, self.interval) if self.trend is None else metamodel
+        with named_errors(metamodel, len(u)):
+            predictor = target.fit(u[rows], values[rows], rng)
+
+        def predict(inputs: Points) -> Prediction:
+            with named_errors(metamodel, len(u)):
+                p = check_prediction(predictor(inputs), len(inputs))
+            if self.noise > 0.0:
+                lacking = np.maximum(self.noise - p.noise**2, 0.0)
+                p = Prediction(p.mean, np.sqrt(p.std**2 + lacking), p.weight, np.sqrt(p.noise**2 + lacking))
+            return p if self.trend is None else Prediction(p.mean + self.trend(inputs), p.std, p.weight, p.noise)
+
+        return predict
+
+
 def fit_log_probability(
-    metamodel: Metamodel, coordinates: Coordinates, critical: CriticalInterval, z: Points, y: Vector, rng: np.random.Generator
-) -> LogProbability:
+    metamodel: Metamodel, coordinates: Callable[[Points], Points], critical: CriticalInterval, z: Points, y: Vector,
+    rng: np.random.Generator, noise: float = 0.0,
+) -> LogProbability:  # fmt: skip
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,).
 
     Of a combination y is (n, q): each metric is learned by itself.
 
-    Where a trend was found, the larger P of two fits: to the metric, and to what the trend leaves of it.
+    Held-out runs near the boundary tell in which form the metric is predicted best: warped or as it is, whole or without a
+    trend. A trend that wins by far is trusted alone; else the larger P of two fits counts.
+
+    Args:
+        metamodel: learns the metric.
+        coordinates: normal scores to the metamodel's inputs.
+        critical: M_c.
+        z: normal scores of the runs.
+        y: their metrics.
+        rng: the only source of randomness.
+        noise: variance of y among runs of the same inputs, as repeats tell: the metamodel's is not allowed to be smaller.
     """
     if isinstance(critical, CombinedInterval):
+        known = np.isfinite(y)
         parts = [
-            fit_log_probability(metamodel, coordinates, leaf, z[np.isfinite(column)], column[np.isfinite(column)], rng)
-            for leaf, column in zip(critical.leaves, y.T, strict=True)
+            fit_log_probability(metamodel, coordinates, leaf, z[known[:, k]], y[known[:, k], k], rng)
+            for k, leaf in enumerate(critical.leaves)
         ]
         return JointLogProbability(critical, tuple(parts))
     u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
-    t, inside = warp.values(y), warp.interval(critical)
+    t = warp.values(y)
+    log_slope = -0.5 * np.log1p(((y - warp.edge) / warp.scale) ** 2) - np.log(warp.scale)
+    whole = _Form(t, warp.interval(critical), log_slope, noise=noise / warp.scale**2)
+    plain = _Form(y, critical, np.zeros(len(y)), noise=noise)
+    trends = [replace(form, trend=_trend(u, form.values)) for form in (whole, plain)]
+    forms = [whole, plain, *(form for form in trends if form.trend is not None)]
+    every = np.arange(len(y))
+    if len(y) < _FEWEST_SCORED:
+        chosen = [whole, *forms[2:3]]
+    else:
+        gain = _gains(metamodel, forms, u, np.exp(-0.5 * t**2), rng)
+        best = int(np.argmax(gain))
+        sure = forms[best].trend is None or gain[best] > _SURE
+        chosen = [forms[best]] if sure else [whole, forms[best]]
+    found = [(form.interval, form.fit(metamodel, u, every, rng)) for form in chosen]
 
-    def fit(model: Metamodel, values: Vector) -> Predictor:
-        with named_errors(metamodel, len(y)):
-            predictor = model.fit(u, values, rng)
-
-        def predict(inputs: Points) -> Prediction:
-            with named_errors(metamodel, len(y)):
-                return check_prediction(predictor(inputs), len(inputs))
-
-        return predict
-
-    plain = fit(with_target(metamodel, inside), t)
-    trend = _trend(u, t)
-    if trend is None:
-        return lambda points: plain(coordinates(points)).log_probability(inside)
-    residual = fit(metamodel, t - trend(u))
-
-    def larger_of_both(points: Points) -> tuple[Vector, Vector]:
+    def largest(points: Points) -> tuple[Vector, Vector]:
         inputs = coordinates(points)
-        first, rest = plain(inputs).log_probability(inside), residual(inputs)
-        second = Prediction.gaussian(rest.mu + trend(inputs), rest.sigma).log_probability(inside)
-        larger = second[0] > first[0]
-        return np.where(larger, second[0], first[0]), np.where(larger, second[1], first[1])
+        each = [predict(inputs).log_probability(interval) for interval, predict in found]
+        log_pi, log_not = each[0]
+        for other_pi, other_not in each[1:]:
+            larger = other_pi > log_pi
+            log_pi, log_not = np.where(larger, other_pi, log_pi), np.where(larger, other_not, log_not)
+        return log_pi, log_not
 
-    return larger_of_both
+    return largest
+
+
+def _gains(metamodel: Metamodel, forms: list[_Form], u: Points, weight: Vector, rng: np.random.Generator) -> Vector:
+    """Return by how much each form predicts held-out runs better than the first: log density, with the runs' weights (n,)."""
+    rows = rng.permutation(len(u))[:_MOST_SCORED]
+    held_out, learned = rows[: len(rows) // _HELD_OUT], rows[len(rows) // _HELD_OUT :]
+    scores = []
+    for form in forms:
+        if form.trend is not None:
+            rest = _trend(u[learned], form.values[learned])
+            if rest is None:
+                scores.append(-np.inf)
+                continue
+            form = replace(form, trend=rest)
+        prediction = form.fit(metamodel, u, learned, rng)(u[held_out])
+        log_density = prediction.log_density(form.values[held_out]) + form.log_slope[held_out]
+        scores.append(float(np.average(log_density, weights=weight[held_out] + 1e-9)))
+    return np.array(scores) - scores[0]
 
 
 def _trend(u: Points, t: Vector) -> Callable[[Points], Vector] | None:

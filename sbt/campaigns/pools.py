@@ -1,0 +1,190 @@
+"""Pools that the draws of an estimation come from: points of a proposal with exact density, and how a batch is drawn from them.
+
+The proposal changes the distribution of all inputs, or of the coordinates of a subspace alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sbt.campaigns.counting import DRAWN, LEARNED
+from sbt.campaigns.each import part_draws
+from sbt.campaigns.records import COUNT, LEARN, CountedDraws, EstimationProposal, NominalDraws, PoolSummary
+from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
+from sbt.estimators.importance import Plan, draw_systematic, plan_batch
+from sbt.estimators.mixture import Mixture, Near, effective_size, fit_mixture, particles, reweighted
+from sbt.estimators.parts import parts_of_pool
+from sbt.estimators.surrogate import LogProbability
+from sbt.problem.arrays import Points, Vector
+from sbt.problem.space import ParameterSpace
+from sbt.store.database import PlannedRun
+
+__all__ = ["Frame", "Pool", "Proposal", "draw_batch", "draw_pool", "fit_proposal", "planned"]
+
+# Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/estimation.md).
+_POOL = 10_000
+"""Points of a pool: its own variance is a hundredth of what 100 draws leave."""
+_PILOT = 2_500
+"""Points of a pilot pool."""
+_PARTICLES = 800
+"""Particles that the mixture is fitted to, per cloud."""
+_REFITS, _REFIT_POINTS, _ENOUGH = 4, 3000, 0.15
+"""How often the mixture is fitted again to its own points at most, how many they are, and the effective share of them that is
+enough: of a perfect fit four tenths would be."""
+
+
+def _unchanged(v: Points, rng: np.random.Generator) -> Points:
+    del rng
+    return v
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The coordinates v (n, m) whose distribution a proposal changes, standard normal under that of the inputs.
+
+    Args:
+        wide: (m,) standard deviations of the wide component.
+        choices: the scores of inputs with choices among the coordinates.
+        lift: coordinates to normal scores z (n, d) of all inputs.
+    """
+
+    wide: Vector
+    choices: tuple[ChoiceScore, ...] = ()
+    lift: Callable[[Points, np.random.Generator], Points] = field(default=_unchanged)
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What a pool is drawn with.
+
+    Attributes:
+        mixture: the proposal.
+        log_probability: of the metamodel, at the frame's coordinates; None: there is none.
+        pilot: the plan of a pilot pool, which decides the form of the estimator and whether the newest metamodel is drawn with: a
+            pool that is counted must not decide that itself, as it would choose what its own points happen to flatter.
+    """
+
+    mixture: Mixture
+    log_probability: LogProbability | None
+    pilot: Plan
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """A pool: points z (N, d) and x (N, d), how a batch is drawn from it, and what the metamodel says there.
+
+    Attributes:
+        mixture, log_probability: what it was drawn with.
+        z, x: normal scores and inputs.
+        plan: how a batch is drawn.
+        log_pi, log_not: log P(critical) and log P(uncritical) by the metamodel.
+        v, stratum: coordinates that the metamodel was asked at, and component of the mixture that each point was drawn from.
+    """
+
+    mixture: Mixture
+    log_probability: LogProbability | None
+    z: Points
+    x: Points
+    plan: Plan
+    log_pi: Vector
+    log_not: Vector
+    v: Points
+    stratum: Vector
+
+
+def fit_proposal(
+    space: ParameterSpace, frame: Frame, log_probability: LogProbability | None, hits: Points | None,
+    shares: tuple[float, ...], rng: np.random.Generator,
+) -> Proposal:  # fmt: skip
+    """Return the proposal that fits a metamodel, with a pilot pool.
+
+    Args:
+        space: of the inputs.
+        frame: whose distribution the proposal changes.
+        log_probability: of the metamodel; None: there is none.
+        hits: (k, m) coordinates of known critical runs; None: the proposal is the nominal and the wide distribution.
+        shares: of the draws, as `SHARES`.
+        rng: the only source of randomness.
+    """
+    start = Mixture(frame.wide, choices=frame.choices)
+    mixture = start if log_probability is None or hits is None else _fitted(log_probability, start, hits, rng)
+    return Proposal(mixture, log_probability, _pooled(space, frame, mixture, log_probability, shares, _PILOT, rng).plan)
+
+
+def draw_pool(
+    space: ParameterSpace, frame: Frame, proposal: Proposal, shares: tuple[float, ...], rng: np.random.Generator
+) -> Pool:
+    """Return a fresh pool and how a batch would be drawn from it."""
+    return _pooled(space, frame, proposal.mixture, proposal.log_probability, shares, _POOL, rng, proposal.pilot.form)
+
+
+def _pooled(
+    space: ParameterSpace, frame: Frame, mixture: Mixture, log_probability: LogProbability | None, shares: tuple[float, ...],
+    n: int, rng: np.random.Generator, form: str | None = None,
+) -> Pool:  # fmt: skip
+    """Return a pool of n points."""
+    v, stratum = mixture.sample(n, rng)
+    z = frame.lift(v, rng)
+    x = space.from_normal(z)
+    log_h = mixture.log_density(v)
+    log_w = log_normal(v) - log_h
+    if space.constraints:
+        log_w = np.where(space.feasible(x), log_w - math.log(space.feasible_mass), -np.inf)
+    unsure = np.full(len(v), np.log(0.5))
+    log_pi, log_not = (unsure, unsure) if log_probability is None else log_probability(v)
+    plan = plan_batch(log_pi, log_not, log_w, log_wide(v, frame.wide, frame.choices) - log_h, stratum, shares, form)
+    return Pool(mixture, log_probability, z, x, plan, log_pi, log_not, v, stratum)
+
+
+def _fitted(log_probability: LogProbability, start: Mixture, hits: Points, rng: np.random.Generator) -> Mixture:
+    """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
+
+    def mass(v: Points) -> Vector:
+        return log_normal(v) + log_probability(v)[0]
+
+    def boundary(v: Points) -> Vector:
+        log_pi, log_not = log_probability(v)
+        return log_normal(v) + 0.5 * (log_pi + log_not)
+
+    near = Near(start, hits)
+    clouds = tuple(particles(target, near, _PARTICLES, rng) for target in (mass, boundary))
+    mixture = fit_mixture(clouds, start.wide, rng, choices=start.choices)
+    for _ in range(_REFITS):  # from particles that a few ancestors share to points that are independent
+        v, _ = mixture.sample(_REFIT_POINTS, rng)
+        log_h, log_p, (log_pi, log_not) = mixture.log_density(v), log_normal(v), log_probability(v)
+        targets = (log_p + log_pi, log_p + 0.5 * (log_pi + log_not))
+        if min(effective_size(target - log_h) for target in targets) >= _ENOUGH * len(v):
+            break
+        clouds = tuple(v[reweighted(target, log_h, _PARTICLES, rng)] for target in targets)
+        mixture = fit_mixture(clouds, start.wide, rng, choices=start.choices)
+    return mixture
+
+
+def draw_batch(
+    space: ParameterSpace, pool: Pool, n: int, rng: np.random.Generator, *, counts: bool, fallback: bool = False
+) -> tuple[tuple[PlannedRun, ...], EstimationProposal]:
+    """Return n runs drawn from a pool with known density, that count or only teach, and what the log keeps of them."""
+    draws, plan = draw_systematic(pool.plan, n, pool.log_pi - pool.log_not, rng), pool.plan
+    summary = PoolSummary(len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback)
+    pi = tuple(np.exp(pool.log_pi[draws.rows]).tolist())
+    z, nominal = pool.z[draws.rows], NominalDraws(pi[: draws.nominal])
+    if not counts:
+        return planned(space, z, LEARNED), EstimationProposal(LEARN, "uncertainty", pool=summary, nominal=nominal)
+    log_q = space.log_density(pool.x[draws.rows]) - np.log(draws.coefficient)
+    counted = CountedDraws(
+        plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi,
+        part_draws(parts_of_pool(pool.log_probability, pool.v, plan, pool.stratum), draws.rows),
+    )  # fmt: skip
+    kept = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted, nominal=nominal)
+    return planned(space, z, DRAWN, log_q), kept
+
+
+def planned(space: ParameterSpace, z: Points, stage: str, log_q: Vector | None = None) -> tuple[PlannedRun, ...]:
+    """Return the runs at normal scores z (n, d), with their log densities (n,) where they are known."""
+    rows = space.from_normal(z)
+    densities = [None] * len(rows) if log_q is None else [float(q) for q in log_q]
+    return tuple(PlannedRun(stage, space.named(row), density) for row, density in zip(rows, densities, strict=True))
