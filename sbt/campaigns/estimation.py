@@ -130,6 +130,9 @@ def recipe(settings: Settings) -> Campaign:
         raise InputError("estimation needs a scenario that can be run anywhere, but recorded rows have no proposal density")
     method = settings.method
     if method == "auto" and settings.scenario.space.dimension >= _HIGH_DIMENSION:
+        if settings.transfer is not None:
+            rule = f"warm_start.transfer needs fewer than {_HIGH_DIMENSION} inputs, or acquisition.kind difference"
+            raise InputError(f"{rule}, but got {settings.scenario.space.dimension} inputs")
         return _campaign(settings, ManyInputsStage(settings), _from_either)
     method = "difference" if method == "auto" else method
     if method == "monte_carlo":

@@ -36,6 +36,9 @@ METHODS = ("portfolio", *CRITERIA, "cma_es")
 """Ways to choose a batch, as in `acquisition.kind`; any acquisition function is one more."""
 
 _INITIAL, _SEARCH, _EVEN = "initial", "search", "even"
+_TRANSFER = "transfer"
+"""Runs that were critical in an earlier campaign of another setup."""
+"""Stage of runs that were critical in an earlier campaign of another setup."""
 _FILL_SHARE = 0.1  # of every batch that fills space, held-out runs included: what it finds is independent of the metamodel
 _REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
 _MOST_CONFIRMED = 10  # modes, the deepest first
@@ -91,8 +94,9 @@ class SearchStage:
         last = log.last(SearchProposal)
         start = 0 if last is None else last.next_position
         if first:
-            filled, at = self._even(size, start)
-            chosen = self._snapped([(_INITIAL, filled)], runs)
+            known = self._known_elsewhere(size // 2)
+            filled, at = self._even(size - len(known), start)
+            chosen = self._snapped([(_TRANSFER, known), (_INITIAL, filled)], runs)
             return Batch((*chosen, *held_out_runs(s, 0, s.reference)), SearchProposal("even", at))
         none = s.scenario.pool is not None or few(s.scenario, runs, s.budget)
         held_out = 0 if none else min(_share_of(s.holdout_fraction, spent, size), size - 1)
@@ -113,6 +117,19 @@ class SearchStage:
     def _number(self, log: Log) -> int:
         """Return the number of the next batch of the search; confirmations in between do not count."""
         return sum(batch.stage == self.name for batch in log.iterations)
+
+    def _known_elsewhere(self, n: int) -> Points:
+        """Return up to n critical runs (k, d) of an earlier campaign of another setup, each far from those before it."""
+        s = self.failure_search.settings
+        space = s.scenario.space
+        if s.transfer is None or n == 0 or not len(s.transfer.hits):
+            return np.empty((0, space.dimension))
+        u = np.clip(space.to_unit(space.from_normal(s.transfer.hits)), 0.0, 1.0)
+        chosen, distance = [0], cdist(u, u[:1])[:, 0]
+        while len(chosen) < n and distance.max() > 0.0:
+            chosen.append(int(distance.argmax()))
+            distance = np.minimum(distance, cdist(u, u[chosen[-1:]])[:, 0])
+        return u[chosen]
 
     def _even(self, n: int, start: int) -> tuple[Points, int]:
         """Return the next n points of the campaign's Sobol sequence, and the position after them."""
@@ -243,5 +260,5 @@ def _share_of(share: float, spent: int, size: int) -> int:
 
 FALSIFICATION = CampaignKind(
     "find critical concrete scenarios, and distinct failure modes", recipe, FalsificationConclusion, acquisition="portfolio",
-    methods=METHODS, stop={"failures": None, "modes": None}, most_initial=10, batch=10,
+    methods=METHODS, stop={"failures": None, "modes": None}, most_initial=10, batch=10, takes_transfer=True,
 )  # fmt: skip

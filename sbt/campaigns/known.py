@@ -49,8 +49,16 @@ class Known:
 
     @property
     def one_sided(self) -> bool:
-        """Whether all runs are critical, or none is."""
+        """Whether all runs are critical, or none is; before the first run not, where an earlier campaign tells of both."""
+        if not len(self.y) and self.settings.transfer is not None:
+            return False
         return not self.critical.any() or bool(self.critical.all())
+
+    @property
+    def starts(self) -> Points:
+        """(k, d) normal scores of critical runs to look around, at first those of an earlier campaign."""
+        found, transfer = self.z[self.critical], self.settings.transfer
+        return found if transfer is None or len(found) else transfer.hits
 
     def modes(self, log_probability: LogProbability | None) -> int:
         """Return the number of groups of critical runs that the metamodel's critical region does not connect."""
@@ -72,10 +80,11 @@ class Known:
 
     def learn(self, rng: np.random.Generator) -> LogProbability | None:
         """Return the log_probability; None with too few runs."""
-        if len(self.y) < 2:
+        transfer = self.settings.transfer
+        if len(self.y) < 2 and transfer is None:
             return None
-        interval = self.settings.scenario.requirement.critical
-        return fit_log_probability(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng)
+        interval, earlier = self.settings.scenario.requirement.critical, () if transfer is None else transfer.trends
+        return fit_log_probability(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng, earlier=earlier)
 
 
 def metamodel_of(settings: Settings) -> Metamodel:

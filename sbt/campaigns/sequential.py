@@ -96,7 +96,7 @@ class SequentialStage:
 
     def _proposed(self, log: Log, size: int) -> Batch:
         s = self.settings
-        if log.iteration == 0 and (s.prior_runs is None or len(s.prior_runs.training) < 2):
+        if log.iteration == 0 and s.transfer is None and (s.prior_runs is None or len(s.prior_runs.training) < 2):
             return self._initial(min(s.initial, s.budget))
         known = Known.of(log.history, self._coordinates, s)
         log_probability = known.learn(stream(s.seed, "fit", log.iteration))
@@ -128,8 +128,10 @@ class SequentialStage:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
         It ends with 40 % of the budget, after three batches without a new mode, and where failures are common:
-        draws from the inputs' distribution meet every region that counts.
+        draws from the inputs' distribution meet every region that counts. An earlier campaign tells where to draw at once.
         """
+        if self.settings.transfer is not None and not known.one_sided:
+            return None
         proposals = [batch.read(EstimationProposal) for batch in log.iterations]
         if len(log.history) >= _SEARCH_BUDGET * self.settings.budget or any(p.phase in (LEARN, COUNT) for p in proposals):
             return None
@@ -171,8 +173,8 @@ class SequentialStage:
             proposal = self._proposal(fallback, known, shares, rng)
         pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng)
         counts = known.one_sided or count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
-        common = self._common(log_probability, log.iteration)
-        searched = 0 if common else min(round(_SEARCH_SHARE[counts] * size), size - 1)
+        blind = not len(known.y) or self._common(log_probability, log.iteration)
+        searched = 0 if blind else min(round(_SEARCH_SHARE[counts] * size), size - 1)
         runs, kept = draw_batch(s.scenario.space, pool, size - searched, rng, counts=counts, fallback=fallback is not None)
         return Batch((*runs, *self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)), kept)
 
@@ -180,7 +182,7 @@ class SequentialStage:
         self, log_probability: LogProbability | None, known: Known, shares: tuple[float, ...], rng: np.random.Generator
     ) -> Proposal:
         """Return what a pool is drawn with, by this metamodel."""
-        hits = known.z[known.critical] if known.critical.any() else None
+        hits = known.starts if len(known.starts) else None
         return fit_proposal(self.settings.scenario.space, self._frame, log_probability, hits, shares, rng)
 
     def _fallback(self, log: Log, known: Known, error: float) -> LogProbability | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from sbt.errors import InputError
+from sbt.estimators.transfer import Transfer
 from sbt.loop.learner import Learner
 from sbt.loop.stages import Campaign, Conclusion, Facts
 from sbt.metamodels.prediction import Prediction
@@ -47,6 +48,7 @@ class Settings:
         stop: rules by name, None where one is off.
         gate: what an estimation has to show; None: no verdict.
         prior_runs: runs of another campaign to learn from, never to count.
+        transfer: what a campaign of another setup tells, as a trend.
     """
 
     scenario: LogicalScenario
@@ -62,6 +64,7 @@ class Settings:
     stop: Mapping[str, float | int | None] = field(default_factory=dict)
     gate: Gate | None = None
     prior_runs: History | None = None
+    transfer: Transfer | None = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ class CampaignKind:
         most_initial: the most runs that the default of `initial` takes.
         batch: default runs per iteration; None: as many as initial.
         takes_gate: it takes the keys `gate` and `warm_start`.
+        takes_transfer: it takes the key `warm_start` with `transfer: true`.
     """
 
     description: str
@@ -119,6 +123,7 @@ class CampaignKind:
     most_initial: int | None = None
     batch: int | None = None
     takes_gate: bool = False
+    takes_transfer: bool = False
 
     @classmethod
     def of(cls, found: Any, name: str) -> CampaignKind:

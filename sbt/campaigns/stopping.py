@@ -52,7 +52,7 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
     spent = len(log.history)
     if spent + size > _LATEST * settings.budget:
         return True
-    if len(drawn) < _FEWEST_LEARNED:
+    if len(drawn) < (_FEWEST_LEARNED if settings.transfer is None else 1):
         return False
     left = math.sqrt(drawn_share * (settings.budget - spent))
     errors = [relative_error_of(pool) / left for _, pool in drawn[-_VALUES:]]

@@ -213,12 +213,19 @@ class ExecutorChoice(_Strict):
         return value
 
 
+_TRANSFERRED = 10
+"""Runs of a batch where an earlier campaign tells where to look: the first ones only have to correct it."""
+
+
 def _tenth(data: Json) -> int:
     most = (_learns(data) and kind_of(data["campaign"]).most_initial) or data["budget"]
     return int(min(max(10, data["budget"] // 10), data["budget"], most))
 
 
 def _batch(data: Json) -> int:
+    warm = data.get("warm_start")
+    if warm is not None and warm.transfer and kind_of(data["campaign"]).takes_gate:
+        return min(_TRANSFERRED, int(data["initial"]))
     return (_learns(data) and kind_of(data["campaign"]).batch) or int(data["initial"])
 
 
@@ -249,6 +256,19 @@ class WarmStart(_Strict):
     """An earlier campaign to learn from: its runs teach the metamodel, they are never counted."""
 
     store: Name = Field(description="Store of a finished campaign of the same scenario, ego, step and inputs.")
+    transfer: bool = Field(
+        default=False, description="It had another ego, step, net, version or other inputs: its metrics are a trend only."
+    )
+    fixed: dict[str, float | str] = Field(
+        default={}, description="With transfer: values of inputs that only the earlier campaign has; the others are integrated."
+    )
+
+    @field_validator("fixed")
+    @classmethod
+    def _with_transfer(cls, value: dict[str, float | str], info: ValidationInfo) -> dict[str, float | str]:
+        if value and not info.data.get("transfer"):
+            raise ValueError(f"inputs are fixed with transfer: true only, but got {', '.join(value)}")
+        return value
 
 
 class Configuration(_Strict):
@@ -284,6 +304,9 @@ class Configuration(_Strict):
         default_factory=_acquisition,
         description="How runs are chosen; default: that of the campaign.",
     )
+    warm_start: WarmStart | None = Field(
+        default=None, description="An earlier campaign to learn from; null: none."
+    )
     initial: int = Field(
         default_factory=_tenth, ge=1,
         description="Evenly distributed runs before the first fit; default: budget / 10, at least 10; at most 10 in a "
@@ -304,9 +327,6 @@ class Configuration(_Strict):
     )
     gate: GateChoice | None = Field(
         default=None, description="Estimation: pass, fail or undecided about a largest probability; null: no verdict."
-    )
-    warm_start: WarmStart | None = Field(
-        default=None, description="Estimation: an earlier campaign whose runs teach the metamodel; null: none."
     )
     judges: Annotated[tuple[Name, ...] | None, Field(strict=False)] = Field(
         default=None, description="Egos to run failures again with; default: falsification, the four reference drivers.",
@@ -341,6 +361,8 @@ class Configuration(_Strict):
     @classmethod
     def _of_estimation(cls, value: Any, info: ValidationInfo) -> Any:
         name = info.data.get("campaign")
+        if isinstance(value, WarmStart) and value.transfer and name is not None and kind_of(name).takes_transfer:
+            return value
         if value is not None and name is not None and not kind_of(name).takes_gate:
             raise ValueError(f"only an estimation campaign takes it, but the campaign is {name}")
         return value

@@ -7,13 +7,14 @@ without trend limits its confidence where it only extrapolates.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from sbt.estimators.transfer import Trend, trended
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, with_target
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
@@ -127,7 +128,7 @@ class _Form:
 
 def fit_log_probability(
     metamodel: Metamodel, coordinates: Callable[[Points], Points], critical: CriticalInterval, z: Points, y: Vector,
-    rng: np.random.Generator, noise: float = 0.0,
+    rng: np.random.Generator, noise: float = 0.0, earlier: Sequence[Trend] = (),
 ) -> LogProbability:  # fmt: skip
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,).
 
@@ -144,14 +145,22 @@ def fit_log_probability(
         y: their metrics.
         rng: the only source of randomness.
         noise: variance of y among runs of the same inputs, as repeats tell: the metamodel's is not allowed to be smaller.
+        earlier: each metric in an earlier campaign, used where runs are better predicted with it; with it no run is needed.
     """
     if isinstance(critical, CombinedInterval):
         known = np.isfinite(y)
         parts = [
-            fit_log_probability(metamodel, coordinates, leaf, z[known[:, k]], y[known[:, k], k], rng)
+            fit_log_probability(
+                metamodel, coordinates, leaf, z[known[:, k]], y[known[:, k], k], rng, earlier=earlier[k : k + 1]
+            )
             for k, leaf in enumerate(critical.leaves)
         ]
         return JointLogProbability(critical, tuple(parts))
+    if earlier:
+        warp = earlier[0].warp
+        belief, edges = trended(metamodel, earlier[0], coordinates(z), z, warp.values(y), rng), warp.interval(critical)
+        if belief is not None:
+            return lambda points: belief(coordinates(points), points).log_probability(edges)
     u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
     log_slope = -0.5 * np.log1p(((y - warp.edge) / warp.scale) ** 2) - np.log(warp.scale)

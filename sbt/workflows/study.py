@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sbt.campaigns.settings import CampaignKind, Gate, Settings
+from sbt.campaigns.transferring import transfer_of
 from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of, spec_of
 from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, read_text, resumed
-from sbt.config.model import Configuration
+from sbt.config.model import Configuration, WarmStart
 from sbt.errors import InputError, PluginError
 from sbt.execution.dask import DaskExecutor
 from sbt.execution.local import LocalExecutor
@@ -25,6 +26,9 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History
+
+if TYPE_CHECKING:
+    from sbt.estimators.transfer import Transfer
 
 __all__ = ["RESOLVED", "Study", "changed_since"]
 
@@ -183,7 +187,7 @@ class Study:
             reference=0 if recorded else config.validation.reference, learner=self.learner,
             acquisition=self._assembly.acquisition if self.live else None, method=config.acquisition.kind,
             stop=config.stop.model_dump(), gate=None if config.gate is None else Gate(**config.gate.model_dump()),
-            prior_runs=self._prior_runs(),
+            prior_runs=self._prior_runs(), transfer=self._transfer(),
         )  # fmt: skip
 
     @cached_property
@@ -238,16 +242,13 @@ class Study:
             InputError: there is no finished campaign, or it ran another scenario, ego, step or other inputs, or
                 did not measure the metric.
         """
-        if self.config.warm_start is None:
+        if self.config.warm_start is None or self.config.warm_start.transfer:
             return None
-        folder = self.loaded.folder / Path(self.config.warm_start.store).expanduser()
-        with Store.read(folder) as store:
-            before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
-        if not finished:
-            raise InputError(f"warm_start.store must be a finished campaign, but the one in {folder} has not concluded")
+        folder, before, history = self._earlier(self.config.warm_start)
         if before._simulator != self._simulator:
             names = f"{before.config.scenario} there, {self.config.scenario} here"
-            raise InputError(f"warm_start.store must have the same scenario, ego and step, but {folder} has another ({names})")
+            rule = f"warm_start.store must have the same scenario, ego and step, but {folder} has another ({names})"
+            raise InputError(f"{rule}; transfer: true takes it as a trend")
         here, there = self.scenario.space.names, tuple(before.kept["names"])
         if there != here:
             raise InputError(
@@ -264,6 +265,34 @@ class Study:
             if len(runs) and metric not in runs.metrics and runs.ok.any():
                 raise InputError(f"warm_start.store must have measured {metric}, but {folder} did not")
         return runs
+
+    def _earlier(self, choice: WarmStart) -> tuple[Path, Study, History]:
+        """Return folder, study and runs of the campaign that `warm_start` names.
+
+        Raises:
+            InputError: it has not concluded.
+        """
+        folder = self.loaded.folder / Path(choice.store).expanduser()
+        with Store.read(folder) as store:
+            before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
+        if not finished:
+            raise InputError(f"warm_start.store must be a finished campaign, but the one in {folder} has not concluded")
+        return folder, before, history
+
+    def _transfer(self) -> Transfer | None:
+        """Return what a campaign of another setup tells; None where `warm_start` names none.
+
+        Raises:
+            InputError: it has no input or metric in common with this one, or there is no metamodel to learn it with.
+        """
+        choice = self.config.warm_start
+        if choice is None or not choice.transfer:
+            return None
+        if self.learner is None:
+            raise InputError(f"warm_start.transfer needs a metamodel, but {self.config.acquisition.kind} uses none")
+        _, before, history = self._earlier(choice)
+        learn = self.learner.metamodel
+        return transfer_of(before.scenario, history.training, self.scenario, learn, self.config.seed, choice.fixed)
 
     @property
     def _simulator(self) -> tuple[Any, ...]:

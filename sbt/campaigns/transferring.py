@@ -1,0 +1,135 @@
+"""What is taken over from an earlier campaign of another setup: another ego, step, net, version or other inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sbt.errors import InputError, did_you_mean
+from sbt.estimators.transfer import Transfer, Trend
+from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.warp import Warp
+from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Value
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.seeds import stream
+from sbt.store.history import History
+
+__all__ = ["transfer_of"]
+
+_ROWS, _NEAREST = 250, 180
+"""Old runs that the trend learns from, and how many of them are those nearest to the critical edge: every prediction of a trend
+costs the square of its rows."""
+_INTEGRATED = 16
+"""Points over which an input is integrated that only the old campaign has."""
+_QUANTILE = 0.5
+"""Of the distances to the critical edge: the scale of the warp, as in estimations."""
+
+
+def transfer_of(
+    old: LogicalScenario, runs: History, new: LogicalScenario, metamodel: Metamodel, seed: int,
+    fixed: Mapping[str, Value] | None = None,
+) -> Transfer:  # fmt: skip
+    """Return what the runs of an old campaign say about the metrics of a new one, as a trend in its inputs.
+
+    Args:
+        old: the scenario of the old campaign.
+        runs: of it, with metrics.
+        new: the scenario of the new campaign; its requirement decides.
+        metamodel: learns the old metrics.
+        seed: of the new campaign.
+        fixed: values of inputs that only the old one has; the others are integrated over their distribution.
+
+    Raises:
+        InputError: no input in common, a metric that was not measured, or a fixed input that the old one does not have.
+    """
+    shared = [name for name in new.space.names if name in old.space.names]
+    if not shared:
+        named = ", ".join(old.space.names), ", ".join(new.space.names)
+        raise InputError("warm_start.transfer needs an input in common, but got {} there, {} here".format(*named))
+    gone = [name for name in old.space.names if name not in shared]
+    for name in fixed or {}:
+        if name not in gone:
+            rule = f"warm_start.fixed must name inputs that only the earlier campaign has ({', '.join(gone) or 'none'})"
+            raise InputError(f"{rule}, but got '{name}'{did_you_mean(name, gone)}")
+    for part in new.requirement.parts:
+        if part.metric not in runs.metrics:
+            rule = f"warm_start.store must have measured {part.metric}"
+            raise InputError(f"{rule}, but only measured {', '.join(runs.metrics) or 'nothing'}")
+    at = _taken(old.space, new.space, runs)
+    runs = runs.where(at[1])
+    rng = stream(seed, "transfer")
+    trends = tuple(_trend(part, old.space, runs, new.space, metamodel, dict(fixed or {}), rng) for part in new.requirement.parts)
+    hits = at[0][at[1]][new.requirement.critical_runs(runs)]
+    return Transfer(trends, new.space.to_normal(hits[new.space.feasible(hits)]))
+
+
+def _taken(old: ParameterSpace, new: ParameterSpace, runs: History) -> tuple[Points, Mask]:
+    """Return old runs at the inputs of the new space, what only that has at its centre, and (n,) whether they lie in it."""
+    x = np.array([[p.centre for p in new.parameters]]).repeat(len(runs), axis=0)
+    inside = np.ones(len(runs), dtype=bool)
+    for k, p in enumerate(new.parameters):
+        if p.name in old.names:
+            values = runs.x[:, old.names.index(p.name)]
+            x[:, k] = _recoded(old.parameters[old.names.index(p.name)], p, values)
+            inside &= x[:, k] >= 0 if p.choices else inside
+            x[:, k] = np.clip(np.round(x[:, k]) if p.discrete else x[:, k], *p.bounds)
+    return x, inside
+
+
+def _recoded(old: Parameter, new: Parameter, values: Vector) -> Vector:
+    """Return the numbers of an input in the new space, -1 for a choice that it does not have."""
+    if bool(old.choices) != bool(new.choices):
+        raise InputError(f"warm_start.transfer needs an input to have choices in both campaigns or in none, but not {new.name}")
+    if not old.choices:
+        return values
+    place = np.array([new.choices.index(c) if c in new.choices else -1 for c in old.choices], dtype=np.float64)
+    return np.asarray(place[values.astype(np.intp)])
+
+
+def _trend(
+    part: Requirement, old: ParameterSpace, runs: History, new: ParameterSpace, metamodel: Metamodel, fixed: dict[str, Value],
+    rng: np.random.Generator,
+) -> Trend:  # fmt: skip
+    """Return one metric of the old campaign as a function of the new inputs."""
+    y = runs.y(part.metric)
+    runs, y = runs.where(np.isfinite(y)), y[np.isfinite(y)]
+    if len(y) < 2:
+        raise InputError(f"warm_start.transfer needs at least two runs with {part.metric}, but got {len(y)}")
+    warp = Warp.around_edge(y, part.critical, quantile=_QUANTILE)
+    t = warp.values(y)
+    if len(t) > _ROWS:
+        order = np.argsort(np.abs(t), kind="stable")
+        rows = np.sort(np.concatenate([order[:_NEAREST], rng.permutation(order[_NEAREST:])[: _ROWS - _NEAREST]]))
+        runs, t = runs.where(np.isin(np.arange(len(t)), rows)), t[rows]
+    gone = [k for k, name in enumerate(old.names) if name not in new.names]
+    if gone:
+        t = _integrated(metamodel.fit(_inputs(old, runs.x), t, rng), old, runs.x, gone, fixed)
+    columns = [k for k, name in enumerate(new.names) if name in old.names]
+    mine = ParameterSpace(tuple(new.parameters[k] for k in columns))
+    predict = metamodel.fit(_inputs(mine, _taken(old, new, runs)[0][:, columns]), t, rng)
+    return Trend(warp, lambda z: predict(_inputs(mine, new.from_normal(z)[:, columns])).mu)
+
+
+def _inputs(space: ParameterSpace, x: Points) -> Points:
+    return space.metamodel_inputs(space.to_unit(x))
+
+
+def _integrated(predict: Predictor, old: ParameterSpace, x: Points, gone: list[int], fixed: dict[str, Value]) -> Vector:
+    """Return the prediction at old runs, with inputs that are gone fixed or integrated over their distribution."""
+    from scipy.special import ndtri
+    from scipy.stats import qmc
+
+    even = old.from_normal(ndtri(qmc.Sobol(old.dimension, scramble=True, rng=0).random(_INTEGRATED)))
+    total = np.zeros(len(x))
+    for point in even:
+        at = x.copy()
+        for k in gone:
+            p = old.parameters[k]
+            at[:, k] = p.number(fixed[p.name]) if p.name in fixed else point[k]
+        total += predict(_inputs(old, at)).mu
+    return total / len(even)
