@@ -20,6 +20,7 @@ SMALLEST = {
     "screening.py": "--rows 50 --inputs 4 --samples 4 --kinds gp",
     "slice_teeth.py": "--scenario following --points 2 --values 4",
     "step_length.py": "--scenario cut_in --points 16 --seeds 2 --reference 0.025",
+    "transfer.py": "--seeds 1 --cases cut_in --budget 60 --crude 50 --table {folder}/table.jsonl",
     "throughput.py": "--scenario cut_in --runs 4 --repeats 1 --no-campaign",
     "watcher.py": "--repeats 1 --vehicles 20",
     "warm_start.py": "{folder}/store --seeds 2 --batch 10 --batches 2",
@@ -31,7 +32,7 @@ SMALLEST = {
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
-SUMO |= {"physics.py", "throughput.py", "watcher.py"}
+SUMO |= {"physics.py", "throughput.py", "transfer.py", "watcher.py"}
 LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
 SHARED = {"street_traffic.py"}  # networks and traffic of the scripts
 
