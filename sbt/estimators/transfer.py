@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, without_repetitions
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
@@ -105,6 +105,7 @@ def _slope(old: Vector, t: Vector) -> float:
 
 def _score(metamodel: Metamodel, u: Points, rest: Vector, rng: np.random.Generator) -> tuple[float, Predictor]:
     """Return the mean log density of each row as predicted from the others, and the metamodel of all."""
+    u, rest = without_repetitions(u, rest)  # as a process learns them
     with named_errors(metamodel, len(rest)):
         predict = metamodel.fit(u, rest, rng)
     if isinstance(predict, _LeavesOut):
