@@ -96,7 +96,7 @@ def test_commands_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 LANGUAGES = {"bash", "console", "python", "text", "toml", "xml", "yaml"}
 RUN = {
     "README.md": {"bash", "python", "yaml"}, "docs/benchmark.md": {"bash"}, "docs/boundary.md": {"console"},
-    "docs/clusters.md": {"bash", "yaml"}, "docs/configuration.md": {"yaml"}, "docs/estimation.md": {"yaml"},
+    "docs/clusters.md": {"bash", "yaml"}, "docs/configuration.md": {"yaml"}, "docs/estimation.md": {"bash", "yaml"},
     "docs/extending.md": {"python", "toml", "yaml"},
     "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
     "docs/python.md": {"python"}, "docs/reference_drivers.md": {"python"}, "docs/requirements.md": {"python", "yaml"},
