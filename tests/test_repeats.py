@@ -11,10 +11,12 @@ import pytest
 import sbt
 from sbt.campaigns.repeats import REPEAT, repeats_wanted, simulator_noise
 from sbt.problem.outcome import Status
+from sbt.problem.requirement import Requirement
 from sbt.store.history import VALIDATION, History, Record
 from sbt.testbeds import analytic
 
 OK, FAILED = Status.OK, Status.FAILED
+Y = Requirement("y", high=0.0)
 
 
 def history(rows: list[tuple[float, float | None]], stage: str = "initial") -> History:
@@ -30,21 +32,21 @@ PLANE = analytic(lambda x: x[:, 0] - 0.1, inputs={"a": (0.0, 1.0)}, critical=(-n
 def test_the_noise_is_pooled_over_equal_inputs():
     rng = np.random.default_rng(0)
     a = np.repeat(np.linspace(0.0, 1.0, 400), 3)
-    found = simulator_noise(history(list(zip(a, 5.0 * a + 0.3 * rng.standard_normal(len(a)), strict=True))), "y")
+    found = simulator_noise(history(list(zip(a, 5.0 * a + 0.3 * rng.standard_normal(len(a)), strict=True))), Y)
     assert (found.repeats, found.noisy) == (800, True)
     assert found.std == pytest.approx(0.3, rel=0.08)
-    same = simulator_noise(history([(0.5, 1.0), (0.5, 1.0 + 1e-13), (0.7, 2.0), (0.5, None)]), "y")
+    same = simulator_noise(history([(0.5, 1.0), (0.5, 1.0 + 1e-13), (0.7, 2.0), (0.5, None)]), Y)
     assert (same.repeats, same.noisy, same.std) == (1, False, 0.0)
-    unknown = simulator_noise(history([(0.5, 1.0), (0.7, 2.0), (0.7, None)]), "y")
+    unknown = simulator_noise(history([(0.5, 1.0), (0.7, 2.0), (0.7, None)]), Y)
     assert (unknown.repeats, unknown.noisy, unknown.std) == (0, None, None)
 
 
 def test_noise_in_another_metric_is_noise():
     rows = history([(0.5, 3.0), (0.5, 3.0)])
-    assert not simulator_noise(rows, "y").noisy
+    assert not simulator_noise(rows, Y).noisy
     rows.columns["y.other"][1] = 0.7
-    assert simulator_noise(rows, "y").noisy
-    assert simulator_noise(rows, "y").std == 0.0
+    assert simulator_noise(rows, Y).noisy
+    assert simulator_noise(rows, Y).std == 0.0
 
 
 def test_the_smallest_margins_are_repeated_once_and_plateaus_last():

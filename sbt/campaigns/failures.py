@@ -12,9 +12,9 @@ from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
-from sbt.campaigns.repeats import SimulatorNoise, stated_noise
+from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
-from sbt.campaigns.wording import plural
+from sbt.campaigns.wording import percent, plural
 from sbt.errors import InputError
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Facts
@@ -32,6 +32,7 @@ __all__ = [
 
 CONFIRM = "confirm"
 """Stage of the runs that repeat a failure mode's representative with fresh seeds; they come beside the budget."""
+_TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
 FILLING = ("initial", "even", VALIDATION)
 """Stages of runs that fill the space, whatever the results."""
 
@@ -127,6 +128,7 @@ class FalsificationConclusion:
         if self.simulator_noise is not None:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         said += [*violations_words(self.violates), *independence_words(self.independence)]
+        said += _rates(self.failure_modes)
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
         return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence()]
 
@@ -177,7 +179,11 @@ class FailureSearch:
             return [Mode((only,), only, only, None)]
         u, y = scenario.space.to_unit(history.x[ok]), scenario.requirement.values(history)[ok]
         fitted = fit_warped(self.search, u, y, stream(self.settings.seed, "modes", len(history)))
-        return modes_of(fitted, history, scenario)
+        return modes_of(fitted, history, scenario, noisy=self.noisy(history))
+
+    def noisy(self, history: History) -> bool:
+        """Say whether runs of equal inputs had different metrics."""
+        return bool(simulator_noise(history, self.settings.scenario.requirement).noisy)
 
     def conclusion(self, history: History, fit: FitRecord | None) -> FalsificationConclusion:
         """Return what was found."""
@@ -187,7 +193,7 @@ class FailureSearch:
         modes = []
         for mode in self.modes(searched):
             again = history.where(confirmations(history, searched.x[mode.representative]))
-            modes.append(describe(mode, searched, scenario, again))
+            modes.append(describe(mode, searched, scenario, again, noisy=self.noisy(history)))
         first = int(hits[0]) if len(hits) else None
         bound = None if len(hits) else SearchBound.of(searched)
         return FalsificationConclusion(
@@ -207,6 +213,17 @@ def search_runs(history: History) -> History:
 def confirmations(history: History, x: Vector) -> Mask:
     """Return (n,) booleans: the run repeated the inputs x (d,) to confirm a failure mode."""
     return (history.stage == CONFIRM) & (history.x == x).all(axis=1)
+
+
+def _rates(modes: tuple[FailureMode, ...]) -> list[str]:
+    """Return the failure rates of the first modes in words; nothing where there are none."""
+    rates = [(mode.representative, mode.failure_rate) for mode in modes if mode.failure_rate is not None]
+    if not rates:
+        return []
+    told = "; ".join(
+        f"run {run} {percent(r.estimate or 0.0)} of {r.runs} ({percent(r.low)} to {percent(r.high)})" for run, r in rates[:_TOLD]
+    )
+    return [f"Failure rates with fresh seeds ({percent(rates[0][1].confidence)} interval): {told}."]
 
 
 def _closest(runs: History, margin: Vector, requirement: Requirement) -> ClosestRun | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,10 @@ from scipy.spatial.distance import cdist
 
 from sbt.acquisitions import even, is_greedy, log_scores
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
-from sbt.campaigns.failures import CONFIRM, FailureSearch, FalsificationConclusion, confirmations, search_runs
+from sbt.campaigns.failures import CONFIRM, FILLING, FailureSearch, FalsificationConclusion, confirmations, search_runs
 from sbt.campaigns.parts import held_out_runs, named_inputs
 from sbt.campaigns.records import SearchProposal
-from sbt.campaigns.repeats import repeats_wanted
+from sbt.campaigns.repeats import REPEAT, repeats_wanted
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
@@ -41,6 +41,7 @@ _TRANSFER = "transfer"
 """Stage of runs that were critical in an earlier campaign of another setup."""
 _FILL_SHARE = 0.1  # of every batch that fills space, held-out runs included: what it finds is independent of the metamodel
 _REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
+_MOST_REPEATS, _REPEATS_IN_ALL = 10, 30  # of a noisy simulator, whose modes have a failure rate
 _MOST_CONFIRMED = 10  # modes, the deepest first
 
 
@@ -102,9 +103,12 @@ class SearchStage:
         held_out = 0 if none else min(_share_of(s.holdout_fraction, spent, size), size - 1)
         filling = min(_share_of(max(_FILL_SHARE - s.holdout_fraction, 0.0), spent, size), size - 1 - held_out)
         again = repeats_wanted(runs, s.scenario, size - held_out - filling) if self._learns else ()
-        picks, criteria = self._guided(log, runs, size - held_out - filling - len(again))
+        picks = self._guided(log, runs, size - held_out - filling - len(again))
+        names, counts = np.unique(np.array(picks.why, dtype=np.str_), return_counts=True)
+        criteria = {str(name): int(count) for name, count in zip(names, counts, strict=True)}
         filled, at = self._even(filling, start)
-        chosen = self._snapped([(_SEARCH, picks), (_EVEN, filled)], runs)
+        chosen = self._snapped([(_SEARCH, picks.u), (_EVEN, filled)], runs)
+        again = (*again, *(PlannedRun(REPEAT, runs.inputs(row)) for row in picks.repeat))
         proposal = SearchProposal(s.method, at, criteria, filling, held_out, len(again) or None)
         return Batch((*chosen, *again, *held_out_runs(s, number, held_out)), proposal)
 
@@ -140,24 +144,22 @@ class SearchStage:
         draw = rejection(lambda u: np.zeros(len(u)), sobol, n, start=start, seed=s.seed, label="even", accept_filter=feasible)
         return draw.u, draw.next_position
 
-    def _guided(self, log: Log, runs: History, n: int) -> tuple[Points, Mapping[str, int]]:
-        """Return n points by the configured method, and how many of them each criterion chose."""
+    def _guided(self, log: Log, runs: History, n: int) -> Picks:
+        """Return n points by the configured method; none by a criterion of its own where an acquisition function chooses."""
         s, search = self.failure_search.settings, self.failure_search.search
         space, requirement = s.scenario.space, s.scenario.requirement
         u, y = np.clip(space.to_unit(runs.x), 0.0, 1.0), requirement.values(runs)
         rng = stream(s.seed, "search", self._number(log))
         if n == 0:
-            return np.empty((0, space.dimension)), {}
+            return Picks(np.empty((0, space.dimension)), ())
         if s.acquisition is not None:
-            return self._scored(log, n), {}
+            return Picks(self._scored(log, n), ())
         if s.method == "cma_es":
-            picks = self._evolved(runs, u, n)
-        elif s.method == "portfolio":
-            picks = portfolio.propose(search, u, y, n, rng, runs.iteration)
-        else:
-            picks = propose_by(s.method, search, u, y, n, rng, runs.iteration)
-        names, counts = np.unique(np.array(picks.why, dtype=np.str_), return_counts=True)
-        return picks.u, {str(name): int(count) for name, count in zip(names, counts, strict=True)}
+            return self._evolved(runs, u, n)
+        if s.method == "portfolio":
+            filling = np.isin(runs.stage, FILLING)
+            return portfolio.propose(search, u, y, n, rng, runs.iteration, filling, repeats=s.scenario.pool is None)
+        return propose_by(s.method, search, u, y, n, rng, runs.iteration)
 
     def _evolved(self, runs: History, u: Points, n: int) -> Picks:
         """Return the next generation of CMA-ES, which starts at the best run of the even start."""
@@ -238,9 +240,13 @@ class ConfirmStage:
         if self.failure_search.settings.scenario.pool is not None:
             return []  # a recorded row cannot be repeated
         runs, planned = search_runs(log.history), []
-        for mode in self.failure_search.modes(runs)[:_MOST_CONFIRMED]:
+        modes = self.failure_search.modes(runs)[:_MOST_CONFIRMED]
+        repeats = _REPEATS
+        if modes and self.failure_search.noisy(runs):
+            repeats = min(max(_REPEATS_IN_ALL // len(modes), _REPEATS), _MOST_REPEATS)
+        for mode in modes:
             done = int(confirmations(log.history, runs.x[mode.representative]).sum())
-            planned += [PlannedRun(CONFIRM, runs.inputs(mode.representative))] * (_REPEATS - done)
+            planned += [PlannedRun(CONFIRM, runs.inputs(mode.representative))] * (repeats - done)
         return planned
 
     def stop(self, log: Log) -> str | None:
@@ -248,7 +254,7 @@ class ConfirmStage:
         return None if self._missing(log) else SearchStage(self.failure_search).stop(log)
 
     def propose(self, log: Log) -> Batch:
-        """Return three runs a mode, beside the budget."""
+        """Return three runs a mode, up to ten with a noisy simulator, beside the budget."""
         last = log.last(SearchProposal)
         return Batch(tuple(self._missing(log)), SearchProposal("repeat", 0 if last is None else last.next_position))
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.plain import Value
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -19,7 +20,7 @@ from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
 from sbt.store.records import Judgement, optional
 
-__all__ = ["FailureMode", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of", "violations"]
+__all__ = ["FailureMode", "FailureRate", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of", "violations"]
 
 _PROBES = 9  # on the segment between two runs
 _MOST = 200  # critical runs that are compared with each other; further ones join the nearest
@@ -27,6 +28,7 @@ _CHUNK = 100  # segments asked for at once
 _UNMEASURED = -2.0
 _FAR = 1e6  # beyond any distance in the unit cube
 _NOT_WITHIN = 1e-9
+_RATE_STEPS = 20  # rates within a twentieth are alike: depth decides
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class Mode:
 
     Args:
         rows: of its critical runs in the history.
-        representative: the row deepest in the critical interval.
+        representative: the row deepest in the critical interval; with a noisy simulator the one of the largest P(critical), for
+            depth is luck.
         most_likely: the row of largest p(x).
         safe: the uncritical row nearest to the representative in the unit cube; None: there is none.
     """
@@ -66,17 +69,43 @@ class NearestSafe:
 
 
 @dataclass(frozen=True)
+class FailureRate:
+    """How often runs of the same inputs and fresh seeds are critical.
+
+    Attributes:
+        estimate: share of critical ones among those that gave a metric; None: none did.
+        low, high: ends of its exact binomial interval; failed runs count as uncritical for the low end, as critical for the high.
+        confidence: of the interval.
+        runs: repetitions, all after the representative was chosen.
+    """
+
+    estimate: float | None
+    low: float
+    high: float
+    confidence: float
+    runs: int
+
+    @classmethod
+    def of(cls, critical: Mask, failed: Mask) -> FailureRate:
+        """Return the rate of repetitions that were critical (n,) or failed (n,)."""
+        hits, lost, n = int(critical.sum()), int(failed.sum()), len(critical)
+        low, high = float(interval(hits, n)[0]), float(interval(hits + lost, n)[1])
+        return cls(hits / (n - lost) if n > lost else None, low, high, 0.95, n)
+
+
+@dataclass(frozen=True)
 class FailureMode:
     """A distinct way to fail, as the conclusion tells it.
 
     Attributes:
-        representative: index of its run deepest in the critical interval.
+        representative: index of its run deepest in the critical interval, or most likely to fail again (see `Mode`).
         inputs, metric: of the representative.
         size: critical runs of the search in it.
         conflict: how ego and the nearest other met; None where it is not measured.
         runs: their indices.
         confirmed: share of the repetitions of the representative with fresh seeds that were critical; None: not repeated.
         confirmation_runs: repetitions.
+        failure_rate: of the representative's inputs, where the simulator is noisy; None: it is not, or nothing was repeated.
         most_likely: its run of largest density.
         nearest_safe: the uncritical run nearest to the representative; None: there is none.
         preventable: what the reference drivers made of the representative; None: they were not asked.
@@ -97,17 +126,23 @@ class FailureMode:
     preventable: tuple[Judgement, ...] | None = optional()
     unconfirmed: int = 0
     violates: Mapping[str, int] | None = optional()
+    failure_rate: FailureRate | None = optional()
 
 
-def connected(fitted: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]:
+def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
+
+    With a noisy simulator P(critical) is small even where runs fail most: there it must exceed half of the smaller P at the two
+    ends.
 
     Args:
         fitted: of the metamodel.
         u: (n, d) critical runs in the unit cube.
         kind: (n,) only runs of the same kind are joined.
+        noisy: see above.
     """
     n = len(u)
+    level = 0.5 * fitted.probability(u) if noisy else np.full(n, 0.5)
     group = np.arange(n, dtype=np.int64)
     distance = cdist(u, u)
     first, second = np.triu_indices(n, 1)
@@ -124,19 +159,21 @@ def connected(fitted: WarpedModel, u: Points, kind: Vector) -> NDArray[np.int64]
         if len(a) == 0:
             break
         probes = u[a][:, None, :] * (1.0 - steps) + u[b][:, None, :] * steps  # (pairs, 9, d)
-        inside = (fitted.probability(probes.reshape(-1, u.shape[1])) > 0.5).reshape(len(a), _PROBES).all(axis=1)
+        least = np.minimum(level[a], level[b])[:, None]
+        inside = (fitted.probability(probes.reshape(-1, u.shape[1])).reshape(len(a), _PROBES) > least).all(axis=1)
         for i, j in zip(a[inside], b[inside], strict=True):
             group[group == group[j]] = group[i]
     return group
 
 
-def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -> list[Mode]:
+def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *, noisy: bool = False) -> list[Mode]:
     """Return the failure modes, the one with the deepest run first.
 
     Args:
         fitted: learned from these runs.
         history: runs; only finished ones count.
         scenario: with the campaign's space and requirement.
+        noisy: the simulator is, see `connected` and `Mode`.
     """
     critical = scenario.requirement.critical
     y = scenario.requirement.values(history)
@@ -148,7 +185,10 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -
     depth = critical.margin(y)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
     kind = _kind(history, cube.choices(u))
-    group = connected(fitted, u[chosen], kind[chosen])
+    group = connected(fitted, u[chosen], kind[chosen], noisy=noisy)
+    unlikely = np.zeros(len(history))
+    if noisy:
+        unlikely[hits] = -np.round(_RATE_STEPS * fitted.probability(u[hits]))
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]
     log_p = scenario.space.log_density(history.x[hits])
@@ -156,7 +196,7 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario) -
     found = []
     for name in np.unique(label):
         rows = hits[label == name]
-        representative = int(rows[np.argmin(depth[rows])])
+        representative = int(rows[np.lexsort((depth[rows], unlikely[rows]))[0]])
         likely = int(rows[np.argmax(log_p[label == name])])
         safe = int(uncritical[cdist(at[[representative]], at[uncritical])[0].argmin()]) if len(uncritical) else None
         found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
@@ -169,7 +209,7 @@ def _kind(history: History, choices: Points) -> Vector:
     return np.unique(told, axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
 
 
-def describe(mode: Mode, history: History, scenario: LogicalScenario, again: History) -> FailureMode:
+def describe(mode: Mode, history: History, scenario: LogicalScenario, again: History, *, noisy: bool = False) -> FailureMode:
     """Return what is said of a mode.
 
     Args:
@@ -177,6 +217,7 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, again: His
         history: the runs.
         scenario: with the campaign's space and requirement.
         again: the representative's runs with fresh seeds.
+        noisy: the simulator is: the mode has a failure rate.
     """
     requirement = scenario.requirement
     y, at, likely = requirement.told(history), mode.representative, mode.most_likely
@@ -191,6 +232,7 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, again: His
         None if mode.safe is None else _nearest_safe(mode.safe, inputs, history, y),
         unconfirmed=int(history.unconfirmed[list(mode.rows)].sum()),
         violates=violations(requirement, history.where(np.isin(np.arange(len(history)), mode.rows))),
+        failure_rate=FailureRate.of(requirement.critical_runs(again), ~again.ok) if noisy and len(again) else None,
     )  # fmt: skip
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import ndtr
 
 from sbt.metamodels.extra_trees import ForestPredictor
@@ -192,6 +194,24 @@ class GaussianProcessPredictor:
             latent = self.hyper.covariance(at, at) - half.T @ half
             root = host(cholesky(latent, np.full(len(u), 1e-8 * self.hyper.outputscale)))
             return self.shift + self.scale * (mean + rng.standard_normal((n, len(u))) @ root.T)
+
+    def left_out(self, groups: Sequence[Sequence[int]]) -> list[tuple[Vector, Vector]]:
+        """Return for each group of k rows (k,) residuals and (k,) standard deviations of what the other rows predict of them.
+
+        Hyperparameters and the constant mean are those of all rows.
+
+        Source:
+            Rasmussen & Williams (2006), eqs. (5.10) to (5.12), for blocks of rows.
+        """
+        with single_threaded():
+            root = solve_triangular(self.factor, np.eye(len(self.u)), lower=True)
+            inverse = root.T @ root
+            found = []
+            for rows in groups:
+                at = np.asarray(rows, dtype=np.intp)
+                block = np.linalg.inv(inverse[np.ix_(at, at)])
+                found.append((self.scale * (block @ self.alpha[at]), self.scale * np.sqrt(np.diag(block))))
+        return found
 
     def _moments(self, u: Points) -> tuple[Vector, Vector]:
         """Return (m,) mean and (m,) variance without noise, standardised."""

@@ -1,4 +1,4 @@
-"""Where to look for the next failure: several trust regions, global picks of P(critical), deflation.
+"""Where to look for the next failure: trust regions, niches, global picks of P(critical), filling, deflation.
 
 Everything is a function of the runs so far: what a trust region has become is read from them each
 time, nothing is remembered between batches.
@@ -6,35 +6,52 @@ time, nothing is remembered between batches.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.problem.cube import CONTINUOUS, Cube
-from sbt.samplers.search import Picks, Search, WarpedModel, fill_uniformly, fit_warped, log_repulsion, refine_best, search_data
+from sbt.problem.cube import Cube
+from sbt.samplers.regions import PATIENCE, Region, clusters, niches, regions
+from sbt.samplers.search import (
+    Picks,
+    Search,
+    SearchData,
+    WarpedModel,
+    fill_uniformly,
+    fit_warped,
+    log_repulsion,
+    refine_best,
+    search_data,
+    spread_out,
+)  # fmt: skip
 
 __all__ = ["Region", "propose", "regions"]
 
-_APART = 0.25  # of the best runs of two trust regions, Chebyshev distance: a little more than DEFLATION
-_MOST_REGIONS = 3  # a batch of ten has two Thompson draws for each
-_LONGEST, _SHORTEST = 0.8, 2.0**-6  # side of a trust region: TuRBO's first one; it is retired after six halvings
-_PATIENCE = 3  # batches without an improvement before a trust region is halved; two were measured to be worse
 _HOPELESS = 1e-4  # largest inflated P(critical) in a region that is given up, and below which all candidates are alike
 _INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a fit to few runs is too sure; measured
 _THOMPSON = 0.6  # share of the picks; 75 % and 30 % were measured, see docs/falsification.md
+_STAGNANT = 60  # runs without a better one or a new failure, after which the Thompson draws give way to filling:
+_THOMPSON_LATE, _FILLING_LATE = 0.2, 0.4  # shares of the picks from then on
+_REPEATED = 0.1  # of the picks, rounded up: repetitions of critical runs of a noisy simulator
 _LOCAL = 350  # candidates of a trust region: the cost of sample paths is cubic in them
+_IN_NICHE, _IN_NICHE_DRAWN = 3, 200  # picks in a niche, the first of them the best of a sample path; its candidates
+_FEWEST_FOR_NICHES = 20  # runs: with fewer the metamodel expects nothing
 _CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
 _CLEAR_OF_RUNS = 0.2 * _CLEAR  # the metamodel knows what a finished run says of its neighbourhood
 
 
-def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None) -> Picks:
+def propose(
+    search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None,
+    filling: Mask | None = None, *, repeats: bool = False,
+) -> Picks:  # fmt: skip
     """Return n points where the next failure may be, away from the failures that are known.
 
     About 60 % are Thompson draws in up to three trust regions, the others are global picks of
-    P(critical) that repel each other; where nothing promises anything, they fill the space. The caller
-    adds a share of space-filling runs (about 10 %).
+    P(critical) that repel each other; where nothing promises anything, they fill the space. Runs that lie far below what
+    the metamodel expects without them get a few picks about them (niches). After 60 runs without a better one two fifths of
+    the picks fill space instead of two thirds of the Thompson draws. The caller adds a share of space-filling runs (about 10 %).
 
     Args:
         search: what is searched.
@@ -43,102 +60,68 @@ def propose(search: Search, u: Points, y: Vector, n: int, rng: np.random.Generat
         n: points wanted >= 1.
         rng: the only source of randomness.
         batch: (m,) number of the batch that each run came with; None: each run by itself.
+        filling: (m,) the run fills space, whatever the results; None: all do.
+        repeats: where the simulator is noisy, up to a tenth of the n are repetitions that decide whether a basin is deflated.
 
     Returns:
         The picks; random ones (`global`) where there are fewer than two runs to learn from.
 
     Source:
-        Trust regions and Thompson draws: Eriksson et al. (2019), TuRBO, arXiv 1910.01739; the mixture
+        Trust regions and Thompson draws: Eriksson et al. (2019), TuRBO, arXiv 1910.01739; the mixture, the niches
         and the deflation were measured, see docs/falsification.md.
     """
     seen, d = search_data(search, u, y, batch, rng), u.shape[1]
+    again = seen.undecided[: math.ceil(_REPEATED * n)] if repeats and n > 1 else ()
+    n -= len(again)
     if len(seen.u) < 2:
-        return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n)
+        return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n, again)
     model = fit_warped(search, seen.u, seen.y, rng, seen.success)
-    fresh = ~seen.flank
+    margin = search.critical.margin(seen.y) if not seen.noisy else model.critical.margin(model(seen.u).mu)
+    fresh, fills = ~seen.flank, np.ones(len(u), dtype=bool) if filling is None else filling
     found = regions(
-        np.vstack([seen.u[fresh], seen.failed]),
-        np.concatenate([search.critical.margin(seen.y[fresh]), np.full(len(seen.failed), np.inf)]),
+        np.vstack([seen.u[fresh], seen.failed]), np.concatenate([margin[fresh], np.full(len(seen.failed), np.inf)]),
         np.concatenate([seen.batch[fresh], seen.failed_batch]), search.cube,
+        np.concatenate([fills[seen.rows][fresh], np.zeros(len(seen.failed), dtype=bool)]), minima=not seen.noisy,
     )  # fmt: skip
-    niches = _hopeful(model, found, seen.admissible, rng, search.cube)
-    drawn = _thompson(model, niches, round(_THOMPSON * n), d, rng)
-    picks = _globally(model, drawn, n, u, niches, seen.admissible, rng, search.cube)
-    why = ("thompson",) * len(drawn) + ("global",) * (n - len(drawn))
+    hopeful = _hopeful(model, found, seen.admissible, rng, search.cube)
+    stagnant = not seen.noisy and seen.runs_since(margin) >= _STAGNANT  # noise hides what is better
+    small = _in_niches(model, seen, margin, [region for region, _ in hopeful], n - 2, rng, search.cube)
+    filled = round(_FILLING_LATE * (n - len(small))) if stagnant else 0
+    thompson = min(round((_THOMPSON_LATE if stagnant else _THOMPSON) * n), n - len(small) - filled)
+    drawn = _thompson(model, hopeful, thompson if len(small) == 0 else min(thompson, (n - len(small)) // 2), d, rng)
+    picks = np.vstack([drawn, small])
+    picks = np.vstack([picks, spread_out(seen.admissible, np.vstack([u, picks]), filled, rng, search.cube)])
+    why = ("thompson",) * len(drawn) + ("niche",) * len(small) + ("fill",) * filled + ("global",) * (n - len(picks))
+    picks = _globally(model, picks, n, u, hopeful, seen.admissible, rng, search.cube)
     order = np.argsort(-model.log_probability(picks), kind="stable")
-    return Picks(picks[order], tuple(why[k] for k in order))
+    return Picks(picks[order], tuple(why[k] for k in order), again)
 
 
-@dataclass(frozen=True, eq=False)
-class Region:
-    """A trust region: a box around the best run of its neighbourhood.
-
-    Args:
-        centre: (d,) the run.
-        side: of the box.
-        failures: batches in it since the last improvement.
-    """
-
-    centre: Vector
-    side: float
-    failures: int = 0
-
-    def candidates(self, n: int, rng: np.random.Generator, cube: Cube = CONTINUOUS) -> Points:
-        """Return (n, d) points of the box, of the cube too; at most about 20 coordinates are moved.
-
-        Another choice is as likely as the candidate's step is long, so that a small box keeps to the choices of its centre.
-        """
-        d = len(self.centre)
-        moved = rng.random((n, d)) < min(1.0, 20.0 / d)
-        moved[np.arange(n), rng.integers(0, d, n)] = True
-        reach = 0.5 * self.side * 2.0 ** (-3.0 * rng.random((n, 1)))
-        step = reach * rng.uniform(-1.0, 1.0, (n, d))
-        start = np.tile(self.centre, (n, 1))
-        return cube.flipped(np.clip(start + np.where(moved, step, 0.0), 0.0, 1.0), start, reach[:, 0], rng)
-
-
-def regions(u: Points, margin: Vector, batch: Vector, cube: Cube = CONTINUOUS) -> list[Region]:
-    """Return the trust regions around the best runs, at least 0.25 apart or of different choices, the best first.
-
-    The side is replayed from the runs near the centre: halved after three batches without an
-    improvement, doubled after two with one; a side below 2^-6 retires the region.
-
-    Args:
-        u: (n, d) runs, none of them critical.
-        margin: (n,) distance of the metric to the critical interval; inf where a run failed: it found no region, but tried.
-        batch: (n,) number of the batch of each run, increasing.
-        cube: which coordinates take single values.
-    """
-    found: list[Region] = []
-    at = cube.embedded(u)
-    finite = np.isfinite(margin)
-    left = margin < (np.median(margin[finite]) if finite.any() else -np.inf)  # on a plateau no run is better than the others
-    while left.any() and len(found) < _MOST_REGIONS:
-        best = int(np.flatnonzero(left)[np.argmin(margin[left])])
-        near = np.abs(at - at[best]).max(axis=1) <= _APART
-        side, failures = _side(at[near], margin[near], batch[near])
-        if side >= _SHORTEST:
-            found.append(Region(u[best], side, failures))
-        left &= ~near
-    return found
-
-
-def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
-    """Return side and failures of a trust region from the runs of its neighbourhood, in order."""
-    side, best, failures, successes = _LONGEST, -1, 0, 0
-    for number in np.unique(batch):
-        mine = np.flatnonzero(batch == number)
-        leader = int(mine[np.argmin(margin[mine])])
-        if best < 0:
-            best = leader
+def _in_niches(
+    model: WarpedModel, seen: SearchData, margin: Vector, others: list[Region], most: int, rng: np.random.Generator, cube: Cube
+) -> Points:
+    """Return up to `most` points in the niches: in each the best of a sample path, and random ones."""
+    d, left_out, learned = seen.u.shape[1], getattr(model.predictor, "left_out", None), getattr(model.predictor, "u", ())
+    picks = np.empty((0, d))
+    kept = np.sort(np.unique(model.columns(seen.u), axis=0, return_index=True)[1])  # equal runs are learned from once
+    if left_out is None or seen.noisy or len(kept) < _FEWEST_FOR_NICHES or len(learned) != len(kept):
+        return picks
+    u, margin, flank, warped = seen.u[kept], margin[kept], seen.flank[kept], model.warp.values(seen.y[kept])
+    lone = clusters(u, margin, cube)
+    surprise = np.zeros(len(u))
+    for (k, rows), (residual, std) in zip(lone, left_out([rows for _, rows in lone]), strict=True):
+        at = rows.index(k)
+        gain = model.critical.margin(warped[[k]] - residual[[at]]) - model.critical.margin(warped[[k]])
+        surprise[k] = 0.0 if flank[k] else float(gain[0]) / std[at]
+    for region in niches(surprise, u, margin, seen.batch[kept], others, cube):
+        points = region.candidates(_IN_NICHE_DRAWN, rng, cube)
+        points = points[seen.admissible(points)]
+        if len(points) < _IN_NICHE or len(picks) + _IN_NICHE > most:
             continue
-        if margin[leader] < margin[best]:
-            best, successes, failures = leader, successes + 1, 0
-            side = min(2 * side, _LONGEST) if successes >= 2 else side
-        elif (np.abs(u[mine] - u[best]).max(axis=1) <= 0.5 * side).any():
-            failures, successes = failures + 1, 0
-            side = side / 2 if failures % _PATIENCE == 0 else side
-    return side, failures
+        path = model.critical.margin(model.sample_paths(points, 1, rng))[0]
+        rest = rng.choice(len(points), _IN_NICHE - 1, replace=False)
+        picks = np.vstack([picks, points[[int(np.argmin(path))]], points[rest]])
+    return picks
 
 
 def _hopeful(
@@ -151,7 +134,7 @@ def _hopeful(
         points = points[admissible(points)]
         if len(points) == 0:
             continue
-        tried = region.failures >= _PATIENCE
+        tried = region.failures >= PATIENCE
         if not tried or model.log_probability(points, _INFLATION).max() >= np.log(_HOPELESS):
             hopeful.append((region, points))
     return hopeful
@@ -164,9 +147,7 @@ def _thompson(model: WarpedModel, niches: list[tuple[Region, Points]], n: int, d
     """
     if not niches:
         return np.empty((0, d))
-    drawn = [
-        -model.expected(-model.critical.margin(model.sample_paths(points, n, rng)), points) for _, points in niches
-    ]
+    drawn = [-model.expected(-model.critical.margin(model.sample_paths(points, n, rng)), points) for _, points in niches]
     picks = np.empty((n, d))
     for k in range(n):
         which = (k // 2) % len(niches) if k % 2 else int(np.argmin([values[k].min() for values in drawn]))
@@ -182,7 +163,7 @@ def _globally(
 ) -> Points:  # fmt: skip
     """Return the picks and further ones, n in all: the largest P(critical), every second time inflated.
 
-    Below `_HOPELESS` all candidates are alike, and what repels them alone decides.
+    Where the best is below `_HOPELESS` all candidates are alike, and the pick fills space.
     """
     d = u.shape[1]
     start = np.vstack([np.empty((0, d)), *(points for _, points in niches)])
@@ -194,6 +175,9 @@ def _globally(
         away += log_repulsion(at_candidates, point[None], _CLEAR * np.sqrt(d))
     for k in range(n - len(picks)):
         at = int(np.argmax(scores[k % 2] + away))
+        if scores[k % 2][at] <= np.log(_HOPELESS):
+            picks = np.vstack([picks, spread_out(admissible, np.vstack([u, picks]), 1, rng, cube)])
+            continue
         picks = np.vstack([picks, candidates[at]])
         away += log_repulsion(at_candidates, at_candidates[at][None], _CLEAR * np.sqrt(d))
     return picks

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
@@ -27,7 +28,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
     "DEFLATION", "FreeRegion", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fill_uniformly", "fit_warped",
-    "log_repulsion", "refine_best", "search_data",
+    "log_repulsion", "refine_best", "search_data", "spread_out",
 ]  # fmt: skip
 
 DEFLATION = 0.22
@@ -40,6 +41,10 @@ _STEPS = (0.1, 0.03)  # standard deviations of the steps from the best candidate
 _BEST, _CHILDREN = 30, 10  # candidates that are refined in a round, steps from each
 _MOVED = 0.3  # share of the coordinates that a step changes: others stay, which pays where few inputs matter
 _MOST_TRIES, _MOST_AT_ONCE = 2**18, 2**14  # to find admissible points: 260 where a thousandth is feasible
+_PRIOR_RUNS = 2.0  # what the metamodel's P(critical) weighs beside repetitions of a run
+_MOST_SEEDS, _CERTAIN, _DOUBTFUL = 0.5, 0.9, 0.3  # failure rates: deflated from, without repetition from, left alone below
+_MOST_REPEATED = 3  # runs of the same inputs, after which their basin is left as it is
+_FARTHEST_OF = 30  # uniform points, the farthest of which fills a gap
 
 
 @dataclass(frozen=True)
@@ -70,10 +75,12 @@ class Picks:
     Args:
         u: (n, d) in the unit cube, the one of largest P(critical) first.
         why: (n,) by which criterion, such as `thompson` or `global`.
+        repeat: critical runs to repeat with other seeds, beside these points, as numbers of rows.
     """
 
     u: Points
     why: tuple[str, ...]
+    repeat: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +137,7 @@ class WarpedModel:
             return sample_paths(self.predictor, inputs, n, rng)
 
 
-def fit_warped(
-    search: Search, u: Points, y: Vector, rng: np.random.Generator, success: LogSuccess | None = None
-) -> WarpedModel:
+def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator, success: LogSuccess | None = None) -> WarpedModel:
     """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2; `success` is passed on."""
     warp = warp_around(y, search.critical)
     inputs, target = search.columns(u), warp.interval(search.critical)
@@ -196,6 +201,11 @@ class SearchData:
         flank: (m,) the run lies just outside of a deflated basin: near-critical for what is known already.
         admissible: (n, d) points to (n,) booleans: feasible, not deflated, and a run there may well give a metric.
         failed, failed_batch: (k, d), (k,) runs that gave no metric.
+        rows: (m,) which of the runs they are.
+        noisy: equal inputs gave different metrics.
+        last_hit: number of the batch of the last critical run; -inf: there is none.
+        undecided: critical runs, as numbers of rows, whose repetition decides whether their basin is deflated; the most likely
+            to fail again first.
         success: log P(a run gives a metric), as in `WarpedModel`.
     """
 
@@ -206,7 +216,16 @@ class SearchData:
     admissible: Callable[[Points], Mask]
     failed: Points
     failed_batch: Vector
+    rows: NDArray[np.intp]
+    noisy: bool = False
+    last_hit: float = -np.inf
+    undecided: tuple[int, ...] = ()
     success: LogSuccess | None = None
+
+    def runs_since(self, margin: Vector) -> int:
+        """Return the number of runs since the last critical one, and the last one that was better than all before (m,)."""
+        better = self.batch[int(np.argmin(np.where(self.flank, np.inf, margin)))] if len(margin) else -np.inf
+        return int((self.batch > max(float(better), self.last_hit)).sum())
 
 
 def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng: np.random.Generator) -> SearchData:
@@ -222,9 +241,15 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
     number = np.arange(len(u), dtype=np.float64) if batch is None else np.asarray(batch, dtype=np.float64)
     ok = search.critical.known(y)
     hit = ok & search.critical.contains(y)
-    free = deflate(search, u[hit], rng, u.shape[1])
+    noisy = gives_different(u[ok], y[ok])
+    last_hit = float(number[hit].max()) if hit.any() else -np.inf
+    deflated: Mask = hit
+    undecided: tuple[int, ...] = ()
+    if noisy and hit.any():
+        deflated, undecided = _decided(search, u, y, ok, hit, rng)
+    free = deflate(search, u[deflated], rng, u.shape[1])
     at = search.cube.embedded
-    left = ok & ~hit & free(at(u))
+    left = ok & ~deflated & free(at(u))
     flank = ~free(at(u[left]), _FLANK)
     success = log_success(search.columns(u), ok, rng)
 
@@ -234,7 +259,38 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
             left[left] = np.isfinite(success(search.columns(points[left])))
         return left
 
-    return SearchData(u[left], y[left], number[left], flank, admissible, u[~ok], number[~ok], success)
+    return SearchData(
+        u[left], y[left], number[left], flank, admissible, u[~ok], number[~ok], np.flatnonzero(left), noisy, last_hit, undecided,
+        success,
+    )  # fmt: skip
+
+
+def gives_different(u: Points, y: Vector) -> bool:
+    """Say whether equal rows of u (n, d) have different values of y (n,): the simulator is noisy."""
+    if len(u) < 2:
+        return False
+    _, first, group = np.unique(u, axis=0, return_index=True, return_inverse=True)
+    return not np.allclose(y, y[first][group.reshape(-1)], rtol=1e-9, atol=0.0)
+
+
+def _decided(search: Search, u: Points, y: Vector, ok: Mask, hit: Mask, rng: np.random.Generator) -> tuple[Mask, tuple[int, ...]]:
+    """Return (n,) the critical runs whose basin is deflated, and those of which a repetition decides.
+
+    A basin is deflated where most seeds fail. The failure rate at a run's inputs is that of its repetitions, the first critical
+    run aside (it was chosen by its result), shrunk to the metamodel's P(critical) with the weight of two runs. One that was not
+    repeated needs P(critical) of at least 0.9.
+    """
+    model = fit_warped(search, u[ok], y[ok], rng)
+    prior = np.zeros(len(u))
+    prior[hit] = model.probability(u[hit])
+    group = np.unique(u, axis=0, return_inverse=True)[1].reshape(-1)
+    runs, critical = (np.bincount(group, weights=mask)[group] for mask in (ok, hit))
+    rate = (critical - 1.0 + _PRIOR_RUNS * prior) / (runs - 1.0 + _PRIOR_RUNS)
+    deflated = hit & (rate >= np.where(runs > 1, _MOST_SEEDS, _CERTAIN))
+    open_ = hit & ~deflated & (rate >= _DOUBTFUL) & (runs <= _MOST_REPEATED)
+    rows = np.flatnonzero(open_)
+    _, first = np.unique(group[rows], return_index=True)
+    return deflated, tuple(int(k) for k in rows[first][np.argsort(-rate[rows[first]], kind="stable")])
 
 
 def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:
@@ -250,6 +306,24 @@ def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np
     if len(found) == 0:
         return rng.random((n, d))
     return found[:n] if len(found) >= n else np.vstack([found, found[rng.integers(0, len(found), n - len(found))]])
+
+
+def spread_out(
+    admissible: Callable[[Points], Mask], others: Points, n: int, rng: np.random.Generator, cube: Cube = CONTINUOUS
+) -> Points:
+    """Return (n, d) points that fill the gaps among the others (m, d): each the farthest of 30 uniform admissible ones.
+
+    Distances go around the edges of the cube: without that the farthest points are corners.
+    """
+    d = others.shape[1]
+    found = np.empty((0, d))
+    for _ in range(n):
+        candidates = fill_uniformly(admissible, _FARTHEST_OF, d, rng)
+        there = cube.embedded(np.vstack([others, found]))
+        apart = np.abs(cube.embedded(candidates)[:, None, :] - there[None])
+        nearest = (np.minimum(apart, 1.0 - apart) ** 2).sum(axis=2).min(axis=1)
+        found = np.vstack([found, candidates[int(np.argmax(nearest))]])
+    return found
 
 
 def refine_best(

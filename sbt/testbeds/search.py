@@ -105,14 +105,14 @@ def multi_needle(x: Points) -> Vector:
     return np.where(inside, np.minimum(y, -0.05), np.maximum(y, 0.02))
 
 
-def deceptive(x: Points, radius: float) -> Vector:
-    """A broad harmless basin in the low corner; the critical ball is in the high one, seen from four radii away.
+def deceptive(x: Points, radius: float, sight: float = 3.5) -> Vector:
+    """A broad harmless basin in the low corner; the critical ball is in the high one, seen from about `sight` radii away.
 
     Source:
         Constructed; exact volume.
     """
     broad = 0.35 + 1.1 * np.sqrt(((x - 0.2) ** 2).sum(axis=1) / x.shape[1])
-    narrow = 0.4 * (np.sqrt(((x - 0.88) ** 2).sum(axis=1)) / radius - 1.0)
+    narrow = (np.sqrt(((x - 0.88) ** 2).sum(axis=1)) / radius - 1.0) / (sight - 1.0)
     return np.minimum(broad, narrow)
 
 
@@ -172,6 +172,13 @@ def _uniform(
     return Problem(name, title, inputs, function, critical, Truth(share, error, modes, share, error))
 
 
+def _trap(d: int, share: float, sight: float = 3.5) -> Problem:
+    """Return a narrow well of this share of the box beside a broad trap; the well is seen in 1 to 2 % of the box."""
+    name = f"deceptive_d{d}" if sight == 3.5 else f"deceptive_d{d}_{share:.0e}".replace("e-0", "e-")
+    function = partial(deceptive, radius=ball_radius(d, share), sight=sight)
+    return _uniform(name, "A trend to the wrong corner", d, function, NEGATIVE, share, 0.0, 1)
+
+
 def _needle(centre: tuple[float, ...], reach: float) -> Problem:
     """Return a needle of volume 1e-3 with a funnel of width `reach`, in radii."""
     d, share = len(centre), 1e-3
@@ -192,6 +199,7 @@ PROBLEMS = (
     _uniform("multi_needle_d4", "Five needles", 4, multi_needle, NEGATIVE, _FIVE_BALLS, 0.0, 5),
     _uniform("deceptive_d2", "A trend to the wrong corner", 2, partial(deceptive, radius=_SMALL), NEGATIVE,
              ball_volume(2, _SMALL), 0.0, 1),
+    _trap(3, 3e-4), _trap(4, 1e-4), _trap(6, 1e-5), _trap(2, 1e-5, 37.0), _trap(4, 1e-5, 6.2),
     _uniform("goldstein_price_partx", "Goldstein-Price below 50", 2, goldstein_price, NEGATIVE, 0.025970937, 3e-06, 1),
     _uniform("himmelblau_partx", "Himmelblau below 40", 2, himmelblau, NEGATIVE, 0.17649613, 7.9e-06, 3),
     _uniform("interval_ring_d3", "A thin shell", 3, interval_ring, CriticalInterval(0.0, 0.02), 0.00089661055, 3.6e-06, 1),
