@@ -36,6 +36,12 @@ CASES = {
     "interval_ring_d3": ("testbed:interval_ring_d3", None, (55, 95)),
     "plateau_ttc_d6": ("testbed:plateau_ttc_d6", None, (100, 220)),
     "hartmann6_in_25": ("testbed:hartmann6_in_25", None, (65, 95)),
+    "deceptive_d2": ("testbed:deceptive_d2", None, None),
+    "deceptive_d3": ("testbed:deceptive_d3", None, None),
+    "deceptive_d4": ("testbed:deceptive_d4", None, None),
+    "deceptive_d6": ("testbed:deceptive_d6", None, None),
+    "deceptive_d2_1e-5": ("testbed:deceptive_d2_1e-5", None, None),
+    "deceptive_d4_1e-5": ("testbed:deceptive_d4_1e-5", None, None),
     "sumo_cut_in": ("cut_in", "{critical: [-5.0, -0.95]}", None),
     "sumo_emergency_braking": ("emergency_braking", "{metric: impact_speed, critical: [20.3, .inf]}", None),
 }
