@@ -1,6 +1,7 @@
 """Is the estimate right, and does its interval hold? Many seeds on testbeds with known probability.
 
     python benchmarks/estimation.py [--seeds 50] [--problems four_branch_7@124,rp38@200] [--table runs/estimation.jsonl]
+    python benchmarks/estimation.py --cov 0.1 [--seeds 50] ...      # with the stop rule, at the default budget
 
 Every cell (problem, runs, seed) is a campaign with default settings, through the public way. Finished
 cells are lines of the table: run again to go on where it stopped; `--show` only prints what is there.
@@ -65,23 +66,25 @@ LAWS = {
 KEPT = ("probability", "low", "high", "cov", "hits", "undetected_mass_bound", "warnings")
 
 
-def campaign(cell: str, seed: int) -> dict:
+def campaign(cell: str, seed: int, cov: float | None) -> dict:
     name, _, runs = cell.partition("@")
+    size = {"budget": int(runs)} if cov is None else {}
     name, changed, _ = LAWS.get(cell, (f"testbed:{name}", {}, 0.0))
     with tempfile.TemporaryDirectory() as folder:
         start, cpu = time.perf_counter(), time.process_time()
         result = sbt.run(
-            campaign="estimation", scenario=name, budget=int(runs), seed=seed, stop={"cov": None}, executor="serial",
-            store=f"{folder}/store", report=False, **changed,
+            campaign="estimation", scenario=name, seed=seed, stop={"cov": cov}, executor="serial",
+            store=f"{folder}/store", report=False, **size, **changed,
         )  # fmt: skip
         summary = result.summary
     took = {"seconds": round(time.perf_counter() - start, 1), "cpu": round(time.process_time() - cpu, 1)}
-    return {"cell": cell, "seed": seed, "runs": summary["runs"], **took, **{k: summary["conclusion"][k] for k in KEPT}}
+    kept = {key: summary["conclusion"][key] for key in KEPT}
+    return {"cell": cell, "seed": seed, "stop": cov, "runs": summary["runs"], **took, **kept}
 
 
-def finished(table: Path) -> dict[tuple[str, int], dict]:
+def finished(table: Path, cov: float | None) -> dict[tuple[str, int], dict]:
     rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
-    return {(row["cell"], row["seed"]): row for row in rows}
+    return {(row["cell"], row["seed"]): row for row in rows if row.get("stop") == cov}
 
 
 def one_sided(row: dict) -> bool:
@@ -90,25 +93,31 @@ def one_sided(row: dict) -> bool:
 
 def show(rows: list[dict]) -> None:
     head = (
-        "problem@runs", "seeds", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "covered", "one-sided",
-        "crude runs", "CPU s",
+        "problem@runs", "seeds", "runs", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "half width / (1.96 RMSE)",
+        "covered", "one-sided", "undetected", "CPU s",
     )  # fmt: skip
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
-    every = []
+    every, ratios = [], []
     for cell in dict.fromkeys(row["cell"] for row in rows):
         p = LAWS[cell][2] if cell in LAWS else truth(cell.partition("@")[0]).probability
         mine = [row for row in rows if row["cell"] == cell]
         error = np.array([row["probability"] / p - 1.0 for row in mine])
         covered = [row["low"] <= p <= row["high"] for row in mine]
         every += covered
-        rmse, cpu = float(np.sqrt(np.mean(error**2))), np.mean([row["cpu"] for row in mine])
-        cov = np.median([row["cov"] for row in mine if row["cov"] is not None])
+        rmse = float(np.sqrt(np.mean(error**2)))
+        half = np.median([0.5 * (row["high"] - row["low"]) for row in mine]) / p
+        ratios.append(half / (1.96 * rmse))
+        keys = ("runs", "cov", "undetected_mass_bound", "cpu")
+        runs, cov, undetected, cpu = (np.median([row[key] for row in mine if row[key] is not None]) for key in keys)
         print(
-            f"| {cell} | {len(mine)} | {rmse:.3f} | {BARS.get(cell, '-')} | {error.mean():+.3f} "
-            f"({error.std(ddof=1) / np.sqrt(len(error)):.3f}) | {cov:.3f} | {np.mean(covered):.2f} | "
-            f"{np.mean([one_sided(row) for row in mine]):.2f} | {(1 - p) / p / rmse**2:.2g} | {cpu:.1f} |"
+            f"| {cell} | {len(mine)} | {runs:.0f} | {rmse:.3f} | {BARS.get(cell, '-')} | {error.mean():+.3f} "
+            f"({error.std(ddof=1) / np.sqrt(len(error)) if len(error) > 1 else math.nan:.3f}) | {cov:.3f} | {ratios[-1]:.1f} | "
+            f"{sum(covered)} of {len(covered)} | {np.mean([one_sided(row) for row in mine]):.2f} | {undetected:.2f} | {cpu:.1f} |"
         )
-    print(f"\npooled coverage of the 95 % interval: {np.mean(every):.3f} of {len(every)} campaigns")
+    print(
+        f"\npooled coverage of the 95 % interval: {np.mean(every):.3f} of {len(every)} campaigns; median of half width / (1.96 "
+        f"RMSE): {np.median(ratios):.2f}; median runs: {np.median([row['runs'] for row in rows]):.0f}"
+    )
 
 
 def main() -> None:
@@ -116,16 +125,17 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--problems", default=",".join((*BARS, *LAWS)))
     parser.add_argument("--table", type=Path, default=Path("runs/estimation.jsonl"))
+    parser.add_argument("--cov", type=float, help="the stop rule; default: none, all runs of the cell are used")
     parser.add_argument("--show", action="store_true")
     args = parser.parse_args()
     args.table.parent.mkdir(parents=True, exist_ok=True)
-    done, cells = finished(args.table), args.problems.split(",")
+    done, cells = finished(args.table, args.cov), args.problems.split(",")
     if unknown := set(cells) - {*BARS, *LAWS}:
         parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join((*BARS, *LAWS))}")
     for seed in range(0 if args.show else args.seeds):
         for cell in cells:
             if (cell, seed) not in done:
-                done[cell, seed] = campaign(cell, seed)
+                done[cell, seed] = campaign(cell, seed, args.cov)
                 with args.table.open("a") as file:
                     file.write(json.dumps(done[cell, seed]) + "\n")
     show([done[key] for cell in cells for key in done if key[0] == cell and key[1] < args.seeds])

@@ -208,6 +208,13 @@ def test_the_gate_decides_by_one_sided_limits():
     assert gate_verdict(limits, Gate(0.01)).verdict == "undecided"
 
 
+@pytest.mark.parametrize(("undetected", "told"), [(0.12, True), (0.01, False)])
+def test_a_gate_that_passes_says_what_it_cannot_exclude(undetected, told):
+    verdict = gate_verdict(Limits(lambda _: 0.001, lambda _: 0.002), Gate(0.02), undetected)
+    assert verdict.verdict == "pass"
+    assert ("could hold up to 0.12" in verdict.statement) == told
+
+
 @pytest.mark.parametrize(("probability", "code", "verdict"), [(0.9, 0, "pass"), (0.05, 3, "fail"), (0.28, 3, "undecided")])
 def test_the_gate_is_an_exit_code_and_junit(configured: Callable[..., Path], tmp_path, probability, code, verdict):
     config = configured(**QUICK | {"acquisition": {"kind": "monte_carlo"}, "budget": 100, "gate": {"probability": probability}})

@@ -17,7 +17,7 @@ from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.stopping import FEWEST_BATCHES
 from sbt.campaigns.wording import number, percent, plural
 from sbt.errors import InputError
-from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
+from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.estimators.subset import combine_repeats
 from sbt.loop.stages import Campaign, Facts, Log, Stage
 from sbt.problem.plain import Json
@@ -154,7 +154,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
             warning = f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
             found = replace(found, warnings=(warning, *found.warnings))
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
-        gate = None if settings.gate is None else gate_verdict(limits, settings.gate)
+        gate = None if settings.gate is None else gate_verdict(limits, settings.gate, found.undetected_mass_bound)
         return replace(found, gate=gate, simulator_noise=noise, requirements=each_estimate(log, settings)), None
 
     return Campaign((stage,), conclude)
@@ -192,10 +192,10 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
     elif misses == 0:
         limits = Limits(lambda c: min(low.limit(c, side=-1), 1.0 - seen.most(seen.draws - seen.hits, c)), lambda _: 1.0)
         warnings.append("no counted draw was safe: only a lower bound is given")
-    elif min(hits, misses) < FEWEST_HITS:
+    elif min(hits, misses) < FEW_HITS:
         limits = Limits(lambda c: low.limit(c, side=-1, few=True), lambda c: high.limit(c, side=1, few=True))
-        met = f"{hits} counted draws were critical" if hits < FEWEST_HITS else f"{misses} counted draws were safe"
-        warnings.append(f"only {met}, fewer than {FEWEST_HITS}: the interval is that of so small a number")
+        met = f"{hits} counted draws were critical" if hits < FEW_HITS else f"{misses} counted draws were safe"
+        warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
     if len(safe) < FEWEST_BATCHES:
         counts = "1 batch counts" if len(safe) == 1 else f"{len(safe)} batches count"
         warnings.append(f"only {counts}, fewer than {FEWEST_BATCHES}: their spread says little")

@@ -37,17 +37,24 @@ class GateVerdict:
     statement: str
 
 
-def gate_verdict(limits: Limits, gate: Gate) -> GateVerdict:
+def gate_verdict(limits: Limits, gate: Gate, undetected: float = 0.0) -> GateVerdict:
     """Return the verdict: `pass`, `fail` or `undecided`, with the limits it rests on and a sentence.
 
     `pass`: the one-sided upper limit (failed runs as critical) is at most the threshold. `fail`: the one-sided
     lower limit (failed runs as safe) is above it. Each is wrong with probability 1 - confidence at most,
     as far as the interval is right. Otherwise nothing is decided, and a larger budget may help.
+
+    Args:
+        limits: of the probability.
+        gate: what was asked.
+        undetected: what a critical region that no run has met may hold: a `pass` says so where it is more than is allowed.
     """
     low, high = limits.lower(gate.confidence), limits.upper(gate.confidence)
     sure, allowed = f"with {gate.confidence:.3g} confidence", f"{gate.probability:.3g}"
     if high <= gate.probability:
         verdict, statement = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {allowed}"
+        if undetected > gate.probability:
+            statement += f"; it trusts the search: a critical region that no run has met could hold up to {undetected:.2g}"
     elif low > gate.probability:
         verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:
