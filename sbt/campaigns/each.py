@@ -13,7 +13,7 @@ from sbt.campaigns.parts import CriticalShare, share_of
 from sbt.campaigns.records import EstimationProposal, PartDraws
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import number, percent
-from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
+from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.estimators.parts import PartOfPool
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Vector
@@ -87,7 +87,7 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
             return None
         low, high = combine_estimates(safe), combine_estimates(critical)
         hits, misses = (int(sum((batch.critical == side).sum() for batch in safe)) for side in (1.0, 0.0))
-        few, value = min(hits, misses) < FEWEST_HITS, min(max(low.value, 0.0), 1.0)
+        few, value = min(hits, misses) < FEW_HITS, min(max(low.value, 0.0), 1.0)
         if min(hits, misses) == 0:  # no variance is known: the draws from the inputs' distribution bound it
             ends = _bounds(part, log, settings, tail)
         else:
