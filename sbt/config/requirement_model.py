@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 from sbt.problem.combination import KINDS
 from sbt.problem.requirement import CriticalInterval
@@ -39,7 +39,11 @@ def _proper(value: tuple[float, float]) -> tuple[float, float]:
 
 Name = Annotated[str, AfterValidator(_not_blank)]
 Interval = Annotated[tuple[float, float], BeforeValidator(two_values), Field(strict=False)]
-Critical = Annotated[tuple[float, float], BeforeValidator(_open_ends), AfterValidator(_proper), Field(strict=False)]
+_END = {"type": ["number", "null"]}
+Critical = Annotated[
+    tuple[float, float], BeforeValidator(_open_ends), AfterValidator(_proper), Field(strict=False),
+    WithJsonSchema({"type": "array", "prefixItems": [_END, _END], "minItems": 2, "maxItems": 2}),
+]  # fmt: skip
 
 
 class RequirementChange(BaseModel):
