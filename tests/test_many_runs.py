@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import sbt
 from sbt import testbeds
 from sbt.campaigns.boundary import BoundaryConclusion
 from sbt.campaigns.parts import CriticalShare
@@ -90,3 +93,11 @@ def test_shares_are_measured_at_many_points_where_constraints_leave_a_thousandth
     assert len(probe) >= 1024
     assert space.feasible(space.from_unit(probe)).all()
     assert abs((probe[:, 0] < 0.5).mean() - 0.5) < 0.05
+
+
+def test_a_small_share_is_stated_from_many_points(tmp_path: Path):
+    result = sbt.run(
+        campaign="boundary", scenario="testbed:interval_ring_d3:box", seed=1, budget=120, store=tmp_path / "s", executor="serial",
+        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False}, report=False,
+    )  # fmt: skip
+    assert result.conclusion.critical_fraction == pytest.approx(testbeds.truth("interval_ring_d3").box_fraction, rel=0.15)

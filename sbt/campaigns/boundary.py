@@ -28,6 +28,9 @@ from sbt.store.records import Independence, RequirementFit, Validation, optional
 __all__ = ["BOUNDARY", "BoundaryConclusion", "boundary_points", "recipe"]
 
 
+_SMALL = 0.03  # critical share that the log's 4,096 points tell to more than 5 %
+
+
 @dataclass(frozen=True)
 class BoundaryConclusion:
     """Shares of the input space as the metamodel sees them, and how much that is worth.
@@ -121,8 +124,11 @@ def recipe(settings: Settings) -> Campaign:
         if fitted is None:
             return BoundaryConclusion(None, None, None, None, held_out_fraction=held_out, held_out_fractions=each), None
         r = fitted.record
+        shares = r.critical_fraction, r.expected_misclassified, r.ambiguous_volume
+        if r.critical_fraction < _SMALL and not settings.scenario.requirement.combined:
+            shares = learner.fine_shares(fitted)
         return BoundaryConclusion(
-            r.critical_fraction, r.expected_misclassified, r.ambiguous_volume, r.validation, r.weights, r.chosen_because,
+            *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
         ), fitted  # fmt: skip
 

@@ -30,6 +30,8 @@ _PROBE = 4096
 """Points at which shares of the space are measured: their standard error is below 0.8 %."""
 _LEAST_PROBE = 1024
 """Of them, feasible ones: a standard error below 1.6 %."""
+_FINE, _FINE_COST = 2**16, 6e9
+"""Points at which a small share is measured for a conclusion, at most; and points times squared number of runs: some seconds."""
 _CHUNK = 4096
 """Points that are predicted at once: bounds the memory of mixtures."""
 
@@ -139,7 +141,7 @@ class Learner:
         at_probe = predict(u)
         p = at_probe.probability(critical)
         ok = None if success is None else np.exp(success(u))
-        shares = [float(np.average(v, weights=ok)) for v in (p, np.minimum(p, 1.0 - p), (p > 0.05) & (p < 0.95))]
+        shares = _shares(p, ok)
         comparison = getattr(getattr(predictor, "predictor", predictor), "comparison", None)  # also of a recalibrated one
         return FitRecord(
             learned, shares[0], shares[1], shares[2],
@@ -169,6 +171,22 @@ class Learner:
             "independence": None if seen is None else independence(parts, *seen),
         }
 
+    def fine_shares(self, fitted: FittedMetamodel) -> tuple[float, float, float]:
+        """Return critical fraction, expected misclassified and ambiguous volume of a record at up to 65,536 points.
+
+        Of a critical share of 1e-3 the probe meets four points. Fewer points with many runs, whose predictions cost their square.
+        """
+        space, critical = self.scenario.space, self.scenario.requirement.critical
+        n = int(np.clip(_FINE_COST / fitted.record.learned**2, _PROBE, _FINE))
+        sequence = SobolSequence(space.dimension, self.seed)
+        u = sequence.points(0, n)
+        u = u[space.feasible(space.from_unit(u))] if space.constraints else u
+        u = u if len(u) >= _LEAST_PROBE else self.probe
+        parts = [u[k : k + _CHUNK] for k in range(0, len(u), _CHUNK)]
+        p = np.concatenate([fitted.predict(part).probability(critical) for part in parts])
+        success = fitted.log_success
+        return _shares(p, None if success is None else np.exp(np.concatenate([success(part) for part in parts])))
+
     @cached_property
     def probe(self) -> Points:
         """The feasible ones of 4,096 fixed points of the space; where those are few, of as many as it takes to have 1,024."""
@@ -177,6 +195,14 @@ class Learner:
         if not space.constraints:
             return sequence.points(0, _PROBE)
         return sequence.admissible(lambda u: space.feasible(space.from_unit(u)), _PROBE, _LEAST_PROBE)
+
+
+def _shares(p: Vector, weight: Vector | None) -> tuple[float, float, float]:
+    """Return means of P(critical) (n,), of the smaller of it and its complement, and of whether it is ambiguous."""
+    return (
+        float(np.average(p, weights=weight)), float(np.average(np.minimum(p, 1.0 - p), weights=weight)),
+        float(np.average((p > 0.05) & (p < 0.95), weights=weight)),
+    )  # fmt: skip
 
 
 def chunked(predict: Predictor, u: Points) -> Prediction:
