@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 from studies import run_loaded, settings_of
 from typer.testing import CliRunner
 
+import sbt
 from sbt.campaigns.counting import counted_batches
 from sbt.campaigns.gate import Limits, gate_verdict
 from sbt.campaigns.settings import Gate
@@ -21,9 +24,10 @@ from sbt.cli import app
 from sbt.config.load import ConfigError, load, parse
 from sbt.errors import InputError
 from sbt.loop.stages import Log
+from sbt.problem.distribution import Distribution
 from sbt.store.database import Store
 from sbt.store.history import History
-from sbt.testbeds import truth
+from sbt.testbeds import analytic, truth
 
 Run = Callable[..., dict[str, Any]]
 NEAREST = {"kind": "analytic.py:Nearest"}
@@ -223,3 +227,17 @@ def test_the_gate_is_an_exit_code_and_junit(configured: Callable[..., Path], tmp
     assert json.loads(done.stdout.splitlines()[0])["conclusion"]["gate"]["verdict"] == verdict
     suite = ET.parse(tmp_path / "j.xml").getroot()
     assert (suite.get("failures"), suite.get("tests")) == (str(int(code == 3)), "2")
+
+
+def test_heavy_noise_is_left_to_crude_monte_carlo(tmp_path):
+    """P(critical) hardly depends on the inputs: a proposal gains nothing, and the runs that would learn it count instead."""
+    inputs = {name: Distribution.of(kind="normal", mean=0.0, std=1.0) for name in ("a", "b")}
+    noisy = analytic(lambda x: 3.0 - 0.5 * x[:, 0] - 0.3 * x[:, 1], inputs=inputs, critical=(-np.inf, 0.0), name="n", noise=1.3)
+    found = sbt.run(
+        campaign="estimation", scenario=noisy, budget=300, stop={"cov": None}, executor="serial", store=tmp_path / "s",
+        report=False,
+    ).summary["conclusion"]
+    p = ndtr(-3.0 / math.sqrt(0.5**2 + 0.3**2 + 1.3**2))
+    assert found["counted"] >= 0.85 * 300
+    assert found["low"] <= p <= found["high"]
+    assert found["probability"] == found["hits"] / found["counted"]

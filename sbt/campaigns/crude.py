@@ -18,7 +18,7 @@ from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 from sbt.store.records import Iteration
 
-__all__ = ["NOMINAL", "NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of"]
+__all__ = ["NOMINAL", "NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of", "took_monte_carlo"]
 
 NOMINAL = "monte_carlo"
 """Stage of runs that were drawn from the inputs' distribution."""
@@ -84,6 +84,11 @@ class SubsetStage:
                 log_q = space.log_density(x) if repeat.levels == 0 and not space.constraints else None
                 runs += _runs(space, x, stage, log_q)
         return Batch(tuple(runs), EstimationProposal("subset", "subset"))
+
+
+def took_monte_carlo(log: Log) -> bool:
+    """Return whether draws from the inputs' distribution count: crude Monte Carlo from some batch on."""
+    return any(p.phase == COUNT and p.method == "monte_carlo" for p in (b.read(EstimationProposal) for b in log.iterations))
 
 
 def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
-from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of
+from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
@@ -142,7 +142,7 @@ def recipe(settings: Settings) -> Campaign:
     if method == "subset":
         return _campaign(settings, SubsetStage(settings), _from_repeats)
     if method == "difference":
-        return _campaign(settings, SequentialStage(settings), _from_batches)
+        return _campaign(settings, SequentialStage(settings), _from_draws)
     raise InputError(f"estimation draws by auto, difference, monte_carlo or subset, but got '{method}'")
 
 
@@ -259,6 +259,11 @@ def _from_nominal(log: Log, settings: Settings) -> Concluded:
 def _from_either(log: Log, settings: Settings) -> Concluded:
     """Return what subset simulation says where it was taken, else the draws in the subspace."""
     return _from_repeats(log, settings) if took_subset(log) else _from_batches(log, settings)
+
+
+def _from_draws(log: Log, settings: Settings) -> Concluded:
+    """Return what crude Monte Carlo says where noise left it to that, else the draws of pools."""
+    return _from_nominal(log, settings) if took_monte_carlo(log) else _from_batches(log, settings)
 
 
 def _from_repeats(log: Log, settings: Settings) -> Concluded:

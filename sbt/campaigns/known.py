@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores
@@ -22,9 +23,13 @@ _PROBES = 9
 """Points on the segment between two critical runs, at which P must stay above 0.5 for them to be one mode."""
 
 
+_SURE_NOISE = 0.4
+"""Part of the variance among repeats that the metamodel's noise is not allowed to be below: two repeats exaggerate."""
+
+
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Runs to learn from: normal scores z, coordinates u, metric y, what is critical, the batch of each."""
+    """Runs to learn from: normal scores z, coordinates u, metric y, what is critical, the batch of each; noise of repeats."""
 
     z: Points
     u: Points
@@ -33,6 +38,7 @@ class Known:
     batch: Vector
     coordinates: Coordinates
     settings: Settings
+    noise: float = 0.0
 
     @classmethod
     def of(cls, history: History, coordinates: Coordinates, settings: Settings) -> Known:
@@ -45,7 +51,8 @@ class Known:
             x, y = np.vstack([first.x, x]), np.concatenate([requirement.values(first), y])
             batch = np.concatenate([np.full(len(first), -1), batch])
         z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
-        return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings)
+        noise = simulator_noise(history, requirement).std or 0.0
+        return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings, noise)
 
     @property
     def one_sided(self) -> bool:
@@ -84,7 +91,10 @@ class Known:
         if len(self.y) < 2 and transfer is None:
             return None
         interval, earlier = self.settings.scenario.requirement.critical, () if transfer is None else transfer.trends
-        return fit_log_probability(metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng, earlier=earlier)
+        noise = _SURE_NOISE * self.noise**2
+        return fit_log_probability(
+            metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng, noise, earlier=earlier
+        )  # fmt: skip
 
 
 def metamodel_of(settings: Settings) -> Metamodel:

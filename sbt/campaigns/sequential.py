@@ -10,13 +10,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import gammainccinv
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN
+from sbt.campaigns.crude import MonteCarloStage, took_monte_carlo
 from sbt.campaigns.known import Known, metamodel_of
 from sbt.campaigns.pools import Frame, Proposal, draw_batch, draw_pool, fit_proposal, planned
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, EstimationProposal
-from sbt.campaigns.repeats import repeats_wanted
+from sbt.campaigns.repeats import repeats_wanted, simulator_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.stopping import count_begins, is_precise, relative_error, steadier
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, to_cube
@@ -24,7 +26,7 @@ from sbt.estimators.importance import BLIND, SHARES
 from sbt.estimators.mixture import wide_scales
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Batch, Log
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import Cube
 from sbt.samplers import portfolio
 from sbt.samplers.search import Search
@@ -46,9 +48,13 @@ _COMMON = 0.02
 """P(critical) under the inputs' distribution above which draws from it meet every region that counts."""
 _EVEN_SHARE = 0.1
 """Of the search picks, those that are spread evenly: they do not depend on the metamodel."""
+_BEYOND = 1e-9
+"""Mass of the inputs' distribution beyond the ball in normal scores that is searched: failures out there do not count."""
 _SEARCH_SHARE = (0.2, 0.1)
 """Of later batches, the share that still searches: before and after the count has begun."""
 
+_GAIN = 4.0
+"""Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""
 _SURPRISE = 0.01
 """P of an earlier metamodel below which a critical run since then refutes it."""
 
@@ -82,6 +88,8 @@ class SequentialStage:
 
     def stop(self, log: Log) -> str | None:
         """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
+        if took_monte_carlo(log):
+            return MonteCarloStage(self.settings).stop(log)
         if log.iterations and len(log.history) >= self.settings.budget:
             return "budget"
         return "cov" if is_precise(log, self.settings) else None
@@ -89,6 +97,8 @@ class SequentialStage:
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""
         with threadpool_limits(1):
+            if took_monte_carlo(log):
+                return MonteCarloStage(self.settings).propose(log)
             s, left = self.settings, self.settings.budget - len(log.history)
             again = repeats_wanted(log.history, s.scenario, left - 1)
             batch = self._proposed(log, max(min(s.batch, left) - len(again), 1))
@@ -100,11 +110,28 @@ class SequentialStage:
             return self._initial(min(s.initial, s.budget))
         known = Known.of(log.history, self._coordinates, s)
         log_probability = known.learn(stream(s.seed, "fit", log.iteration))
+        if log_probability is not None and self._noise_decides(log, log_probability):
+            return MonteCarloStage(s).propose(log)
         modes = self._modes_while_searching(log, known, log_probability)
         if modes is not None:
             rows = self._search_modes(known, log.iteration, size)
             return Batch(self._runs(rows, _SEARCH_STAGE), EstimationProposal(EXPLORE, "explore", modes=modes))
         return self._drawn(log, known, log_probability, size)
+
+    def _noise_decides(self, log: Log, log_probability: LogProbability) -> bool:
+        """Return whether the simulator is so noisy that the metamodel hardly tells where critical runs are, before any count.
+
+        Then crude Monte Carlo is as precise: no proposal gains what the runs cost that learn it.
+        """
+        s = self.settings
+        if not simulator_noise(log.history, s.scenario.requirement).noisy:
+            return False
+        if any(batch.read(EstimationProposal).counted is not None for batch in log.iterations):
+            return False
+        z = stream(s.seed, "noise", log.iteration).standard_normal((2000, len(self._wide)))
+        pi = np.exp(log_probability(z)[0])
+        p, spread = float(pi.mean()), float(np.sqrt(pi * (1.0 - pi)).mean())
+        return p * (s.budget - len(log.history)) >= 1.0 and p * (1.0 - p) * SHARES[0] < _GAIN * spread**2
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""
@@ -150,10 +177,16 @@ class SequentialStage:
         s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", iteration)
         even = round(_EVEN_SHARE * n)
         spread = rng.random((even, space.dimension))
+        reach = 2.0 * float(gammainccinv(0.5 * space.dimension, _BEYOND))  # squared norm: chi^2
+
+        def within(v: Points) -> Mask:
+            z = self._scores(v)
+            return space.feasible(space.from_normal(z)) & ((z**2).sum(axis=1) <= reach)
+
         if n > even:
             search = Search(
                 s.scenario.requirement.critical, metamodel_of(s), lambda v: self._coordinates(self._scores(v)),
-                lambda v: space.feasible(space.from_normal(self._scores(v))), cube=Cube(nominal=space.cube.nominal),
+                within, cube=Cube(nominal=space.cube.nominal),
             )  # fmt: skip
             picks = portfolio.propose(search, to_cube(known.z, self._wide, self._choices), known.y, n - even, rng, known.batch)
             spread = np.vstack([picks.u, spread])
