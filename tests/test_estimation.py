@@ -155,7 +155,7 @@ def test_subset_simulation_with_repeats(tmp_path):
 
 
 def test_many_inputs_are_estimated_where_they_matter(tmp_path):
-    """Crude Monte Carlo would meet no critical run; subset simulation errs by far more than half with 240 runs."""
+    """Crude Monte Carlo would meet no critical run."""
     p = truth("linear_d30").probability
     found = on_testbed("linear_d30", tmp_path, budget=240, stop={"cov": None})["conclusion"]
     assert found["probability"] == pytest.approx(p, rel=0.1)
