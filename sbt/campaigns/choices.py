@@ -31,7 +31,6 @@ __all__ = ["ChoiceRule", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 
 _MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to particles: about a second with a GP
 _MOST_EVEN = 2**23  # where none is scored: 8,000 runs of a space of which constraints leave a thousandth
-_SUCCESS = 1.5  # power of P(a run gives a metric): 1, as a run that fails shows nothing, to 2, as the shares count what gives one
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
@@ -147,9 +146,7 @@ def _score(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acqu
         if fitted is None or acquisition is even:
             return np.zeros(len(u))
         found = log_scores(acquisition, fitted.predict(u), critical, space.log_density(space.from_unit(u)))
-        if fitted.log_success is None:
-            return found
-        return found + _SUCCESS * fitted.log_success(u)
+        return found if fitted.log_success is None else found + fitted.log_success(u)  # a run that fails shows nothing
 
     return score
 

@@ -33,7 +33,7 @@ __all__ = ["GaussianProcess", "GaussianProcessPredictor"]
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
 _NOISE_FLOOR = 1e-8  # variance relative to that of y: condition numbers stay below 1e-6 / machine epsilon at 2,000 rows
 _LIKELY_NOISE, _NO_NOISE = -5.0, math.log(_NOISE_FLOOR)  # log variances: the mode of a noisy metric, and a deterministic one
-_PAPER_FLOOR = 1e-4  # GPyTorch's own floor, where there are no priors
+_LEAST_NOISE = 1e-4  # GPyTorch's own floor, where there are no priors or certainly noise
 _FOLDS = 5  # of the noise regression
 _FEWEST_FOR_NOISE = 2 * _FOLDS  # rows: two a fold
 _FOREST = ExtraTrees(trees=10, min_samples_split=20)  # of the noise: a smooth average, since squared residuals vary a lot
@@ -63,6 +63,7 @@ class GaussianProcess:
         patience: epochs without an improvement of 0.01 of the mean validation log likelihood, >= 1.
         max_epochs: most epochs of Adam, >= 1.
         device: auto (CUDA where there is one), cpu or cuda.
+        certainly_noisy: the prior of the noise is that of a noisy metric alone, as for labels of a class.
 
     Raises:
         InputError: a value outside its range; at the fit, a device that is not available.
@@ -81,6 +82,7 @@ class GaussianProcess:
     patience: int = 200
     max_epochs: int = 2000
     device: str = "cpu"
+    certainly_noisy: bool = False
 
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"nu": 0.5, "input_noise": False, "priors": False, "learning_rate": 0.1, "patience": 200}
@@ -112,11 +114,11 @@ class GaussianProcess:
             hyper = _fit_early_stopped(self, u[training], z[training], u[validation], z[validation])
             return _condition(self, hyper, u[training], z[training], np.ones(len(z))[training], None, shift, scale)
         rows = rng.permutation(len(z))[: self.fit_rows]
-        hyper = _fit_posterior(self.nu, u[rows], z[rows], np.ones(len(rows)), None, device)
+        hyper = _fit_posterior(self.nu, u[rows], z[rows], np.ones(len(rows)), None, device, noisy=self.certainly_noisy)
         if not self.input_noise or len(z) < _FEWEST_FOR_NOISE:
             return _condition(self, hyper, u, z, np.ones(len(z)), None, shift, scale)
         spread, at_rows = _fit_noise_spread(hyper, u, z, rng, device)
-        hyper = _fit_posterior(self.nu, u[rows], z[rows], at_rows[rows], hyper, device)
+        hyper = _fit_posterior(self.nu, u[rows], z[rows], at_rows[rows], hyper, device, noisy=self.certainly_noisy)
         return _condition(self, hyper, u, z, at_rows, spread, shift, scale)
 
 
@@ -184,9 +186,10 @@ class _Model:
     likelihood: gpytorch.likelihoods.GaussianLikelihood
     floor: float
     priors: bool
+    noisy: bool
 
     @classmethod
-    def build(cls, nu: float, dimension: int, device: torch.device, *, priors: bool) -> _Model:
+    def build(cls, nu: float, dimension: int, device: torch.device, *, priors: bool, noisy: bool = False) -> _Model:
         """Return a model on the device; with priors the output scale is fixed at 1, the variance of standardised y."""
         log = {"transform": torch.exp, "inv_transform": torch.log}
         scale_prior = LogNormalPrior(math.sqrt(2.0) + 0.5 * math.log(dimension), math.sqrt(3.0))
@@ -198,9 +201,9 @@ class _Model:
         )
         kernel = gpytorch.kernels.ScaleKernel(base, outputscale_constraint=Positive(**log))
         kernel.raw_outputscale.requires_grad_(not priors)
-        floor = _NOISE_FLOOR if priors else _PAPER_FLOOR
+        floor = _NOISE_FLOOR if priors and not noisy else _LEAST_NOISE
         likelihood = gpytorch.likelihoods.GaussianLikelihood(noise_constraint=GreaterThan(floor, **log))
-        return cls(kernel.double().to(device), likelihood.double().to(device), floor, priors)
+        return cls(kernel.double().to(device), likelihood.double().to(device), floor, priors, noisy)
 
     def parameters(self) -> list[torch.nn.Parameter]:
         both = (*self.kernel.parameters(), *self.likelihood.parameters())
@@ -236,7 +239,7 @@ class _Model:
         by_noise = torch.full_like(noise, float(diagonal(slope) @ like(spread, slope)))
         penalties = [-prior.log_prob(value_of(module)).sum() / n for _, module, prior, value_of, _ in self.kernel.named_priors()]
         if self.priors:
-            penalties.append(-_log_prior_of_noise(noise).sum() / n)
+            penalties.append(-_log_prior_of_noise(noise, self.noisy).sum() / n)
         for parameter in self.parameters():
             parameter.grad = None
         torch.autograd.backward(
@@ -246,7 +249,7 @@ class _Model:
         return sum((p.item() for p in penalties), -solved.log_likelihood / n)
 
 
-def _log_prior_of_noise(noise: torch.Tensor) -> torch.Tensor:
+def _log_prior_of_noise(noise: torch.Tensor, certain: bool) -> torch.Tensor:
     """Return the log prior density of the log noise variance: half is that of noisy metrics, half is flat down to jitter.
 
     The first alone costs a deterministic metric 80 nats: 100 smooth runs were then learned with noise of 2 % of the
@@ -254,15 +257,24 @@ def _log_prior_of_noise(noise: torch.Tensor) -> torch.Tensor:
     """
     log_noise = noise.log()
     noisy = -0.5 * (log_noise - _LIKELY_NOISE) ** 2 - 0.5 * math.log(2.0 * math.pi)
+    if certain:
+        return noisy
     flat = torch.nn.functional.logsigmoid(2.0 * (_LIKELY_NOISE - log_noise)) - math.log(_LIKELY_NOISE - _NO_NOISE)
     return torch.logaddexp(noisy, flat) - math.log(2.0)
 
 
 def _fit_posterior(
-    nu: float, u: Points, z: Vector, spread: Vector, start: Hyperparameters | None, device: torch.device
+    nu: float,
+    u: Points,
+    z: Vector,
+    spread: Vector,
+    start: Hyperparameters | None,
+    device: torch.device,
+    *,
+    noisy: bool,
 ) -> Hyperparameters:
     """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
-    model = _Model.build(nu, u.shape[1], device, priors=True)
+    model = _Model.build(nu, u.shape[1], device, priors=True, noisy=noisy)
     first = np.full(u.shape[1], _FIRST_LENGTH * math.sqrt(u.shape[1]))
     model.assign(start if start is not None else Hyperparameters(nu, first, 1.0, _FIRST_NOISE))
     x, parameters = torch.from_numpy(u).to(device), model.parameters()

@@ -35,6 +35,8 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
         ok: (n,) the run gave a metric.
         rng: of the fit.
 
+    Labels are certainly noisy: without noise P would be 0 or 1 from run to run.
+
     Source:
         Least-squares classification: Rasmussen and Williams (2006), Gaussian processes for machine learning, section 6.5.
     """
@@ -43,7 +45,7 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
     from sbt.metamodels.extra_trees import ExtraTrees
     from sbt.metamodels.gaussian_process import GaussianProcess
 
-    metamodel: Metamodel = GaussianProcess() if len(u) <= _MOST_EXACT else ExtraTrees()
+    metamodel: Metamodel = GaussianProcess(certainly_noisy=True) if len(u) <= _MOST_EXACT else ExtraTrees()
     predictor, least = metamodel.fit(u, ok.astype(np.float64), rng), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
 
     def score(points: Points) -> Vector:
