@@ -24,6 +24,8 @@ SMALLEST = {
     "throughput.py": "--scenario cut_in --runs 4 --repeats 1 --no-campaign",
     "watcher.py": "--repeats 1 --vehicles 20",
     "warm_start.py": "{folder}/store --seeds 2 --batch 10 --batches 2",
+    "boundary_inputs.py": "--problems testbed:himmelblau_partx --methods even --seeds 1 --store {folder}/inputs",
+    "several.py": "--seeds 1 --what falsification --needs any",
     "boundary_table.py": "--problems testbed:borehole_1e-3:box --methods even --seeds 1 --reference 500 --store {folder}/table",
     "estimation.py": "--problems gayton_hat@200 --seeds 1 --table {folder}/table.jsonl",
     "faults.py": "--kills 2",

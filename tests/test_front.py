@@ -279,7 +279,7 @@ def test_code_that_has_changed_does_not_go_on_with_a_store(tmp_path):
         return {"gap": gap(values, seed)["gap"] + 0.1}
 
     before = run(gap, 12).frame
-    with pytest.raises(sbt.InputError, match=r"run 0 now gives .*choose another store for changed code"):
+    with pytest.raises(sbt.InputError, match=r"run 0 now gives .*choose another store for what has changed"):
         run(shifted, 24)
     after = run(gap, 24).frame
     assert len(after) == 24

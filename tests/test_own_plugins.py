@@ -221,24 +221,29 @@ def test_what_is_no_prediction_is_said_with_the_metamodels_name(run, campaign):
     assert type(caught.value).__name__ == "SbtError"
 
 
+REPEATS = 2
+"""Runs that repeat inputs with other seeds, to know whether a simulator is noisy."""
+
+
 @pytest.mark.parametrize("campaign", ["boundary", "falsification"])
 @pytest.mark.parametrize("kind", ["importance", "own.py:score"])
 def test_scores_above_zero_are_drawn_from(run, campaign, kind):
     """The density on [0, 0.5]^2 is 4, and so is the largest score of `importance`; log sigma has no bound."""
     _, x = run(campaign=campaign, acquisition={"kind": kind}, metamodel={"kind": "own.py:Nearest"}, validation={"share": 0})
-    assert len(np.unique(x, axis=0)) >= 60
+    assert len(np.unique(x, axis=0)) >= 60 - REPEATS
 
 
 @pytest.mark.parametrize("campaign", ["boundary", "falsification"])
 @pytest.mark.parametrize("kind", ["straddle", "expected_feasibility", "u", "own.py:farthest", "own.py:WIDE"])
 def test_greedy_acquisitions_are_chosen_greedily(run, campaign, kind):
-    """No point twice; where the score is the distance to the runs, points lie farther apart than even ones."""
+    """No point twice but the repeats; where the score is the distance to the runs, points lie farther apart than even ones."""
     keys = {"campaign": campaign, "metamodel": {"kind": "own.py:Nearest"}, "validation": {"share": 0}}
     _, x = run(acquisition={"kind": kind}, **keys)
-    assert len(np.unique(x[:60], axis=0)) == 60
+    x = np.unique(x[:60], axis=0)
+    assert len(x) == 60 - REPEATS
     if kind.startswith("own.py"):
         _, even = run("even", acquisition={"kind": "even"}, **keys)
-        assert pdist(x[:60]).min() > pdist(even[:60]).min()
+        assert pdist(x).min() > pdist(even[:60]).min()
 
 
 def test_an_error_of_an_acquisition_names_it_and_the_line(run, folder):

@@ -14,13 +14,13 @@ from sbt.metrics.longitudinal import FAR
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["METRIC_NAME", "conflict_type", "describe_conflict_type"]
+__all__ = ["METRIC_NAME", "STANDING", "conflict_type", "describe_conflict_type"]
 
 METRIC_NAME = "conflict_type"
 """Name of the metric."""
 _SIDES = ("ahead of ego", "left of ego", "behind ego", "right of ego")
 _COURSES = ("same direction", "crossing from the right", "oncoming", "crossing from the left")
-_STANDING, _STANDS = 16, 0.1
+STANDING, _STANDS = 16, 0.1
 """Added where the ego stands, slower than this (m/s): who was hit at rest did not hit."""
 _NOBODY = -1
 """Value if there is no other road user within 1 km."""
@@ -75,7 +75,7 @@ def _code(ego: ActorTrace, other: ActorTrace, k: int) -> int:
     outside_across = abs(across) - 0.5 * (ego.width + s * other.length + c * other.width)
     lengthwise = 0 if along >= 0 else 2
     side = lengthwise if outside_along >= outside_across else 1 if across > 0 else 3
-    return 4 * side + round(turned / (0.5 * math.pi)) % 4 + (_STANDING if abs(ego.speed[k]) < _STANDS else 0)
+    return 4 * side + round(turned / (0.5 * math.pi)) % 4 + (STANDING if abs(ego.speed[k]) < _STANDS else 0)
 
 
 def describe_conflict_type(code: float) -> str:
@@ -84,7 +84,7 @@ def describe_conflict_type(code: float) -> str:
     >>> describe_conflict_type(0.0), describe_conflict_type(29.0), describe_conflict_type(-1.0)
     ('ahead of ego, same direction', 'right of ego, crossing from the right, ego stands', '')
     """
-    standing, kind = divmod(int(code), _STANDING)
+    standing, kind = divmod(int(code), STANDING)
     return "" if code < 0 else f"{_SIDES[kind // 4]}, {_COURSES[kind % 4]}{', ego stands' if standing else ''}"
 
 
