@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sbt
-from sbt.campaigns.repeats import REPEAT, repeats_wanted, simulator_noise
+from sbt.campaigns.repeats import REPEAT, SimulatorNoise, repeats_wanted, simulator_noise
 from sbt.problem.outcome import Status
 from sbt.problem.requirement import Requirement
 from sbt.store.history import VALIDATION, History, Record
@@ -85,3 +85,9 @@ def test_every_guided_campaign_learns_and_says_whether_the_simulator_is_noisy(
     said = " ".join(result.conclusion.sentences(SimpleNamespace(history=rows, requirement=scenario.requirement, unit="m")))
     assert ("The simulator is noisy: where" in said) == (noise > 0)
     assert ("seems deterministic" in said) == (noise == 0)
+
+
+def test_noise_of_other_metrics_is_not_called_a_deviation_of_zero():
+    said = SimulatorNoise(2, noisy=True, std=0.0).sentences("ttc_min", "s")
+    told = "where 2 runs repeated inputs with other seeds, other metrics differed; ttc_min did not."
+    assert said == [f"The simulator is noisy: {told}"]

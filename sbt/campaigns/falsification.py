@@ -37,7 +37,6 @@ METHODS = ("portfolio", *CRITERIA, "cma_es")
 
 _INITIAL, _SEARCH, _EVEN = "initial", "search", "even"
 _TRANSFER = "transfer"
-"""Runs that were critical in an earlier campaign of another setup."""
 """Stage of runs that were critical in an earlier campaign of another setup."""
 _FILL_SHARE = 0.1  # of every batch that fills space, held-out runs included: what it finds is independent of the metamodel
 _REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed

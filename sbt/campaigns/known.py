@@ -21,8 +21,6 @@ __all__ = ["Known", "metamodel_of"]
 
 _PROBES = 9
 """Points on the segment between two critical runs, at which P must stay above 0.5 for them to be one mode."""
-
-
 _SURE_NOISE = 0.4
 """Part of the variance among repeats that the metamodel's noise is not allowed to be below: two repeats exaggerate."""
 

@@ -55,6 +55,8 @@ class SimulatorNoise:
         again = f"{plural(self.repeats, 'run')} repeated inputs with other seeds"
         if not self.noisy:
             return [f"The simulator seems deterministic: {again} and gave the same metrics."]
+        if self.std == 0.0:
+            return [f"The simulator is noisy: where {again}, other metrics differed; {metric} did not."]
         spread = f"{number(self.std, 3)} {unit}".rstrip()
         return [f"The simulator is noisy: where {again}, {metric} has a standard deviation of {spread}."]
 

@@ -27,8 +27,6 @@ _WIDEST = 3.0
 """Half width of the 95 % interval over the coefficient of variation that ends a campaign, at most: 1.96 with normal errors."""
 FEWEST_BATCHES = 4
 """Batches that must count before their spread is taken for a measure of the error."""
-
-
 _LOST, _MEMORY, _EXACT = 10.0, 4, 0.01
 """An earlier metamodel is preferred to the newest one after a loss of precision by this factor against one of so many batches
 before, of which the anticipated coefficient of variation of one draw is taken for at least the last value."""
