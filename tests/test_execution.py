@@ -213,10 +213,10 @@ def test_a_run_that_hangs_is_stopped_and_the_others_go_on(analytic: Path, monkey
     monkeypatch.setattr("sbt.execution.local._GRACE", 0.3)
     work = jobs(20, lambda k: 0.02 if k == 4 else 0.5)
     start = time.monotonic()
-    found = run(LocalExecutor(spec(analytic), 2, timeout=0.7), work)
+    found = run(LocalExecutor(spec(analytic), 2, timeout=2.0), work)
     assert [k for k, o in found.items() if o.status != Status.OK] == [4]
     assert (found[4].status, found[4].reason) == (
-        Status.TIMEOUT, "a run must take at most 0.7 s: its process was stopped",
+        Status.TIMEOUT, "a run must take at most 2 s: its process was stopped",
     )  # fmt: skip
     assert time.monotonic() - start < 60, "it would hang for ever"
 
@@ -308,7 +308,7 @@ def test_workers_end_with_their_driver(analytic: Path):
     assert len(workers) >= 2
     driver.kill()
     driver.wait()
-    deadline = time.monotonic() + 6
+    deadline = time.monotonic() + 60
     while any(alive(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not [pid for pid in workers if alive(pid)]

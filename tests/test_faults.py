@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from sbt import interruption
 from sbt.cli import app
 from sbt.errors import StoreError
+from sbt.execution.pool import close_pool, open_pool
 from sbt.execution.streams import SteadyStream
 from sbt.execution.tasks import each
 from sbt.processes import ProcessId, remove_abandoned, scratch
@@ -45,7 +46,8 @@ def tagged(tag: str) -> list[int]:
     return found
 
 
-def until(condition: Callable[[], Any], seconds: float = 30.0) -> bool:
+def until(condition: Callable[[], Any], seconds: float = 60.0) -> bool:
+    """Wait for what takes a second on a machine of one's own, and a minute on a crowded one."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
@@ -115,12 +117,12 @@ def test_a_signal_is_answered_at_once_and_leaves_nothing(
     at = time.monotonic()
     os.killpg(driver.pid, number)  # as a terminal does: to the driver and its workers
     line = driver.stderr.readline()
-    assert time.monotonic() - at < 1.5, "alone on a machine it takes some milliseconds"
+    assert time.monotonic() - at < 15.0, "alone on a machine it takes some milliseconds (benchmarks/faults.py)"
     name = signal.Signals(number).name
     assert line == f"stopping ({name}): run again to resume; a second signal stops at once\n"
     _, rest = driver.communicate(timeout=90)
     assert (driver.returncode, rest) == (130, "interrupted, run again to resume\n")
-    assert until(lambda: not tagged(str(temporary)), 5.0)
+    assert until(lambda: not tagged(str(temporary)))
     assert list(temporary.iterdir()) == []
     assert finished(store) < 40_000
     keys = {"budget": 200 * (finished(store) // 200 + 1), "batch": 200, "campaign": "coverage"}
@@ -139,7 +141,7 @@ MARK = Path(__file__).parent / "running"
 def deaf(values, seed):
     try:
         MARK.write_text("")
-        time.sleep(1.0)
+        time.sleep(60.0)
     except BaseException:
         pass
     return {"y": 1.0}
@@ -171,9 +173,9 @@ def test_a_run_that_catches_everything_cannot_catch_ctrl_c(configured: Callable[
     os.kill(driver.pid, signal.SIGINT)
     at = time.monotonic()
     _, told = driver.communicate(timeout=90)
-    assert time.monotonic() - at < 5.0
+    assert time.monotonic() - at < 30.0, "half of what the run would take"
     assert (driver.returncode, told.splitlines()[-1]) == (130, "interrupted, run again to resume")
-    assert finished(config.parent / "c") <= 1, "the run that was interrupted is no row"
+    assert finished(config.parent / "c") == 0, "the run that was interrupted is no row"
 
 
 def test_before_there_is_a_store_an_interruption_says_so(configured: Callable[..., Path], rude: Path, started: Any):
@@ -195,7 +197,7 @@ def test_ignored_signals_stay_ignored(configured: Callable[..., Path], started: 
     driver = started("bash", "-c", f"trap '' HUP; exec {' '.join(SBT)} run {config} --quiet --json")
     assert begun(config.parent / "c")
     os.kill(driver.pid, signal.SIGHUP)
-    out, _ = driver.communicate(timeout=60)
+    out, _ = driver.communicate(timeout=90)
     assert (driver.returncode, json.loads(out)["runs"]) == (0, 300)
 
 
@@ -226,7 +228,7 @@ def test_the_library_is_interrupted_as_a_notebook_expects(
     text = NOTEBOOK.format(module=module, executor=executor, more=more, folder=str(analytic.parent))
     script = "from sbt.execution.protocol import SerialExecutor\n" + text
     done = started(sys.executable, "-c", script)
-    out, err = done.communicate(timeout=60)
+    out, err = done.communicate(timeout=90)
     assert (done.returncode, out, err) == (0, "interrupted\n1\n", "")
     assert list(temporary.iterdir()) == []
 
@@ -261,7 +263,7 @@ def test_drivers_that_are_killed_leave_no_process_and_no_folder():
     """A few kills of those that `benchmarks/faults.py` makes."""
     done = subprocess.run(
         [sys.executable, ROOT / "benchmarks" / "faults.py", "--kills", "4", "--seed", "2"],
-        capture_output=True, text=True, timeout=120, check=True,
+        capture_output=True, text=True, timeout=300, check=True,
     )  # fmt: skip
     names, _, values = ([cell.strip() for cell in line.strip("|").split("|")] for line in done.stdout.splitlines()[-3:])
     found = dict(zip(names, values, strict=True))
@@ -292,7 +294,7 @@ def test_a_driver_that_dies_while_its_workers_start_leaves_none(moment: float, a
     assert until(starting)
     time.sleep(moment)
     driver.kill()
-    assert until(lambda: not tagged(str(temporary)), 10.0), "5 s on a machine of one's own"
+    assert until(lambda: not tagged(str(temporary)))
 
 
 def test_a_worker_that_lets_no_other_code_run_ends_with_its_driver(analytic: Path, started: Any, temporary: Path):
@@ -304,7 +306,7 @@ def test_a_worker_that_lets_no_other_code_run_ends_with_its_driver(analytic: Pat
     driver = started(sys.executable, "-c", DRIVER.replace("analytic", "holding"), str(analytic.parent))
     assert driver.stdout.readline() == "holding\n"
     driver.kill()
-    assert until(lambda: not tagged(str(temporary)), 5.0)
+    assert until(lambda: not tagged(str(temporary)))
 
 
 def test_tasks_end_with_their_driver(analytic: Path, started: Any, temporary: Path):
@@ -312,7 +314,19 @@ def test_tasks_end_with_their_driver(analytic: Path, started: Any, temporary: Pa
     driver = started(sys.executable, "-c", script)
     assert until(lambda: len(tagged(str(temporary))) >= 3)
     driver.kill()
-    assert until(lambda: not tagged(str(temporary)), 10.0)
+    assert until(lambda: not tagged(str(temporary)))
+
+
+def test_a_pool_is_closed_at_any_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """loky's thread must not meet tasks that were dropped when the workers were killed."""
+    raised: list[Any] = []
+    monkeypatch.setattr(threading, "excepthook", raised.append)
+    for moment in (0, 3, 5, 20):
+        pool = open_pool(1, str(tmp_path))
+        tasks = [pool.submit(time.sleep, 0.0002) for _ in range(300)]
+        tasks[moment].result()
+        close_pool(pool)
+    assert not raised
 
 
 def raising(item: int) -> int:

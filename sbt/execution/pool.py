@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import queue
 import signal
 import sys
 import threading
@@ -56,7 +57,15 @@ def open_pool(workers: int, folder: str) -> Any:
 
 
 def close_pool(pool: Any) -> None:
-    """Kill the workers of a pool and wait until they have ended."""
+    """Kill the workers of a pool and wait until they have ended.
+
+    What waits to be handed to a worker is forgotten first: loky drops these tasks when it kills the workers, but keeps
+    their numbers, and its thread ends with a KeyError (and leaves its semaphores) where it meets one of them afterwards.
+    """
+    waiting: queue.Queue[int] = pool._work_ids
+    with suppress(queue.Empty):
+        while True:
+            waiting.get_nowait()
     pool.shutdown(wait=True, kill_workers=True)
 
 
