@@ -58,6 +58,7 @@ def test_other_distributions(estimated, mean, std):
 def test_another_threshold(estimated):
     found = estimated.estimate(critical=(-np.inf, 0.1))
     assert found.low <= linear(beta=3.4) <= found.high
+    assert estimated.estimate(critical=(None, 0.1)) == found
     none = estimated.estimate(critical=(-90.0, -80.0))
     assert (none.probability, none.low, none.exact_bound) == (0.0, 0.0, none.exact_bound)
     assert none.exact_bound is not None
@@ -97,6 +98,9 @@ def test_what_the_runs_cannot_tell_is_refused(estimated, crude, tmp_path):
         estimated.estimate({"x3": sbt.Normal(0, 1)})
     with pytest.raises(sbt.InputError, match=r"one that the runs measured \(y\)|must be one of y"):
         estimated.estimate(metric="ttc", critical=(0.0, 1.0))
+    for wrong in (("low", 1.0), (0.0, 1.0, 2.0), 3.0):
+        with pytest.raises(sbt.InputError, match=r"critical must be an interval \(low, high\)"):
+            estimated.estimate(critical=wrong)
     other = sbt.run(
         campaign="falsification", scenario="testbed:linear_d2", budget=10, store=tmp_path / "f", executor="serial", report=False
     )

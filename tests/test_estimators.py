@@ -182,6 +182,13 @@ def test_a_variance_that_one_error_decides_has_few_observations():
     assert wild.freedom == 3.0
 
 
+@pytest.mark.parametrize("scale", [1e-150, 1e-120, 1e60])
+def test_degrees_of_freedom_have_no_scale(scale):
+    """Nothing critical ever, and a metamodel that knows it: errors whose fourth powers are too small for a float."""
+    some, scaled = (combine_estimates([batch(np.array([1.0, 2.0, 3.0]) * s) for _ in range(4)]) for s in (1.0, scale))
+    assert scaled.freedom == pytest.approx(some.freedom)
+
+
 @pytest.mark.parametrize("hits", [1, 4, 9])
 def test_with_few_hits_the_interval_is_also_that_of_their_number(hits):
     found = combine_estimates([batch([1.0] * hits + [0.0] * (1000 - hits))])

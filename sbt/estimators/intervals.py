@@ -155,6 +155,7 @@ def combine_estimates(batches: Sequence[CountedBatch]) -> CombinedEstimate:
 
 
 def _effective(weights: Vector) -> float:
-    """Return the number of equal weights that vary as much as these: 0 without any."""
-    total = float(weights.sum())
-    return total**2 / float((weights**2).sum()) if total > 0 else 0.0
+    """Return the number of equal weights that vary as much as these, whatever their scale: 0 without any."""
+    largest = float(weights.max(initial=0.0))
+    scaled = weights / largest if largest > 0.0 else weights
+    return float(scaled.sum()) ** 2 / float((scaled**2).sum()) if largest > 0.0 else 0.0

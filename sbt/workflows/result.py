@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -163,13 +164,13 @@ class Result(Generic[C]):
         return pd.DataFrame(columns, index=inputs.index if isinstance(inputs, pd.DataFrame) else None)
 
     def estimate(
-        self, inputs: Any = None, *, critical: Sequence[float] | None = None, metric: str | None = None
+        self, inputs: Any = None, *, critical: Sequence[float | None] | None = None, metric: str | None = None
     ) -> EstimationConclusion:
         """Return the probability under other distributions, or of another requirement, from the runs that are there.
 
         Args:
             inputs: changes to the campaign's inputs, as the key of a configuration; None: its own distributions.
-            critical: interval (low, high) of critical values; None: the campaign's.
+            critical: interval (low, high) of critical values, None for an end that is open; None: the campaign's.
             metric: one that the runs measured; None: the campaign's.
 
         Raises:
@@ -178,7 +179,7 @@ class Result(Generic[C]):
         return self._asked(inputs, critical, metric).conclusion
 
     def sensitivity(
-        self, inputs: Any = None, *, critical: Sequence[float] | None = None, metric: str | None = None
+        self, inputs: Any = None, *, critical: Sequence[float | None] | None = None, metric: str | None = None
     ) -> pd.DataFrame:
         """Return how the probability P depends on each parameter of the distributions; arguments as `estimate`.
 
@@ -190,11 +191,17 @@ class Result(Generic[C]):
 
         return pd.DataFrame([vars(each) for each in self._asked(inputs, critical, metric).sensitivity])
 
-    def _asked(self, inputs: Any, critical: Sequence[float] | None, metric: str | None) -> Answer:
+    def _asked(self, inputs: Any, critical: Sequence[float | None] | None, metric: str | None) -> Answer:
         given, _ = as_data({"inputs": inputs or {}})
-        if critical is not None and len(critical) != 2:
-            raise InputError(f"critical must be an interval (low, high), but got {critical!r}")
-        interval = None if critical is None else (float(critical[0]), float(critical[1]))
+        if critical is None:
+            interval = None
+        else:
+            rule = "critical must be an interval (low, high), None for an end that is open"
+            try:
+                low, high = critical
+                interval = (-math.inf if low is None else float(low), math.inf if high is None else float(high))
+            except (TypeError, ValueError):
+                raise InputError(f"{rule}, but got {critical!r}") from None
         return estimate_again(self.store, given["inputs"], critical=interval, metric=metric, objects=self.objects)
 
     def replay(self, run: int) -> Replay:
