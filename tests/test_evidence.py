@@ -221,16 +221,18 @@ def test_the_rear_of_a_train_is_there_although_its_front_is_far(simulate):
 
 def test_a_trailing_body_follows_the_path_and_changes_lanes_as_a_whole():
     body = TrailingBody(12.0)
-    x, poses = 0.0, ()
-    for _ in range(40):
-        x += 1.0
-        poses = body.move((x, 0.0), 1.0, 0.0, "a_0", 1.0)
-    assert np.array(poses) == pytest.approx(np.array([[x - 2, 0, 0], [x - 6, 0, 0], [x - 10, 0, 0]]))
-    poses = body.move((x + 1.0, 3.2), 1.0, 0.0, "a_1", 1.0)
-    assert np.array(poses)[:, 1] == pytest.approx(3.2), "a change of lanes in one step moves all of it"
+    for k in range(1, 41):
+        straight = body.move((float(k), 0.0), 1.0, 0.0, "a_0", 1.0)
+    x = 40.0
+    assert body.poses([straight])[0] == pytest.approx(np.array([[x - 2, 0, 0], [x - 6, 0, 0], [x - 10, 0, 0]]))
+    changed = body.move((x + 1.0, 3.2), 1.0, 0.0, "a_1", 1.0)
+    assert body.poses([changed])[0, :, 1] == pytest.approx(3.2), "a change of lanes in one step moves all of it"
     for k in range(1, 25):
         a = k / 8.0
-        poses = body.move((x + 1 + 8 * math.sin(a), 3.2 + 8 - 8 * math.cos(a)), math.cos(a), math.sin(a), "b_0", 1.0)
+        last = body.move((x + 1 + 8 * math.sin(a), 3.2 + 8 - 8 * math.cos(a)), math.cos(a), math.sin(a), "b_0", 1.0)
+    poses = body.poses([straight, changed, last])
+    assert poses[:2] == pytest.approx(np.array([body.poses([k])[0] for k in (straight, changed)])), "what was stays as it was"
+    poses = poses[2]
     radius = [math.hypot(px - x - 1, py - 11.2) for px, py, _ in poses]
     assert radius == pytest.approx([8.0] * 3, abs=0.3)
     turned = np.unwrap([p[2] for p in poses])

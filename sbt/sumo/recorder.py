@@ -168,7 +168,7 @@ class Recorder:
             self._start_recording()
         elif self._ego in arrived:
             self._handle_arrival()
-        if self._ego in simulation.getStartingTeleportIDList():
+        if simulation.getStartingTeleportNumber() and self._ego in simulation.getStartingTeleportIDList():
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but SUMO teleported it at {self._now()}")
         self._record_step(departed)
 

@@ -23,8 +23,8 @@ from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
 from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
 from sbt.sumo.session import INVALID_DOUBLE
-from sbt.sumo.trailing import LONGEST_RIGID, Pose, TrailingBody, path_behind
-from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_way
+from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, path_behind
+from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
 
 __all__ = ["Surroundings"]
 
@@ -68,7 +68,8 @@ class Surroundings:
         self._centre_offsets: dict[str, float] = {}
         self._bodies: dict[str, TrailingBody] = {}
         self._rows: list[dict[str, _Row]] = []
-        self._parts: list[dict[str, tuple[Pose, ...]]] = []
+        self._parts: list[dict[str, int]] = []
+        self._last_poses: dict[tuple[str, int], np.ndarray] = {}
         self._arrived: frozenset[str] = frozenset()
         self._ways: dict[str, tuple[States, ...]] = {}
         self.states: dict[str, State] = {}
@@ -126,7 +127,7 @@ class Surroundings:
         if self.placed:
             near = {**near, **self._placed_near(near[ego][_POSITION])}
         row: dict[str, _Row] = {}
-        parts: dict[str, tuple[Pose, ...]] = {}
+        parts: dict[str, int] = {}
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
         height = near[ego][_POSITION][2]
@@ -166,16 +167,13 @@ class Surroundings:
             self._ways[name] = (LEFT_THE_ROAD,) * (1 + (self._bodies[name].count if name in self._bodies else 0))
             return
         ahead = line_ahead(self._sumo, name)
-        state, poses = self.states[name], self._parts[-1].get(name, ())
-        size = self._bodies[name].part_length if poses else state.length
-        corners = [(x - side * size * math.cos(h), y - side * size * math.sin(h)) for side in (0.5, -0.5)
-                   for x, y, h in (*poses[::-1],) or ((state.x, state.y, state.heading),)]  # fmt: skip
-        behind = np.array([*corners[: max(len(poses), 1)], corners[-1]])
-        ways = [] if ahead is None else [rectangle_way(behind, ahead, state.length)]
-        if ahead is not None:
-            ways += [rectangle_way(behind, ahead, size, k * size) for k in range(len(poses))]
-        if ways and all(way is not None for way in ways):
-            self._ways[name] = tuple(way for way in ways if way is not None)
+        state, poses = self.states[name], self._poses(name, len(self._rows) - 1)
+        size = state.length / len(poses)
+        corners = [(x - side * size * math.cos(h), y - side * size * math.sin(h)) for side in (0.5, -0.5) for x, y, h in poses[::-1]]
+        behind = np.array([*corners[: len(poses)], corners[-1]])
+        if ahead is not None and (ways := rectangle_ways(behind, ahead, state.length)):
+            parts = [k * size for k in range(len(poses))] if name in self._parts[-1] else []
+            self._ways[name] = (*ways, *rectangle_ways(behind, ahead, size, parts))
 
     def _far(self, near: Mapping[str, Any]) -> list[str]:
         """Return the very long vehicles whose rear may be within the radius although their front is not."""
@@ -197,7 +195,7 @@ class Surroundings:
         return road
 
     def _record(
-        self, row: dict[str, _Row], parts: dict[str, tuple[Pose, ...]], before: Mapping[str, _Row], name: str,
+        self, row: dict[str, _Row], parts: dict[str, int], before: Mapping[str, _Row], name: str,
         variables: Mapping[int, Any],
     ) -> None:  # fmt: skip
         """Record one state; SUMO's position is the front of a vehicle and the centre of a person, ours is the centre."""
@@ -273,12 +271,18 @@ class Surroundings:
 
     def _rectangles(self, name: str, k: int) -> list[_Rectangle]:
         """Return the rectangles of a road user at an instant."""
-        state, poses = self.states[name], self._parts[k].get(name)
-        if poses and name not in self.rigid:
-            length = self._bodies[name].part_length
-            return [(*pose, length, state.width) for pose in poses]
-        x, y, heading = self._rows[k][name][:3]
-        return [(x, y, heading, state.length, state.width)]
+        state, poses = self.states[name], self._poses(name, k)
+        return [(x, y, heading, state.length / len(poses), state.width) for x, y, heading in poses.tolist()]
+
+    def _poses(self, name: str, k: int) -> np.ndarray:
+        """Return x, y (m) and heading (rad) of the rectangles of a road user at an instant: (rectangles, 3)."""
+        at = None if name in self.rigid else self._parts[k].get(name)
+        if at is None:
+            return np.array([self._rows[k][name][:3]])
+        if (name, at) not in self._last_poses:
+            self._last_poses = {key: value for key, value in self._last_poses.items() if key[0] != name or key[1] == at - 1}
+            self._last_poses[name, at] = self._bodies[name].poses([at])[0]
+        return self._last_poses[name, at]
 
     def _step_of(self, name: str, other: str) -> ActorTrace:
         """Return the last two instants of a road user, or the last one if the other was not there before."""
@@ -291,7 +295,7 @@ class Surroundings:
         x, y, heading, speed, acceleration = np.array(rows).T
         parts: tuple[ActorTrace, ...] = ()
         if name in self._bodies and name not in self.rigid:
-            poses = np.array([self._parts[k][name] for k in at])  # (t, parts, 3)
+            poses = self._bodies[name].poses([self._parts[k][name] for k in at])
             parts = _parts(poses, speed, acceleration, self._bodies[name].part_length, state.width)
         return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width, parts)
 
@@ -324,9 +328,8 @@ class Surroundings:
         """Return the parts of a long vehicle over all instants, NaN where it is not there."""
         body, state = self._bodies[name], self.states[name]
         poses = np.full((len(self._rows), body.count, 3), np.nan)
-        for k, parts in enumerate(self._parts):
-            if name in parts:
-                poses[k] = parts[name]
+        rows = [k for k, parts in enumerate(self._parts) if name in parts]
+        poses[rows] = body.poses([self._parts[k][name] for k in rows])
         made = _parts(poses, table[:, 3], table[:, 4], body.part_length, state.width)
         ways = self._ways.get(name, ())[1:]
         return tuple(replace(part, way=way) for part, way in zip(made, ways, strict=True)) if ways else made

@@ -8,9 +8,11 @@ bus would be. So the rear parts follow the path of the front. The body at first 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any
+
+import numpy as np
 
 __all__ = ["LONGEST_RIGID", "TrailingBody", "path_behind"]
 
@@ -26,10 +28,12 @@ _JUMP = 3.0
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
 """x, y (m) and heading (rad) of the middle of a rectangle."""
+_Instant = tuple[int, int, float, float, float, float]
+"""Number of the path, of its points, x and y of the front (m), cosine and sine of the heading."""
 
 
 class TrailingBody:
-    """The parts of one long vehicle, updated with every step.
+    """The parts of one long vehicle. A step only notes where its front is; the parts are placed for those who ask.
 
     Args:
         length: of the vehicle (m).
@@ -39,14 +43,13 @@ class TrailingBody:
     def __init__(self, length: float, behind: Sequence[Point] = ()):
         self.count = min(_MOST_PARTS, math.ceil(length / _PART))
         self.part_length = length / self.count
-        self._length = length
-        self._path: list[Point] = list(reversed(behind))  # the newest last
-        self._front: Point | None = None
+        self._kept = math.ceil(length / _SPACING) + 2
+        self._paths = [_Path(behind[::-1])]
+        self._instants: list[_Instant] = []
         self._lane = ""
-        self._poses: tuple[Pose, ...] = ()
 
-    def move(self, front: Point, cos: float, sin: float, lane: str, travelled: float) -> tuple[Pose, ...]:
-        """Return the poses of the parts, the front one first.
+    def move(self, front: Point, cos: float, sin: float, lane: str, travelled: float) -> int:
+        """Note a step, and return the number by which `poses` knows it.
 
         Args:
             front: middle of the front bumper (m).
@@ -55,65 +58,98 @@ class TrailingBody:
             lane: id; another lane of the same edge is a change of lanes, which moves the whole body sideways.
             travelled: speed times step (m).
         """
-        before, previous, self._front, self._lane = self._front, self._lane, front, lane
-        if before == front and previous == lane:
-            return self._poses
-        if before is not None:
-            self._drive(before, front, cos, sin, changed=_beside(previous, lane), travelled=travelled)
-        self._poses = self._place(front, cos, sin)
-        return self._poses
+        previous, self._lane = self._lane, lane
+        if self._instants:
+            x, y = self._instants[-1][2:4]
+            if (x, y) == front and previous == lane:
+                return len(self._instants) - 1
+            self._drive((x, y), front, cos, sin, changed=_beside(previous, lane), travelled=travelled)
+        self._instants.append((len(self._paths) - 1, len(self._paths[-1].x), *front, cos, sin))
+        return len(self._instants) - 1
 
     def _drive(self, before: Point, front: Point, cos: float, sin: float, *, changed: bool, travelled: float) -> None:
         """Extend the path from the last front to the new one."""
         dx, dy = front[0] - before[0], front[1] - before[1]
-        ahead = dx * cos + dy * sin
+        path = self._paths[-1]
         if changed:  # sideways at once, and the body with it
-            u, v = self._direction(before, cos, sin)
+            u, v = path.direction(before) or (cos, sin)
             along = dx * u + dy * v
             shift_x, shift_y = dx - along * u, dy - along * v
-            self._path = [(x + shift_x, y + shift_y) for x, y in self._path]
+            kept = zip(path.x[-self._kept :], path.y[-self._kept :], strict=True)
+            path = _Path([(x + shift_x, y + shift_y) for x, y in kept])
+            self._paths.append(path)
             before = before[0] + shift_x, before[1] + shift_y
-        elif ahead < -0.1 or math.hypot(dx, dy) > 1.5 * travelled + _JUMP:
-            self._path = []  # backwards, or moved: straight as SUMO turns it
+        elif dx * cos + dy * sin < -0.1 or math.hypot(dx, dy) > 1.5 * travelled + _JUMP:
+            self._paths.append(_Path())  # backwards, or moved: straight as SUMO turns it
             return
-        last = self._path[-1] if self._path else None
-        if last is None or math.hypot(before[0] - last[0], before[1] - last[1]) >= _SPACING:
-            self._path.append(before)
-            needed = math.ceil(self._length / _SPACING) + 2
-            if len(self._path) > 2 * needed:
-                del self._path[:-needed]
+        path.extend(before, _SPACING)
 
-    def _direction(self, front: Point, cos: float, sin: float) -> Point:
-        """Return the direction of the path at the front."""
-        if self._path:
-            dx, dy = front[0] - self._path[-1][0], front[1] - self._path[-1][1]
-            moved = math.hypot(dx, dy)
-            if moved > 1e-3:
-                return dx / moved, dy / moved
-        return cos, sin
+    def poses(self, instants: Sequence[int]) -> np.ndarray:
+        """Return the poses of the parts in these steps, the front one first: (instants, parts, 3)."""
+        table = np.array([self._instants[k] for k in instants])
+        result = np.empty((len(table), self.count, 3))
+        behind = self.part_length * np.arange(1, self.count + 1)
+        for k in np.unique(table[:, 0]):
+            here = table[:, 0] == k
+            points, *state = table[here, 1:].T
+            result[here] = self._paths[int(k)].place(points.astype(int), np.stack(state), behind)
+        return result
 
-    def _place(self, front: Point, cos: float, sin: float) -> tuple[Pose, ...]:
-        """Return the parts between points of the path that are a part's length apart along it."""
-        part, (x, y), joint = self.part_length, front, front
-        poses: list[Pose] = []
-        left, k = part, len(self._path) - 1
-        while len(poses) < self.count:
-            if k >= 0:
-                u, v = self._path[k]
-            else:
-                u, v = x - self._length * cos, y - self._length * sin
-            dx, dy = u - x, v - y
-            step = math.hypot(dx, dy)
-            if step < left:
-                left, x, y, k = left - step, u, v, k - 1
-                if step > 0.0:
-                    cos, sin = -dx / step, -dy / step  # straight on beyond the end of the path
-                continue
-            share = left / step
-            x, y, left = x + share * dx, y + share * dy, part
-            poses.append((0.5 * (joint[0] + x), 0.5 * (joint[1] + y), math.atan2(joint[1] - y, joint[0] - x)))
-            joint = x, y
-        return tuple(poses)
+
+class _Path:
+    """A line that grows at its end, with the distance along it from its first point to each (m)."""
+
+    def __init__(self, points: Iterable[Point] = ()):
+        self.x: list[float] = []
+        self.y: list[float] = []
+        self._along: list[float] = []
+        for point in points:
+            self.extend(point, 1e-6)
+
+    def extend(self, point: Point, spacing: float) -> None:
+        """Append a point, unless it is closer to the last one than the spacing (m)."""
+        step = math.hypot(point[0] - self.x[-1], point[1] - self.y[-1]) if self.x else math.inf
+        if step >= spacing:
+            self._along.append(self._along[-1] + step if self.x else 0.0)
+            self.x.append(point[0])
+            self.y.append(point[1])
+
+    def direction(self, front: Point) -> Point | None:
+        """Return the direction from the last point to the front; None where that is the same point."""
+        dx, dy = (front[0] - self.x[-1], front[1] - self.y[-1]) if self.x else (0.0, 0.0)
+        moved = math.hypot(dx, dy)
+        return (dx / moved, dy / moved) if moved > 1e-3 else None
+
+    def place(self, points: np.ndarray, state: np.ndarray, behind: np.ndarray) -> np.ndarray:
+        """Return the parts between joints that are as far behind the front along the path as is said.
+
+        Args:
+            points: (n,) number of points that the path had then.
+            state: (4, n) x and y of the front (m), cosine and sine of the heading.
+            behind: (parts,) distances of the joints from the front (m); straight on beyond the first point of the path.
+
+        Returns:
+            (n, parts, 3) poses.
+        """
+        fx, fy, cos, sin = (column[:, None] for column in state)
+        there = points[:, None] > 0
+        x, y, along = (np.array(column or [0.0]) for column in (self.x, self.y, self._along))
+        last = np.maximum(points - 1, 0)[:, None]
+        to_x, to_y = np.where(there, x[last] - fx, -cos), np.where(there, y[last] - fy, -sin)
+        gap = np.hypot(to_x, to_y)  # from the front to the last point
+        unit_x, unit_y = (np.where(gap > 0, -d / np.where(gap > 0, gap, 1.0), h) for d, h in ((to_x, cos), (to_y, sin)))
+        at = np.where(there, along[last] + gap, 0.0) - behind  # (n, parts), from the first point on
+        jx = np.where(at > along[last], fx - behind * unit_x, np.interp(at, along, x))
+        jy = np.where(at > along[last], fy - behind * unit_y, np.interp(at, along, y))
+        two = points[:, None] > 1
+        if len(x) > 1:
+            unit_x = np.where(two, (x[1] - x[0]) / along[1], unit_x)
+            unit_y = np.where(two, (y[1] - y[0]) / along[1], unit_y)
+        before = at < 0
+        jx = np.where(before, np.where(there, x[0], fx) + at * unit_x, jx)
+        jy = np.where(before, np.where(there, y[0], fy) + at * unit_y, jy)
+        ahead_x, ahead_y = np.hstack([fx, jx[:, :-1]]), np.hstack([fy, jy[:, :-1]])
+        return np.stack([0.5 * (ahead_x + jx), 0.5 * (ahead_y + jy), np.arctan2(ahead_y - jy, ahead_x - jx)], axis=2)
 
 
 def _beside(lane: str, other: str) -> bool:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from sbt.problem.trace import States
 
-__all__ = ["LEFT_THE_ROAD", "line_ahead", "rectangle_way"]
+__all__ = ["LEFT_THE_ROAD", "line_ahead", "rectangle_ways"]
 
 LEFT_THE_ROAD: States = np.full((1, 3), np.nan)
 """The way of a vehicle that has arrived: there is none."""
@@ -44,27 +45,29 @@ def line_ahead(sumo: Any, name: str) -> States | None:
     return _beside(np.concatenate(ahead), vehicle.getLateralLanePosition(name))
 
 
-def rectangle_way(behind: States, ahead: States, length: float, offset: float = 0.0) -> States | None:
-    """Return the (k, 3) centre and heading of a rectangle whose front and rear go along a line, as SUMO places it.
+def rectangle_ways(behind: States, ahead: States, length: float, offsets: Sequence[float] = (0.0,)) -> list[States]:
+    """Return the (k, 3) centre and heading of rectangles whose front and rear go along a line, as SUMO places them.
 
     Args:
         behind: (n, 2) points that the body stands on now, from its rear to its front.
         ahead: (m, 2) points in front of it.
-        length: of the rectangle (m).
-        offset: from the front of the body to that of the rectangle (m).
+        length: of the rectangles (m).
+        offsets: from the front of the body to that of each rectangle (m).
 
     Returns:
-        None where there is no line ahead.
+        One for each offset; none where there is no line ahead.
     """
     line = np.concatenate([behind, ahead])
     along = _along(line)
     start = float(_along(behind)[-1])
-    front = np.arange(start + _STEP, min(along[-1], start + _LENGTH), _STEP) - offset
-    if not front.size:
-        return None
-    ends = [np.stack([np.interp(s, along, line[:, k]) for k in (0, 1)], axis=1) for s in (front, front - length)]
+    ahead_of_body = np.arange(start + _STEP, min(along[-1], start + _LENGTH), _STEP)
+    if not ahead_of_body.size:
+        return []
+    front = ahead_of_body - np.array(offsets)[:, None]  # (rectangles, k)
+    ends = [np.stack([np.interp(s, along, line[:, k]) for k in (0, 1)], axis=2) for s in (front, front - length)]
     chord = ends[0] - ends[1]
-    return np.concatenate([0.5 * (ends[0] + ends[1]), np.unwrap(np.arctan2(chord[:, 1], chord[:, 0]))[:, None]], axis=1)
+    heading = np.unwrap(np.arctan2(chord[:, :, 1], chord[:, :, 0]), axis=1)
+    return list(np.concatenate([0.5 * (ends[0] + ends[1]), heading[:, :, None]], axis=2))
 
 
 def _inside(lane: Any, first: str) -> list[str]:
