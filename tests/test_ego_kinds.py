@@ -91,6 +91,19 @@ def test_the_departure_of_a_person_is_the_requested_one(tmp_path, old, new, word
     assert failed.value.status in (Status.INVALID, Status.FAILED)
 
 
+FLOW = PERSON.replace("person", "personFlow").replace('id="ego" depart="1"', 'id="f" begin="1" number="3" period="3"')
+
+
+@pytest.mark.sumo
+def test_a_person_of_a_flow_departs_when_the_flow_lets_it(tmp_path):
+    trace = traced(written(tmp_path, FLOW, ego="f.1", width=1.8), 70)
+    assert (trace.actors[0], trace.ended, float(trace.actor("f.1").x[0])) == ("f.1", "duration", 70.0)
+    assert float(trace.actor("f.0").x[0]) == pytest.approx(70 + 3 * 1.4, rel=0.1), "3 s ahead"
+    (tmp_path / "late").mkdir()
+    with pytest.raises(RunError, match=r"kinds\.rou\.xml:5:1: 'f\.3' must depart.*number=\"3\" persons, and the last one is 'f\.2'"):
+        traced(written(tmp_path / "late", FLOW, ego="f.3", width=1.8), 70)
+
+
 @pytest.mark.sumo
 def test_a_person_has_no_controller(tmp_path):
     with pytest.raises(InputError, match=r"ego\.kind: a person as the ego is moved by SUMO and has no kind, but got 'acc_aeb'"):

@@ -10,14 +10,14 @@ from collections.abc import Callable
 
 from sbt.errors import InputError, RunError
 from sbt.problem.plain import Values
-from sbt.sumo.elements import Element, element, elements
+from sbt.sumo.elements import PEOPLE, Element, element, elements
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.session import session
 from sbt.sumo.template import fill
 
 __all__ = ["why_absent"]
 
-_VEHICLES = ("vehicle", "trip", "flow")
+_ROAD_USERS = ("vehicle", "trip", "flow", *PEOPLE)
 
 
 def why_absent(
@@ -33,7 +33,7 @@ def why_absent(
         start: when the simulation begins (s).
         added: the vehicle is not of the files.
     """
-    one = element(files, name, _VEHICLES)
+    one = element(files, name, _ROAD_USERS)
     if one is None:
         what = "has added it, and SUMO has dropped it" if added and depart is not None else "has not added it"
         return f"the loop {what}: sumo.vehicle.add('{name}', ...)"
@@ -89,10 +89,11 @@ def _unsorted(files: SumoFiles, values: Values, one: Element, depart: float | No
 def _past_end_of_flow(one: Element, name: str, values: Values) -> str:
     number = _number(one.attributes.get("number"), values)
     rank = name.rpartition(".")[2]
-    if one.tag != "flow" or number is None or not rank.isdigit() or int(rank) < number:
+    if one.tag not in ("flow", "personFlow") or number is None or not rank.isdigit() or int(rank) < number:
         return ""
     last = f"{one.attributes['id']}.{number - 1:g}"
-    return f'the flow has number="{number:g}" vehicles, and the last one is \'{last}\': raise its number'
+    who = "vehicles" if one.tag == "flow" else "persons"
+    return f'the flow has number="{number:g}" {who}, and the last one is \'{last}\': raise its number'
 
 
 def _scaled(files: SumoFiles, one: Element, scale: float | None, place: str) -> str:

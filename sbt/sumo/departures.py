@@ -78,7 +78,8 @@ def requested_departures(files: SumoFiles, values: Values, ego: str) -> dict[str
     if walker is not None:
         texts = (walker.depart or "", walker.attributes.get("departPos", ""))
         depart, position = (number_or_none(fill(text, values, walker.place)) for text in texts)
-        requested[ego] = RequestedDeparture(walker.place, depart, position, None, None, on_foot=True)
+        of_flow = walker.tag == "personFlow"
+        requested[ego] = RequestedDeparture(walker.place, depart, position, None, None, of_flow=of_flow, on_foot=True)
     for name, template in compared:
         vehicle = template.vehicles[name]
         place = f"{template.path}:{vehicle.place[0]}:{vehicle.place[1]}: "
@@ -125,7 +126,7 @@ class DepartureMonitor:
     ):  # fmt: skip
         self._sumo, self._ego, self._files, self._values = sumo, ego, files, values
         self._start = float(sumo.simulation.getTime())
-        self._in_files = files.vehicle(ego.id) is not None
+        self._in_files = files.vehicle(ego.id) is not None or person(files.templates, ego.id) is not None
         self._requested: dict[str, RequestedDeparture] = {}
         self._due: list[tuple[float, str]] = []
         self._places: dict[str, str] = {}
@@ -268,7 +269,7 @@ class DepartureMonitor:
     def _compare_person(self, name: str, requested: RequestedDeparture, dt: float) -> None:
         """Compare time and position of a person in the step in which it begins to walk."""
         departure = float(self._sumo.simulation.getTime()) - dt
-        if requested.depart is not None and self._late(departure, requested.depart, dt):
+        if requested.depart is not None and not requested.of_flow and self._late(departure, requested.depart, dt):
             rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
             raise RunError(Status.INVALID, f"{rule}, but SUMO inserted it at t = {departure:g} s")
         domain = self._sumo.person

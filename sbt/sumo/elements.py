@@ -10,8 +10,10 @@ from sbt.plugins import kept
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import Template
 
-__all__ = ["Element", "element", "elements", "person"]
+__all__ = ["PEOPLE", "Element", "element", "elements", "person"]
 
+PEOPLE = ("person", "personFlow")
+"""Elements that put persons on the road."""
 _DEPARTING = {"vehicle": "depart", "trip": "depart", "person": "depart", "container": "depart", "flow": "begin",
               "personFlow": "begin", "containerFlow": "begin"}  # fmt: skip
 """Elements that depart, and their attribute for it."""
@@ -68,9 +70,12 @@ def _elements_of(one: Template) -> list[Element]:
 
 @kept
 def person(templates: tuple[Template, ...], name: str) -> Element | None:
-    """Return the person of this id, None if there is none; looked for once per process."""
-    of_files = (one for each in templates if each.root[0] != "net" for one in _elements_of(each))
-    return next((one for one in of_files if one.tag == "person" and one.attributes["id"] == name), None)
+    """Return the person of this id, or for `f.3` the flow `f` of persons; None if there is none; looked for once per process."""
+    people = [one for each in templates if each.root[0] != "net" for one in _elements_of(each) if one.tag in PEOPLE]
+    found = next((one for one in people if one.tag == "person" and one.attributes["id"] == name), None)
+    flow, _, rank = name.rpartition(".")
+    of_flow = (one for one in people if one.tag == "personFlow" and one.attributes["id"] == flow and rank.isdigit())
+    return found if found is not None else next(of_flow, None)
 
 
 def element(files: SumoFiles, name: str, tags: Collection[str]) -> Element | None:
