@@ -100,7 +100,7 @@ def test_a_person_of_a_flow_departs_when_the_flow_lets_it(tmp_path):
     assert (trace.actors[0], trace.ended, float(trace.actor("f.1").x[0])) == ("f.1", "duration", 70.0)
     assert float(trace.actor("f.0").x[0]) == pytest.approx(70 + 3 * 1.4, rel=0.1), "3 s ahead"
     (tmp_path / "late").mkdir()
-    with pytest.raises(RunError, match=r"kinds\.rou\.xml:5:1: 'f\.3' must depart.*number=\"3\" persons, and the last one is 'f\.2'"):
+    with pytest.raises(RunError, match=r"xml:5:1: 'f\.3' must depart.*number=\"3\" persons, and the last one is 'f\.2'"):
         traced(written(tmp_path / "late", FLOW, ego="f.3", width=1.8), 70)
 
 

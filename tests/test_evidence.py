@@ -111,6 +111,8 @@ def test_on_a_bridge_and_below_is_no_contact_and_a_net_without_heights_is_warned
     for network in (net(flat), net({k: [(*p, 0.0)[:3] for p in shape] for k, shape in high.items()}, z=True)):
         trace = simulate(network, MEETING, deaf("ego", "other"))
         assert (trace.ended, trace.unconfirmed) != ("collision", ())
+        doubt = [] if network.count("6.0") else ["on another level: 'other' at"]
+        assert [text[: len(doubt[0])] for text in trace.unconfirmed] == doubt, "a contact that rests on a guess is told"
         assert trace.actors == ("ego",), "nobody on another level is recorded, so no metric counts them"
     one = simulation(tmp_path, net(flat), MEETING, deaf("ego", "other"), 5.0)
     one({}, 1)

@@ -10,9 +10,10 @@ import pytest
 
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
+from sbt.metrics.conflict_types import conflict_type, describe_conflict_type
 from sbt.metrics.fcd import read_fcd
 from sbt.metrics.tracks import read_meta, read_recording
-from sbt.problem.outcome import Status
+from sbt.problem.outcome import Doubt, Status, doubts
 from sbt.sumo.recorded import recorded_tracks
 from sbt.sumo.recorded_net import extent, motorway
 
@@ -174,6 +175,18 @@ def test_a_contact_with_one_of_them_ends_the_run_and_sumo_lists_it(tmp_path):
     assert trace.ended == "collision"
     assert trace.reported[0].startswith("av>4")
     assert trace.unconfirmed == ()
+
+
+@pytest.mark.sumo
+def test_one_who_drives_into_the_ego_from_behind_does_not_react_and_is_told(tmp_path):
+    trace = traced(tmp_path, along="[[60, 2], [300, 2]]", place=16, speed=3, t=0)
+    assert (trace.ended, trace.unreacting) == ("collision", ("1", "2", "3", "4"))
+    assert sorted(doubts(" | ".join(trace.unconfirmed)))[0] == Doubt.STRUCK
+    assert "hit from behind by '1' at" in trace.unconfirmed[-1]
+    assert describe_conflict_type(conflict_type("av")(trace)) == "behind ego, same direction, recorded and does not react"
+    (tmp_path / "ahead").mkdir()
+    into = traced(tmp_path / "ahead", along="[[0, 2], [300, 2]]", place=48, speed=30, t=0)
+    assert conflict_type("av")(into) < 32, "who is ahead was hit"
 
 
 @pytest.mark.sumo

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
-from sbt.metrics.conflict_types import STANDING, describe_conflict_type
+from sbt.metrics.conflict_types import describe_conflict_type, without_standing
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.plain import Value
 from sbt.problem.requirement import Requirement
@@ -205,8 +205,7 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
 
 def _kind(history: History, choices: Points) -> Vector:
     """Return (n,) numbers, the same for runs of one type of conflict (where it is measured) and of the same choices (n, c)."""
-    types = np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED)
-    types = np.where(types >= 0, types % STANDING, types)  # one that just stopped fails as one that is about to
+    types = without_standing(np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED))
     told = np.column_stack([types, choices])
     return np.unique(told, axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
 

@@ -103,6 +103,10 @@ def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
     ended = f", stopped: {result['stopped']}" if result.get("stopped") else ""
     doubtful = result.get("unconfirmed", 0)
     unconfirmed = f", of them {doubtful} with a contact that SUMO does not list" if doubtful else ""
+    if struck := result.get("struck", 0):
+        unconfirmed += f", {struck} hit from behind by a recorded road user, who does not react"
+    if passed := result.get("other_level", 0):
+        unconfirmed += f"; in {passed} runs roads are taken for bridges, and a contact across them is not counted"
     lines = [
         f"{result['campaign']} of {result['scenario']}: {result['runs']} runs in {result['iterations']} iterations{ended}",
         f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}{unconfirmed}",

@@ -69,7 +69,7 @@ def _print_run(run: Run) -> None:
     each = "; ".join(f"{part.metric} critical in [{part.low:g}, {part.high:g}]" for part in need.parts)
     print(f"{verdict} ({need.metric}: {each})" if need.combined else f"{verdict} ({each})")
     if run.unconfirmed:
-        print(f"SUMO's own list differs: {run.unconfirmed}")
+        print(f"doubtful: {run.unconfirmed}")
 
 
 def _write_trace(path: Path, run: Run) -> None:

@@ -11,28 +11,33 @@ import numpy as np
 
 from sbt.metrics.geometry import part_pairs, rectangle_distance
 from sbt.metrics.longitudinal import FAR
+from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["METRIC_NAME", "STANDING", "conflict_type", "describe_conflict_type"]
+__all__ = ["METRIC_NAME", "conflict_type", "describe_conflict_type", "from_behind", "without_standing"]
 
 METRIC_NAME = "conflict_type"
 """Name of the metric."""
 _SIDES = ("ahead of ego", "left of ego", "behind ego", "right of ego")
 _COURSES = ("same direction", "crossing from the right", "oncoming", "crossing from the left")
-STANDING, _STANDS = 16, 0.1
+_STANDING, _STANDS = 16, 0.1
 """Added where the ego stands, slower than this (m/s): who was hit at rest did not hit."""
+_UNREACTING = 32
+"""Added where a recorded road user, who does not react, comes from behind."""
+_FROM_BEHIND = (2, 0)
+"""Side and course of one who drives into the ego from behind."""
 _NOBODY = -1
 """Value if there is no other road user within 1 km."""
 
 
 def conflict_type(ego: str = "ego") -> Metric:
-    """Return the metric `conflict_type`: 4 side + course at the smallest distance, + 16 where ego stands; -1: nobody within 1 km.
+    """Return the metric `conflict_type`: 4 side + course at the smallest distance; -1: nobody within 1 km.
 
     Side: 0 ahead, 1 left, 2 behind, 3 right of the ego's rectangle, by the side that the other is farther away from.
     Course: heading of the other relative to the ego's; 0 the same, 1 turned left by 45 to 135 degrees (it comes from
-    the right), 2 oncoming, 3 turned right. Absent road users (NaN) do not count. If no actor has the name `ego`, the
-    first actor is the ego.
+    the right), 2 oncoming, 3 turned right. 16 more where ego stands, 32 more where one of `Trace.unreacting` comes from
+    behind. Absent road users (NaN) do not count. If no actor has the name `ego`, the first actor is the ego.
     """
 
     def function(trace: Trace) -> float:
@@ -48,12 +53,12 @@ def conflict_type(ego: str = "ego") -> Metric:
                 for part, other in part_pairs(own, trace.actor(trace.actors[k])):
                     distance, at = _nearest(part, other)
                     if distance < best:
-                        best, code = distance, _code(part, other, at)
+                        best, code = distance, _code(part, other, at, unreacting=trace.actors[k] in trace.unreacting)
         return float(code)
 
     return Metric(
         METRIC_NAME, function, "", "low", _NOBODY,
-        "side of ego and course of the nearest other, when nearest: 4 side + course, + 16 where ego stands, -1 nobody",
+        "side of ego and course of the nearest other: 4 side + course, + 16 ego stands, + 32 recorded, behind; -1 nobody",
     )  # fmt: skip
 
 
@@ -65,7 +70,18 @@ def _nearest(ego: ActorTrace, other: ActorTrace) -> tuple[float, int]:
     return float(distance[k]), k
 
 
-def _code(ego: ActorTrace, other: ActorTrace, k: int) -> int:
+def _code(ego: ActorTrace, other: ActorTrace, k: int, *, unreacting: bool) -> int:
+    side, course = _side_and_course(ego, other, k)
+    standing = _STANDING if abs(ego.speed[k]) < _STANDS else 0
+    return 4 * side + course + standing + (_UNREACTING if unreacting and (side, course) == _FROM_BEHIND else 0)
+
+
+def from_behind(ego: ActorTrace, other: ActorTrace) -> bool:
+    """Return whether the other is behind the ego at the last instant, in the same direction."""
+    return _side_and_course(ego, other, -1) == _FROM_BEHIND
+
+
+def _side_and_course(ego: ActorTrace, other: ActorTrace, k: int) -> tuple[int, int]:
     cos, sin = math.cos(ego.heading[k]), math.sin(ego.heading[k])
     dx, dy = other.x[k] - ego.x[k], other.y[k] - ego.y[k]
     along, across = cos * dx + sin * dy, cos * dy - sin * dx
@@ -75,7 +91,13 @@ def _code(ego: ActorTrace, other: ActorTrace, k: int) -> int:
     outside_across = abs(across) - 0.5 * (ego.width + s * other.length + c * other.width)
     lengthwise = 0 if along >= 0 else 2
     side = lengthwise if outside_along >= outside_across else 1 if across > 0 else 3
-    return 4 * side + round(turned / (0.5 * math.pi)) % 4 + (STANDING if abs(ego.speed[k]) < _STANDS else 0)
+    return side, round(turned / (0.5 * math.pi)) % 4
+
+
+def without_standing(codes: Vector) -> Vector:
+    """Return conflict types without the difference whether ego stands: one that just stopped fails as one that is about to."""
+    stands = (codes >= 0) & (codes // _STANDING % 2 == 1)
+    return np.where(stands, codes - _STANDING, codes)
 
 
 def describe_conflict_type(code: float) -> str:
@@ -83,9 +105,14 @@ def describe_conflict_type(code: float) -> str:
 
     >>> describe_conflict_type(0.0), describe_conflict_type(29.0), describe_conflict_type(-1.0)
     ('ahead of ego, same direction', 'right of ego, crossing from the right, ego stands', '')
+    >>> describe_conflict_type(40.0)
+    'behind ego, same direction, recorded and does not react'
     """
-    standing, kind = divmod(int(code), STANDING)
-    return "" if code < 0 else f"{_SIDES[kind // 4]}, {_COURSES[kind % 4]}{', ego stands' if standing else ''}"
+    if code < 0:
+        return ""
+    bits, kind = divmod(int(code), _STANDING)
+    stands = ", ego stands" if bits % 2 else ""
+    return f"{_SIDES[kind // 4]}, {_COURSES[kind % 4]}{stands}{', recorded and does not react' if bits // 2 else ''}"
 
 
 CONFLICT_TYPE = conflict_type()

@@ -8,15 +8,36 @@ from enum import StrEnum
 
 from sbt.problem.plain import Values
 
-__all__ = ["LISTED_ONLY", "UNCONFIRMED", "Job", "Outcome", "Status", "has_unconfirmed_contact"]
+__all__ = ["LISTED_ONLY", "OTHER_LEVEL", "STRUCK", "UNCONFIRMED", "Doubt", "Job", "Outcome", "Status", "doubts"]
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
 """How the text begins of a contact that SUMO's own list does not have, and of an entry of that list without a contact."""
+STRUCK, OTHER_LEVEL = "hit from behind by ", "on another level: "
+"""How the text begins of a contact with a recorded road user from behind, and of one on a road taken for a bridge."""
 
 
-def has_unconfirmed_contact(text: str) -> bool:
-    """Return whether what differs (`Outcome.unconfirmed`) holds a contact that SUMO does not list."""
-    return any(part.startswith(UNCONFIRMED) for part in text.split(" | "))
+class Doubt(StrEnum):
+    """What is doubtful about the contacts of a run, as a table says it."""
+
+    UNCONFIRMED = "unconfirmed"
+    """a contact that SUMO's own list does not have"""
+    LISTED_ONLY = "listed only"
+    """an entry of that list without a contact"""
+    STRUCK = "hit from behind by one who does not react"
+    """a recorded road user drove into the ego from behind"""
+    OTHER_LEVEL = "taken for another level"
+    """bodies overlap in the plane, on roads that are taken for bridges, since the network has no heights"""
+
+
+_BEGINNINGS = {
+    UNCONFIRMED: Doubt.UNCONFIRMED, LISTED_ONLY: Doubt.LISTED_ONLY, STRUCK: Doubt.STRUCK, OTHER_LEVEL: Doubt.OTHER_LEVEL,
+}  # fmt: skip
+
+
+def doubts(text: str) -> tuple[Doubt, ...]:
+    """Return what is doubtful by the text of a run (`Outcome.unconfirmed`), each once."""
+    found = (doubt for part in text.split(" | ") for words, doubt in _BEGINNINGS.items() if part.startswith(words))
+    return tuple(dict.fromkeys(found))
 
 
 class Status(StrEnum):
@@ -56,4 +77,4 @@ class Outcome:
     collisions: str = ""
     """SUMO's own collision list, as a cross-check of the geometric verdict"""
     unconfirmed: str = ""
-    """contacts that SUMO's own list does not confirm, entries of it without a contact, and what differs"""
+    """contacts that SUMO's own list does not confirm and what differs, and other doubts about contacts (`doubts`)"""

@@ -70,7 +70,8 @@ class Trace:
         signals: name to (t,) numbers recorded beside the states, such as what the ego perceived.
         ways: name to the way that an actor would go on after the last instant at which it is there (`ActorTrace.way`).
         parts: name to the parts of a long vehicle (`ActorTrace.parts`), NaN where it is not there.
-        unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`).
+        unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`); other doubts.
+        unreacting: actors that are moved as they were recorded, whatever happens.
 
     In traffic road users come and go: where one is not there, all its states are NaN (`present`).
 
@@ -95,6 +96,7 @@ class Trace:
     ways: Mapping[str, States] = field(default_factory=dict)
     parts: Mapping[str, tuple[ActorTrace, ...]] = field(default_factory=dict)
     unconfirmed: tuple[str, ...] = ()
+    unreacting: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.actors))
@@ -145,7 +147,7 @@ class Trace:
         if actors is not None:
             return some
         signals = {name: v[i] for name, v in self.signals.items()}
-        return replace(some, reported=self.reported, signals=signals, unconfirmed=self.unconfirmed)
+        return replace(some, reported=self.reported, signals=signals, unconfirmed=self.unconfirmed, unreacting=self.unreacting)
 
     def signal(self, name: str) -> Vector:
         """Return the (t,) values of one signal.
@@ -166,7 +168,7 @@ class Trace:
         same = same and all(np.array_equal(values, other.signals[name]) for name, values in self.signals.items())
         same = same and self.ways.keys() == other.ways.keys()
         same = same and all(np.array_equal(way, other.ways[name], equal_nan=True) for name, way in self.ways.items())
-        texts = ("actors", "ended", "reported", "unconfirmed")
+        texts = ("actors", "ended", "reported", "unconfirmed", "unreacting")
         same = same and all(getattr(self, name) == getattr(other, name) for name in texts)
         return same and self.parts.keys() == other.parts.keys() and self._part_states() == other._part_states()
 

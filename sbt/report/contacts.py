@@ -84,6 +84,7 @@ class Contacts:
         for contact, ring in zip(self._contacts, self._rings, strict=True):
             ring.set_visible(contact.instant <= k and self._time[k] - self._time[contact.instant] < _SHOWN)
             if contact.instant <= k:
-                doubt = "unconfirmed " if any(f"{UNCONFIRMED}'{contact.other}'" in text for text in self._unconfirmed) else ""
+                beginning = f"{UNCONFIRMED}'{contact.other}'"
+                doubt = "unconfirmed " if any(text.startswith(beginning) for text in self._unconfirmed) else ""
                 words.append(f"{doubt}contact with {contact.other[:20]} at {self._time[contact.instant]:.1f} s")
         return ", ".join(words[:2])

@@ -14,7 +14,7 @@ from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
 from sbt.plugins import OBJECT
 from sbt.problem.arrays import Vector
-from sbt.problem.outcome import has_unconfirmed_contact
+from sbt.problem.outcome import doubts
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
@@ -198,7 +198,7 @@ def critical_table(
 
 
 def contact_table(history: History, requirement: Requirement, replay: str) -> Table:
-    """Return the runs in which contacts and SUMO's own list differ, critical ones first, at most 200.
+    """Return the runs with doubtful contacts, such as those that SUMO's own list does not have, critical ones first, at most 200.
 
     Args:
         history: finished runs.
@@ -209,13 +209,13 @@ def contact_table(history: History, requirement: Requirement, replay: str) -> Ta
     found = sorted(np.flatnonzero(texts != "").tolist(), key=lambda k: (not critical[k], k))
     rows = tuple(
         (Cell.of(int(history.index[k])), Cell("critical" if critical[k] else "not critical"),
-         Cell("unconfirmed" if has_unconfirmed_contact(str(texts[k])) else "listed only"),
+         Cell(", ".join(doubts(str(texts[k])))),
          Cell(str(texts[k])), Cell("film", code=replay.replace("RUN", str(history.index[k]))))
         for k in found[:_MOST]
     )  # fmt: skip
     rest = len(found) - len(rows)
     note = f"{rest:,} more are in the store: sumo-sbt export lists all (column unconfirmed)." if rest else ""
-    return Table(("run", "verdict", "SUMO's list", "what differs", "see it"), rows, note)
+    return Table(("run", "verdict", "doubt", "what differs", "see it"), rows, note)
 
 
 def failed_table(history: History, reference: str) -> Table:

@@ -13,6 +13,7 @@ from sbt.campaigns.wording import number, percent
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Conclusion, Facts
 from sbt.problem.combination import CombinedRequirement
+from sbt.problem.outcome import Doubt
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
@@ -39,6 +40,10 @@ SCORES: Mapping[str, str] = {
     "calibration_error": "calibration error",
 }
 """Keys of a fit, as written for people."""
+_DOUBTS = {
+    Doubt.UNCONFIRMED: "a contact that SUMO's own list of collisions does not confirm",
+    Doubt.STRUCK: "a recorded road user, who does not react, driving into the ego from behind",
+}
 _FEW_CRITICAL = 10
 _POOR_CALIBRATION = 0.1
 
@@ -150,12 +155,18 @@ def conclusion_sentences(found: Findings) -> list[str]:
 
 
 def _about_contacts(found: Findings) -> list[str]:
-    """Return how many critical runs have a contact that SUMO does not list; nothing where there is none."""
-    critical, n = int(found.critical.sum()), int((found.critical & found.history.unconfirmed).sum())
-    if n == 0:
-        return []
-    which = "The critical run has" if critical == 1 else f"{n:,} of the {critical:,} critical runs have"
-    return [f"{which} a contact that SUMO's own list of collisions does not confirm; the table of contacts says what differs."]
+    """Return how many runs have doubtful contacts; nothing where there is none."""
+    critical, sentences = int(found.critical.sum()), []
+    for doubt, words in _DOUBTS.items():
+        n = int((found.critical & found.history.doubtful(doubt)).sum())
+        which = "The critical run has" if critical == 1 else f"{n:,} of the {critical:,} critical runs have"
+        sentences += [f"{which} {words}; the table of contacts says more."] if n else []
+    passed = int(found.history.doubtful(Doubt.OTHER_LEVEL).sum())
+    if passed:
+        which = f"In {passed:,} run{'s' if passed > 1 else ''} bodies overlap that are not counted as a contact"
+        why = "roads that cross without a junction are taken for bridges, since the network has no heights"
+        sentences.append(f"{which}: {why}; the table of contacts names them.")
+    return sentences
 
 
 def _not_a_share(found: Findings) -> str:

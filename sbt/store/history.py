@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sbt.errors import StoreError
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.problem.outcome import Status, has_unconfirmed_contact
+from sbt.problem.outcome import Doubt, Status, doubts
 from sbt.problem.plain import Value
 from sbt.problem.requirement import Requirement
 
@@ -196,7 +196,11 @@ class History:
     @property
     def unconfirmed(self) -> NDArray[np.bool_]:
         """(n,) the run has a contact that SUMO's own list does not confirm; `columns["unconfirmed"]` says what differs."""
-        return np.array([has_unconfirmed_contact(text) for text in self.columns["unconfirmed"]], dtype=bool)
+        return self.doubtful(Doubt.UNCONFIRMED)
+
+    def doubtful(self, doubt: Doubt) -> NDArray[np.bool_]:
+        """(n,) there is this doubt about the contacts of the run."""
+        return np.array([text != "" and doubt in doubts(text) for text in self.columns["unconfirmed"]], dtype=bool)
 
     @property
     def versions(self) -> NDArray[Any]:

@@ -17,7 +17,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from sbt.errors import InputError, RunError
-from sbt.problem.outcome import Status
+from sbt.metrics.conflict_types import from_behind
+from sbt.problem.outcome import STRUCK, Status
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.appearances import AppearanceMonitor
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, listed_only, unconfirmed_contact
@@ -103,6 +104,7 @@ class Recorder:
         self._collisions: list[str] = []
         self._listed: dict[str, float] = {}
         self._differing: dict[str, str] = {}
+        self._struck: list[str] = []
         self._ended: RunEnded | None = None
         self._steps = 0
         self._timeout = timeout
@@ -260,6 +262,10 @@ class Recorder:
         for name in listed:
             self._differing.pop(name, None)
         self._differing |= {name: text for name, text in texts.items() if name not in listed}
+        self._struck = [
+            f"{STRUCK}'{name}' at {self._t:.3f} s: it drives as it was recorded, whatever the ego does"
+            for name, own, other in touched if name in near.placed and from_behind(own, other)
+        ]  # fmt: skip
 
     def trace(self, ended: str) -> Trace:
         """Return the recorded trace; states of absent road users are NaN.
@@ -269,4 +275,4 @@ class Recorder:
         """
         if not len(self._surroundings):
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must depart, but had not when the loop ended at {self._now()}")
-        return self._surroundings.trace(ended, self._collisions, list(self._differing.values()))
+        return self._surroundings.trace(ended, self._collisions, [*self._differing.values(), *self._struck])

@@ -17,11 +17,12 @@ import numpy as np
 
 from sbt.errors import RunError
 from sbt.metrics.geometry import contact_part, rectangle_distance
-from sbt.problem.outcome import Status
+from sbt.problem.outcome import OTHER_LEVEL, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
 from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
+from sbt.sumo.overlaps import deepest_overlap, instant, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, path_behind
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
@@ -34,6 +35,8 @@ _VEHICLES, _PERSONS = 0xA4, 0xAE
 """TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
 _VERY_LONG = 20.0
 """Length from which on a vehicle may be near although its front is not within the radius (m)."""
+_LONGEST = 30.0
+"""Length up to which others on another level are compared with the ego (m)."""
 _SLACK = 1e-6
 """Below this distance (m) of two rectangles the quick separation test does not decide, but the exact one."""
 
@@ -76,6 +79,8 @@ class Surroundings:
         self.present: list[str] = []
         self.rigid: set[str] = set()
         self.placed: Mapping[str, Placed] = {}
+        self._unreacting: set[str] = set()
+        self._other_level: dict[tuple[str, str], str] = {}
         self.levels = levels_of(sumo)
         self.follow(sumo.vehicle.getIDList())
 
@@ -104,6 +109,7 @@ class Surroundings:
         """Take the states of these road users as they are given: SUMO neither sees them off the lanes nor knows their speed."""
         self.placed = placed
         self.rigid.update(placed)
+        self._unreacting.update(placed)
 
     def subscribe(self, *, walks: bool = False) -> None:
         """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
@@ -131,13 +137,16 @@ class Surroundings:
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
         height = near[ego][_POSITION][2]
-        apart = self.levels.apart.get(self._own_domain.getRoadID(ego)) if self.levels.apart else None
+        road = self._own_domain.getRoadID(ego) if self.levels.apart else ""
+        apart = self.levels.apart.get(road)
         for name in sorted([*near, *self._far(near)] if self._very_long else near):
             variables = near[name] if name in near else self._read(name)
             if name == ego or variables.get(_VEHICLE) or abs(variables[_POSITION][2] - height) >= LEVEL_HEIGHT:
                 continue
-            if apart is None or name in self.placed or self._road(name, variables) not in apart:
+            if apart is None or name in self.placed or (other := self._road(name, variables)) not in apart:
                 self._record(row, parts, before, name, variables)
+            elif (road, other) not in self._other_level:
+                self._note_level(road, other, name, near[ego][_POSITION], variables)
         for name in sorted(self._named_present - set(near) - set(row)):
             self._record(row, parts, before, name, self._read(name))
         for name in self.present:
@@ -169,8 +178,8 @@ class Surroundings:
         ahead = line_ahead(self._sumo, name)
         state, poses = self.states[name], self._poses(name, len(self._rows) - 1)
         size = state.length / len(poses)
-        corners = [(x - side * size * math.cos(h), y - side * size * math.sin(h)) for side in (0.5, -0.5) for x, y, h in poses[::-1]]
-        behind = np.array([*corners[: len(poses)], corners[-1]])
+        reach = 0.5 * size * np.stack([np.cos(poses[::-1, 2]), np.sin(poses[::-1, 2])], axis=1)
+        behind = np.vstack([poses[::-1, :2] - reach, poses[:1, :2] + reach[-1]])
         if ahead is not None and (ways := rectangle_ways(behind, ahead, state.length)):
             parts = [k * size for k in range(len(poses))] if name in self._parts[-1] else []
             self._ways[name] = (*ways, *rectangle_ways(behind, ahead, size, parts))
@@ -215,6 +224,18 @@ class Surroundings:
         if name in self._bodies and name not in self.rigid:
             lane = self._sumo.vehicle.getLaneID(name)
             parts[name] = self._bodies[name].move((x, y), state.cos, state.sin, lane, speed * self._dt)
+
+    def _note_level(self, road: str, other: str, name: str, ego: tuple[float, ...], variables: Mapping[int, Any]) -> None:
+        """Note a contact in the plane that is none, as the network has no heights and the roads are taken for bridges."""
+        own, person = self.states[self._ego], _VEHICLE in variables
+        if math.dist(ego[:2], variables[_POSITION][:2]) > own.length + _LONGEST:
+            return
+        state = state_in_sumo(self._sumo.person if person else self._sumo.vehicle, name, person=person)
+        found = deepest_overlap(instant(own), {name: instant(state)})
+        if found is not None:
+            why = f"'{road}' and '{other}' cross without a junction and are taken for a bridge: heights (z) of nodes decide it"
+            at = f"'{name}' at {len(self._rows) * self._dt:.3f} s"
+            self._other_level[road, other] = f"{OTHER_LEVEL}{at}: bodies overlap by {found[1]:.2f} m in the plane, but {why}"
 
     def _first_seen(self, name: str, front: tuple[float, float], variables: Mapping[int, Any]) -> State:
         person = _VEHICLE in variables
@@ -317,7 +338,7 @@ class Surroundings:
             np.array([self.states[n].length for n in names]), np.array([self.states[n].width for n in names]),
             ended, tuple(reported), ways={name: ways[0] for name, ways in self._ways.items()},
             parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
-            unconfirmed=tuple(unconfirmed),
+            unconfirmed=(*unconfirmed, *self._other_level.values()), unreacting=tuple(n for n in names if n in self._unreacting),
         )  # fmt: skip
 
     def _bent(self) -> list[str]:

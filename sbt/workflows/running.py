@@ -18,7 +18,7 @@ from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Finished, Log, Progress, Shard, check_shard, run_shard, run_stages
 from sbt.plugins import OBJECT, Objects
 from sbt.problem.description import scenario_differences
-from sbt.problem.outcome import Job, Outcome
+from sbt.problem.outcome import Doubt, Job, Outcome
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
@@ -42,6 +42,8 @@ class Summary:
         campaign, scenario, store: as configured.
         runs, ok, failed, critical: counts.
         unconfirmed: critical runs with a contact that SUMO's own list does not confirm.
+        struck: critical runs in which a recorded road user, who does not react, hit the ego from behind.
+        other_level: runs with a contact that is not counted, as roads that cross without a junction are taken for bridges.
         iterations: batches.
         stopped: why it ended.
         seconds: of `simulate`, `fit` and `propose`.
@@ -60,6 +62,8 @@ class Summary:
     seconds: Mapping[str, float]
     conclusion: Conclusion
     unconfirmed: int = 0
+    struck: int = 0
+    other_level: int = 0
 
     def to_dict(self) -> Json:
         """Return what `run --json` prints."""
@@ -154,7 +158,8 @@ def summarise(store: Store, study: Study, finished: Finished) -> Summary:
         config.campaign, config.scenario, str(Path(config.store)), len(history), ok, len(history) - ok,
         int(np.count_nonzero(critical)), len(store.iterations()), finished.stopped,
         {k: round(v, 4) for k, v in finished.seconds.items()}, finished.conclusion,
-        int(np.count_nonzero(critical & history.unconfirmed)),
+        int(np.count_nonzero(critical & history.unconfirmed)), int(np.count_nonzero(critical & history.doubtful(Doubt.STRUCK))),
+        int(np.count_nonzero(history.doubtful(Doubt.OTHER_LEVEL))),
     )  # fmt: skip
 
 
