@@ -47,6 +47,8 @@ def test_noise_in_another_metric_is_noise():
     rows.columns["y.other"][1] = 0.7
     assert simulator_noise(rows, Y).noisy
     assert simulator_noise(rows, Y).std == 0.0
+    rows.columns["y.y"][1] += 1e-14
+    assert simulator_noise(rows, Y) == SimulatorNoise(1, True, 0.0), "the last digit of a sum is no noise"
 
 
 def test_the_smallest_margins_are_repeated_once_and_plateaus_last():

@@ -78,11 +78,13 @@ def simulator_noise(history: History, requirement: Requirement) -> SimulatorNois
         return SimulatorNoise(0, None, None)
     noisy = any(_differs(runs.y(name), group) for name in runs.metrics)
     y = np.nan_to_num(requirement.told(runs), posinf=np.nan, neginf=np.nan)
+    if not _differs(y, group):
+        return SimulatorNoise(repeats, noisy, 0.0)
     finite = np.isfinite(y)
     count = np.bincount(group[finite], minlength=len(size))
     mean = np.bincount(group[finite], y[finite], len(size)) / np.maximum(count, 1)
     squares = float(((y[finite] - mean[group[finite]]) ** 2).sum())
-    return SimulatorNoise(repeats, noisy, float(np.sqrt(squares / max(int((count - 1).clip(0).sum()), 1))) if noisy else 0.0)
+    return SimulatorNoise(repeats, noisy, float(np.sqrt(squares / max(int((count - 1).clip(0).sum()), 1))))
 
 
 def stated_noise(history: History, scenario: LogicalScenario) -> SimulatorNoise | None:
