@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from sbt.campaigns.settings import PlainConclusion
 from sbt.cli import app, console
+from sbt.cli.conclusion import conclusion_lines
 from sbt.errors import InputError, StoreError
 from sbt.loop.stages import Progress
 from sbt.problem.outcome import Outcome, Status
@@ -75,6 +76,7 @@ SCENARIO, REFUSED, BROKEN, UNSTEADY, ELSEWHERE = map(scenario, (margin, refused,
 RESULT: dict[str, Any] = {
     "campaign": "boundary", "scenario": "plane", "store": "there", "runs": 10, "ok": 9, "failed": 1, "critical": 2,
     "iterations": 2, "stopped": "budget", "unconfirmed": 0, "seconds": {"simulate": 1.0, "fit": 0.0, "propose": 0.0},
+    "struck": 0, "other_level": 0, "sentences": ["A fifth is critical."], "metric": "margin", "units": {"gap": "m"},
     "conclusion": {"critical_fraction": 0.2222222, "validation": {"log_likelihood": -1.25, "rmse": None}},
 }  # fmt: skip
 
@@ -169,10 +171,25 @@ def test_run_tells_people_the_conclusion(folder: Path, campaign: list[Any]):
     done = call("run", "c.yaml")
     assert done.exit_code == 0
     assert "5/10 runs, iteration 0, 2 critical, 1 failed, simulating" in done.stderr
-    assert re.search(r"critical fraction +0\.2222", done.stdout)
-    assert re.search(r"log likelihood +-1\.25", done.stdout)
+    assert done.stdout.splitlines()[2:] == ["  A fifth is critical.", "store: there"]
+    done = call("run", "c.yaml", "--verbose")
+    assert re.search(r"critical_fraction +0\.2222", done.stdout)
+    assert re.search(r"log_likelihood +-1\.25", done.stdout)
     assert "noise" not in done.stdout
     assert call("run", "c.yaml", "--quiet").stderr.strip() == "noise on stdout"
+
+
+def test_failure_modes_are_told_by_names_and_units_and_what_to_try_next():
+    mode = {
+        "representative": 7, "inputs": {"gap": 1.23456, "kind": "bus"}, "metric": -0.5, "size": 3, "conflict": "rear end",
+        "confirmed": 0.5, "confirmation_runs": 4, "unconfirmed": 1,
+    }  # fmt: skip
+    found = conclusion_lines({**RESULT, "store": "a b", "conclusion": {"failure_modes": [mode], "warnings": ["few runs"]}})
+    told = "run 7, margin -0.5, at gap 1.23 m, kind bus; rear end; 3 critical runs; critical again in 2 of 4 repetitions; 1 with"
+    assert found[3:] == [
+        f"  mode 1: {told} a contact that SUMO does not list", "  warning: few runs", "store: a b",
+        "next: sumo-sbt replay 'a b' 7",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -370,7 +387,7 @@ def test_status_of_a_store(folder: Path):
     assert (found["iterations"], found["validation"]["rmse"], found["conclusion"]) == (1, 0.5, None)
     assert "not finished" in call("status", str(folder / "s")).stdout
     done = call("status", str(store(folder / "d", concluded=True)), "--watch")
-    assert "critical fraction" in done.stdout
+    assert "A fifth is critical." in done.stdout
 
 
 def test_export_writes_a_table(folder: Path):

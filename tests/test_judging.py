@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import sbt
 from sbt.campaigns.preventable import DRIVERS, describe_judgements, with_judgements
 from sbt.cli import app
-from sbt.cli.campaign import conclusion_lines
+from sbt.cli.conclusion import conclusion_lines
 from sbt.errors import InputError
 from sbt.metrics.preventability import applicability, why_not
 from sbt.problem.trace import Trace

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from sbt.cli.conclusion import conclusion_lines, shown
 from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 from sbt.errors import InputError
 
@@ -25,6 +26,7 @@ JUnit = Annotated[
     Path | None, typer.Option("--junit", metavar="FILE.xml", help="Write the verdict as JUnit XML, for a CI's view.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="Print every number of the conclusion.")]
 
 
 def run(
@@ -43,6 +45,7 @@ def run(
     junit: JUnit = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
     as_json: AsJson = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run a campaign, or resume it where it was interrupted."""
     overrides = list(changes or [])
@@ -59,7 +62,7 @@ def run(
             study, part = study.sharded(shard, apart=store is None)
         work.folder = Path(study.config.store)
         result = run_study(study, progress=show, shard=part).to_dict()
-    _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
+    _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json, verbose=verbose)
 
 
 def merge(
@@ -69,16 +72,17 @@ def merge(
     fail_on_critical: FailOnCritical = False,
     junit: JUnit = None,
     as_json: AsJson = False,
+    verbose: Verbose = False,
 ) -> None:
     """Join the stores of shards (run --shard) into the one that a run without shards would have written."""
     with clean_stdout():
         from sbt.workflows.merging import merge_shards
 
         result = merge_shards([_with_store(folder) for folder in folders], into).to_dict()
-    _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json)
+    _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json, verbose=verbose)
 
 
-def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path | None, as_json: bool) -> None:
+def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path | None, as_json: bool, verbose: bool) -> None:
     """Print the result of a campaign; raise the exit of its verdict, where that is not 0."""
     if junit is not None:
         from sbt.report.junit import write_junit
@@ -87,7 +91,7 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
     if as_json:
         print_json(result)
     else:
-        print("\n".join(conclusion_lines(result)))
+        print("\n".join(conclusion_lines(result, verbose=verbose)))
     gate = result["conclusion"].get("gate")
     if gate is not None and gate["verdict"] != "pass":
         raise fail(f"gate {gate['verdict']}: {gate['statement']}", Exit.CRITICAL)
@@ -96,55 +100,6 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
     if 2 * result["failed"] > result["runs"]:
         reason = f"at most half of the runs may fail, but {result['failed']} of {result['runs']} did"
         raise fail(f"{reason}; `sumo-sbt status` and `export` show why", Exit.FAILED_RUNS)
-
-
-def conclusion_lines(result: Mapping[str, Any]) -> list[str]:
-    """Return the result of a campaign (`run --json`) for people."""
-    ended = f", stopped: {result['stopped']}" if result.get("stopped") else ""
-    doubtful = result.get("unconfirmed", 0)
-    unconfirmed = f", of them {doubtful} with a contact that SUMO does not list" if doubtful else ""
-    if struck := result.get("struck", 0):
-        unconfirmed += f", {struck} hit from behind by a recorded road user, who does not react"
-    if passed := result.get("other_level", 0):
-        unconfirmed += f"; in {passed} runs roads are taken for bridges, and a contact across them is not counted"
-    lines = [
-        f"{result['campaign']} of {result['scenario']}: {result['runs']} runs in {result['iterations']} iterations{ended}",
-        f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}{unconfirmed}",
-    ]
-    for key, value in result.get("conclusion", {}).items():
-        if key == "convergence":
-            continue  # a figure of the report
-        if key == "warnings":
-            lines += [f"  warning: {warning}" for warning in value]
-        elif isinstance(value, Mapping):
-            lines.append(f"  {key.replace('_', ' ')}")
-            lines += [f"    {name.replace('_', ' '):<24}{_number(item)}" for name, item in value.items()]
-        elif isinstance(value, list) and all(isinstance(item, Mapping) for item in value):
-            lines.append(f"  {key.replace('_', ' '):<26}{len(value)}")
-            lines += [f"    {_plain(item)}" for item in value]
-        else:
-            lines.append(f"  {key.replace('_', ' '):<26}{_number(value)}")
-    path = Path(result["store"]) / "report.html"
-    lines.append(f"report: {path}" if path.is_file() else f"store: {result['store']}")
-    return lines
-
-
-def _plain(item: Mapping[str, Any]) -> str:
-    """Return the numbers of a record on one line, those inside inner records by their own names."""
-    inner = item.get("inputs", {})
-    values = {k: v for k, v in item.items() if isinstance(v, (int, float, str))} | dict(inner)
-    found = [f"{name.replace('_', ' ')} {_number(value)}" for name, value in values.items()]
-    if item.get("preventable"):
-        from sbt.workflows.judging import in_words
-
-        found.append(f"avoided {in_words(item['preventable'])}")
-    return ", ".join(found)
-
-
-def _number(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def status(
@@ -181,7 +136,7 @@ def _status_lines(found: Mapping[str, Any]) -> list[str]:
     counts = ", ".join(f"{n} {name}" for name, n in sorted(found["runs"].items())) or "none planned"
     lines = [f"{found['store']}: {counts}; {found['iterations']} iterations"]
     if found["validation"] is not None:
-        scores = (f"{key.replace('_', ' ')} {_number(found['validation'].get(key))}" for key in _SCORES)
+        scores = (f"{key.replace('_', ' ')} {shown(found['validation'].get(key))}" for key in _SCORES)
         lines.append("  validation: " + ", ".join(scores))
     if found["conclusion"] is None:
         return [*lines, "  not finished"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from sbt.execution.protocol import Executor
 from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
-from sbt.loop.stages import Conclusion, Finished, Log, Progress, Shard, check_shard, run_shard, run_stages
+from sbt.loop.stages import Conclusion, Facts, Finished, Log, Progress, Shard, check_shard, run_shard, run_stages
 from sbt.plugins import OBJECT, Objects
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Doubt, Job, Outcome
@@ -48,6 +48,9 @@ class Summary:
         stopped: why it ended.
         seconds: of `simulate`, `fit` and `propose`.
         conclusion: what was found.
+        sentences: the same in plain words.
+        metric: that of the requirement, or what stands for it in a formula or a combination.
+        units: of inputs and metrics, by name.
     """
 
     campaign: str
@@ -64,10 +67,14 @@ class Summary:
     unconfirmed: int = 0
     struck: int = 0
     other_level: int = 0
+    sentences: tuple[str, ...] = ()
+    metric: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> Json:
         """Return what `run --json` prints."""
-        return {**vars(self), "seconds": dict(self.seconds), "conclusion": self.conclusion.to_dict()}
+        plain = {"seconds": dict(self.seconds), "units": dict(self.units), "sentences": list(self.sentences)}
+        return {**vars(self), **plain, "conclusion": self.conclusion.to_dict()}
 
 
 def run_study(
@@ -152,14 +159,17 @@ def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> Non
 
 def summarise(store: Store, study: Study, finished: Finished) -> Summary:
     """Return how a campaign ended."""
-    history, config = store.history(), study.config
-    ok, critical = int(history.ok.sum()), study.scenario.requirement.critical_runs(history)
+    history, config, scenario = store.history(), study.config, study.scenario
+    ok, critical = int(history.ok.sum()), scenario.requirement.critical_runs(history)
+    units = {p.name: p.unit for p in scenario.space.parameters} | {m.name: m.unit for m in scenario.metrics}
     return Summary(
         config.campaign, config.scenario, str(Path(config.store)), len(history), ok, len(history) - ok,
         int(np.count_nonzero(critical)), len(store.iterations()), finished.stopped,
         {k: round(v, 4) for k, v in finished.seconds.items()}, finished.conclusion,
         int(np.count_nonzero(critical & history.unconfirmed)), int(np.count_nonzero(critical & history.doubtful(Doubt.STRUCK))),
         int(np.count_nonzero(history.doubtful(Doubt.OTHER_LEVEL))),
+        tuple(finished.conclusion.sentences(Facts(history, scenario.requirement, scenario.unit))),
+        scenario.requirement.told_as, units,
     )  # fmt: skip
 
 

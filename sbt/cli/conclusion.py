@@ -1,0 +1,120 @@
+"""How a campaign ended, on the console: the answer in sentences, the failure modes, and what to try next."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+__all__ = ["conclusion_lines", "shown"]
+
+_MOST_INPUTS = 6
+"""More inputs of a failure mode are for `--verbose` and the report."""
+
+
+def conclusion_lines(result: Mapping[str, Any], *, verbose: bool = False) -> list[str]:
+    """Return the result of a campaign (`run --json`) for people.
+
+    Args:
+        result: see above.
+        verbose: every number of the conclusion, instead of what it says.
+    """
+    ended = f", stopped: {result['stopped']}" if result.get("stopped") else ""
+    head = f"{result['campaign']} of {result['scenario']}: {result['runs']} runs in {result['iterations']} iterations{ended}"
+    lines = [head, f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}{_doubts(result)}"]
+    conclusion = result.get("conclusion", {})
+    lines += _values(conclusion) if verbose or not result.get("sentences") else _answer(result)
+    lines += [f"  warning: {warning}" for warning in conclusion.get("warnings", ())]
+    path = Path(result["store"]) / "report.html"
+    lines.append(f"report: {path}" if path.is_file() else f"store: {result['store']}")
+    return [*lines, *([] if verbose else _next(result))]
+
+
+def shown(value: Any) -> str:
+    """Return a number with four significant digits, a dash where there is none, anything else as it is."""
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _doubts(result: Mapping[str, Any]) -> str:
+    doubtful = result.get("unconfirmed", 0)
+    words = f", of them {doubtful} with a contact that SUMO does not list" if doubtful else ""
+    if struck := result.get("struck", 0):
+        words += f", {struck} hit from behind by a recorded road user, who does not react"
+    if passed := result.get("other_level", 0):
+        words += f"; in {passed} runs roads are taken for bridges, and a contact across them is not counted"
+    return words
+
+
+def _answer(result: Mapping[str, Any]) -> list[str]:
+    """Return the sentences, and a line for each failure mode."""
+    modes = result["conclusion"].get("failure_modes") or ()
+    told = [f"  mode {k}: {_mode(mode, result['metric'], result['units'])}" for k, mode in enumerate(modes, start=1)]
+    return [*(f"  {sentence}" for sentence in result["sentences"]), *told]
+
+
+def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str:
+    """Return a failure mode on one line."""
+
+    def measured(name: str, value: Any) -> str:
+        return f"{name} {_short(value)} {units.get(name, '')}".rstrip()
+
+    inputs = list(mode["inputs"].items())
+    told = [measured(name, value) for name, value in inputs[:_MOST_INPUTS]]
+    if len(inputs) > _MOST_INPUTS:
+        told.append(f"and {len(inputs) - _MOST_INPUTS} more inputs")
+    said = [f"run {mode['representative']}, {measured(metric, mode['metric'])}, at {', '.join(told)}"]
+    said += [str(mode["conflict"])] if mode.get("conflict") else []
+    said.append(f"{mode['size']} critical run{'' if mode['size'] == 1 else 's'}")
+    if mode.get("confirmed") is not None:
+        n = mode["confirmation_runs"]
+        said.append(f"critical again in {round(mode['confirmed'] * n)} of {n} repetitions")
+    if mode.get("unconfirmed"):
+        said.append(f"{mode['unconfirmed']} with a contact that SUMO does not list")
+    if mode.get("preventable"):
+        from sbt.workflows.judging import in_words
+
+        said.append(f"avoided {in_words(mode['preventable'])}")
+    return "; ".join(said)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _values(conclusion: Mapping[str, Any]) -> list[str]:
+    """Return every number of a conclusion by its name."""
+    lines = []
+    for key, value in conclusion.items():
+        if key in {"convergence", "warnings"}:
+            continue  # a figure of the report; said below
+        if isinstance(value, Mapping):
+            lines.append(f"  {key}")
+            lines += [f"    {name:<24}{shown(item)}" for name, item in value.items()]
+        elif isinstance(value, list) and all(isinstance(item, Mapping) for item in value):
+            lines.append(f"  {key:<26}{len(value)}")
+            lines += [f"    {_record(item)}" for item in value]
+        else:
+            lines.append(f"  {key:<26}{shown(value)}")
+    return lines
+
+
+def _record(item: Mapping[str, Any]) -> str:
+    """Return the numbers of a record on one line, those of its inputs by their own names."""
+    values = {k: v for k, v in item.items() if isinstance(v, (int, float, str))} | dict(item.get("inputs", {}))
+    found = [f"{name} {shown(value)}" for name, value in values.items()]
+    if item.get("preventable"):
+        from sbt.workflows.judging import in_words
+
+        found.append(f"avoided {in_words(item['preventable'])}")
+    return ", ".join(found)
+
+
+def _next(result: Mapping[str, Any]) -> list[str]:
+    """Return the command that shows most: the film of the deepest failure, else of the closest run."""
+    conclusion, folder = result.get("conclusion", {}), shlex.quote(str(result["store"]))
+    modes = conclusion.get("failure_modes") or ()
+    run = modes[0]["representative"] if modes else (conclusion.get("closest") or {}).get("run")
+    return [] if run is None else [f"next: sumo-sbt replay {folder} {run}"]
