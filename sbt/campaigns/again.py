@@ -20,6 +20,7 @@ from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores, log_normal
+from sbt.estimators.events import events
 from sbt.estimators.mixture import Mixture, Near, fit_mixture, particles, wide_scales
 from sbt.estimators.reweighting import Predicted, ReusedBatch, effective_size
 from sbt.estimators.surrogate import Coordinates, LogProbability
@@ -55,8 +56,9 @@ class Reused:
 
     Attributes:
         space: the inputs with that distribution.
-        batches: of draws; one batch where they all come from the campaign's distribution.
-        failed: (n,) of every draw in their order: the run failed; it counts as safe in the batches.
+        batches: of draws, a failed one as safe; one batch where they all come from the campaign's distribution.
+        worst: the same with every failed draw as critical.
+        failed: draws that failed.
         nominal: (n,) share of each draw in proportion to the campaign's distribution.
         ratio: (m,) new over old density at draws from the new one.
         crude: the draws come from the campaign's distribution itself.
@@ -66,7 +68,8 @@ class Reused:
 
     space: ParameterSpace
     batches: tuple[ReusedBatch, ...]
-    failed: Mask
+    worst: tuple[ReusedBatch, ...]
+    failed: int
     nominal: Vector
     ratio: Vector
     crude: bool
@@ -95,13 +98,17 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
     draws = [_Draws(-1, plain, len(plain))] if crude else [*_counted(log)]
     every, reached = np.concatenate([d.rows for d in draws]), np.isfinite(space.log_density(history.x))
     least = _least(history.where(np.isin(np.arange(len(history)), every)), old, space)
-    predicted: list[tuple[Vector, Predicted | None]] = [(np.zeros(len(every)), None)]
+    predicted = [(_NOTHING_SAID, _NOTHING_SAID)]
     if not crude:
         with threadpool_limits(1):
             predicted = [*_predicted(log, settings, space, draws)]
+    batches, worst = (
+        tuple(_batch(history, space, outcomes, d.rows, said[k]) for d, said in zip(draws, predicted, strict=True))
+        for k, outcomes in enumerate((hits, hits | ~history.ok))
+    )
+    nominal = np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws])
     return Reused(
-        space, tuple(_batch(history, space, hits, d.rows, g, pool) for d, (g, pool) in zip(draws, predicted, strict=True)),
-        ~history.ok[every], np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws]),
+        space, batches, worst, int((~history.ok[every]).sum()), nominal,
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         least,
@@ -119,13 +126,23 @@ def _least(drawn: History, old: ParameterSpace, space: ParameterSpace) -> float:
     return least
 
 
-def _batch(
-    history: History, space: ParameterSpace, hits: Mask, rows: Rows, control_variate: Vector, pool: Predicted | None
-) -> ReusedBatch:
+def _batch(history: History, space: ParameterSpace, hits: Mask, rows: Rows, said: _Said) -> ReusedBatch:
     """Return the draws in these rows, weighted by the new density over that which they were drawn with."""
     x = history.x[rows]
     weight = np.exp(space.log_density(x) - history.log_q[rows])
-    return ReusedBatch(x, weight, control_variate, hits[rows].astype(np.float64), pool)
+    at_draws = np.zeros(len(rows)) if said.at_draws is None else said.at_draws
+    return ReusedBatch(x, weight, at_draws, hits[rows].astype(np.float64), said.pool)
+
+
+@dataclass(frozen=True, eq=False)
+class _Said:
+    """What a metamodel says of an event: P at the draws of a batch, and over a pool of its own; None: there is no metamodel."""
+
+    at_draws: Vector | None = None
+    pool: Predicted | None = None
+
+
+_NOTHING_SAID = _Said()
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +182,8 @@ def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
             raise InputError(f"{rule}, but is to reach {outside.min():.6g} to {outside.max():.6g}: run a campaign there")
 
 
-def _predicted(
-    log: Log, settings: Settings, space: ParameterSpace, draws: list[_Draws]
-) -> Iterator[tuple[Vector, Predicted | None]]:
-    """Yield P(critical) at the draws of each batch, by a metamodel of earlier runs only, and over a pool of its own."""
+def _predicted(log: Log, settings: Settings, space: ParameterSpace, draws: list[_Draws]) -> Iterator[tuple[_Said, _Said]]:
+    """Yield what a metamodel of earlier runs only says of each batch, failed runs as safe, and as critical."""
     old, history = settings.scenario.space, log.history
     step = -(-len(draws) // _FITS)
     for k, batch in enumerate(draws):
@@ -178,15 +193,21 @@ def _predicted(
             if learned is not None:
                 mixture = _mixture(learned, known, old, space, stream(settings.seed, "again", batch.number))
         if learned is None:
-            yield np.zeros(len(batch.rows)), None
+            yield _NOTHING_SAID, _NOTHING_SAID
             continue
         z, stratum = mixture.sample(_POOL, stream(settings.seed, "again pool", batch.number))
         x = space.from_normal(z)
         log_w = log_normal(z) - mixture.log_density(z)
         if space.constraints:
             log_w = np.where(space.feasible(x), log_w - np.log(space.feasible_mass), -np.inf)
-        at_draws, at_pool = (np.exp(learned(old.to_normal(points))[0]) for points in (history.x[batch.rows], x))
-        yield at_draws, Predicted(x, np.exp(log_w) / _POOL, at_pool, stratum)
+        weight = np.exp(log_w) / _POOL
+        at_draws, at_pool = (events(learned, old.to_normal(points))[0] for points in (history.x[batch.rows], x))
+        said = [
+            _Said(np.exp(there[0]), Predicted(x, weight, np.exp(here[0]), stratum))
+            for there, here in ((at_draws.safe, at_pool.safe), (at_draws.critical, at_pool.critical))
+            if there is not None and here is not None
+        ]  # fmt: skip
+        yield said[0], said[-1]
 
 
 def _mixture(
@@ -204,5 +225,10 @@ def _mixture(
     def mass(z: Points) -> Vector:
         return log_normal(z) + learned(old.to_normal(space.from_normal(z)))[0]
 
-    cloud = particles(mass, Near(blank, hits), _PARTICLES, rng, _CANDIDATES)
-    return fit_mixture((cloud,), blank.wide, rng, choices=choices)
+    def failed_critical(z: Points) -> Vector:
+        worst = events(learned, old.to_normal(space.from_normal(z)))[0].critical
+        return log_normal(z) if worst is None else log_normal(z) + 0.5 * worst[0]
+
+    targets = (mass, failed_critical) if len(known.failed) else (mass,)
+    clouds = tuple(particles(target, Near(blank, hits), _PARTICLES, rng, _CANDIDATES) for target in targets)
+    return fit_mixture(clouds, blank.wide, rng, choices=choices)

@@ -9,8 +9,7 @@ import numpy as np
 from sbt.campaigns.again import Reused
 from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.gate import Limits
-from sbt.campaigns.wording import plural
-from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
+from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.estimators.reweighting import ReusedBatch, WeightedShare, defended_bound, effective_size
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.sensitivity import SpaceParameter, space_parameters
@@ -55,41 +54,47 @@ def answer(found: Reused) -> EstimationConclusion:
     warnings = list(told.warnings)
     if share > _HEAVY:
         warnings.append(f"one draw carries {share:.0%} of the weight")
-    if found.failed.any():
-        counts = f"{found.failed.sum()} of {len(weight)} draws failed"
+    if found.failed:
+        counts = f"{found.failed} of {len(weight)} draws failed"
         warnings.insert(0, f"{counts}: the lower end counts them as safe, the upper end as critical")
     return replace(told, effective_sample_size=size, largest_weight_share=share, counted=len(weight), warnings=tuple(warnings))
 
 
 def _from_batches(found: Reused) -> EstimationConclusion:
     """Return what batches with a control variate say."""
-    safe, worst = [_weighted(b) for b in found.batches], [_weighted(b) for b in _with_failed(found)]
+    safe, worst = [_weighted(b) for b in found.batches], [_weighted(b) for b in found.worst]
     low, high = combine_estimates(safe), combine_estimates(worst)
     hits, perhaps = (int(sum((b.critical[b.coefficient > 0] > 0).sum() for b in batches)) for batches in (safe, worst))
     misses = int(sum((b.coefficient > 0).sum() for b in safe)) - perhaps
     missed = defended_bound(0, found.nominal, found.ratio, _CONFIDENCE)
 
-    def few(count: int, confidence: float) -> float:
+    def bound(count: int, confidence: float) -> float:
         return defended_bound(count, found.nominal, found.ratio, confidence)
 
+    few_low, few_high = (min(e.hits, e.misses) < FEW_HITS for e in (low, high))  # effective numbers: new weights vary a lot
     value, exact, warnings = min(max(low.value, 0.0), 1.0), None, []
-    limits = Limits(lambda c: low.limit(c, side=-1), lambda c: high.limit(c, side=1))
+    limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
     if not found.critical:
-        value, limits = 0.0, Limits(lambda _: 0.0, lambda c: few(perhaps, c))
+        value, limits = 0.0, Limits(lambda _: 0.0, lambda c: bound(perhaps, c))
         exact = limits.upper(_CONFIDENCE)
         warnings.append("nothing critical was met: the probability is only bounded from above")
-    elif not found.safe or misses < FEWEST_HITS:
-        limits = Limits(lambda c: 1.0 - few(misses, c), lambda _: 1.0)
-        warnings.append(f"only {plural(misses, 'counted draw')} safe, fewer than {FEWEST_HITS}: only a lower bound is given")
-    elif hits < FEWEST_HITS:
-        limits = Limits(lambda _: 0.0, lambda c: few(perhaps, c))
-        warnings.append(f"only {plural(hits, 'counted draw')} critical, fewer than {FEWEST_HITS}: only an upper bound is given")
+    elif not found.safe or misses == 0:
+        limits = Limits(lambda c: 1.0 - bound(misses, c), lambda _: 1.0)
+        warnings.append("no counted draw was safe: only a lower bound is given")
+    elif hits == 0:
+        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), bound(perhaps, c)))
+        warnings.append("no counted draw was critical: only an upper bound is given")
+    elif few_low or few_high:
+        least = min(low.hits, low.misses, high.hits, high.misses)
+        warnings.append(
+            f"critical or safe draws are worth {least:.2g}, fewer than {FEW_HITS}: the interval is that of so small a number"
+        )
     return _conclusion(value, limits, low.std_error, max(min(max(high.value, 0.0), 1.0), value), hits, missed, exact, warnings)
 
 
 def _from_nominal(found: Reused) -> EstimationConclusion:
     """Return what draws from the campaign's distribution itself say."""
-    batch, worst = found.batches[0], _with_failed(found)[0]
+    batch, worst = found.batches[0], found.worst[0]
     low, high = (WeightedShare(b.coefficient, b.critical) for b in (batch, worst))
     hits = int((batch.critical[batch.coefficient > 0] > 0).sum())
     missed = defended_bound(0, found.nominal, found.ratio, _CONFIDENCE)
@@ -115,13 +120,6 @@ def _conclusion(
 
 def _weighted(batch: ReusedBatch) -> CountedBatch:
     return batch.tilted(np.ones(len(batch.x)), np.ones(len(batch.predicted_at)))
-
-
-def _with_failed(found: Reused) -> list[ReusedBatch]:
-    """Return the batches with failed runs as critical."""
-    ends = np.cumsum([len(b.x) for b in found.batches])[:-1]
-    failed = np.split(found.failed, ends)
-    return [replace(b, critical=np.maximum(b.critical, f)) for b, f in zip(found.batches, failed, strict=True)]
 
 
 def sensitivities(found: Reused) -> tuple[Sensitivity, ...]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.campaigns.records import CountedDraws, EstimationProposal, PoolSummary
+from sbt.campaigns.records import CountedDraws, EstimationProposal, EventDraws, PoolSummary
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators import binomial
@@ -15,7 +15,7 @@ from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.store.records import Iteration
 
-__all__ = ["DRAWN", "LEARNED", "Seen", "counted_batches", "counted_iterations"]
+__all__ = ["DRAWN", "LEARNED", "Seen", "counted_batches", "counted_iterations", "with_event"]
 
 DRAWN = "estimation"
 """Stage of runs that were drawn with a known density."""
@@ -41,11 +41,21 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
         if np.isnan(history.log_q[rows]).any():
             raise InputError("an estimate needs runs with a known proposal density, but a counted run has none")
         prior = pool.probability if batch.read(EstimationProposal).method == "difference" else 0.0
-        found.append(CountedBatch(
+        of_batch = CountedBatch(
             prior, pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
             critical[rows].astype(np.float64),
-        ))  # fmt: skip
+        )  # fmt: skip
+        stated = draws.failed_critical if failed_critical else None
+        found.append(of_batch if stated is None else with_event(of_batch, stated))
     return found
+
+
+def with_event(batch: CountedBatch, stated: EventDraws) -> CountedBatch:
+    """Return a batch with what the metamodel states of another event of its draws."""
+    return replace(
+        batch, prior=stated.probability, anticipated=stated.anticipated, pool_variance=stated.pool_variance,
+        control_variate=np.array(stated.pi),
+    )  # fmt: skip
 
 
 def _counted(log: Log) -> Iterator[tuple[Iteration, PoolSummary, CountedDraws]]:

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations
+from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations, with_event
 from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion
 from sbt.campaigns.parts import CriticalShare, share_of
-from sbt.campaigns.records import EstimationProposal, PartDraws
+from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import number, percent
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
-from sbt.estimators.parts import PartOfPool
 from sbt.loop.stages import Log
-from sbt.problem.arrays import Vector
 from sbt.problem.requirement import Requirement
 from sbt.store.history import History
 from sbt.store.records import Independence, RequirementFit
 
 __all__ = [
     "RequirementEstimate", "each_estimate", "each_share", "estimates_words", "fits_words",
-    "independence_words", "part_draws", "shares_words", "violations_words",
+    "independence_words", "shares_words", "violations_words",
 ]  # fmt: skip
 
 _CONFIDENCE = 0.95
@@ -119,10 +117,8 @@ def _batches_of(k: int, part: Requirement, log: Log, settings: Settings, *, fail
             ))  # fmt: skip
             continue
         mine = draws.parts[k]
-        found.append(replace(
-            whole, prior=mine.probability, anticipated=mine.anticipated, pool_variance=mine.pool_variance,
-            control_variate=np.array(mine.pi), critical=outcomes,
-        ))  # fmt: skip
+        mine = (mine.failed_critical or mine) if failed_critical else mine
+        found.append(with_event(replace(whole, critical=outcomes), mine))
     return found
 
 
@@ -134,13 +130,6 @@ def _complete(log: Log) -> list[int]:
         n for n in counted_iterations(log)
         if (found := planned[n]) is not None and (drawn & (log.history.iteration == n)).sum() >= len(found.coefficient)
     ]  # fmt: skip
-
-
-def part_draws(parts: Sequence[PartOfPool] | None, rows: Vector) -> tuple[PartDraws, ...] | None:
-    """Return what the log keeps of each requirement at the drawn rows of a pool; None without a combination."""
-    if parts is None:
-        return None
-    return tuple(PartDraws(p.prior, p.anticipated, p.pool_variance, tuple(p.pi[rows].tolist())) for p in parts)
 
 
 def estimates_words(estimates: tuple[RequirementEstimate, ...] | None, confidence: float = _CONFIDENCE) -> list[str]:

@@ -173,9 +173,12 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
     if not safe:
         return _uncounted(log, settings)
     low, high, seen = combine_estimates(safe), combine_estimates(critical), Seen.of(log, settings)
-    hits, misses = _hits(safe), sum(len(b.critical) for b in critical) - _hits(critical)
+    counted, hits, worst = sum(len(b.critical) for b in safe), _hits(safe), _hits(critical)
+    misses = counted - worst
+    few_low, few_high = min(hits, counted - hits) < FEW_HITS, min(worst, misses) < FEW_HITS  # the same where no run failed
     value, exact_bound = _clipped(low.value), None
-    limits, warnings = Limits(lambda c: low.limit(c, side=-1), lambda c: high.limit(c, side=1)), []
+    limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
+    warnings = []
     if not seen.critical:
         limits, value = _nothing_critical(seen), 0.0
         exact_bound = limits.upper(_CONFIDENCE)
@@ -187,13 +190,14 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
             "everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution"
         )
     elif hits == 0:
-        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), seen.most(seen.hits + seen.failed, c)))
+        missed = (lambda c: seen.most(seen.hits + seen.failed, c)) if few_high else limits.upper
+        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), missed(c)))
         warnings.append("no counted draw was critical: only an upper bound is given")
     elif misses == 0:
-        limits = Limits(lambda c: min(low.limit(c, side=-1), 1.0 - seen.most(seen.draws - seen.hits, c)), lambda _: 1.0)
+        missed = (lambda c: 1.0 - seen.most(seen.draws - seen.hits, c)) if few_low else limits.lower
+        limits = Limits(lambda c: min(low.limit(c, side=-1), missed(c)), lambda _: 1.0)
         warnings.append("no counted draw was safe: only a lower bound is given")
     elif min(hits, misses) < FEW_HITS:
-        limits = Limits(lambda c: low.limit(c, side=-1, few=True), lambda c: high.limit(c, side=1, few=True))
         met = f"{hits} counted draws were critical" if hits < FEW_HITS else f"{misses} counted draws were safe"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
     if len(safe) < FEWEST_BATCHES:
@@ -211,7 +215,7 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
         largest_weight_share=low.largest_share,
         convergence=_convergence(log, safe, critical),
-        counted=int(sum(len(b.critical) for b in safe)), exact_bound=exact_bound,
+        counted=counted, exact_bound=exact_bound,
     ), limits  # fmt: skip
 
 

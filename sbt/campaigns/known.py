@@ -12,6 +12,7 @@ from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores
+from sbt.estimators.events import given_a_metric, with_failed_runs
 from sbt.estimators.surrogate import Coordinates, LogProbability, fit_log_probability
 from sbt.metamodels.base import Metamodel
 from sbt.problem.arrays import Mask, Points, Vector
@@ -27,7 +28,15 @@ _SURE_NOISE = 0.4
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Runs to learn from: normal scores z, coordinates u, metric y, what is critical, the batch of each; noise of repeats."""
+    """What is known of finished runs.
+
+    Attributes:
+        z, u, y, critical, batch: normal scores, coordinates, metric, what is critical, and the batch, of runs to learn from.
+        coordinates: from normal scores to the metamodel's inputs.
+        settings: of the campaign.
+        noise: standard deviation among repeats.
+        failed, failed_batch: (k, d) normal scores and (k,) batch of runs that gave no metric.
+    """
 
     z: Points
     u: Points
@@ -36,7 +45,9 @@ class Known:
     batch: Vector
     coordinates: Coordinates
     settings: Settings
-    noise: float = 0.0
+    noise: float
+    failed: Points
+    failed_batch: Vector
 
     @classmethod
     def of(cls, history: History, coordinates: Coordinates, settings: Settings) -> Known:
@@ -44,13 +55,17 @@ class Known:
         runs, space = history.training, settings.scenario.space
         requirement = settings.scenario.requirement
         x, y, batch = runs.x, requirement.values(runs), runs.iteration
+        lost, lost_batch = history.x[~history.ok], history.iteration[~history.ok]
         if settings.prior_runs is not None:
-            first = settings.prior_runs.training
+            first, all_first = settings.prior_runs.training, settings.prior_runs
             x, y = np.vstack([first.x, x]), np.concatenate([requirement.values(first), y])
             batch = np.concatenate([np.full(len(first), -1), batch])
-        z = space.to_normal(x) if len(x) else np.empty((0, space.dimension))
+            lost = np.vstack([all_first.x[~all_first.ok], lost])
+            lost_batch = np.concatenate([np.full(len(lost) - len(lost_batch), -1), lost_batch])
+        z, failed = (space.to_normal(rows) if len(rows) else np.empty((0, space.dimension)) for rows in (x, lost))
         noise = simulator_noise(history, requirement).std or 0.0
-        return cls(z, coordinates(z), y, requirement.critical.contains(y), batch, coordinates, settings, noise)
+        critical = requirement.critical.contains(y)
+        return cls(z, coordinates(z), y, critical, batch, coordinates, settings, noise, failed, lost_batch)
 
     @property
     def one_sided(self) -> bool:
@@ -78,20 +93,29 @@ class Known:
             return len(hits)
         along = np.linspace(0.1, 0.9, _PROBES)[:, None, None]
         probes = hits[i] * along + hits[j] * (1.0 - along)  # (probes, pairs, d)
-        inside = log_probability(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
+        inside = given_a_metric(log_probability)(probes.reshape(-1, hits.shape[1]))[0].reshape(_PROBES, -1) > np.log(0.5)
         joined = inside.all(axis=0)
         graph = coo_array((np.ones(int(joined.sum())), (i[joined], j[joined])), shape=(len(hits), len(hits)))
         return int(connected_components(graph, directed=False)[0])
 
     def learn(self, rng: np.random.Generator) -> LogProbability | None:
-        """Return the log_probability; None with too few runs."""
+        """Return log P(critical), failed runs as safe; None with too few runs."""
         transfer = self.settings.transfer
         if len(self.y) < 2 and transfer is None:
             return None
         interval, earlier = self.settings.scenario.requirement.critical, () if transfer is None else transfer.trends
         noise = _SURE_NOISE * self.noise**2
-        return fit_log_probability(
+        given = fit_log_probability(
             metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng, noise, earlier=earlier
+        )  # fmt: skip
+        ok = np.arange(len(self.z) + len(self.failed)) < len(self.z)
+        return with_failed_runs(given, self.coordinates, np.vstack([self.z, self.failed]), ok, rng)
+
+    def attempts(self) -> tuple[Points, Vector, Vector]:
+        """Return normal scores (n, d), metric (n,) and batch (n,) of all runs; the metric is NaN where a run failed."""
+        none = np.full((len(self.failed), *self.y.shape[1:]), np.nan)
+        return (
+            np.vstack([self.z, self.failed]), np.concatenate([self.y, none]), np.concatenate([self.batch, self.failed_batch]),
         )  # fmt: skip
 
 

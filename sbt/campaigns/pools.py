@@ -8,17 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from sbt.campaigns.counting import DRAWN, LEARNED
-from sbt.campaigns.each import part_draws
-from sbt.campaigns.records import COUNT, LEARN, CountedDraws, EstimationProposal, NominalDraws, PoolSummary
+from sbt.campaigns.records import COUNT, LEARN, CountedDraws, EstimationProposal, EventDraws, NominalDraws, PoolSummary
 from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
-from sbt.estimators.importance import Plan, draw_systematic, plan_batch
+from sbt.estimators.events import Event, events
+from sbt.estimators.importance import Plan, draw_systematic, plan_batch, stated
 from sbt.estimators.mixture import Mixture, Near, effective_size, fit_mixture, particles, reweighted
-from sbt.estimators.parts import parts_of_pool
 from sbt.estimators.surrogate import LogProbability
+from sbt.metamodels.joint import LogPair
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import PlannedRun
@@ -78,21 +79,19 @@ class Pool:
     """A pool: points z (N, d) and x (N, d), how a batch is drawn from it, and what the metamodel says there.
 
     Attributes:
-        mixture, log_probability: what it was drawn with.
+        mixture: what it was drawn with.
         z, x: normal scores and inputs.
         plan: how a batch is drawn.
-        log_pi, log_not: log P(critical) and log P(uncritical) by the metamodel.
-        v, stratum: coordinates that the metamodel was asked at, and component of the mixture that each point was drawn from.
+        whole, parts: what the metamodel says of critical runs, and of each requirement of a combination.
+        stratum: (N,) component of the mixture that each point was drawn from.
     """
 
     mixture: Mixture
-    log_probability: LogProbability | None
     z: Points
     x: Points
     plan: Plan
-    log_pi: Vector
-    log_not: Vector
-    v: Points
+    whole: Event
+    parts: tuple[Event, ...]
     stratum: Vector
 
 
@@ -135,28 +134,27 @@ def _pooled(
     if space.constraints:
         log_w = np.where(space.feasible(x), log_w - math.log(space.feasible_mass), -np.inf)
     unsure = np.full(len(v), np.log(0.5))
-    log_pi, log_not = (unsure, unsure) if log_probability is None else log_probability(v)
-    plan = plan_batch(log_pi, log_not, log_w, log_wide(v, frame.wide, frame.choices) - log_h, stratum, shares, form)
-    return Pool(mixture, log_probability, z, x, plan, log_pi, log_not, v, stratum)
+    whole, parts = (Event((unsure, unsure)), ()) if log_probability is None else events(log_probability, v)
+    plan = plan_batch(
+        *whole.safe, log_w, log_wide(v, frame.wide, frame.choices) - log_h, stratum, shares, form,
+        others=tuple(event for event in (whole.critical, *(part.safe for part in parts)) if event is not None),
+    )  # fmt: skip
+    return Pool(mixture, z, x, plan, whole, parts, stratum)
 
 
 def _fitted(log_probability: LogProbability, start: Mixture, hits: Points, rng: np.random.Generator) -> Mixture:
-    """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi))."""
+    """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi)), and of what else is estimated."""
 
-    def mass(v: Points) -> Vector:
-        return log_normal(v) + log_probability(v)[0]
-
-    def boundary(v: Points) -> Vector:
-        log_pi, log_not = log_probability(v)
-        return log_normal(v) + 0.5 * (log_pi + log_not)
+    def target(v: Points, k: int) -> Vector:
+        return _targets(log_probability, v)[k]
 
     near = Near(start, hits)
-    clouds = tuple(particles(target, near, _PARTICLES, rng) for target in (mass, boundary))
+    count = len(_targets(log_probability, hits[:1]))
+    clouds = tuple(particles(partial(target, k=k), near, _PARTICLES, rng) for k in range(count))
     mixture = fit_mixture(clouds, start.wide, rng, choices=start.choices)
     for _ in range(_REFITS):  # from particles that a few ancestors share to points that are independent
         v, _ = mixture.sample(_REFIT_POINTS, rng)
-        log_h, log_p, (log_pi, log_not) = mixture.log_density(v), log_normal(v), log_probability(v)
-        targets = (log_p + log_pi, log_p + 0.5 * (log_pi + log_not))
+        log_h, targets = mixture.log_density(v), _targets(log_probability, v)
         if min(effective_size(target - log_h) for target in targets) >= _ENOUGH * len(v):
             break
         clouds = tuple(v[reweighted(target, log_h, _PARTICLES, rng)] for target in targets)
@@ -164,23 +162,44 @@ def _fitted(log_probability: LogProbability, start: Mixture, hits: Points, rng: 
     return mixture
 
 
+def _targets(log_probability: LogProbability, v: Points) -> list[Vector]:
+    """Return the log densities that points of a pool should follow, not normalised, at coordinates v (n, m).
+
+    Those of the event's mass and boundary; where runs failed, between the mass and the boundary of critical or failed ones;
+    the mass of each requirement of a combination.
+    """
+    whole, parts = events(log_probability, v)
+    log_p, (log_pi, log_not) = log_normal(v), whole.safe
+    worst = [] if whole.critical is None else [log_p + 0.5 * whole.critical[0]]
+    return [log_p + log_pi, log_p + 0.5 * (log_pi + log_not), *worst, *(log_p + part.safe[0] for part in parts)]
+
+
 def draw_batch(
     space: ParameterSpace, pool: Pool, n: int, rng: np.random.Generator, *, counts: bool, fallback: bool = False
 ) -> tuple[tuple[PlannedRun, ...], EstimationProposal]:
     """Return n runs drawn from a pool with known density, that count or only teach, and what the log keeps of them."""
-    draws, plan = draw_systematic(pool.plan, n, pool.log_pi - pool.log_not, rng), pool.plan
+    log_pi, log_not = pool.whole.safe
+    draws, plan = draw_systematic(pool.plan, n, log_pi - log_not, rng), pool.plan
     summary = PoolSummary(len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback)
-    pi = tuple(np.exp(pool.log_pi[draws.rows]).tolist())
+    pi = tuple(np.exp(log_pi[draws.rows]).tolist())
     z, nominal = pool.z[draws.rows], NominalDraws(pi[: draws.nominal])
     if not counts:
         return planned(space, z, LEARNED), EstimationProposal(LEARN, "uncertainty", pool=summary, nominal=nominal)
     log_q = space.log_density(pool.x[draws.rows]) - np.log(draws.coefficient)
     counted = CountedDraws(
         plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi,
-        part_draws(parts_of_pool(pool.log_probability, pool.v, plan, pool.stratum), draws.rows),
+        tuple(_event_draws(part.safe, pool, draws.rows, part.critical) for part in pool.parts) or None,
+        None if pool.whole.critical is None else _event_draws(pool.whole.critical, pool, draws.rows),
     )  # fmt: skip
     kept = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted, nominal=nominal)
     return planned(space, z, DRAWN, log_q), kept
+
+
+def _event_draws(event: LogPair, pool: Pool, rows: Vector, failed_critical: LogPair | None = None) -> EventDraws:
+    """Return what the log keeps of an event at the drawn rows of a pool."""
+    said = stated(event, pool.plan, pool.stratum)
+    worst = None if failed_critical is None else _event_draws(failed_critical, pool, rows)
+    return EventDraws(said.prior, said.anticipated, said.pool_variance, tuple(said.pi[rows].tolist()), worst)
 
 
 def planned(space: ParameterSpace, z: Points, stage: str, log_q: Vector | None = None) -> tuple[PlannedRun, ...]:

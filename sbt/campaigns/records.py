@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from sbt.store.records import optional
 
 __all__ = [
-    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "NominalDraws", "PartDraws",
+    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "EventDraws", "NominalDraws",
     "PoolSummary", "SearchProposal",
 ]  # fmt: skip
 
@@ -88,20 +88,22 @@ class PoolSummary:
 
 
 @dataclass(frozen=True)
-class PartDraws:
-    """What the metamodel of one requirement of a combination states of counted draws.
+class EventDraws:
+    """What the metamodel states of an event, such as one requirement of a combination, at counted draws.
 
     Attributes:
-        probability: mean P(it is violated) over the pool, under the inputs' distribution.
+        probability: mean P(event) over the pool, under the inputs' distribution.
         anticipated: variance of one draw that it anticipates.
         pool_variance: variance of the pool's mean.
-        pi: of each draw, P(it is violated).
+        pi: of each draw, P(event).
+        failed_critical: the same with every failed run as the event; left out where no run had failed.
     """
 
     probability: float
     anticipated: float
     pool_variance: float
     pi: tuple[float, ...]
+    failed_critical: EventDraws | None = optional()
 
 
 @dataclass(frozen=True)
@@ -113,14 +115,16 @@ class CountedDraws:
         coefficient: of each draw in the estimate: density ratio over the number of draws.
         control_variate: of each draw, P(critical) that the pool's mean accounts for.
         pi: of each draw, the metamodel's P(critical).
-        parts: of a combination, the same of each requirement.
+        parts: of a combination, what is stated of each requirement.
+        failed_critical: what is stated of critical or failed runs; left out where no run had failed.
     """
 
     pool_variance: float
     coefficient: tuple[float, ...]
     control_variate: tuple[float, ...]
     pi: tuple[float, ...]
-    parts: tuple[PartDraws, ...] | None = optional()
+    parts: tuple[EventDraws, ...] | None = optional()
+    failed_critical: EventDraws | None = optional()
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,8 @@ class SequentialStage:
                 s.scenario.requirement.critical, metamodel_of(s), lambda v: self._coordinates(self._scores(v)),
                 within, cube=Cube(nominal=space.cube.nominal),
             )  # fmt: skip
-            picks = portfolio.propose(search, to_cube(known.z, self._wide, self._choices), known.y, n - even, rng, known.batch)
+            z, y, batch = known.attempts()
+            picks = portfolio.propose(search, to_cube(z, self._wide, self._choices), y, n - even, rng, batch)
             spread = np.vstack([picks.u, spread])
         return self._feasible(self._scores(spread), iteration)
 

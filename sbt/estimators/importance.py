@@ -13,13 +13,14 @@ Source:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sbt.problem.arrays import Vector
 
-__all__ = ["SHARES", "Draws", "Plan", "draw_systematic", "plan_batch", "stratified_variance"]
+__all__ = ["BLIND", "SHARES", "Draws", "Plan", "Stated", "draw_systematic", "plan_batch", "stated", "stratified_variance"]
 
 SHARES = (0.63, 0.20, 0.05, 0.12)
 """Shares of the draws in proportion to the metamodel's uncertainty, to the nominal distribution, to the pool and to the
@@ -27,6 +28,32 @@ wide distribution. The last three (37 %) do not depend on the metamodel: they bo
 says how much a region may hold that no run has met: 15 such draws in 200 runs bound it by 0.2."""
 BLIND = (0.0, 0.5, 0.1, 0.4)
 """The same while all runs are on one side of the boundary: the metamodel knows nothing of the other."""
+
+
+_LEAST_PROBABILITY = 1e-12
+"""Of an event, in the coefficient of variation that draws are planned by: one that is denied must not take them all."""
+_OWN = 0.5
+"""Share of the guided draws that no further event has a say in."""
+
+LogPair = tuple[Vector, Vector]
+"""(N,) log P(event) and (N,) log of the rest, at the points of a pool."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """What the metamodel states of an event at the points of a pool, as a control variate of its draws.
+
+    Attributes:
+        pi: (N,) P(event).
+        prior: mean of w pi, the prediction of its probability.
+        anticipated: variance of one draw in the difference form, if the metamodel is right.
+        pool_variance: of the prior through the pool.
+    """
+
+    pi: Vector
+    prior: float
+    anticipated: float
+    pool_variance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +104,13 @@ class Draws:
 
 def plan_batch(
     log_pi: Vector, log_not: Vector, log_w: Vector, log_wide: Vector, stratum: Vector, shares: tuple[float, ...] = SHARES,
-    form: str | None = None,
-) -> Plan:
+    form: str | None = None, *, others: Sequence[LogPair] = (),
+) -> Plan:  # fmt: skip
     """Return the plan of a form, the difference form or Meta-IS.
+
+    Where the same draws estimate several events, half of the guided ones are in proportion to w sqrt(sum of u^2 / P^2), u the
+    uncertainty of an event and P its probability: that minimises the sum of the squared coefficients of variation. The
+    other half is the first event's alone.
 
     Args:
         log_pi: (N,) log P(critical) of the metamodel.
@@ -90,6 +121,7 @@ def plan_batch(
         shares: of the draws, as `SHARES`.
         form: "difference" or "meta"; None: that of smaller anticipated variance. A pool that is counted must not choose its
             own form: it would choose the one that its points happen to flatter.
+        others: further events that the draws estimate.
     """
     n = len(log_w)
     w, pi = np.exp(log_w) / n, np.exp(log_pi)
@@ -101,9 +133,9 @@ def plan_batch(
         if form not in (None, name):
             continue
         r = shares[1] * nominal + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
-        r += shares[0] * _normalised(log_spread + log_w, alive)
-        r /= r.sum()
         mean = float((w * pi).sum())
+        r += shares[0] * _guided(log_spread, mean, others, w, log_w)
+        r /= r.sum()
         second = float((w**2 * pi / np.where(alive, r, 1.0)).sum())
         if name == "difference":
             variance = float((w**2 * pi * np.exp(log_not) / np.where(alive, r, 1.0)).sum())
@@ -115,6 +147,34 @@ def plan_batch(
             max(variance, 0.0), pool_variance, shares[1], nominal,
         ))  # fmt: skip
     return min(plans, key=lambda plan: plan.anticipated)
+
+
+def stated(event: LogPair, plan: Plan, stratum: Vector) -> Stated:
+    """Return what is stated of an event at the points of a pool that draws are made from by this plan."""
+    w, pi = plan.weight, np.exp(event[0])
+    one_draw = np.where(plan.probability > 0, w**2 * pi * np.exp(event[1]) / np.maximum(plan.probability, 1e-300), 0.0)
+    return Stated(pi, float((w * pi).sum()), float(one_draw.sum()), stratified_variance(len(w) * w * pi, stratum))
+
+
+def _guided(log_spread: Vector, mean: float, others: Sequence[LogPair], w: Vector, log_w: Vector) -> Vector:
+    """Return (N,) the probabilities of guided draws, sum 1; `log_spread` and `mean` are those of the first event."""
+    alive = np.isfinite(log_w)
+    own = _normalised(log_spread + log_w, alive)
+    if not others:
+        return own
+    every = 2.0 * (log_spread - _log(mean))
+    for event in others:
+        every = np.logaddexp(every, _relative(event, w))
+    return _OWN * own + (1.0 - _OWN) * _normalised(0.5 * every + log_w, alive)
+
+
+def _relative(event: LogPair, w: Vector) -> Vector:
+    """Return (N,) log u^2 / P^2 of an event."""
+    return event[0] + event[1] - 2.0 * _log(float((w * np.exp(event[0])).sum()))
+
+
+def _log(probability: float) -> float:
+    return float(np.log(max(probability, _LEAST_PROBABILITY)))
 
 
 def _normalised(log_value: Vector, alive: Vector) -> Vector:

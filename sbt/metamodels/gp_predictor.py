@@ -83,6 +83,14 @@ class GaussianProcessPredictor:
             noise=common * (self.scale * np.sqrt(noise)),
         )
 
+    def mu(self, u: Points) -> Vector:
+        """Return the (m,) mean at u (m, d) alone: many times quicker than the prediction."""
+        rows, _, alpha = self._placed
+        with single_threaded():
+            at = [like(u[i : i + _CHUNK], rows) for i in range(0, len(u), _CHUNK)]
+            chunks = [host(alpha @ self.hyper.covariance(part, rows).T) for part in at]
+        return np.asarray(self.shift + self.scale * (self.centre + np.concatenate([np.empty(0), *chunks])))
+
     def leave_one_out(self, y: Vector) -> Prediction:
         """Return the prediction of each row's y (n,) from all other rows, the hyperparameters kept; cubic in n.
 

@@ -7,13 +7,17 @@ fail, and everything that looks for uncertainty goes there again and again.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel
 from sbt.problem.arrays import Mask, Points, Vector
 
-__all__ = ["LogSuccess", "log_success"]
+if TYPE_CHECKING:
+    from sbt.metamodels.extra_trees import ForestPredictor
+    from sbt.metamodels.gaussian_process import GaussianProcessPredictor
+
+__all__ = ["LogSuccess", "failure_probability", "log_success"]
 
 LogSuccess = Callable[[Points], Vector]
 """(n, d) metamodel inputs -> (n,) log P(a run there gives a metric) <= 0, -inf where one is not worth the try."""
@@ -42,11 +46,7 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
     """
     if len(u) < 2 or ok.all() or not ok.any():
         return None
-    from sbt.metamodels.extra_trees import ExtraTrees
-    from sbt.metamodels.gaussian_process import GaussianProcess
-
-    metamodel: Metamodel = GaussianProcess(certainly_noisy=True) if len(u) <= _MOST_EXACT else ExtraTrees()
-    predictor, least = metamodel.fit(u, ok.astype(np.float64), rng), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
+    predictor, least = _fitted(u, ok, rng, input_noise=True), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
 
     def score(points: Points) -> Vector:
         p = np.clip(predictor(points).mu, 0.0, 1.0)
@@ -54,3 +54,29 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
             return np.asarray(np.log(np.where(p < least, 0.0, p)))
 
     return score
+
+
+def failure_probability(u: Points, ok: Mask, rng: np.random.Generator) -> Callable[[Points], Vector]:
+    """Return P(a run gives no metric) as a function of the metamodel's inputs, never closer to 0 or 1 than n runs can tell.
+
+    The ends are 1 / (n + 2) away: that of an event which n runs have not met, by the rule of succession. Noise of labels that
+    depends on the inputs would cost five times as much, and predicted new labels no better (docs/estimation.md).
+
+    Args:
+        u: (n, d) metamodel inputs of all runs, n >= 2.
+        ok: (n,) the run gave a metric.
+        rng: of the fit.
+    """
+    least = 1.0 / (len(u) + 2.0)
+    predictor = _fitted(u, ok, rng, input_noise=False)
+    return lambda points: np.clip(1.0 - predictor.mu(points), least, 1.0 - least)
+
+
+def _fitted(u: Points, ok: Mask, rng: np.random.Generator, *, input_noise: bool) -> GaussianProcessPredictor | ForestPredictor:
+    """Return a predictor of the labels 0 and 1: a Gaussian process, or a forest where there are many."""
+    from sbt.metamodels.extra_trees import ExtraTrees
+    from sbt.metamodels.gaussian_process import GaussianProcess
+
+    if len(u) <= _MOST_EXACT:
+        return GaussianProcess(certainly_noisy=True, input_noise=input_noise).fit(u, ok.astype(np.float64), rng)
+    return ExtraTrees().fit(u, ok.astype(np.float64), rng)

@@ -1,0 +1,157 @@
+"""Do intervals of an estimation cover where runs fail, whether these count as safe or as critical?
+
+    python benchmarks/failing_estimates.py [--seeds 20] [--problems overlap_d2_half,random_d3_tenth] [--table runs/failing.jsonl]
+
+Campaigns with default settings, `stop: {cov: null}`, 124 runs. The probability of both readings is known: P(critical, and the run
+gives a metric) counts failed runs as safe, P(critical, or the run fails) as critical. Finished cells are lines of the table: run
+again to go on; `--show` only prints what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+from scipy.stats import multivariate_normal, norm
+
+import sbt
+from sbt.seeds import stream
+from sbt.testbeds import find
+
+RUNS = 124
+_BETA = 3.0
+"""Of the hyperplane beyond which runs are critical: P = 1.3e-3."""
+Fails = Callable[[np.ndarray, int], bool]
+"""Normal scores (d,) and the seed of a run: it gives no metric."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A problem: its scenario, and the probabilities with failed runs as safe and as critical."""
+
+    scenario: sbt.Scenario | str
+    safe: float
+    critical: float
+
+
+def plane(d: int, fails: Fails, both: float, share: float) -> Cell:
+    """Return the half-space of distance 3 in d standard-normal inputs; `both`: its part that fails, `share`: what fails."""
+
+    def evaluate(values: dict[str, float], seed: int) -> dict[str, float]:
+        z = np.array(list(values.values()))
+        return {"y": math.nan if fails(z, seed) else _BETA - float(z.sum()) / math.sqrt(d)}
+
+    inputs = [sbt.Parameter(f"x{k + 1}", -math.inf, math.inf, "", sbt.Normal(0.0, 1.0)) for k in range(d)]
+    scenario = sbt.Scenario("plane", inputs=inputs, evaluate=evaluate, requirement=sbt.Requirement("y", high=0.0))
+    whole = float(norm.sf(_BETA))
+    return Cell(scenario, whole - both, share + whole - both)
+
+
+def at_random(d: int, share: float) -> Cell:
+    """Return the plane where runs fail whatever their inputs."""
+    return plane(d, lambda z, seed: bool(stream(seed, "fails").random() < share), share * float(norm.sf(_BETA)), share)
+
+
+def half_space(d: int, share: float, correlation: float) -> Cell:
+    """Return the plane where runs fail beyond another one, whose normal has this correlation with the first."""
+    first = np.full(d, 1.0 / math.sqrt(d))
+    across = np.zeros(d)
+    across[:2] = 1.0 / math.sqrt(2.0), -1.0 / math.sqrt(2.0)
+    normal, edge = correlation * first + math.sqrt(1.0 - correlation**2) * across, float(norm.isf(share))
+    both = multivariate_normal.cdf([-_BETA, -edge], cov=[[1.0, correlation], [correlation, 1.0]])
+    return plane(d, lambda z, _: bool(z @ normal > edge), float(both), share)
+
+
+def testbed(name: str, share: float) -> Cell:
+    """Return a testbed of which this share fails."""
+    p = find(name).truth.probability
+    return Cell(f"testbed:{name}", p, share + p)
+
+
+CELLS: dict[str, Callable[[], Cell]] = {
+    "random_d3_tenth": lambda: at_random(3, 0.1),
+    "random_d2_half": lambda: at_random(2, 0.5),
+    "apart_d4_tenth": lambda: half_space(4, 0.1, 0.0),
+    "apart_d2_half": lambda: half_space(2, 0.5, 0.0),
+    "overlap_d2_half": lambda: half_space(2, 0.5, 0.3),
+    "overlap_d6_tenth": lambda: half_space(6, 0.1, 0.5),
+    "overlap_d5_half": lambda: half_space(5, 0.5, 0.3),
+    "needle_half_fails": lambda: testbed("needle_half_fails", 0.5),
+    "hartmann6_third_fails": lambda: testbed("hartmann6_third_fails", 0.37895),
+    "wavy_half_fails": lambda: testbed("wavy_half_fails", 0.49868),
+}
+"""Where runs fail, whether that is apart from the critical region or overlaps it, inputs, share that fails."""
+KEPT = ("probability", "failed_as_critical", "low", "high", "cov", "hits", "warnings")
+
+
+def campaign(name: str, seed: int) -> dict:
+    with tempfile.TemporaryDirectory() as folder:
+        cpu = time.process_time()
+        result = sbt.run(
+            campaign="estimation", scenario=CELLS[name]().scenario, seed=seed, budget=RUNS, stop={"cov": None}, executor="serial",
+            store=f"{folder}/store", report=False,
+        )  # fmt: skip
+        kept = {key: result.summary["conclusion"][key] for key in KEPT}
+        failed = float((result.frame.status != "ok").mean())
+    return {"cell": name, "seed": seed, "failed": failed, "cpu": round(time.process_time() - cpu, 1), **kept}
+
+
+def finished(table: Path) -> dict[tuple[str, int], dict]:
+    rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
+    return {(row["cell"], row["seed"]): row for row in rows}
+
+
+def show(rows: list[dict]) -> None:
+    head = (
+        "problem", "seeds", "P, failed as safe", "low > P", "rel. RMSE", "median (P - low) / P", "P, failed as critical",
+        "high < P", "rel. RMSE (crude)", "median (high - P) / P", "failed runs", "CPU s",
+    )  # fmt: skip
+    print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+    for name in dict.fromkeys(row["cell"] for row in rows):
+        cell, mine = CELLS[name](), [row for row in rows if row["cell"] == name]
+        safe, worst, low, high, failed, cpu = (
+            np.array([row[key] if row[key] is not None else np.nan for row in mine], dtype=np.float64)
+            for key in ("probability", "failed_as_critical", "low", "high", "failed", "cpu")
+        )
+        crude = math.sqrt((1.0 - cell.critical) / (cell.critical * RUNS))
+        rmse = [float(np.sqrt(np.nanmean((found / p - 1.0) ** 2))) for found, p in ((safe, cell.safe), (worst, cell.critical))]
+        print(
+            f"| {name} | {len(mine)} | {cell.safe:.3g} | {int((low > cell.safe).sum())} | {rmse[0]:.3f} | "
+            f"{np.median(1.0 - low / cell.safe):.2f} | {cell.critical:.3g} | {int((high < cell.critical).sum())} | "
+            f"{rmse[1]:.3f} ({crude:.3f}) | {np.median(high / cell.critical - 1.0):.2f} | {failed.mean():.2f} | "
+            f"{np.median(cpu):.1f} |"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--problems", default=",".join(CELLS))
+    parser.add_argument("--table", type=Path, default=Path("runs/failing.jsonl"))
+    parser.add_argument("--show", action="store_true")
+    args = parser.parse_args()
+    args.table.parent.mkdir(parents=True, exist_ok=True)
+    done, names = finished(args.table), args.problems.split(",")
+    if unknown := set(names) - set(CELLS):
+        parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join(CELLS)}")
+    for seed in range(0 if args.show else args.seeds):
+        for name in names:
+            if (name, seed) not in done:
+                done[name, seed] = campaign(name, seed)
+                with args.table.open("a") as file:
+                    file.write(json.dumps(done[name, seed]) + "\n")
+    show([done[key] for name in names for key in done if key[0] == name and key[1] < args.seeds])
+
+
+if __name__ == "__main__":
+    main()
