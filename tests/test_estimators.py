@@ -13,7 +13,8 @@ from scipy.stats import binomtest
 from sbt.campaigns.pools import Frame, draw_pool, fit_proposal
 from sbt.estimators.binomial import interval, lower, upper
 from sbt.estimators.choices import log_normal
-from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch
+from sbt.estimators.events import FailingLogProbability, events
+from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch, stated
 from sbt.estimators.intervals import CountedBatch, combine_estimates
 from sbt.estimators.mixture import Mixture, Near, Normals, fit_mixture, particles, wide_scales
 from sbt.estimators.monte_carlo import Proportion
@@ -60,6 +61,39 @@ def test_unbiased_with_a_wrong_metamodel(predict, form):
     error = values.std(ddof=1) / math.sqrt(len(values))
     assert abs(values.mean() - TRUTH) < 3 * error
     assert error < 0.5 * TRUTH  # the law says something
+
+
+def test_both_readings_of_failed_runs_are_unbiased_with_wrong_metamodels():
+    """Runs fail where x2 > 0, half of them; the metamodels are wrong about where, and about what is critical."""
+    rng, values = stream(1, "failing"), []
+    for _ in range(250):
+        z, stratum = H.sample(300, rng)
+        log_h = H.log_density(z)
+        event = events(FailingLogProbability(wrong, lambda at: np.clip(0.9 * (at[:, 0] < 0.5), 0.05, 0.95)), z)[0]
+        assert event.critical is not None
+        given = log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum
+        plan = plan_batch(*event.safe, *given, others=(event.critical,))
+        draws = draw_systematic(plan, 20, z[:, 0], rng)
+        at, fails, worst = draws.rows, z[draws.rows, 1] > 0.0, stated(event.critical, plan, stratum)
+        met = (z[at, 0] > 2.0) & ~fails
+        safe = CountedBatch(plan.prior, plan.anticipated, 0.0, draws.coefficient, draws.control_variate, met.astype(float))
+        critical = CountedBatch(worst.prior, worst.anticipated, 0.0, draws.coefficient, worst.pi[at], (met | fails).astype(float))
+        values.append((safe.value, critical.value))
+    mean, error = np.mean(values, axis=0), np.std(values, axis=0, ddof=1) / math.sqrt(len(values))
+    truth = np.array([0.5 * TRUTH, 0.5 + 0.5 * TRUTH])
+    assert (np.abs(mean - truth) < 3 * error).all()
+    assert (error < 0.5 * truth).all()
+
+
+def test_draws_for_a_further_event_take_half_of_the_guided_ones_at_most():
+    z, stratum = H.sample(300, stream(15, "further"))
+    log_h = H.log_density(z)
+    given = log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum
+    there = z[:, 1] < -1.5  # where the further event is uncertain
+    further = np.log(np.where(there, 0.5, 1e-6)), np.log(np.where(there, 0.5, 1.0))
+    alone, both = (plan_batch(*wrong(z), *given, others=others) for others in ((), (further,)))
+    assert both.probability[there].sum() > 1.5 * alone.probability[there].sum()
+    assert (both.probability > 0.5 * alone.probability).all()
 
 
 def test_the_mean_of_p_over_q_is_one():

@@ -9,7 +9,7 @@ import pytest
 
 import sbt
 from sbt import testbeds
-from sbt.metamodels.success import log_success
+from sbt.metamodels.success import failure_probability, log_success
 from sbt.seeds import stream
 
 AWAY = 0.25
@@ -76,6 +76,35 @@ def test_p_of_success_is_a_probability_and_never_learned_from_success_alone():
     at_random = log_success(u, rng.random(60) < 0.8, rng)  # failures that no input explains
     assert at_random is not None
     assert np.exp(at_random(rng.random((500, 2)))).mean() == pytest.approx(0.8, abs=0.12)
+
+
+def test_p_of_failure_is_never_certain():
+    rng = stream(4, "failure")
+    u = rng.random((60, 2))
+    p = failure_probability(u, u[:, 0] < 0.5, rng)(np.array([[0.1, 0.5], [0.9, 0.5]]))
+    assert p.tolist() == pytest.approx([1 / 62, 61 / 62])
+
+
+def test_an_estimation_states_both_readings(tmp_path: Path):
+    """Half of the space fails, and most of the critical region: x1 + x2 > 3 sqrt(2) where x1 - 0.5 x2 > 0."""
+    scenario = sbt.Scenario(
+        "half", inputs=[sbt.Parameter(name, -np.inf, np.inf, "", sbt.Normal(0.0, 1.0)) for name in ("a", "b")],
+        evaluate=lambda v, _: {"y": np.nan if v["a"] > 0.5 * v["b"] else 3.0 - (v["a"] + v["b"]) / np.sqrt(2.0)},
+        requirement=sbt.Requirement("y", high=0.0),
+    )  # fmt: skip
+    z = stream(5, "truth").standard_normal((2_000_000, 2))
+    fails, critical = z[:, 0] > 0.5 * z[:, 1], z.sum(axis=1) > 3.0 * np.sqrt(2.0)
+    safe, worst = (critical & ~fails).mean(), (critical | fails).mean()
+    result = sbt.run(
+        campaign="estimation", scenario=scenario, seed=1, budget=90, executor="serial", store=tmp_path / "s", report=False,
+        stop={"cov": None},
+    )  # fmt: skip
+    for found in (result.conclusion, result.estimate()):
+        assert found.low <= safe <= found.failed_as_safe + found.failed_as_critical
+        assert found.failed_as_safe == pytest.approx(safe, rel=0.5)
+        assert found.failed_as_critical == pytest.approx(worst, rel=0.25)
+        assert found.low > 0.0
+        assert worst <= found.high < 1.0
 
 
 def test_runs_that_fail_for_no_reason_do_not_stop_the_search(tmp_path: Path):

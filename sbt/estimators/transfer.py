@@ -62,7 +62,7 @@ class Transfer:
 
 @runtime_checkable
 class _LeavesOut(Protocol):
-    def leave_one_out(self, y: Vector) -> Prediction:
+    def leave_one_out(self, u: Points, y: Vector) -> Prediction:
         """Return predictions of the rows that it was fitted to, each without its own."""
         ...
 
@@ -105,11 +105,11 @@ def _slope(old: Vector, t: Vector) -> float:
 
 def _score(metamodel: Metamodel, u: Points, rest: Vector, rng: np.random.Generator) -> tuple[float, Predictor]:
     """Return the mean log density of each row as predicted from the others, and the metamodel of all."""
-    u, rest = without_repetitions(u, rest)  # as a process learns them
+    u, rest = without_repetitions(u, rest)  # each input counts once
     with named_errors(metamodel, len(rest)):
         predict = metamodel.fit(u, rest, rng)
     if isinstance(predict, _LeavesOut):
-        left = predict.leave_one_out(rest)
+        left = predict.leave_one_out(u, rest)
         return _log_density(left, rest), predict
     fold = rng.permutation(len(rest)) % _FOLDS
     found = np.empty(len(rest))

@@ -121,7 +121,7 @@ class Auto:
         """Return the process alone, or the mixture where it is better for where the runs fell, at the edge and over the space."""
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
         process = self.simplest.fit(u, y, rng)
-        own = bins.log_score(process.leave_one_out(y), y)
+        own = bins.log_score(process.leave_one_out(u, y), y)
         shares = cell_shares(u, rng)
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             left = f"of {n} rows, each predicted from all others, {-own.mean():.1g}: others could add no more"

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import ndtr
 
@@ -91,20 +92,48 @@ class GaussianProcessPredictor:
             chunks = [host(alpha @ self.hyper.covariance(part, rows).T) for part in at]
         return np.asarray(self.shift + self.scale * (self.centre + np.concatenate([np.empty(0), *chunks])))
 
-    def leave_one_out(self, y: Vector) -> Prediction:
-        """Return the prediction of each row's y (n,) from all other rows, the hyperparameters kept; cubic in n.
+    def leave_one_out(self, u: Points, y: Vector) -> Prediction:
+        """Return the prediction of each row y (n,) at u (n, d) from all other rows, the hyperparameters kept; cubic in n.
+
+        The rows are those that were given to the fit. Of repetitions that it learned once, each is predicted from the
+        other inputs; what it did not learn (the validation rows of the paper's preset) is predicted from all that it did.
 
         Source:
             Rasmussen & Williams (2006), eqs. (5.10)-(5.12).
         """
         with single_threaded():
             variance = 1.0 / inverse_diagonal(self._placed[1])
-        relative = self.spread(self.u) if self.spread is not None else np.ones(len(y))
-        mean, k = y - self.scale * self.alpha * variance, len(self.widths)
+        relative = self.spread(self.u) if self.spread is not None else np.ones(len(self.u))
+        at = self._learned_as(u, y)
+        own, k = at >= 0, len(self.widths)
+        mean, sigma, noise = np.empty(len(y)), np.empty(len(y)), np.empty(len(y))
+        mean[own] = y[own] - self.scale * (self.alpha * variance)[at[own]]
+        sigma[own] = self.scale * np.sqrt(variance)[at[own]]
+        noise[own] = self.scale * np.sqrt(self.hyper.noise * relative)[at[own]]
+        if not own.all():
+            others = self(u[~own])
+            mean[~own], noise[~own] = others.mean[0], others.noise
+            sigma[~own] = others.std[0] / self.widths[0]
         return Prediction(
-            mean=np.repeat(mean[None], k, axis=0), std=self.widths[:, None] * (self.scale * np.sqrt(variance)),
-            weight=np.full(k, 1.0 / k), noise=self.scale * np.sqrt(self.hyper.noise * relative),
+            mean=np.repeat(mean[None], k, axis=0), std=self.widths[:, None] * sigma, weight=np.full(k, 1.0 / k), noise=noise,
         )  # fmt: skip
+
+    def _learned_as(self, u: Points, y: Vector) -> NDArray[np.intp]:
+        """Return (n,) which of the learned rows each row of u (n, d) and y (n,) is, -1 where it was not learned."""
+        if np.array_equal(u, self.u):
+            return np.arange(len(u))
+        group = np.unique(np.vstack([self.u, u]), axis=0, return_inverse=True)[1].reshape(-1)
+        left: dict[int, list[int]] = {}
+        for row, g in enumerate(group[: len(self.u)]):
+            left.setdefault(int(g), []).append(row)
+        found, values = np.full(len(u), -1, dtype=np.intp), dict[int, tuple[int, float]]()
+        for row in range(len(u))[::-1]:  # the last ones are learned where not all are
+            g = int(group[len(self.u) + row])
+            if left.get(g):
+                values[g] = left[g].pop(), float(y[row])
+            if g in values and values[g][1] == y[row]:
+                found[row] = values[g][0]
+        return found
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) lower and (n,) upper bounds of P(y in M_c), from the mean and a bound of the variance.
