@@ -2,7 +2,7 @@
 
     python benchmarks/failing_estimates.py [--seeds 20] [--problems overlap_d2_half,random_d3_tenth] [--table runs/failing.jsonl]
 
-Campaigns with default settings, `stop: {cov: null}`, 124 runs. The probability of both readings is known: P(critical, and the run
+Campaigns with default settings, `stop: {cov: null}`, 150 runs. The probability of both readings is known: P(critical, and the run
 gives a metric) counts failed runs as safe, P(critical, or the run fails) as critical. Finished cells are lines of the table: run
 again to go on; `--show` only prints what is there.
 """
@@ -28,7 +28,7 @@ import sbt
 from sbt.seeds import stream
 from sbt.testbeds import find
 
-RUNS = 124
+RUNS = 150
 _BETA = 3.0
 """Of the hyperplane beyond which runs are critical: P = 1.3e-3."""
 Fails = Callable[[np.ndarray, int], bool]
