@@ -141,5 +141,5 @@ def _check_choices(ego: dict[str, Any] | None, step: float | None, isolation: st
         raise InputError(f"--ego needs kind=NAME, but got {', '.join(ego)}")
     if step is not None and not 0 < step < float("inf"):
         raise InputError(f"--step must be > 0 s, but got {step}")
-    if isolation not in ("auto", "fresh", "reuse", "replicas"):
-        raise InputError(f"--isolation must be auto, fresh, reuse or replicas, but got '{isolation}'")
+    if isolation not in ("auto", "fresh", "reuse", "replicas", "snapshot"):
+        raise InputError(f"--isolation must be auto, fresh, reuse, replicas or snapshot, but got '{isolation}'")

@@ -198,9 +198,10 @@ class ExecutorChoice(_Strict):
         default=None, description="Of dask's scheduler, such as tcp://host:8786; null: dask workers on this machine."
     )
     timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped; .inf: never.")
-    isolation: Literal["auto", "fresh", "reuse", "replicas"] = Field(
+    isolation: Literal["auto", "fresh", "reuse", "replicas", "snapshot"] = Field(
         default="auto",
-        description="SUMO is loaded per run (fresh) or kept (reuse, replicas); auto: the fastest allowed.",
+        description="SUMO is loaded per run (fresh), kept (reuse, replicas), or its traffic warmed up once (snapshot); auto: the "
+        "fastest allowed, snapshot where that spares much.",
     )
 
     @field_validator("address")

@@ -33,6 +33,7 @@ from sbt.sumo.friction import Friction, has_friction
 from sbt.sumo.guided import Participant
 from sbt.sumo.recorded import RecordedTraffic
 from sbt.sumo.recorder import RecordingSettings
+from sbt.sumo.snapshot import WarmUp
 from sbt.sumo.template import placeholders
 from sbt.sumo.user_simulation import Loop, UserSimulation, step_until_over
 
@@ -143,6 +144,7 @@ class _Builder:
                 tuple(one.further() for one in further if one is not None),
             ),
             files, loop, self._folder, model.step_length, profiles=tuple(self._profiles.values()), participants=moved,
+            warm=self._warm_up(), space=space or ParameterSpace(()),
         ))  # fmt: skip
         problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
@@ -150,6 +152,10 @@ class _Builder:
             name, space or ParameterSpace(()), requirement or Requirement("", high=0.0), simulation, metrics,
             model.description, roles=Roles(model.ego.id, None),
         )  # fmt: skip
+
+    def _warm_up(self) -> WarmUp | None:
+        entry = self._model.warm_up
+        return None if entry is None else WarmUp(entry.end, entry.seeds)
 
     def _space(self) -> ParameterSpace | None:
         """Return the inputs with their correlation, constraints and features."""

@@ -174,6 +174,22 @@ class MetricEntry(_Open):
         return value
 
 
+class WarmUpEntry(_Strict):
+    """Traffic that is warmed up once for many runs."""
+
+    until: Annotated[float, Field(gt=0, allow_inf_nan=False)] | Literal["auto"] = Field(
+        default="auto", description="Time (s) at which runs begin; auto: shortly before the ego and all that inputs change."
+    )
+    seeds: int | None = Field(
+        default=None, ge=1, description="Number of warm-ups; null: one for 25 runs, at most 8; of an estimation 20."
+    )
+
+    @property
+    def end(self) -> float | None:
+        """The time, None for auto."""
+        return None if self.until == "auto" else float(self.until)
+
+
 class ScenarioModel(_Strict):
     """A logical scenario of the user's own files or loop."""
 
@@ -203,6 +219,9 @@ class ScenarioModel(_Strict):
     )
     step_length: float | None = Field(
         default=None, gt=0, allow_inf_nan=False, description="SUMO's step (s); null: the files', or 0.1."
+    )
+    warm_up: WarmUpEntry | None = Field(
+        default=None, description="Traffic is warmed up once; null: where that spares much and changes no input's effect."
     )
     metrics: Annotated[tuple[Annotated[MetricEntry, _under("kind")], ...], Field(strict=False)] = Field(
         default=(), description="What is measured."

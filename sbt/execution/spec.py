@@ -19,6 +19,7 @@ from sbt.execution.exchange import with_drivers
 from sbt.metrics.conflict_types import conflict_type
 from sbt.metrics.pairwise import in_traffic, without_overtaking
 from sbt.plugins import kept, load
+from sbt.problem.isolation import Isolation, Warmable
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 
@@ -35,7 +36,8 @@ class ScenarioSpec:
         name: an installed scenario, or `file.py:NAME`; where the scenario is carried only for people.
         folder: where a relative file is looked up; make it absolute before it goes to another process.
         ego: the AV under test; None: the scenario's own.
-        isolation: auto, fresh, reuse or replicas; scenarios without SUMO ignore it.
+        isolation: auto, fresh, reuse, replicas or snapshot; scenarios without SUMO ignore it.
+        isolated: the isolation that was decided for a campaign; None: as `isolation` says and the scenario's conditions are.
         step_length: simulation step (s); None: the scenario's own.
         formulas: further formulas, the metric that measures each and its text; they change no requirement.
         friction: smallest and largest coefficient of friction of the roads, an input where they differ; None: the scenario's own.
@@ -60,6 +62,7 @@ class ScenarioSpec:
     drivers: tuple[Mapping[str, Any], ...] = ()
     friction: tuple[float, float] | None = None
     formulas: tuple[tuple[str, str], ...] = ()
+    isolated: Isolation | None = None
 
     def resolve(self) -> LogicalScenario:
         """Return the scenario; loaded once per process and specification.
@@ -108,6 +111,8 @@ class ScenarioSpec:
             low, high = self.friction
             yield ("simulation", "friction"), partial(LogicalScenario.with_friction, low=low, high=high)
         yield ("executor", "isolation"), partial(LogicalScenario.configured, isolation=self.isolation)  # may depend on the ego
+        if self.isolated is not None:
+            yield ("executor", "isolation"), partial(_isolated, isolation=self.isolated)
 
 
 def _loaded(name: str, folder: Path, carried: bytes) -> LogicalScenario:
@@ -117,6 +122,12 @@ def _loaded(name: str, folder: Path, carried: bytes) -> LogicalScenario:
         hint = "; a TraCI loop goes into a scenario.yaml: simulate: file.py:NAME" if callable(scenario) else ""
         raise PluginError(f"a scenario must be a LogicalScenario, but '{name}' is a {type(scenario).__name__}{hint}")
     return scenario
+
+
+def _isolated(scenario: LogicalScenario, isolation: Isolation) -> LogicalScenario:
+    """Return the scenario at this isolation level, where its traffic can be warmed up at all."""
+    simulate = scenario.simulate
+    return replace(scenario, simulate=simulate.isolated(isolation)) if isinstance(simulate, Warmable) else scenario
 
 
 @kept

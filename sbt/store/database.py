@@ -64,7 +64,7 @@ class PlannedRun:
         log_q: log density that they were drawn with; None: they were chosen.
         seed: where it was chosen for what it draws; None: it is drawn.
         level: of fidelity, 0 the scenario's own.
-        warm_up: number of the warm-up to start from.
+        warm_up: number of the warm-up to start from; None: that of its seed, where the campaign has warm-ups.
     """
 
     stage: str
@@ -253,12 +253,14 @@ class Store:
         """
         start, names = self.planned, self._known.names
         places = range(start, start + len(runs)) if indices is None else indices
+        warm_ups = int(self.configuration.get("isolation", {}).get("seeds", 0))
         rows = []
         for k, (index, run) in enumerate(zip(places, runs, strict=True)):
             inputs = _dump([run.inputs[name] for name in names])
             chosen, seed = run.seed is not None, seeds[k] if run.seed is None else run.seed
             log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
-            row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, run.warm_up, log_q)
+            warm_up = int(seed) % warm_ups if warm_ups and run.warm_up is None else run.warm_up
+            row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, warm_up, log_q)
             rows.append((*row, _checksum(*row), PLANNED))
         text = _dump(proposal if isinstance(proposal, dict) else to_json(proposal))
         with self._transaction():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from sbt.errors import RunError
@@ -13,10 +14,12 @@ __all__ = ["traci_connection"]
 
 
 @contextlib.contextmanager
-def traci_connection(traci: Any, command: list[str]) -> Iterator[Any]:
-    """Start a SUMO program, provide traci connected to it, and close it in the end."""
+def traci_connection(traci: Any, command: list[str], state: Path | None = None) -> Iterator[Any]:
+    """Start a SUMO program, load a saved state where one is given, provide traci connected to it, and close it in the end."""
     try:
         traci.start(command)
+        if state is not None:
+            traci.simulation.loadState(str(state))
         yield traci
     except (traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError) as error:
         raise RunError(Status.FAILED, f"SUMO: {error}") from None

@@ -88,7 +88,7 @@ def _spans(data: bytes) -> Iterator[tuple[str, str, int, int]]:
         if open_elements and tag == open_elements[-1][1]:
             name, _, first = open_elements.pop()
             last = parser.CurrentByteIndex  # of <trip .../> already its end, otherwise the beginning of </trip>
-            found.append((name, tag, first, data.index(b">", last) + 1 if data.startswith(b"</", last) else last))
+            found.append((name, tag, first, data.index(b">", last) + 1 if data.startswith(b"</" + tag.encode(), last) else last))
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.Parse(data, True)

@@ -7,10 +7,12 @@ import os
 import shutil
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sbt.errors import InputError
+from sbt.problem.isolation import Isolation
 from sbt.sumo.session import session
 
 __all__ = ["gui_program", "run_in_gui"]
@@ -53,7 +55,7 @@ def run_in_gui(
     """Run one concrete scenario in a separate SUMO process and return its trace.
 
     Args:
-        simulate: a simulation that can be `configured` with isolation `fresh`.
+        simulate: a simulation that can be `configured` with isolation `fresh`, or begins with warmed traffic.
         values: its inputs.
         seed: of the run.
         program: sumo-gui, or sumo.
@@ -91,9 +93,17 @@ def run_in_gui(
     client = _Override(traci, simulation=_Override(traci.simulation, step=step), start=start, simulationStep=step)
     with session().using(client):
         try:
-            trace = simulate.configured(isolation="fresh")(values, seed)
+            trace = _here(simulate)(values, seed)
             time.sleep(linger if has_window else 0.0)
             return trace
         finally:
             if traci.isLoaded():
                 traci.close()
+
+
+def _here(simulate: Any) -> Any:
+    """Return the simulation as it runs through the client of this process, and to the same trace."""
+    isolation = getattr(simulate, "isolation", None)
+    if isinstance(isolation, Isolation):
+        return simulate.isolated(replace(isolation, forking=False))
+    return simulate.configured(isolation="fresh")

@@ -1,12 +1,14 @@
 """The SUMO simulation of this process; every error of SUMO is raised as a plain `RunError`.
 
 libsumo has one simulation per process, its exceptions cannot be pickled, and the cause of an error is
-often written to file descriptor 2 only. This module handles all three. There are three isolation levels:
+often written to file descriptor 2 only. This module handles all three. There are four isolation levels:
 
 - `fresh`: SUMO is loaded again for every run; always valid.
 - `reuse`: one simulation keeps running, actors are removed and inserted again. Bit-identical to `fresh`
   where SUMO draws no random numbers and nothing else has a state to reset.
 - `replicas`: like `reuse`, in a simulation with several copies of the network and one run in each.
+- `snapshot`: the simulation is loaded once, and every run is a child of this process that begins with a saved state;
+  or it is loaded for every run, and the state then. Both give the same run (`sbt.sumo.warming`).
 """
 
 from __future__ import annotations
@@ -149,8 +151,14 @@ class Session:
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
 
     @contextlib.contextmanager
-    def run(self, setup: Loadable, seed: int, isolation: str) -> Iterator[Any]:
+    def run(self, setup: Loadable, seed: int, isolation: str, state: Path | None = None) -> Iterator[Any]:
         """Provide libsumo with an empty simulation of this setup, for one run or for one run per replica.
+
+        Args:
+            setup: what is loaded.
+            seed: of the run.
+            isolation: level; all but `fresh` go on with the simulation that is there, if it is of this setup.
+            state: what SUMO has saved, loaded then.
 
         Raises:
             RunError: SUMO raised an error; the reason includes what it wrote to file descriptor 2.
@@ -158,6 +166,8 @@ class Session:
         with self._captured():
             try:
                 self._load(setup, seed, isolation)
+                if state is not None:
+                    self._sumo.simulation.loadState(str(state))
                 yield self._sumo
                 if self._setup is not None:
                     self.remove()
@@ -167,6 +177,19 @@ class Session:
                     raise RunError(Status.FAILED, self._reason(error)) from None
                 self._flush()
                 raise
+
+    def hold(self, setup: Loadable) -> None:
+        """Load a simulation for children of this process to go on with, where it is not there yet.
+
+        Raises:
+            RunError: SUMO raised an error.
+        """
+        with self.run(setup, 0, "snapshot"):
+            pass
+
+    def begin_child(self) -> None:
+        """In a child of this process: keep apart what SUMO writes there."""
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
 
     def close(self) -> None:
         """End the simulation that is still loaded: only then the files that SUMO writes are complete."""

@@ -145,15 +145,20 @@ class Template:
         """
         if not self.copied:
             return self.path
-        pieces, at = [], 0
-        for part in self.parts:
-            pieces += [self.data[at : part.start], self._replacement(part, values, folder)]
-            at = part.end
         target = folder / f"{abs(hash(self.path)):x}" / self.path.name.removesuffix(".gz")
         target.parent.mkdir(exist_ok=True)
         target.unlink(missing_ok=True)  # the previous simulation may still have the old copy open
-        target.write_bytes(b"".join([*pieces, self.data[at:]]))
+        target.write_bytes(self.excerpt(self.data, 0, len(self.data), values, folder))
         return target
+
+    def excerpt(self, data: bytes, start: int, end: int, values: Values, folder: Path) -> bytes:
+        """Return some bytes of the file, which are `data`, with everything in them replaced as a run in `folder` needs it."""
+        pieces, at = [], start
+        for part in self.parts:
+            if start <= part.start and part.end <= end:
+                pieces += [data[at : part.start], self._replacement(part, values, folder)]
+                at = part.end
+        return b"".join([*pieces, data[at:end]])
 
     def _replacement(self, part: _Part, values: Values, folder: Path) -> bytes:
         if part.placeholder is not None:

@@ -17,47 +17,41 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sbt import interruption
 from sbt.errors import InputError, RunError
+from sbt.problem.isolation import SNAPSHOT, Isolation
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.problem.profile import Profile
+from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
-from sbt.seeds import stream
 from sbt.sumo.connecting import traci_connection
-from sbt.sumo.departures import DepartureMonitor, RequestedDeparture, WaitingEgo, number_or_none, requested_departures
 from sbt.sumo.ego import Ego
-from sbt.sumo.files import Launch, SumoFiles, options_of_command
-from sbt.sumo.foreign import check_not_stepped, error_in_loop, place_in_loop, started_another
-from sbt.sumo.formatting import plain, plain_values
+from sbt.sumo.files import SumoFiles
+from sbt.sumo.forking import in_fork
+from sbt.sumo.formatting import plain_values
 from sbt.sumo.friction import Friction
-from sbt.sumo.guided import Motion, Participant
+from sbt.sumo.guided import Participant
 from sbt.sumo.levels import levels_of
-from sbt.sumo.messages import explained
-from sbt.sumo.phases import PHASES, Stopwatch
-from sbt.sumo.recorder import Recorder, RecordingSettings, RunEnded
+from sbt.sumo.phases import Stopwatch
+from sbt.sumo.recorder import RecordingSettings, RunEnded
 from sbt.sumo.session import scratch_folder, session
-from sbt.sumo.several import Recorders, further_recorders
+from sbt.sumo.snapshot import CAN_FORK, NoSnapshot, Snapshot, WarmUp, snapshot_of
+from sbt.sumo.traci_proxy import Loop, TraciProxy, step_until_over
+from sbt.sumo.warming import WarmedFiles, warmed_files
 
 __all__ = ["Loop", "TraciProxy", "UserSimulation", "step_until_over"]
 
-Loop = Callable[[Any, Values, np.random.Generator], object]
-"""The user's `simulate(sumo, values, rng)`."""
-Connect = Callable[[Launch], AbstractContextManager[Any]]
-"""Starts SUMO and provides its client module: libsumo or traci."""
-
-
-def step_until_over(sumo: Any, values: Values, rng: np.random.Generator) -> None:
-    """Step until the run is over: the loop of a scenario without one."""
-    while True:
-        sumo.simulationStep()
+WARM_UPS = 8
+"""Warm-ups of a scenario that states no number, outside campaigns."""
+_GRACE = 1.0
+"""Time by which a run may exceed its limit before its process is ended (s): most runs stop themselves."""
+Connect = Callable[[SumoFiles, Values], AbstractContextManager[Any]]
+"""Starts SUMO with the files of a run and provides its client module: libsumo or traci."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +67,10 @@ class UserSimulation:
         timeout: wall-clock limit of a run (s); None: none.
         profiles: curves that inputs shape; the loop finds them among its values by name, as functions of time (s).
         participants: road users that this package moves.
+        level: the isolation level that is asked for; None: snapshot where its conditions hold, else fresh.
+        warm: the warm-up that is asked for; None: none.
+        space: of the inputs, for the conditions of a snapshot.
+        decided: the isolation of a campaign; None: as the conditions are.
 
     Raises:
         InputError: a step is not a whole number of milliseconds, or neither files nor a loop are given.
@@ -87,6 +85,10 @@ class UserSimulation:
     isolations: tuple[str, ...] = ("fresh",)
     profiles: tuple[Profile, ...] = ()
     participants: tuple[Participant, ...] = ()
+    level: str | None = None
+    warm: WarmUp | None = None
+    space: ParameterSpace = field(default_factory=lambda: ParameterSpace(()))
+    decided: Isolation | None = None
 
     def __post_init__(self) -> None:
         if self.files is None and self.loop is step_until_over:
@@ -104,14 +106,81 @@ class UserSimulation:
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
     ) -> UserSimulation:
         """Return a copy with another driver of the ego or another step length."""
-        if isolation not in (None, "auto", "fresh"):
-            raise InputError(f"executor.isolation must be auto or fresh here, but got '{isolation}'")
+        if isolation not in (None, "auto", "fresh", SNAPSHOT):
+            raise InputError(f"executor.isolation must be auto, fresh or snapshot here, but got '{isolation}'")
+        level = self.level if isolation is None else None if isolation == "auto" else isolation
         recording = self.recording
         if ego is not None:
             driver = Ego.of(**ego)
             further = tuple(one.with_driver(driver) for one in recording.further)
             recording = replace(recording, ego=recording.ego.with_driver(driver), further=further)
-        return replace(self, recording=recording, step=self.step if step_length is None else step_length)
+        made = replace(self, recording=recording, step=self.step if step_length is None else step_length, level=level)
+        if isolation == SNAPSHOT:
+            made.isolation_in(made.space, WARM_UPS)  # refuses what cannot be
+        return made
+
+    def isolation_in(self, space: ParameterSpace, seeds: int) -> Isolation:
+        """Return the isolation level for the inputs of a space; see `sbt.problem.isolation.Warmable`."""
+        if self.level == "fresh":
+            return Isolation(why="it is asked for")
+        try:
+            divided = self._divided(space)
+        except NoSnapshot as error:
+            if self.level == SNAPSHOT or self.warm is not None:
+                asked = "warm_up" if self.warm is not None else "executor.isolation snapshot"
+                raise InputError(f"{asked} needs traffic that can be warmed up apart from the inputs, but {error}") from None
+            return Isolation(why=str(error))
+        stated = None if self.warm is None else self.warm.seeds
+        return Isolation(SNAPSHOT, divided.until, seeds if stated is None else stated)
+
+    def isolated(self, isolation: Isolation) -> UserSimulation:
+        """Return a copy that runs at this level."""
+        return replace(self, decided=isolation)
+
+    @cached_property
+    def isolation(self) -> Isolation:
+        """The isolation level of the runs."""
+        return self.isolation_in(self.space, WARM_UPS) if self.decided is None else self.decided
+
+    def _divided(self, space: ParameterSpace, until: float | None = None) -> Snapshot:
+        """Return how traffic is divided between warm-ups and runs.
+
+        Raises:
+            NoSnapshot: it cannot be.
+        """
+        if self.files is None or self.loop is not step_until_over:
+            raise NoSnapshot("a loop of one's own drives the simulation from its beginning")
+        if self.participants:
+            raise NoSnapshot("actors, recorded road users and friction act from the beginning of the simulation")
+        if math.isnan(self.step_length):
+            raise NoSnapshot("the step depends on an input")
+        egos = tuple(one.id for one in (self.recording.ego, *self.recording.further))
+        asked = WarmUp() if self.warm is None and self.level == SNAPSHOT else self.warm
+        return snapshot_of(self.files, egos, space, self.step_length, asked, until)
+
+    @cached_property
+    def _warmed(self) -> WarmedFiles:
+        """The files of warm-ups and runs.
+
+        Raises:
+            InputError: the files no longer allow the warm-up that was decided.
+        """
+        try:
+            divided = self._divided(self.space, self.isolation.until)
+        except NoSnapshot as error:
+            raise InputError(f"runs must begin at t = {self.isolation.until:g} s with warmed traffic, but {error}") from None
+        if self.files is None:
+            raise InputError("a simulation must have files to be warmed up, but has none")
+        return warmed_files(self.files, divided, self.step)
+
+    def warmed_up(self, snapshot: int) -> bool:
+        """Return whether the state of a warm-up is there."""
+        return self.isolation.warm and self._warmed.path_of(snapshot, self.isolation.states).is_file()
+
+    def warm_up(self, snapshot: int) -> None:
+        """Make the state of one warm-up where it is not there yet."""
+        if self.isolation.warm:
+            self._warmed.state(snapshot, self.isolation.states)
 
     def with_friction(self, low: float, high: float) -> UserSimulation:
         """Return a copy on roads of this friction.
@@ -146,18 +215,59 @@ class UserSimulation:
             RunError: SUMO or the loop fails, a vehicle departs differently than requested, the ego is absent
                 or leaves, or the run takes too long.
         """
-        return self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"), Stopwatch())
+        return self._simulated(values, seed)[0]
 
     def timed(self, values: Values, seed: int) -> tuple[Trace | RunError, dict[str, float]]:
         """Return what a call gives, its error too, and the CPU seconds of each phase (`sbt.sumo.phases`)."""
         watch = Stopwatch()
-        result: Trace | RunError
         try:
-            result = self._run(values, seed, lambda launch: session().run(launch, seed, "fresh"), watch)
+            return self._simulated(values, seed)
         except RunError as error:
-            result = error
+            watch.enter(watch.phase)
+            return error, watch.seconds
+
+    def _simulated(self, values: Values, seed: int) -> tuple[Trace, dict[str, float]]:
+        """Return the trace of a run, and its CPU seconds by phase."""
+        connect: Connect = partial(self._loaded, seed=seed)
+        if self.isolation.warm:
+            state, warmed = self._state(seed), self._warmed
+            forking = CAN_FORK and self.isolation.forking
+            isolation = SNAPSHOT if forking else "fresh"
+            connect = partial(self._warm, start=lambda: session().run(warmed.launch, 0, isolation, state))
+            if forking:
+                session().hold(warmed.launch)
+                limit = None if self.timeout is None else self.timeout + _GRACE
+                return in_fork(partial(self._in_child, values, seed, connect), limit, "a run")
+        watch = Stopwatch()
+        trace = self._run(values, seed, connect, watch)
         watch.enter(watch.phase)
-        return result, watch.seconds
+        return trace, watch.seconds
+
+    def _in_child(self, values: Values, seed: int, connect: Connect) -> tuple[Trace, dict[str, float]]:
+        """Run in a child of the process that holds the simulation."""
+        session().begin_child()
+        self._warmed.begin_child()
+        watch = Stopwatch()
+        trace = self._run(values, seed, connect, watch)
+        watch.enter(watch.phase)
+        return trace, watch.seconds
+
+    def _state(self, seed: int) -> Path:
+        """Write the state that a run begins with, and return its path."""
+        warmed, chosen = self._warmed, self.isolation
+        return warmed.state(seed % chosen.seeds, chosen.states).write(seed, warmed.folder / "run.state.xml")
+
+    def _loaded(self, files: SumoFiles, values: Values, *, seed: int) -> AbstractContextManager[Any]:
+        """Load the files of a run."""
+        return session().run(files.launch(values, scratch_folder(), self.step), seed, "fresh")
+
+    def _warm(
+        self, files: SumoFiles, values: Values, *, start: Callable[[], AbstractContextManager[Any]]
+    ) -> AbstractContextManager[Any]:
+        """Begin a run with warmed traffic."""
+        own = files.additional[len(self.files.additional) if self.files is not None else 0 :]
+        self._warmed.begin(values, own)
+        return start()
 
     def warnings(self) -> tuple[str, ...]:
         """Return SUMO's warnings about the files in the last run of this process, each once, and that on missing heights."""
@@ -178,7 +288,35 @@ class UserSimulation:
         Returns:
             The trace, identical to that of a call.
         """
-        return self._run(values, seed, lambda launch: traci_connection(traci, [*program, *launch.command(seed)]), Stopwatch())
+        if not self.isolation.warm:
+
+            def load(files: SumoFiles, given: Values) -> AbstractContextManager[Any]:
+                launch = files.launch(given, scratch_folder(), self.step)
+                return traci_connection(traci, [*program, *launch.command(seed)])
+
+            return self._run(values, seed, load, Stopwatch())
+        state, launch = self._state(seed), self._warmed.launch
+        start = partial(traci_connection, traci, [*program, *launch.command(0)], state)
+        return self._run(values, seed, partial(self._warm, start=start), Stopwatch())
+
+    @property
+    def outputs(self) -> Path:
+        """The folder that holds what the last run in this process wrote."""
+        return self._warmed.folder if self.isolation.warm else scratch_folder()
+
+    def write_files(self, values: Values, seed: int, folder: Path) -> None:
+        """Write the SUMO files of a run, placeholders filled, and a `run.sumocfg` that any SUMO reads.
+
+        What a controller or a loop does in the run is not in them; files without placeholders are named where they are.
+        """
+        files = self.files_of_run(values, seed)
+        if not self.isolation.warm:
+            files.launch(plain_values(values), folder, self.step).write(seed, folder / "run.sumocfg")
+            return
+        state = self._state(seed)
+        own = files.additional[len(self.files.additional) if self.files is not None else 0 :]
+        self._warmed.begin(plain_values(values), own)
+        self._warmed.write(state, folder)
 
     def files_of_run(self, values: Values, seed: int) -> SumoFiles:
         """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.
@@ -209,7 +347,7 @@ class UserSimulation:
                 stack.enter_context(contextlib.chdir(self.folder))
 
                 def start(files: SumoFiles) -> Any:
-                    return stack.enter_context(connect(files.launch(given, scratch_folder(), self.step)))
+                    return stack.enter_context(connect(files, given))
 
                 proxy = TraciProxy(self, given, seed, start, watch)
                 if self.files is not None:
@@ -218,181 +356,3 @@ class UserSimulation:
                 return proxy.recorder.trace(ended)
         except RunError as error:
             raise RunError(error.status, error.reason if proxy is None else proxy.explained(error.reason)) from None
-
-
-class TraciProxy:
-    """SUMO's client module as the user's loop sees it; starting, stepping and closing are intercepted.
-
-    Args:
-        simulation: what runs.
-        values: inputs of the run.
-        seed: of the run.
-        connect: starts SUMO with files and returns its client module.
-        watch: of the phases of the run.
-    """
-
-    def __init__(
-        self, simulation: UserSimulation, values: Values, seed: int, connect: Callable[[SumoFiles], Any],
-        watch: Stopwatch,
-    ):  # fmt: skip
-        self._user_simulation, self._values, self._seed, self._connect = simulation, values, seed, connect
-        self._watch = watch
-        self._files: SumoFiles | None = None
-        self._time = 0.0
-        self._module: Any = None
-        self._recorder: Recorder | Recorders | None = None
-        self._motions: tuple[Motion, ...] = ()
-        self.simulation = _SimulationProxy(self)
-        self.vehicle, self.person = _CommandProxy(self, "vehicle"), _CommandProxy(self, "person")
-        self._error_place = ""
-
-    def explained(self, reason: str) -> str:
-        """Return the reason of an error with its place in the files and in the loop, and what to change."""
-        return f"{reason if self._files is None else explained(reason, self._files)}{self._error_place}"
-
-    def __getattr__(self, name: str) -> Any:
-        """Return the attribute of SUMO's client module."""
-        if self._module is None:
-            raise RunError(Status.FAILED, f"sumo.start([...]) must be called before sumo.{name}, but was not")
-        return getattr(self._module, name)
-
-    @property
-    def recorder(self) -> Recorder | Recorders:
-        """The recorder of the run."""
-        if self._recorder is None:
-            why = started_another(self._user_simulation.loop)
-            raise RunError(Status.FAILED, f"a loop must call sumo.start([...]), but it did not{why}")
-        return self._recorder
-
-    def start(self, command: Sequence[str], *_: Any, **__: Any) -> tuple[int, str]:
-        """Start SUMO as `traci.start` does; the program's name, ports and labels are ignored."""
-        if self._module is not None:
-            raise RunError(
-                Status.FAILED, "sumo.start must be called once, by the loop or (files) by the scenario, but was called again"
-            )
-        folder = self._user_simulation.folder
-        self.start_files(SumoFiles.of(options_of_command(list(command)[1:], folder), folder, "sumo.start"))
-        version: tuple[int, str] = self.__getattr__("getVersion")()
-        return version
-
-    def start_files(self, files: SumoFiles) -> None:
-        """Fill the placeholders of the files, start SUMO with them, and begin to record."""
-        simulation = self._user_simulation
-        ego = simulation.recording.ego
-        vehicle_types = "".join(one.vehicle_type() or "" for one in (ego, *simulation.recording.further))
-        if vehicle_types:
-            path = scratch_folder() / "ego.add.xml"
-            path.write_text(f"<additional>{vehicle_types}</additional>")
-            files = replace(files, additional=(*files.additional, path))
-        requested = requested_departures(files, self._values, ego.id)
-        self._files = files
-        self._module = self._connect(files)
-        self._time = float(self._module.simulation.getTime())
-        waiting = WaitingEgo(ego.id, ego.delay, simulation.recording.wait)
-        departures = DepartureMonitor(self._module, waiting, requested, files, self._values)
-        rng = stream(self._seed, "ego")
-        first = Recorder(self._module, simulation.recording, rng, departures, simulation.timeout)
-        further = further_recorders(self._module, simulation.recording, files, self._values, self._seed)
-        self._recorder = Recorders(first, further) if further else first
-        self._motions = tuple(p.begin(self._module, self._values) for p in simulation.participants)
-        self._watch.enter(PHASES[1])
-
-    def simulationStep(self, until: float = 0.0) -> None:  # noqa: N802  (SUMO's name)
-        """Make one step, or all steps until a time (s), and record each."""
-        while True:
-            recorder = self.recorder
-            recorder.before_step()
-            check_not_stepped(self._module, self._time, self._user_simulation.loop)
-            for motion in self._motions:
-                motion.before_step(recorder.scenario_time)
-            self._module.simulationStep()
-            self._time = float(self._module.simulation.getTime())
-            if self._motions:
-                recorder.place({name: state for motion in self._motions for name, state in motion.after_step().items()})
-            recorder.after_step()
-            if self._watch.phase != PHASES[2] and recorder.scenario_time is not None:
-                self._watch.enter(PHASES[2])
-            if self._time >= until - 1e-9:
-                return
-
-    def close(self, *_: Any) -> None:
-        """Do nothing: SUMO is closed at the end of the run."""
-
-    def run_loop(self) -> str:
-        """Run the loop and return why it ended.
-
-        Raises:
-            RunError: the loop raised an error. SUMO's own errors are passed on to the context that started SUMO.
-        """
-        loop = self._user_simulation.loop
-        try:
-            curves = {p.name: p.curve(self._values) for p in self._user_simulation.profiles}
-            loop(self, {**self._values, **curves}, stream(self._seed, "loop"))
-        except RunEnded as end:
-            return end.reason
-        except BaseException as error:  # SystemExit too
-            self._error_place = "" if loop is step_until_over else place_in_loop(error, loop)
-            if isinstance(error, RunError) or interruption.is_interruption(error):
-                raise
-            translated = error_in_loop(error, self._module)
-            if translated is error:
-                raise
-            raise translated from error
-        if self._recorder is not None and self._recorder.ended:  # a bare `except` in the loop has caught the end
-            return self._recorder.ended
-        if self._module is not None:
-            check_not_stepped(self._module, self._time, loop)
-            self._module.simulationStep()  # SUMO holds pointers to actors moved since the last step, which a load would free
-        return "loop"
-
-
-class _SimulationProxy:
-    """The `simulation` domain, with a recorded `step`."""
-
-    def __init__(self, proxy: TraciProxy):
-        self._proxy = proxy
-
-    def step(self, until: float = 0.0) -> None:
-        """Make one step, or all steps until a time (s)."""
-        self._proxy.simulationStep(until)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._proxy.__getattr__("simulation"), name)
-
-
-class _CommandProxy:
-    """The `vehicle` or `person` domain; arguments of commands must be finite, and departures of added vehicles are compared."""
-
-    def __init__(self, proxy: TraciProxy, domain: str):
-        self._proxy, self._domain = proxy, domain
-
-    def __getattr__(self, name: str) -> Any:
-        function = getattr(self._proxy.__getattr__(self._domain), name)
-        if name.startswith("get"):
-            return function
-        return partial(self._command, name, function)
-
-    def _command(self, name: str, function: Any, *args: Any, **kwargs: Any) -> Any:
-        args, kwargs = tuple(map(plain, args)), {key: plain(value) for key, value in kwargs.items()}
-        for value in (*args, *kwargs.values()):
-            if isinstance(value, float) and not math.isfinite(value):  # SUMO accepts it silently
-                shown = ", ".join(map(repr, (*args, *kwargs.values())))
-                raise RunError(Status.FAILED, f"a loop must give finite numbers, but called sumo.{self._domain}.{name}({shown})")
-        result = function(*args, **kwargs)
-        if self._domain == "vehicle" and name == "add":
-            self._expect(*args, **kwargs)
-        elif self._domain == "vehicle" and name.startswith(("moveTo", "remove")) and args:
-            self._proxy.recorder.ignore_departure(str(args[0]))
-            if name == "moveToXY":
-                self._proxy.recorder.take_as_rigid(str(args[0]))
-        return result
-
-    def _expect(
-        self, vehID: str, routeID: str = "", typeID: str = "", depart: Any = None, departLane: Any = "first",  # noqa: N803
-        departPos: Any = "base", departSpeed: Any = "0", *_: Any, **__: Any,  # noqa: N803
-    ) -> None:  # fmt: skip
-        """Register the departure that `vehicle.add` requests; the parameters have SUMO's names."""
-        when = self._proxy.simulation.getTime() if depart in (None, "now") else number_or_none(depart)
-        position, speed, lane = map(number_or_none, (departPos, departSpeed, departLane))
-        requested = RequestedDeparture("", when, position, speed, lane)
-        self._proxy.recorder.expect_departure(vehID, requested)

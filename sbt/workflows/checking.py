@@ -15,6 +15,7 @@ from sbt import interruption
 from sbt.errors import RunError, SbtError, described
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import elsewhere
+from sbt.execution.warming import keeping_states
 from sbt.metrics.physics import breaches
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Value, Values, written
@@ -25,6 +26,7 @@ from sbt.seeds import run_seed
 from sbt.workflows.comparing import compared_times
 from sbt.workflows.findings import Finding
 from sbt.workflows.rehearsal import rehearse
+from sbt.workflows.snapshots import snapshot_findings, which_isolation
 
 __all__ = ["Finding", "check_scenario", "findings_of"]
 
@@ -71,7 +73,13 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
 
 def findings_of(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | None = None) -> Iterator[Finding]:
     """Yield the findings of `check_scenario`, each as soon as it is known."""
+    with keeping_states(spec) as kept:
+        yield from _findings(kept, seed, scenario)
+
+
+def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -> Iterator[Finding]:
     asked = scenario if scenario is not None else spec.resolve()
+    yield from which_isolation(spec)
     points = list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
     first = _runs(spec, jobs)
@@ -86,6 +94,7 @@ def findings_of(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | N
     yield _equal("same seed, same trace", first, again, points)
     yield _in_worker(spec, jobs, first, points)
     yield from _isolations(spec, jobs, points)
+    yield from snapshot_findings(spec, points, seed, _digest)
     yield from _physics(first, points)
     yield _sides([run for run in first if not run.problem], asked)
     for name, said in compared_times(asked, jobs):

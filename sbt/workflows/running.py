@@ -12,6 +12,7 @@ import numpy as np
 from sbt.config.load import differences, dump
 from sbt.errors import InputError
 from sbt.execution.protocol import Executor
+from sbt.execution.warming import warm_up
 from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
@@ -110,6 +111,8 @@ def run_study(
             "seed": study.config.seed, "requirement": study.scenario.requirement, "versions": versions(),
             "listener": progress or (lambda _: None),
         }  # fmt: skip
+        executor = study.executor()  # at the isolation level that the store remembers
+        warm_up(study.spec, study.config.executor.workers, partial(_tell, store, study, common["listener"]))
         with executor:
             _check_code(store, study, executor)
             if shard is None:

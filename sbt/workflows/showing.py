@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,36 +35,37 @@ def show_replay(
     """
     from sbt.report.outside import write_csv, write_folder
     from sbt.sumo.gui import gui_program, run_in_gui
-    from sbt.sumo.outputs import collect_outputs
-    from sbt.sumo.session import scratch_folder, session
 
     scenario, record, states = again.scenario, again.record, shown_trace(again)
+    simulate: Any = scenario.simulate
     program = gui_program() if gui else ""
     try:
         if csv is not None:
             write_csv(csv, states)
         if folder is not None:
             write_folder(folder, states, net_of_run(again))
-            if hasattr(scenario.simulate, "files_of_run"):
-                session().close()
-                collect_outputs(scratch_folder(), folder / "outputs")
-                _write_sumo_files(again, folder.resolve() / "sumo")
+            if hasattr(simulate, "files_of_run"):
+                _write_outputs(again, folder / "outputs")
+                simulate.write_files(record.inputs, record.seed, folder.resolve() / "sumo")
         if gif is not None:
             save_film(gif, states, scenario, f"{scenario.name}, run {record.index}: {_result(again)}", net_of_run(again))
     except OSError as error:
         rule = "a place to write to must be in a folder that is there"
         raise InputError(f"{rule}, but {error.filename}: {error.strerror}") from None
-    return not gui or run_in_gui(scenario.simulate, record.inputs, record.seed, program, ego=states.actors[0]).identical(states)
+    return not gui or run_in_gui(simulate, record.inputs, record.seed, program, ego=states.actors[0]).identical(states)
 
 
-def _write_sumo_files(again: Replay, folder: Path) -> None:
-    """Write the SUMO files of a run, placeholders filled, and a `run.sumocfg` that any SUMO reads.
+def _write_outputs(again: Replay, folder: Path) -> None:
+    """Write what the files' detectors measured in the run, which is run again where it was one of a process of its own."""
+    from sbt.sumo.outputs import collect_outputs
+    from sbt.sumo.session import session
 
-    What a controller or a loop does in the run is not in them; files without placeholders are named where they are.
-    """
     simulate: Any = again.scenario.simulate
-    inputs, seed = again.record.inputs, again.record.seed
-    simulate.files_of_run(inputs, seed).launch(inputs, folder, simulate.step).write(seed, folder / "run.sumocfg")
+    if simulate.isolation.warm:
+        simulate = simulate.isolated(replace(simulate.isolation, forking=False))
+        simulate(again.record.inputs, again.record.seed)
+    session().close()
+    collect_outputs(simulate.outputs, folder)
 
 
 def _result(again: Replay) -> str:

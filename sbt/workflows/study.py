@@ -22,6 +22,7 @@ from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.stages import Campaign, Conclusion, Shard
 from sbt.plugins import Objects, Scope, newer
 from sbt.problem.description import describe_scenario, is_complete, rebuild_scenario
+from sbt.problem.isolation import Isolation, Warmable, warm_ups
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 __all__ = ["RESOLVED", "Study", "changed_since"]
 
+STATES = "snapshots"
+"""Folder of the warmed states in that of a store."""
 RESOLVED = "config.resolved.yaml"
 """The configuration with its defaults, in a store's folder."""
 
@@ -51,11 +54,13 @@ class Study:
         kept: what the store remembers of it; empty where there is no store yet.
         live: the scenario's code is loaded, so that it can be run; False: its description in the store is enough, where that
             is complete.
+        place: the folder of the store; None: as configured.
     """
 
     loaded: Loaded
     kept: JsonMapping = field(default_factory=dict)
     live: bool = True
+    place: Path | None = None
 
     @classmethod
     def from_file(cls, path: str | Path, overrides: Sequence[str] = (), **more: Any) -> Study:
@@ -92,7 +97,7 @@ class Study:
             if "kind" in kept:
                 given["campaigns", name] = CampaignKind.absent(name, kept["kind"])
         loaded = parse(kept["yaml"], name=str(store.folder / RESOLVED), folder=folder, objects=given)
-        return cls(loaded, kept, live)
+        return cls(loaded, kept, live, store.folder)
 
     def stored_in(self, store: Store) -> Study:
         """Return the study with the defaults that its store was begun with."""
@@ -145,10 +150,11 @@ class Study:
             return rebuild_scenario(described)
         return self._assembly.scenario if self.live else scenario_of(self.loaded)
 
-    @property
+    @cached_property
     def spec(self) -> ScenarioSpec:
-        """The scenario for other processes."""
-        return self._assembly.spec if self.live else spec_of(self.loaded)
+        """The scenario for other processes, at the isolation level of the campaign."""
+        spec = self._assembly.spec if self.live else spec_of(self.loaded)
+        return replace(spec, isolated=self.isolation)
 
     @cached_property
     def runnable(self) -> LogicalScenario:
@@ -157,7 +163,29 @@ class Study:
         Raises:
             ConfigError: its code is not at hand, or it does not offer what is configured.
         """
-        return scenario_of(self.loaded)
+        scenario, isolation = scenario_of(self.loaded), self.isolation
+        if isolation is None or not isinstance(scenario.simulate, Warmable):
+            return scenario
+        return replace(scenario, simulate=scenario.simulate.isolated(isolation))
+
+    @cached_property
+    def isolation(self) -> Isolation | None:
+        """The isolation level: that of the store where there is one, else what the scenario's conditions allow.
+
+        None where the scenario has no traffic to warm up. A store that says nothing of it was made without.
+
+        Raises:
+            InputError: a warm-up is asked for, but impossible.
+        """
+        states = str((self.place or Path(self.config.store)).resolve() / STATES)
+        before, asked = self.kept.get("isolation", Isolation().described()), self.config.executor.isolation
+        if self.kept and asked in ("auto", before["level"]):
+            return Isolation.read(before, states)
+        simulate = self.scenario.simulate
+        if not isinstance(simulate, Warmable):
+            return None
+        decided = simulate.isolation_in(self.scenario.space, warm_ups(self.config.budget, estimating=self.kind.takes_gate))
+        return replace(decided, states=states)
 
     @property
     def learns(self) -> bool:
@@ -225,6 +253,7 @@ class Study:
             "described": described, "folder": str(Path(self.loaded.folder).resolve()),
             "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
+            **({"isolation": self.isolation.described()} if self.isolation is not None and self.isolation.warm else {}),
         }  # fmt: skip
 
     def conclusion(self, data: JsonMapping) -> Conclusion:

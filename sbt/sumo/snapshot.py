@@ -1,0 +1,249 @@
+"""Whether and where a user's simulation can begin with traffic that was warmed up once: the conditions of `snapshot`.
+
+What no input changes, up to some time, is simulated once; a run then begins with the state at that time. So whatever an
+input changes must depart at that time or later, and nothing else may depend on an input. The conditions are found in the files;
+what they forbid is said with its place.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import sys
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+
+from sbt.errors import InputError, RunError
+from sbt.problem.outcome import Status
+from sbt.problem.plain import Values
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of
+from sbt.sumo.files import SumoFiles
+from sbt.sumo.template import placeholders
+
+__all__ = ["CAN_FORK", "NoSnapshot", "Snapshot", "WarmUp", "snapshot_of"]
+
+CAN_FORK = hasattr(os, "fork") and sys.platform.startswith("linux")
+"""Whether a run can be a child of a process that has loaded the network; elsewhere each run loads it."""
+_TESTED = ("1.28.0",)
+"""Versions of libsumo whose states were compared with simulations that load them in a process of their own."""
+_SETTLING = 2.0
+"""Simulated time that a run has from its state to the first departure that depends on an input (s)."""
+_WORTH = (60.0, 100)
+"""A warm-up that nobody asks for must be at least so long (s) and have so many departures, or loading is as good."""
+_LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Where in the range of an input departures are computed."""
+_MOST_POINTS = 3125
+_STANDING = frozenset((
+    "busStop", "trainStop", "containerStop", "chargingStation", "parkingArea", "overheadWireSegment", "tractionSubstation",
+    "inductionLoop", "e1Detector", "instantInductionLoop", "laneAreaDetector", "e2Detector", "entryExitDetector", "e3Detector",
+    "edgeData", "laneData", "routeProbe", "vTypeProbe", "tlLogic", "poly", "poi", "taz", "tazs", "location", "param", "access",
+))  # fmt: skip
+"""Elements that have no events of their own, or whose state SUMO saves. Rerouters, calibrators and the like begin anew."""
+_FORBIDDEN = {
+    "load-state": "", "mesosim": "false", "threads": "1", "device.rerouting.threads": "0", "pedestrian.model": "striping",
+}  # fmt: skip
+"""Options with the one value that a snapshot takes; "": none."""
+
+
+class NoSnapshot(Exception):  # noqa: N818  (an answer, not a failure)
+    """Why a simulation cannot begin with warmed traffic."""
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """What a scenario asks for.
+
+    Args:
+        until: simulated time at which the warm-up ends (s); None: shortly before the first departure that depends on an input.
+        seeds: number of warm-ups; None: by the campaign.
+
+    Raises:
+        InputError: there is no warm-up.
+    """
+
+    until: float | None = None
+    seeds: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.seeds is not None and self.seeds < 1:
+            raise InputError(f"warm_up.seeds must be >= 1, but got {self.seeds}")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """How the traffic of a simulation is divided.
+
+    Attributes:
+        begin: of the simulation (s).
+        until: end of the warm-up (s).
+        definitions: types and routes that no input changes.
+        before, after: traffic that no input changes, of the warm-up and of the runs, by departure.
+        varying: types, routes and traffic that inputs change.
+    """
+
+    begin: float
+    until: float
+    definitions: tuple[Piece, ...]
+    before: tuple[Piece, ...]
+    after: tuple[Piece, ...]
+    varying: tuple[Piece, ...]
+
+    def departing(self, values: Values) -> list[Piece]:
+        """Return what varies as a run needs it: definitions, then traffic by departure.
+
+        Raises:
+            RunError: something departs before the end of the warm-up.
+        """
+        first = [piece for piece in self.varying if not piece.is_traffic]
+        timed = [(_departure(piece, values), piece) for piece in self.varying if piece.is_traffic]
+        for time, piece in timed:
+            if time < self.until:
+                rule = f"{piece.place}: '{piece.id}' must depart when the warm-up is over, at t = {self.until:g} s or later"
+                raise RunError(Status.INVALID, f"{rule}, but departs at {time:g} s")
+        return first + [piece for _, piece in sorted(timed, key=lambda each: each[0])]
+
+
+def snapshot_of(
+    files: SumoFiles, egos: tuple[str, ...], space: ParameterSpace, step: float, asked: WarmUp | None, until: float | None = None
+) -> Snapshot:
+    """Return how traffic is divided between the warm-up and the runs of a space.
+
+    Args:
+        files: of the simulation.
+        egos: vehicles under test.
+        space: of the inputs.
+        step: SUMO's step (s).
+        asked: what the scenario asks for; None: nothing.
+        until: end of the warm-up (s) where that is decided already.
+
+    Raises:
+        NoSnapshot: a condition does not hold; the message says which, and where.
+    """
+    _check_surroundings(files)
+    begin = seconds_of(files.options.get("begin", "0"))
+    if begin is None:
+        raise NoSnapshot(f"the option begin must be a number, but is '{files.options['begin']}'")
+    pieces = [piece for one in files.templates if one.root[0] != "net" for piece in pieces_of(one)[0]]
+    varies = _varying(pieces, egos)
+    constant = [piece for piece, changes in zip(pieces, varies, strict=True) if not changes]
+    varying = tuple(piece for piece, changes in zip(pieces, varies, strict=True) if changes)
+    end = _end_of_warm_up(varying, space, begin, step, asked) if until is None else until
+    moving = [(_constant_departure(piece, begin), piece) for piece in constant if piece.is_traffic]
+    moving.sort(key=lambda each: each[0])
+    before = tuple(piece for time, piece in moving if time < end)
+    if asked is None and until is None:
+        _check_worth(end - begin, before)
+    return Snapshot(
+        begin, end, tuple(piece for piece in constant if not piece.is_traffic), before,
+        tuple(piece for time, piece in moving if time >= end), varying,
+    )  # fmt: skip
+
+
+def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: float, step: float, asked: WarmUp | None) -> float:
+    """Return when the warm-up ends (s): as asked for, or shortly before the first departure that depends on an input."""
+    first, earliest = _earliest(varying, _points(space, varying), begin)
+    wanted = None if asked is None else asked.until
+    end = _in_steps(earliest - _SETTLING if wanted is None else wanted, begin, step)
+    if end <= begin and wanted is not None:
+        raise NoSnapshot(f"the simulation begins at {begin:g} s, and the warm-up ends at {wanted:g} s")
+    if end <= begin:
+        least = begin + _SETTLING + step
+        raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s; before {least:g} s there is nothing to warm up")
+    if end > earliest:
+        remedy = "let it depart later, or warm_up.until be smaller or auto"
+        raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s, before the warm-up ends ({end:g} s): {remedy}")
+    return end
+
+
+def _check_surroundings(files: SumoFiles) -> None:
+    """Refuse what a saved state does not hold, and inputs anywhere but in traffic."""
+    for name, value in files.options.items():
+        place = files.places.get(name, "options")
+        if placeholders(value, place):
+            raise NoSnapshot(f"{place}: the option {name} depends on an input")
+        if name in _FORBIDDEN and value != _FORBIDDEN[name]:
+            raise NoSnapshot(f"{place}: runs with the option {name} {value} load their traffic")
+    for one in files.templates:
+        if one.root[0] == "net":
+            if one.placeholders:
+                raise NoSnapshot(f"{one.placeholders[0].place}: the network depends on an input")
+            continue
+        for other in pieces_of(one)[1]:
+            if other.varies:
+                raise NoSnapshot(f"{other.place}: <{other.tag}> depends on an input")
+            if other.tag not in _STANDING:
+                raise NoSnapshot(f"{other.place}: a saved state does not hold what <{other.tag}> has done")
+    try:
+        found = version("libsumo")
+    except PackageNotFoundError:
+        found = "none"
+    if found not in _TESTED:
+        raise NoSnapshot(f"warmed states were tested with libsumo {', '.join(_TESTED)}, but this is {found}")
+
+
+def _varying(pieces: list[Piece], egos: tuple[str, ...]) -> list[bool]:
+    """Return what varies: what has a placeholder, the vehicles under test, and what names a type or route that varies."""
+    under_test = {name for ego in egos for name in (ego, ego.rpartition(".")[0]) if name}
+    varies = [piece.varies or (piece.is_traffic and piece.id in under_test) for piece in pieces]
+    names: set[str] = set()
+    while True:
+        found = {name for piece, changes in zip(pieces, varies, strict=True) if changes for name in piece.defines}
+        if found == names:
+            return varies
+        names = found
+        varies = [changes or not names.isdisjoint(piece.names) for piece, changes in zip(pieces, varies, strict=True)]
+
+
+def _points(space: ParameterSpace, varying: tuple[Piece, ...]) -> list[Values]:
+    """Return values at which departures are computed: a grid over the inputs that they depend on."""
+    used = {name for piece in varying if piece.departs is not None for hole in placeholders(piece.departs, piece.place)
+            for name in hole.formula.names()}  # fmt: skip
+    axes = [_LEVELS if p.name in used else (0.5,) for p in space.parameters]
+    grid = np.array(list(itertools.islice(itertools.product(*axes), _MOST_POINTS)))
+    if not len(space.parameters):
+        return [{}]
+    return [space.named(x) for x in space.from_unit(grid)]
+
+
+def _earliest(varying: tuple[Piece, ...], points: list[Values], begin: float) -> tuple[Piece, float]:
+    """Return what departs first of all that varies, and when (s)."""
+    traffic = [piece for piece in varying if piece.is_traffic]
+    if not traffic:
+        raise NoSnapshot("the ego is not in the files")
+    times = {piece: min(_departure(piece, values) for values in points) for piece in traffic}
+    first = min(traffic, key=lambda piece: times[piece])
+    return first, max(times[first], begin)
+
+
+def _departure(piece: Piece, values: Values) -> float:
+    """Return when a piece departs (s)."""
+    time = piece.departure(values)
+    if time is None or not math.isfinite(time):
+        what = "has no departure" if piece.departs is None else f'departs at "{piece.departs}"'
+        raise NoSnapshot(f"{piece.place}: '{piece.id}' {what}, which is no time")
+    return time
+
+
+def _constant_departure(piece: Piece, begin: float) -> float:
+    """Return when traffic that no input changes departs (s); a flow without a beginning begins with the simulation."""
+    return begin if piece.departs is None and piece.tag.lower().endswith("flow") else _departure(piece, {})
+
+
+def _check_worth(duration: float, before: tuple[Piece, ...]) -> None:
+    """Refuse warm-ups that nobody asks for and that spare little."""
+    least, many = _WORTH
+    count = sum(expected_departures(piece, duration) for piece in before)
+    if duration < least or count < many:
+        said = f"{duration:g} s with {count:.0f} departures before the first that depends on an input"
+        raise NoSnapshot(f"{said} are no warm-up (from {least:g} s and {many} departures on), unless warm_up asks for it")
+
+
+def _in_steps(time: float, begin: float, step: float) -> float:
+    """Return the last instant of the simulation that is not after a time (s)."""
+    milliseconds = round(step * 1000)
+    return begin + math.floor(round((time - begin) * 1000) / milliseconds) * milliseconds / 1000
+

@@ -1,0 +1,152 @@
+"""Traffic that is warmed up once: a run from a snapshot is the run of a process of its own, or there is no snapshot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import sbt
+from sbt.errors import InputError, RunError
+from sbt.execution.spec import ScenarioSpec
+from sbt.execution.tasks import elsewhere
+from sbt.problem.outcome import Status
+from sbt.problem.trace import Trace
+from sbt.store.database import Store
+from sbt.sumo import snapshot
+from sbt.sumo.demand import seconds_of
+from sbt.sumo.user_simulation import UserSimulation
+from tests.warm_networks import T0, town
+
+CENTRE = {"accel": 2.0, "tau": 1.25}
+
+
+def simulation(path: Path, isolation: str = "auto") -> UserSimulation:
+    found = ScenarioSpec(str(path), isolation=isolation).resolve().simulate
+    assert isinstance(found, UserSimulation)
+    return found
+
+
+def alone(path: str, values: dict[str, float], seed: int) -> Trace:
+    """Run in a process that loads everything and warms up itself."""
+    found = simulation(Path(path))
+    return found.isolated(replace(found.isolation, forking=False))(values, seed)
+
+
+@pytest.mark.sumo
+def test_a_forked_run_is_that_of_a_process_of_its_own(tmp_path):
+    path = town(tmp_path)
+    found = simulation(path)
+    assert (found.isolation.level, found.isolation.until, found.isolation.seeds) == ("snapshot", T0, 2)
+    forked = [found(CENTRE, seed) for seed in (4, 6, 5)]
+    assert forked[0].identical(found(CENTRE, 4))  # also after others
+    loaded = found.isolated(replace(found.isolation, forking=False))
+    assert all(loaded(CENTRE, seed).identical(trace) for seed, trace in zip((4, 6, 5), forked, strict=True))
+    assert elsewhere(300, alone, str(path), CENTRE, 4).identical(forked[0])
+    assert not forked[0].identical(forked[1])  # the warm-up is the same, what is drawn later is not
+    assert not found({**CENTRE, "accel": 1.0}, 4).identical(forked[0])
+    assert not any(tmp_path.glob("loop.xml"))
+
+
+@pytest.mark.sumo
+def test_a_run_that_dies_or_hangs_costs_itself_alone(tmp_path):
+    code = "import os, signal, time\nclass Dies:\n    def __init__(self, rng, set_speed, how): self.how = how\n"
+    code += "    def act(self, t, own, others):\n        os.kill(os.getpid(), 11) if self.how == 0 else time.sleep(99)\n"
+    (tmp_path / "av.py").write_text(code)
+    ok, limit = simulation(town(tmp_path)), 3.0
+    before = ok(CENTRE, 1)
+    for how, status in ((0, Status.CRASHED), (1, Status.TIMEOUT)):
+        driven = ok.configured(ego={"kind": f"{tmp_path / 'av.py'}:Dies", "how": how}).limited(limit)
+        with pytest.raises(RunError) as error:
+            driven(CENTRE, 1)
+        assert error.value.status == status
+    assert ok(CENTRE, 1).identical(before)
+
+
+@pytest.mark.sumo
+def test_rows_replays_and_resumption_keep_the_isolation_of_the_store(tmp_path, rows):
+    common = {"campaign": "coverage", "scenario": str(town(tmp_path)), "seed": 3}
+    sbt.run(**common, budget=4, store=tmp_path / "one", executor={"kind": "serial"})
+    sbt.run(**common, budget=2, initial=4, batch=4, store=tmp_path / "two", workers=2)
+    sbt.run(**common, budget=4, initial=4, batch=4, store=tmp_path / "two", workers=1)  # resumed
+    one, two = (rows(tmp_path / name)["runs"] for name in ("one", "two"))
+    assert [run.metrics for run in one] == [run.metrics for run in two]
+    assert [run.warm_up for run in one] == [run.seed % 2 for run in two]
+    assert sbt.open(tmp_path / "two").trace(1) is not None  # verified against the store
+    with pytest.raises(InputError, match="isolation"):
+        sbt.run(**common, budget=5, initial=4, batch=4, store=tmp_path / "two", executor={"isolation": "fresh"})
+    write_without_isolation(tmp_path / "one")
+    with pytest.raises(InputError, match="must give the runs"):  # fresh, as a store that says nothing was made; and they differ
+        sbt.run(**common, budget=5, initial=4, batch=4, store=tmp_path / "one", executor={"kind": "serial"})
+
+
+def write_without_isolation(folder: Path) -> None:
+    """Make a store one of a version that knew no warm-ups."""
+    with Store.open(folder) as store:
+        store.update_configuration({k: v for k, v in store.configuration.items() if k != "isolation"})
+
+
+@pytest.mark.sumo
+def test_check_proves_it(tmp_path):
+    findings = {finding.name: finding for finding in sbt.check(str(town(tmp_path))).findings}
+    proof = next(finding for name, finding in findings.items() if name.startswith("snapshot: "))
+    assert proof.ok
+    assert findings["for information: isolation"].numbers == {"until": T0, "seeds": 2}
+    assert findings["for information: two seeds from one warm-up"].numbers == {"differ": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"depart": "30"}, r"ego.rou.xml:2:\d+: 'ego' departs at 30 s, before the warm-up ends \(42 s\)"),
+        ({"depart": "${tau * 30}"}, r"'ego' departs at 15 s, before"),
+        ({"depart": "triggered"}, r'departs at "triggered", which is no time'),
+        ({"options": "time-to-teleport: '${tau}'"}, "the option time-to-teleport depends on an input"),
+        ({"options": "threads: 2"}, "the option threads 2"),
+        ({"more": '<poi id="x" x="${tau}" y="1"/>'}, r"stops.add.xml:3:\d+: <poi> depends on an input"),
+        ({"more": '<rerouter id="r" edges="A1B1"/>'}, r"stops.add.xml:3:\d+: a saved state does not hold"),
+        ({"more": '<route id="r" edges="A1B1"/><flow id="f" begin="2" period="${tau}" route="r"/>'}, "'f' departs at 2 s"),
+    ],
+)
+def test_a_snapshot_that_cannot_be_says_why_and_where(tmp_path, change, reason):
+    path = town(tmp_path, warm_up="warm_up: {until: 42}", **change)
+    with pytest.raises(InputError, match=reason):
+        simulation(path).isolation.warm  # noqa: B018
+    with pytest.raises(InputError, match=reason):
+        simulation(town(tmp_path, warm_up="", **change), "snapshot").isolation.warm  # noqa: B018
+    without = simulation(town(tmp_path, warm_up="", **change)).isolation
+    assert without.level == "fresh"
+    assert without.why
+
+
+def test_what_names_something_that_varies_varies(tmp_path):
+    more = '<vTypeDistribution id="both" vTypes="av car"/><route id="r" edges="A1B1"/>'
+    more += '<vehicle id="x" type="both" route="r" depart="9"/>'
+    with pytest.raises(InputError, match="'x' departs at 9 s"):
+        simulation(town(tmp_path, warm_up="warm_up: {until: 42}", more=more)).isolation.warm  # noqa: B018
+
+
+def test_a_libsumo_that_was_not_tested_loads_every_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(snapshot, "version", lambda _: "9.9.9")
+    with pytest.raises(InputError, match=r"tested with libsumo 1.28.0, but this is 9.9.9"):
+        simulation(town(tmp_path)).isolation.warm  # noqa: B018
+
+
+def test_short_warm_ups_that_nobody_asked_for_are_none(tmp_path):
+    assert "are no warm-up" in simulation(town(tmp_path, warm_up="")).isolation.why
+    assert simulation(town(tmp_path, depart="70", warm_up="")).isolation.until == 68.0
+    assert simulation(town(tmp_path, depart="70", warm_up=""), "fresh").isolation.level == "fresh"
+
+
+@pytest.mark.sumo
+def test_a_departure_before_the_end_of_the_warm_up_is_no_row(tmp_path):
+    path = town(tmp_path, depart="${t}", warm_up="warm_up: {until: 42}", inputs=", t: {min: 43, max: 46}")
+    found = simulation(path)
+    assert found.isolation.until == T0
+    with pytest.raises(RunError, match=r"'ego' must depart when the warm-up is over, at t = 42 s or later, but departs at 40 s"):
+        found({**CENTRE, "t": 40.0}, 1)
+
+
+def test_times_are_read_as_sumo_reads_them():
+    assert [seconds_of(text) for text in ("12.5", "1:00:02", "1:0:0:1", "triggered")] == [12.5, 3602.0, 86401.0, None]
