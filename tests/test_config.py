@@ -143,7 +143,7 @@ def test_all_errors_at_once_each_at_its_place():
         ("executor: {kind: daks}", "executor.kind: must be serial or local or dask, but got 'daks' (did you mean 'dask'?)"),
         ("executor: {address: 'tcp://a:1'}", "executor.address: only the executor dask takes it, but the executor is local"),
         ("executor: {kind: dask, address: a}", "executor.address: must be a scheduler's address such as tcp://host:8786, but got"),
-        ("executor: {isolation: none}", "executor.isolation: must be 'auto', 'fresh', 'reuse' or 'replicas', but got 'none'"),
+        ("executor: {isolation: none}", "executor.isolation: must be 'auto', 'fresh', 'reuse', 'replicas' or 'snapshot', but got 'none'"),
         ("requirement: {critical: [1, 0.5]}", "requirement.critical: a critical interval needs low <= high, but got [1.0, 0.5]"),
         ("requirement: {critical: [-.inf, .inf]}", "requirement.critical: a critical interval needs at least one finite end"),
         ("requirement: {critical: [.nan, 1]}", "requirement.critical: a critical interval needs low <= high"),

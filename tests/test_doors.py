@@ -331,7 +331,7 @@ def test_the_driver_of_the_ego_makes_the_difference(study):
     assert starts == [starts[0]] * 3
     ends = [float(t.actor("ego").x[50]) for t in traces]
     assert len(set(ends)) == 3
-    with pytest.raises(InputError, match="auto or fresh"):
+    with pytest.raises(InputError, match="auto, fresh or snapshot"):
         scenario.configured(isolation="reuse")
 
 

@@ -14,7 +14,7 @@ _SCENARIO = """sumo: {{net: town.net.xml, routes: [cars.rou.xml, buses.rou.xml, 
        options: {{device.rerouting.probability: 0.2, {options}}}}}
 inputs: {{accel: {{min: 1, max: 3, unit: m/s^2}}, tau: {{min: 0.5, max: 2, unit: s}}{inputs}}}
 ego: {{id: ego, delay: 20{ego}}}
-duration: 4
+duration: 3
 {warm_up}
 metrics: [ttc_path_min, distance_min]
 requirement: {{metric: ttc_path_min, critical: [-.inf, 1.0]}}
@@ -39,6 +39,7 @@ def town(
     more: str = "",
 ) -> Path:  # fmt: skip
     """Write the town with its traffic and a scenario about an ego that departs at some time, and return the scenario."""
+    folder.mkdir(exist_ok=True)
     (folder / "town.net.xml").write_bytes(_net())
     rng, traffic = random.Random(1), []
     device = '<param key="has.rerouting.device" value="true"/>'
@@ -66,7 +67,7 @@ def town(
       <busStop id="bs1" lane="C2D2_1" startPos="40" endPos="60"/>
       <inductionLoop id="loop" lane="B2C2_1" pos="50" period="10" file="loop.xml"/>{more}</additional>""")
     (folder / "ego.rou.xml").write_text(f"""<routes><vType id="av" sigma="0" tau="${{tau}}" accel="${{accel}}"/>
-      <trip id="ego" type="av" depart="{depart}" from="A2B2" to="C3D3" departLane="free"/></routes>""")
+      <trip id="ego" type="av" depart="{depart}" from="A2B2" to="C3D3" departLane="free" departSpeed="0"/></routes>""")
     text = _SCENARIO.format(warm_up=warm_up, options=options, inputs=inputs, ego=ego)
     (folder / "scenario.yaml").write_text(text)
     return folder / "scenario.yaml"
