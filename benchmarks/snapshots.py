@@ -119,7 +119,7 @@ def main() -> None:
         wall = (time.monotonic() - wall) / len(jobs)
         ended = max(float(trace.time[-1]) for trace in traces)
         load, steps, vehicles, private = stepping(found, 12.0)
-        print(f"run: {each:.2f} s CPU, {wall:.2f} s wall (up to {ended:g} s recorded); 12 s of steps alone {steps:.2f} s", flush=True)
+        print(f"run: {each:.2f} s CPU, {wall:.2f} s wall (to {ended:g} s); 12 s of steps alone {steps:.2f} s", flush=True)
         print(f"loadState {load:.2f} s; {vehicles} vehicles; {private:.0f} MB private of a child", flush=True)
         same = elsewhere(3600, alone, path, seeds, [job for job in jobs if job[1] % seeds == jobs[0][1] % seeds][:3])
         expected = [trace for trace, job in zip(traces, jobs, strict=True) if job[1] % seeds == jobs[0][1] % seeds][:3]

@@ -20,6 +20,8 @@ from sbt.cli import app
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import load_benchmark
 from sbt.config.load import load, parse
+from sbt.config.scenario_model import ScenarioModel
+from sbt.config.source import read_yaml
 
 BENCHMARKS = sorted((ROOT / "configs").glob("benchmark_*.yaml"))
 CONFIGS = sorted(set((ROOT / "configs").glob("*.yaml")) - set(BENCHMARKS))
@@ -101,7 +103,7 @@ RUN = {
     "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
     "docs/python.md": {"python"}, "docs/reference_drivers.md": {"python"}, "docs/requirements.md": {"python", "yaml"},
     "docs/scenarios.md": {"python"},
-    "docs/testbeds.md": {"console", "python", "yaml"},
+    "docs/testbeds.md": {"console", "python", "yaml"}, "docs/traffic.md": {"yaml"},
     "docs/tutorials/actors.md": {"bash", "python", "yaml"}, "docs/tutorials/own_files.md": {"bash", "xml", "yaml"},
     "docs/tutorials/opendrive.md": {"bash", "xml", "yaml"},
     "docs/tutorials/recorded_traffic.md": {"bash", "python", "xml", "yaml"},
@@ -189,7 +191,10 @@ def test_recipes_are_short():
 
 @pytest.mark.parametrize("block", of("yaml"))
 def test_yaml_fits_the_schema(block: Block):
-    """A whole configuration, or lines that are each a change of one."""
+    """A whole configuration or scenario, or lines that are each a change of a configuration."""
+    if re.search(r"^sumo:", block.text, re.MULTILINE):
+        ScenarioModel.model_validate(read_yaml(block.text, str(block))[0])
+        return
     whole = re.search(r"^campaign:", block.text, re.MULTILINE)
     texts = [block.text] if whole else [f"campaign: boundary\nscenario: cut_in\n{line}" for line in block.text.splitlines()]
     for text in texts:
