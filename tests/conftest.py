@@ -52,6 +52,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in of_sumo]
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _approvals(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep approvals of code out of the folder of who runs the tests, and theirs out of the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        patch.delenv("SBT_TRUST", raising=False)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _without_sumo() -> Iterator[None]:
     """Fail a test that wanted SUMO under `--no-sumo`, also where it took the failed runs for granted."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
+import random
 import re
 import sqlite3
 import subprocess
@@ -15,7 +17,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+import sbt
+from sbt.cli import app
 from sbt.errors import StoreError
 from sbt.problem.outcome import Outcome, Status
 from sbt.problem.requirement import Requirement
@@ -212,10 +217,10 @@ def read_everything(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("written", "damaged", "what"),
     [
-        (b'{"y":3.1', b'{"y":3.2', "the outcome of run 3 is damaged"),
-        (b"[0.4,0.3", b"[0.5,0.3", "run 4 is damaged"),
-        (b'"rejection"', b'"rejectiom"', "iteration 0 is damaged"),
-        (b'"seed":3', b'"seed":4', "the configuration is damaged"),
+        (b'{"y":3.1', b'{"y":3.2', "is damaged: the outcome of run 3 "),
+        (b"[0.4,0.3", b"[0.5,0.3", "is damaged: run 4 "),
+        (b'"rejection"', b'"rejectiom"', "is damaged: iteration 0 "),
+        (b'"seed":3', b'"seed":4', "is damaged: the configuration "),
     ],
 )
 def test_damage_is_told_and_never_read_as_a_result(tmp_path: Path, written: bytes, damaged: bytes, what: str):
@@ -328,3 +333,70 @@ def test_a_disk_that_refuses_ends_the_campaign_with_one_line(configured: Callabl
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(r"the store must be readable and writable, but .*/c is not: .*\n", done.stderr)
     assert 0 < len(rows(config.parent / "c")["runs"]) < 600
+
+
+def damaged_somewhere(content: bytes, rng: random.Random, bits: int) -> bytes:
+    """Return the bytes of a file with some bits flipped."""
+    found = bytearray(content)
+    for _ in range(bits):
+        found[rng.randrange(len(found))] ^= 1 << rng.randrange(8)
+    return bytes(found)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small campaign that has concluded."""
+    folder = tmp_path_factory.mktemp("finished")
+    sbt.run(**CAMPAIGN, store=folder, report=False)
+    return folder
+
+
+CAMPAIGN = {"campaign": "coverage", "scenario": "testbed:four_branch_7", "budget": 120, "batch": 10, "executor": "serial"}
+
+
+def content_of(folder: Path) -> tuple[Any, ...]:
+    with Store.read(folder) as store:
+        return store.history().records, store.iterations(), store.fits(), store.conclusion, store.configuration, store.counts
+
+
+@pytest.mark.parametrize("bits", [1, 8])
+def test_flipped_bits_are_refused_or_change_nothing(finished: Path, tmp_path: Path, bits: int):
+    """A few of those that `benchmarks/faults.py --corruptions` makes."""
+    right, content, rng = content_of(finished), (finished / DATABASE).read_bytes(), random.Random(bits)
+    refused = 0
+    for _ in range(40):
+        (tmp_path / DATABASE).write_bytes(damaged_somewhere(content, rng, bits))
+        try:
+            assert content_of(tmp_path) == right
+        except StoreError:
+            refused += 1
+    assert refused > (5 if bits == 1 else 30)
+
+
+def test_what_is_whole_is_saved_and_goes_on_to_the_same_rows(finished: Path, tmp_path: Path, rows: Any):
+    content = (finished / DATABASE).read_bytes()
+    with Store.read(finished) as store:
+        history = store.history()
+        record = history.record(70)
+    whole = sum(each.iteration < record.iteration for each in history.records)
+    assert 30 < whole <= 70, "in the batches before its own"
+    inputs = json.dumps(list(record.inputs.values()), separators=(",", ":"))
+    metric = json.dumps(record.metrics["y"])
+    for name, wrong, again, kept in (
+        ("outcome", (metric, metric[:-1] + ("1" if metric[-1] != "1" else "2")), 1, 120),
+        ("plan", (inputs, inputs.replace("0.", "1.", 1)), 0, whole),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        assert content.count(wrong[0].encode()) == 1
+        (folder / DATABASE).write_bytes(content.replace(wrong[0].encode(), wrong[1].encode()))
+        with pytest.raises(StoreError, match="sumo-sbt doctor"):
+            content_of(folder)
+        done = CliRunner().invoke(app, ["doctor", str(folder), "--save", str(folder / "new"), "--json"])
+        told = json.loads(done.stdout)
+        assert (done.exit_code, told["whole"]) == (1, False)
+        assert told["saved"] == {"store": str(folder / "new"), "runs": kept, "planned_again": again}
+        sbt.run(**CAMPAIGN, store=folder / "new", report=False)
+        assert rows(folder / "new")["runs"] == rows(finished)["runs"]
+    done = CliRunner().invoke(app, ["doctor", str(finished)])
+    assert (done.exit_code, done.stdout) == (0, f"{finished} is whole: 120 runs\n")

@@ -33,6 +33,7 @@ for _verb in (
     campaign.status,
     campaign.report,
     campaign.export,
+    campaign.bundle,
     predict,
     estimate_again,
     replay,

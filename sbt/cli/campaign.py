@@ -14,8 +14,9 @@ import typer
 from sbt.cli.conclusion import conclusion_lines, shown
 from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
 from sbt.errors import InputError
+from sbt.plugins.approval import trust_store
 
-__all__ = ["export", "merge", "report", "run", "status"]
+__all__ = ["bundle", "export", "merge", "report", "run", "status"]
 
 _SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
 """Scores of the last validation that `status` prints."""
@@ -24,6 +25,9 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaig
 FailOnCritical = Annotated[bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")]
 JUnit = Annotated[
     Path | None, typer.Option("--junit", metavar="FILE.xml", help="Write the verdict as JUnit XML, for a CI's view.")
+]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Approve the code (file.py) that the store names, with the content that it has now.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print every number of the conclusion.")]
@@ -71,6 +75,7 @@ def merge(
     into: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the whole campaign.")],
     fail_on_critical: FailOnCritical = False,
     junit: JUnit = None,
+    trust: Trust = False,
     as_json: AsJson = False,
     verbose: Verbose = False,
 ) -> None:
@@ -78,7 +83,7 @@ def merge(
     with clean_stdout():
         from sbt.workflows.merging import merge_shards
 
-        result = merge_shards([_with_store(folder) for folder in folders], into).to_dict()
+        result = merge_shards([with_store(folder, trust=trust) for folder in folders], into).to_dict()
     _conclude(result, fail_on_critical=fail_on_critical, junit=junit, as_json=as_json, verbose=verbose)
 
 
@@ -129,7 +134,7 @@ def _status(folder: Path) -> dict[str, Any]:
     with clean_stdout():
         from sbt.workflows.status import read_status
 
-        return read_status(_with_store(folder))
+        return read_status(with_store(folder))
 
 
 def _status_lines(found: Mapping[str, Any]) -> list[str]:
@@ -143,12 +148,12 @@ def _status_lines(found: Mapping[str, Any]) -> list[str]:
     return [*lines, *conclusion_lines(found["conclusion"])]
 
 
-def report(folder: Folder) -> None:
+def report(folder: Folder, *, trust: Trust = False) -> None:
     """Write the report of a campaign again."""
     with clean_stdout():
         from sbt.workflows.running import rebuild_report
 
-        path = rebuild_report(_with_store(folder))
+        path = rebuild_report(with_store(folder, trust=trust))
     print(path)
 
 
@@ -159,17 +164,36 @@ def export(
         str,
         typer.Option("--format", metavar="csv|parquet|dsiod|boundary", help="boundary: points where P(critical) is 0.5."),
     ] = "csv",
+    trust: Trust = False,
 ) -> None:
     """Write the runs of a campaign as a table."""
     with clean_stdout():
         from sbt.workflows.exporting import export_store
 
-        path = export_store(_with_store(folder), form)
+        path = export_store(with_store(folder, trust=trust), form)
     print(path)
 
 
-def _with_store(folder: Path) -> Path:
-    """Return the folder if a campaign is in it."""
+def bundle(
+    folder: Folder,
+    *,
+    to: Annotated[Path | None, typer.Option("--to", metavar="FILE.zip", help="Default: DIR.zip.")] = None,
+    trust: Trust = False,
+) -> None:
+    """Pack a campaign with the files of its scenario, so that it replays on another machine."""
+    with clean_stdout():
+        from sbt.workflows.running import bundle_store
+
+        store = with_store(folder, trust=trust)
+        target = store.resolve().with_name(f"{store.resolve().name}.zip") if to is None else to
+        files = bundle_store(store, target)
+    print("\n".join([str(target), *(f"  {path}" for path in files)]))
+
+
+def with_store(folder: Path, *, trust: bool = False) -> Path:
+    """Return the folder if a campaign is in it; approve the code that it names where the user says so."""
     if not (folder / "campaign.sqlite").is_file():
         raise InputError(f"DIR must be the folder of a campaign (with campaign.sqlite), but got '{folder}'")
+    if trust:
+        trust_store(folder)
     return folder

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sbt.cli.campaign import Folder, _with_store
+from sbt.cli.campaign import Folder, Trust, with_store
 from sbt.cli.console import clean_stdout, print_json
 from sbt.errors import InputError
 
@@ -29,12 +29,13 @@ def estimate_again(
         str | None, typer.Option("--critical", metavar="LOW,HIGH", help="Another critical interval, such as --critical=-inf,0.5.")
     ] = None,
     metric: Annotated[str | None, typer.Option("--metric", help="Another metric that the runs measured.")] = None,
+    trust: Trust = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Estimate under other distributions, or another requirement, from the runs there are; nothing is run or stored."""
     interval = None if critical is None else _interval(critical)
     with clean_stdout():
-        _with_store(folder)
+        with_store(folder, trust=trust)
         from sbt.workflows.asking import estimate_again as ask
 
         found = ask(folder, inputs, critical=interval, metric=metric)

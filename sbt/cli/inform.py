@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sbt.cli.console import Exit, clean_stdout, print_json
 from sbt.errors import InputError
 from sbt.plugins import KINDS
+
+if TYPE_CHECKING:
+    from sbt.store.rescue import Diagnosis
 
 __all__ = ["doctor", "list_", "schema"]
 
@@ -51,11 +55,22 @@ def schema(
 
 
 def doctor(
-    folder: Annotated[Path, typer.Option("--store", metavar="DIR", help="Where results shall go.")] = Path("runs"),
+    store: Annotated[
+        Path | None, typer.Argument(metavar="[DIR]", help="Examine this campaign's store; default: the environment.")
+    ] = None,
     *,
+    save: Annotated[
+        Path | None, typer.Option(metavar="NEW", help="Write a store of what is whole in DIR; run goes on from there.")
+    ] = None,
+    folder: Annotated[Path, typer.Option("--store", metavar="DIR", help="Where results shall go.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Check the environment: versions, SUMO, disk; print advice where something is wrong."""
+    """Check the environment (versions, SUMO, disk), or whether a store is whole; print advice where something is wrong."""
+    if store is not None:
+        _examine_store(store, save, as_json=as_json)
+        return
+    if save is not None:
+        raise InputError("--save needs the store that is damaged: sumo-sbt doctor DIR --save NEW")
     with clean_stdout():
         from sbt.cli.doctor import examine
 
@@ -67,3 +82,44 @@ def doctor(
             print(f"{c.state:<8}{c.name:<14}{c.detail}" + (f"; {c.advice}" if c.advice else ""))
     if any(c.state == "broken" for c in checks):
         raise typer.Exit(int(Exit.INTERNAL))
+
+
+def _examine_store(folder: Path, target: Path | None, *, as_json: bool) -> None:
+    """Print what of a store is whole, and save that where there is a target; exit 1 where something is damaged."""
+    with clean_stdout():
+        from sbt.store.rescue import examine, save
+
+        found = examine(folder)
+        saved = None if target is None else save(folder, target)
+    if as_json:
+        told = None if saved is None else {"store": str(target), "runs": saved[0], "planned_again": saved[1]}
+        print_json({"store": str(folder), "whole": found.whole, **vars(found), "saved": told})
+    else:
+        print("\n".join(_told(folder, found)))
+        if saved is not None:
+            print(f"saved: {saved[0]} runs in {target}, {saved[1]} of them to be run again; run with --store {target} goes on")
+    if not found.whole:
+        raise typer.Exit(int(Exit.INTERNAL))
+
+
+def _told(folder: Path, found: Diagnosis) -> Iterator[str]:
+    """Yield what of a store is whole, a line each."""
+    if found.whole:
+        waiting = f", {found.planned} of them not finished" if found.planned else ""
+        yield f"{folder} is whole: {found.runs} runs{waiting}"
+        return
+    yield f"{folder} is damaged; {found.runs} runs can be read"
+    numbers = {
+        "plan damaged, of runs": found.damaged_plans, "outcome damaged, of runs": found.damaged_outcomes,
+        "runs lost": found.lost_runs, "batches damaged": found.damaged_iterations, "batches lost": found.lost_iterations,
+        "scores of the metamodel damaged, after runs": found.damaged_fits, "damaged": found.damaged_texts,
+        "structure": found.structure,
+    }  # fmt: skip
+    for what, which in numbers.items():
+        if which:
+            more = f" and {len(which) - 8} more" if len(which) > 8 else ""
+            yield f"  {what}: {', '.join(map(str, which[:8]))}{more}"
+    if found.configuration:
+        yield f"  save what is whole: sumo-sbt doctor {folder} --save NEW"
+    else:
+        yield "  nothing can go on without the configuration: begin a new campaign"

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from sbt.cli.campaign import Folder, _with_store
+from sbt.cli.campaign import Folder, Trust, with_store
 from sbt.cli.console import clean_stdout, print_json
 from sbt.errors import InputError
 
@@ -23,11 +23,12 @@ def predict(
     inputs: Annotated[Path, typer.Option("--inputs", metavar="FILE.csv", help="A column for each input, a row each.")],
     output: Annotated[Path | None, typer.Option("--output", metavar="FILE.csv", help="Write here; default: print.")] = None,
     device: Annotated[str | None, typer.Option("--device", help="auto, cpu or cuda; default: where it was fitted.")] = None,
+    trust: Trust = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Predict concrete scenarios with the campaign's metamodel: mean, sigma, P(critical)."""
     with clean_stdout():
-        _with_store(folder)
+        with_store(folder, trust=trust)
         from sbt.workflows.prediction import predict_rows
 
         table = predict_rows(folder, inputs, device)

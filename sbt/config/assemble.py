@@ -57,11 +57,12 @@ def assemble(loaded: Loaded) -> Assembly:
         ConfigError: all problems of the scenario, metamodel and acquisition at once.
     """
     problems = Problems(loaded.source)
-    metamodel = _metamodel(loaded, problems)
-    acquisition = _acquisition(loaded, problems)
-    scenario = _scenario(loaded, problems)
-    for k, driver in enumerate(loaded.config.judges or ()):
-        problems.attempt(("judges", k), partial(loaded.scope.load, "controllers", driver))
+    with loaded.scope.naming():
+        metamodel = _metamodel(loaded, problems)
+        acquisition = _acquisition(loaded, problems)
+        scenario = _scenario(loaded, problems)
+        for k, driver in enumerate(loaded.config.judges or ()):
+            problems.attempt(("judges", k), partial(loaded.scope.load, "controllers", driver))
     problems.check()
     return Assembly(scenario, spec_of(loaded), metamodel, acquisition)
 
@@ -95,7 +96,8 @@ def acquisition_of(loaded: Loaded) -> Acquisition | None:
 
 def _without_problems(loaded: Loaded, make: Callable[[Loaded, Problems], T]) -> T:
     problems = Problems(loaded.source)
-    made = make(loaded, problems)
+    with loaded.scope.naming():
+        made = make(loaded, problems)
     problems.check()
     return made
 

@@ -122,7 +122,7 @@ def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wr
 
 def parse(
     text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None,
-    changes: JsonMapping | None = None, objects: Objects | None = None,
+    changes: JsonMapping | None = None, objects: Objects | None = None, store: Path | None = None,
 ) -> Loaded:  # fmt: skip
     """Check a configuration given as text; like `load`.
 
@@ -133,8 +133,9 @@ def parse(
         folder: where relative names are looked up; None: the working directory.
         changes: as for `load`.
         objects: what was given in Python, by kind and name.
+        store: folder of the store that it was read from; None: the user gives it, and so approves the code that it names.
     """
-    scope = Scope(folder or Path.cwd(), objects or {})
+    scope = Scope(folder or Path.cwd(), objects or {}, store)
     with looked_up_in(scope):
         config, source = checked(Configuration, text, overrides, name, changes or {})
     return Loaded(config, source, scope)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
-__all__ = ["connected", "set_journal"]
+__all__ = ["connected", "copy_database", "set_journal"]
 
 
 def connected(path: Path) -> sqlite3.Connection:
@@ -18,6 +19,13 @@ def connected(path: Path) -> sqlite3.Connection:
         db.close()
         db = sqlite3.connect(f"{address}?immutable=1", uri=True, isolation_level=None)
     return db
+
+
+def copy_database(source: Path, target: Path) -> None:
+    """Write a copy of a file, as it was at one moment; a process may be writing it."""
+    with closing(connected(source)) as db, closing(sqlite3.connect(target)) as copy:
+        db.backup(copy)
+        copy.execute("PRAGMA journal_mode = DELETE")  # one file, which may lie where nobody may write
 
 
 def set_journal(db: sqlite3.Connection, *, durable: bool) -> str:

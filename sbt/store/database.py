@@ -14,7 +14,6 @@ import json
 import math
 import sqlite3
 import time
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -23,32 +22,17 @@ from typing import Any
 
 from sbt.errors import StoreError
 from sbt.problem.description import described_choices
-from sbt.problem.outcome import Job, Outcome
+from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Json, JsonMapping, Values
 from sbt.store.connection import connected, set_journal
 from sbt.store.history import PLANNED, History, Rows, as_numbers
+from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, damaged, refuse_damage, reported
 from sbt.store.records import FitRecord, Iteration, Judgement, from_json, to_json
 
 __all__ = ["DATABASE", "PlannedRun", "Store"]
 
-DATABASE = "campaign.sqlite"
-_VERSION = 2
 _TOGETHER = 0.1
 """Seconds within which runs wait for the disk once."""
-_SCHEMA = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE runs (
-    idx INTEGER PRIMARY KEY, stage TEXT NOT NULL, iteration INTEGER NOT NULL, inputs TEXT NOT NULL,
-    seed INTEGER NOT NULL, seed_chosen INTEGER NOT NULL, level INTEGER NOT NULL, warm_up INTEGER, log_q REAL,
-    plan_checksum INTEGER NOT NULL, status TEXT NOT NULL, metrics TEXT NOT NULL DEFAULT '{}',
-    reason TEXT NOT NULL DEFAULT '', seconds REAL NOT NULL DEFAULT 0, collisions TEXT NOT NULL DEFAULT '',
-    unconfirmed TEXT NOT NULL DEFAULT '', versions TEXT NOT NULL DEFAULT '', checksum INTEGER NOT NULL DEFAULT 0);
-CREATE INDEX unfinished ON runs (status) WHERE status = 'planned';
-CREATE TABLE iterations (iteration INTEGER PRIMARY KEY, stage TEXT NOT NULL, proposal TEXT NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE fits (runs INTEGER PRIMARY KEY, iteration INTEGER NOT NULL, scores TEXT NOT NULL, checksum INTEGER NOT NULL);
-"""
-_PLAN = ("idx", "stage", "iteration", "inputs", "seed", "seed_chosen", "level", "warm_up", "log_q")
-_OUTCOME = ("status", "metrics", "reason", "seconds", "collisions", "unconfirmed", "versions")
 _FIELDS = ("stage", "iteration", "seed", "seed_chosen", "level", "warm_up", "log_q", "status", "reason", "seconds", "collisions",
            "unconfirmed", "versions")  # fmt: skip
 """Columns of a row that a history holds as they are."""
@@ -107,7 +91,7 @@ class Store:
             durable: commits reach the disk; False where the whole file can be written again.
         """
         folder = Path(folder)
-        with _reported(folder):
+        with reported(folder):
             folder.mkdir(parents=True, exist_ok=True)
             lock = (folder / "campaign.lock").open("w")
             try:
@@ -120,6 +104,7 @@ class Store:
             store._may_hurry = durable and mode == "wal"
             if db.execute("PRAGMA user_version").fetchone()[0] != 0:
                 store._check_version()
+                refuse_damage(folder, db)
             elif configuration is not None:
                 store.begin(configuration)
             return store
@@ -129,19 +114,20 @@ class Store:
         if self._db.execute("PRAGMA user_version").fetchone()[0] != 0:
             return
         with self._transaction():
-            for statement in _SCHEMA.strip().split(";\n"):
+            for statement in SCHEMA.strip().split(";\n"):
                 self._db.execute(statement)
             self._set_meta("configuration", dict(configuration))
-            self._db.execute(f"PRAGMA user_version = {_VERSION}")
+            self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @classmethod
     def read(cls, folder: Path) -> Store:
         """Open for reading only; works while a campaign writes."""
         if not cls.begun(folder):
             raise StoreError(f"a store is a folder with a campaign in its {DATABASE}, but there is none in {folder}")
-        with _reported(Path(folder)):
+        with reported(Path(folder)):
             store = cls(Path(folder), connected(Path(folder) / DATABASE))
             store._check_version()
+            refuse_damage(store.folder, store._db)
             return store
 
     @classmethod
@@ -150,7 +136,7 @@ class Store:
         path = Path(folder) / DATABASE
         if not path.is_file():
             return False
-        with _reported(Path(folder)), closing(connected(path)) as db:
+        with reported(Path(folder)), closing(connected(path)) as db:
             return bool(db.execute("PRAGMA user_version").fetchone()[0])
 
     def __enter__(self) -> Store:
@@ -169,18 +155,18 @@ class Store:
 
     def _check_version(self) -> None:
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        if version != _VERSION:
-            raise StoreError(f"{self.folder}: this version reads stores of version {_VERSION}, but got version {version}")
+        if version != VERSION:
+            raise StoreError(f"{self.folder}: this version reads stores of version {VERSION}, but got version {version}")
 
     def _checked(self, what: str, stored: int, *parts: Any) -> None:
         """Refuse a row that is not what was written."""
-        if stored != _checksum(*parts):
-            raise StoreError(f"{self.folder}: {what} is damaged: its checksum is wrong")
+        if stored != checksum_of(*parts):
+            raise damaged(self.folder, f"{what} has a wrong checksum")
 
     @contextmanager
     def _transaction(self, *, waits: bool = True) -> Iterator[None]:
         """Return a transaction that waits for the disk at its end, and there takes along those before that did not."""
-        with _reported(self.folder):
+        with reported(self.folder):
             if self._may_hurry and waits != self._waits:
                 self._db.execute(f"PRAGMA synchronous = {'FULL' if waits else 'NORMAL'}")
                 self._waits = waits
@@ -195,16 +181,22 @@ class Store:
 
     def _set_meta(self, key: str, value: Any) -> None:
         text = _dump(value)
-        self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (key, text, _checksum(key, text)))
+        self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (key, text, checksum_of(key, text)))
 
     def _get_meta(self, key: str) -> Any:
-        if self._db.execute("PRAGMA user_version").fetchone()[0] == 0:
+        if self._select("PRAGMA user_version")[0][0] == 0:
             return None
-        row = self._db.execute("SELECT value, checksum FROM meta WHERE key = ?", (key,)).fetchone()
-        if row is None:
+        rows = self._select("SELECT value, checksum FROM meta WHERE key = ?", (key,))
+        if not rows:
             return None
-        self._checked(f"the {key}", row[1], key, row[0])
-        return json.loads(row[0])
+        text, checksum = rows[0]
+        self._checked(f"the {key}", checksum, key, text)
+        return json.loads(text)
+
+    def _select(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
+        """Return all rows of a query."""
+        with reported(self.folder):
+            return self._db.execute(query, values).fetchall()
 
     @property
     def configuration(self) -> Json:
@@ -261,14 +253,15 @@ class Store:
             log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
             warm_up = int(seed) % warm_ups if warm_ups and run.warm_up is None else run.warm_up
             row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, warm_up, log_q)
-            rows.append((*row, _checksum(*row), PLANNED))
+            rows.append((*row, checksum_of(*row), PLANNED))
         text = _dump(proposal if isinstance(proposal, dict) else to_json(proposal))
         with self._transaction():
             self._db.executemany(
-                f"INSERT INTO runs ({', '.join(_PLAN)}, plan_checksum, status) VALUES ({', '.join('?' * (len(_PLAN) + 2))})", rows
+                f"INSERT INTO runs ({', '.join(PLAN)}, plan_checksum, status) VALUES ({', '.join('?' * (len(PLAN) + 2))})", rows
             )
-            checksum = _checksum(iteration, stage, text)
-            self._db.execute("INSERT INTO iterations VALUES (?, ?, ?, ?)", (iteration, stage, text, checksum))
+            self._db.execute(
+                "INSERT INTO iterations VALUES (?, ?, ?, ?)", (iteration, stage, text, checksum_of(iteration, stage, text))
+            )
 
     def append(self, outcome: Outcome, versions: str = "") -> None:
         """Write one run's outcome."""
@@ -281,27 +274,30 @@ class Store:
         )  # fmt: skip
         with self._transaction(waits=waits):
             self._db.execute(
-                f"UPDATE runs SET {', '.join(f'{name} = ?' for name in _OUTCOME)}, checksum = ? WHERE idx = ?",
-                (*row, _checksum(outcome.index, *row), outcome.index),
+                f"UPDATE runs SET {', '.join(f'{name} = ?' for name in OUTCOME)}, checksum = ? WHERE idx = ?",
+                (*row, checksum_of(outcome.index, *row), outcome.index),
             )
 
     def add_fit(self, fit: FitRecord) -> None:
         """Keep what is known of the metamodel that learned from the first `fit.runs` rows."""
         text = _dump(to_json(fit))
         with self._transaction():
-            row = (fit.runs, fit.iteration, text, _checksum(fit.runs, fit.iteration, text))
+            row = (fit.runs, fit.iteration, text, checksum_of(fit.runs, fit.iteration, text))
             self._db.execute("INSERT OR REPLACE INTO fits VALUES (?, ?, ?, ?)", row)
         self._fits = [known for known in self._fits if known.runs < fit.runs]
 
     @property
     def planned(self) -> int:
         """Number of runs that were ever planned, finished or not."""
-        return int(self._db.execute("SELECT COUNT(*) FROM runs").fetchone()[0])
+        return int(self._select("SELECT COUNT(*) FROM runs")[0][0])
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of runs by status, `planned` for those without an outcome."""
-        return dict(self._db.execute("SELECT status, COUNT(*) FROM runs GROUP BY status").fetchall())
+        found = dict(self._select("SELECT status, COUNT(*) FROM runs GROUP BY status"))
+        if unknown := set(found) - {PLANNED, *map(str, Status)}:
+            raise damaged(self.folder, f"a run has the status {min(map(repr, unknown))}")
+        return found
 
     @property
     def _known(self) -> Rows:
@@ -313,9 +309,7 @@ class Store:
 
     def unfinished(self) -> list[Job]:
         """Return the planned runs that have no outcome yet."""
-        rows = self._db.execute(
-            f"SELECT {', '.join(_PLAN)}, plan_checksum FROM runs WHERE status = ? ORDER BY idx", (PLANNED,)
-        ).fetchall()
+        rows = self._select(f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE status = ? ORDER BY idx", (PLANNED,))
         for row in rows:
             self._checked(f"run {row[0]}", row[-1], *row[:-1])
         names = self._known.names
@@ -324,7 +318,7 @@ class Store:
     def iterations(self) -> list[Iteration]:
         """Return how each batch was chosen."""
         last = self._iterations[-1].number if self._iterations else -1
-        rows = self._db.execute("SELECT * FROM iterations WHERE iteration > ? ORDER BY iteration", (last,))
+        rows = self._select("SELECT * FROM iterations WHERE iteration > ? ORDER BY iteration", (last,))
         for number, stage, text, checksum in rows:
             self._checked(f"iteration {number}", checksum, number, stage, text)
             self._iterations.append(Iteration(number, stage, json.loads(text)))
@@ -333,14 +327,14 @@ class Store:
     def fits(self) -> list[FitRecord]:
         """Return what is known of each fitted metamodel, in the order of the runs."""
         last = self._fits[-1].runs if self._fits else -1
-        for runs, iteration, text, checksum in self._db.execute("SELECT * FROM fits WHERE runs > ? ORDER BY runs", (last,)):
+        for runs, iteration, text, checksum in self._select("SELECT * FROM fits WHERE runs > ? ORDER BY runs", (last,)):
             self._checked(f"the fit after {runs} runs", checksum, runs, iteration, text)
             self._fits.append(from_json(FitRecord, json.loads(text)))
         return list(self._fits)
 
     def history(self) -> History:
         """Return all finished runs as columns; what was read before is not decoded again."""
-        with _reported(self.folder):
+        with reported(self.folder):
             done = self._known
             pending = self._db.execute("SELECT MIN(idx) FROM runs WHERE status = ?", (PLANNED,)).fetchone()[0]
             until = "" if pending is None else f" AND idx < {int(pending)}"
@@ -355,22 +349,17 @@ class Store:
 
     def _read_into(self, rows: Rows, condition: str) -> None:
         """Append the rows that meet a condition, in the order of their index."""
-        query = f"SELECT {', '.join((*_PLAN, *_OUTCOME))}, plan_checksum, checksum FROM runs WHERE {condition} ORDER BY idx"
+        query = f"SELECT {', '.join((*PLAN, *OUTCOME))}, plan_checksum, checksum FROM runs WHERE {condition} ORDER BY idx"
         cursor = self._db.execute(query)
-        n = len(_PLAN)
+        n = len(PLAN)
         while found := cursor.fetchmany(10_000):
             for row in found:
                 self._checked(f"run {row[0]}", row[-2], *row[:n])
                 self._checked(f"the outcome of run {row[0]}", row[-1], row[0], *row[n:-2])
-            columns = dict(zip((*_PLAN, *_OUTCOME), zip(*found, strict=True), strict=False))
+            columns = dict(zip((*PLAN, *OUTCOME), zip(*found, strict=True), strict=False))
             x = as_numbers(json.loads(f"[{','.join(columns['inputs'])}]"), rows.names, rows.choices)
             metrics = json.loads(f"[{','.join(columns['metrics'])}]")
             rows.append(x, {"index": columns["idx"], **{name: columns[name] for name in _FIELDS}}, metrics)
-
-
-def _checksum(*parts: Any) -> int:
-    """Return the CRC-32 of the parts of a row."""
-    return zlib.crc32(repr(parts).encode("utf-8", "surrogatepass"))
 
 
 def _dump(value: Any) -> str:
@@ -385,13 +374,3 @@ def _dump_metrics(metrics: Mapping[str, float]) -> str:
 
 def _number(value: float) -> str:
     return _dump(value) if math.isfinite(value) else ("-1e999" if value < 0 else "1e999")
-
-
-@contextmanager
-def _reported(folder: Path) -> Iterator[None]:
-    """Turn what the disk or SQLite refuses into one clear error; committed runs stay."""
-    try:
-        yield
-    except (sqlite3.Error, OSError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise StoreError(f"the store must be readable and writable, but {folder} is not: {reason}") from error

@@ -21,6 +21,7 @@ from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_traced
 from sbt.plugins import OBJECT, Objects, Scope
+from sbt.plugins.approval import trust_store
 from sbt.problem.description import describe_scenario, scenario_differences
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Json, Value, written
@@ -90,12 +91,13 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
             data["executor"] = {**data.get("executor", {}), "workers": workers}
         study = Study.from_mapping(data, name="sbt.run", scope=Scope(Path.cwd(), objects))
     summary = run_study(study, progress=progress, report=report)
+    trust_store(Path(summary.store))  # the caller has named its code, which has run
     return Result(Path(summary.store), objects)
 
 
 def open_result(
     store: str | Path, *, scenario: LogicalScenario | None = None, metamodel: object = None, acquisition: object = None,
-    metrics: Sequence[Metric | Callable[[Trace], float]] = (), campaign: object = None,
+    metrics: Sequence[Metric | Callable[[Trace], float]] = (), campaign: object = None, trust: bool = False,
 ) -> Result[Any]:  # fmt: skip
     """Return the result in a store, also while its campaign runs.
 
@@ -106,12 +108,15 @@ def open_result(
         acquisition: likewise.
         metrics: likewise, beside the scenario.
         campaign: likewise, for the type of the conclusion.
+        trust: approve the code that the store names (`file.py:NAME`), with the content that it has now.
 
     Raises:
         StoreError: the folder holds no campaign.
         InputError: an object is not the one that the store was made with.
     """
     folder = Path(store)
+    if trust:
+        trust_store(folder)
     given = {"scenario": scenario, "metamodel": metamodel, "acquisition": acquisition, "campaign": campaign}
     for name, value in given.items():
         if isinstance(value, str | Path):

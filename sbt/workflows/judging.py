@@ -7,6 +7,7 @@ reading a store needs no simulation.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -120,7 +121,8 @@ def judge_run(
     with Store.read(folder) as store:
         study, history, known = Study.from_store(store, objects=objects), store.history(), store.judgements
     chosen = tuple(drivers) if drivers is not None else study.config.judges or DRIVERS
-    judged = judge_runs(study, history, [run], chosen, known=known, workers=1)
+    with nullcontext() if drivers is not None else study.loaded.scope.naming():
+        judged = judge_runs(study, history, [run], chosen, known=known, workers=1)
     return tuple(each for driver in chosen for each in judged if (each.run, each.driver) == (run, driver))
 
 

@@ -17,9 +17,10 @@ from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Facts, Finished, Log, Progress, Shard, check_shard, run_shard, run_stages
-from sbt.plugins import OBJECT, Objects
+from sbt.plugins import OBJECT, Objects, forget_files
+from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
-from sbt.problem.outcome import Doubt, Job, Outcome
+from sbt.problem.outcome import Doubt, Job, Outcome, Status
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
@@ -27,11 +28,12 @@ from sbt.store.database import Store
 from sbt.store.history import Record
 from sbt.workflows.asking import sensitivities_in
 from sbt.workflows.judging import judge_campaign
+from sbt.workflows.portable import write_bundle
 from sbt.workflows.study import RESOLVED, Study, changed_since
 
-__all__ = ["Replay", "Summary", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
+__all__ = ["Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
 
-_MAY_CHANGE = {"budget", "folder", "yaml", "described", "kind", "judges"}
+_MAY_CHANGE = {"budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
 
@@ -206,12 +208,14 @@ class Replay:
         outcome: now.
         trace: None where the scenario has none or the run fails.
         scenario: as it was configured.
+        executed: False: there is nothing to show, and the user's code was not run for it; the outcome is the stored one.
     """
 
     record: Record
     outcome: Outcome
     trace: Trace | None
     scenario: LogicalScenario
+    executed: bool = True
 
     @property
     def identical(self) -> bool:
@@ -222,19 +226,49 @@ class Replay:
 def replay_run(folder: Path, index: int, *, objects: Objects | None = None) -> Replay:
     """Execute a stored run again, as the campaign did.
 
+    Where a file of Python gives metrics without a trace, there is nothing to show: its code runs only where the user asks
+    for that by trusting the store.
+
     Raises:
-        InputError: the store has no finished run of this index.
+        InputError: the store has no finished run of this index, or its code is needed and not approved.
     """
     with Store.read(folder) as store:
         study, history = Study.from_store(store, objects=objects), store.history()
-    scenario = study.runnable
     rows = np.flatnonzero(history.index == index)
     if len(rows) == 0:
         have = f"{history.index[0]} to {history.index[-1]}" if len(history) else "none yet"
         raise InputError(f"a run must be a finished one of {folder} ({have}), but got {index}")
     record = history.record(int(rows[0]))
-    outcome, trace = run_traced(study.spec.resolve(), Job(index, record.inputs, record.seed))
+    if study.own_code and not study.kept["described"]["traced"] and not is_trusted(folder):
+        stored = Outcome(index, Status(record.status), record.metrics, record.reason, record.seconds)
+        return Replay(record, stored, None, study.scenario, executed=False)
+    with study.loaded.scope.naming():
+        scenario = study.runnable
+        outcome, trace = run_traced(study.spec.resolve(), Job(index, record.inputs, record.seed))
     return Replay(record, outcome, trace, scenario)
+
+
+def bundle_store(folder: Path, target: Path) -> list[Path]:
+    """Write a zip with a store and the files of its scenario, which replays wherever it is unpacked; return these files.
+
+    The first run that went well is executed again, so that all files are known that a run reads.
+
+    Raises:
+        InputError: the code is not approved, does not give the run again, or names files absolutely.
+        StoreError: the folder holds no campaign.
+    """
+    forget_files()
+    with Store.read(folder) as store:
+        study, history = Study.from_store(store), store.history()
+    with study.loaded.scope.naming():
+        _, scenario = study.runnable, study.spec.resolve()  # the first one says what is wrong
+        for row in np.flatnonzero(history.ok)[:1]:
+            record = history.record(int(row))
+            outcome, _ = run_traced(scenario, Job(record.index, record.inputs, record.seed))
+            if dict(outcome.metrics) != dict(record.metrics):
+                rule = f"a bundle must give the runs again, but run {record.index} now gives {dict(outcome.metrics)}"
+                raise InputError(f"{rule}, not {dict(record.metrics)}{changed_since(folder)}")
+    return write_bundle(folder, study.loaded.folder, target)
 
 
 def _check_same(store: Store, snapshot: JsonMapping) -> None:

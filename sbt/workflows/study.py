@@ -27,6 +27,7 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History
+from sbt.workflows.portable import place_of, where_it_is
 
 if TYPE_CHECKING:
     from sbt.estimators.transfer import Transfer
@@ -71,7 +72,7 @@ class Study:
         place = Path(path)
         if place.name == RESOLVED and Store.begun(place.parent):
             with Store.read(place.parent) as store:
-                folder = Path(store.configuration["folder"])
+                folder, _ = place_of(store.configuration, store.folder)
             return cls(parse(read_text(place), overrides, name=str(path), folder=folder, **more))
         return cls(load(path, overrides, **more))
 
@@ -85,18 +86,19 @@ class Study:
         """Return the study that a store was made with.
 
         Args:
-            store: open for reading or writing.
+            store: open for reading or writing; the code that it names runs only where the user has approved it.
             objects: what was given in Python when it was made, where that is needed.
             live: load the scenario's code, to run it.
         """
-        kept, folder, given = store.configuration, Path(store.configuration["folder"]), dict(objects or {})
+        kept, given = store.configuration, dict(objects or {})
+        folder, text = place_of(kept, store.folder)
         name = kept["campaign"]
         try:
-            Scope(folder, given).load("campaigns", name)
+            Scope(folder, given, store.folder).load("campaigns", name)
         except PluginError:
             if "kind" in kept:
                 given["campaigns", name] = CampaignKind.absent(name, kept["kind"])
-        loaded = parse(kept["yaml"], name=str(store.folder / RESOLVED), folder=folder, objects=given)
+        loaded = parse(text, name=str(store.folder / RESOLVED), folder=folder, objects=given, store=store.folder)
         return cls(loaded, kept, live, store.folder)
 
     def stored_in(self, store: Store) -> Study:
@@ -155,6 +157,13 @@ class Study:
         """The scenario for other processes, at the isolation level of the campaign."""
         spec = self._assembly.spec if self.live else spec_of(self.loaded)
         return replace(spec, isolated=self.isolation)
+
+    @property
+    def own_code(self) -> bool:
+        """Whether files of Python give the metrics: the scenario's, those of the metrics, the ego."""
+        config = self.config
+        names = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
+        return any(".py:" in name or name.endswith((".yaml", ".yml")) for name in names)
 
     @cached_property
     def runnable(self) -> LogicalScenario:
@@ -250,7 +259,7 @@ class Study:
             described = describe_scenario(self.scenario)
         return {
             **fingerprint(config), "budget": config.budget, "names": list(self.scenario.space.names),
-            "described": described, "folder": str(Path(self.loaded.folder).resolve()),
+            "described": described, **where_it_is(self.loaded.folder, Path(config.store)),
             "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
             **({"isolation": self.isolation.described()} if self.isolation is not None and self.isolation.warm else {}),

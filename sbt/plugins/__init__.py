@@ -1,7 +1,7 @@
 """How scenarios, metamodels, acquisitions, metrics and controllers are found: built-ins and strangers alike.
 
 A name is an entry point (groups `sbt.scenarios`, `sbt.metamodels`, ...), `file.py:NAME` runs the
-user's own file, and only because the user names it.
+user's own file, and only because the user names it: what a store names is asked for (`sbt.plugins.approval`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import importlib.util
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
@@ -18,8 +19,12 @@ from typing import Any, TypeVar, cast
 
 from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
+from sbt.plugins.approval import check_approved, modules_of, named_by
 
-__all__ = ["KINDS", "OBJECT", "Objects", "Scope", "forget_changed", "kept", "load", "names", "newer", "noted"]
+__all__ = [
+    "KINDS", "OBJECT", "Objects", "Scope", "forget_changed", "forget_files", "kept", "load", "names", "newer", "noted",
+    "read_files",
+]  # fmt: skip
 
 OBJECT = "object:"
 """Before the name of an object that was given in Python, where a name is asked for."""
@@ -55,15 +60,26 @@ def forget_changed() -> None:
     Called where a command begins, not within one: a campaign runs what it began with.
     """
     if any(_stamp(path) != state for path, state in _stamps.items()):
-        _stamps.clear()
-        for forget in _forgetters:
-            forget()
+        forget_files()
+
+
+def forget_files() -> None:
+    """Forget everything that was made of the user's files, so that `read_files` knows what is read from now on."""
+    _stamps.clear()
+    for forget in _forgetters:
+        forget()
 
 
 def newer(file: Path) -> list[Path]:
     """Return the user's files, of those that this process has read, that were changed later than a file."""
     state = _stamp(file)
     return sorted(path for path in _stamps if _stamp(path) > state)
+
+
+def read_files() -> list[Path]:
+    """Return the user's files that this process has read, and the modules beside them that they import."""
+    found = {path.resolve() for path in _stamps if path.is_file()}
+    return sorted({file for path in found for file in (modules_of(path) if path.suffix == ".py" else (path,))})
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -82,23 +98,30 @@ class Scope:
     Args:
         folder: where a relative `file.py:NAME` is looked up.
         objects: (kind, name) -> object, such as ("scenarios", "object:disc").
+        store: folder of the store that the names come from; their code runs only where it is approved. None: from the user.
     """
 
     folder: Path = field(default_factory=Path.cwd)
     objects: Objects = field(default_factory=dict)
+    store: Path | None = None
+
+    def naming(self) -> AbstractContextManager[None]:
+        """Return the context in which code is loaded that these names stand for."""
+        return named_by(self.store)
 
     def load(self, kind: str, name: str) -> Any:
         """Return the object with this name; as `load`, and the objects of the scope.
 
         Raises:
-            PluginError: nothing has this name, or it was defined in Python and is not given here.
+            PluginError: nothing has this name, it was defined in Python and is not given here, or it is not approved.
         """
         if (kind, name) in self.objects:
             return self.objects[kind, name]
         if name.startswith(OBJECT):
             one, own = kind.removesuffix("s"), name.removeprefix(OBJECT)
             raise PluginError(f"the {one} '{own}' was defined in Python and must be given again: {one}={own}")
-        return load(kind, name, self.folder)
+        with self.naming():
+            return load(kind, name, self.folder)
 
 
 @cache
@@ -185,6 +208,7 @@ def _line_of(error: BaseException, path: str) -> str:
 
 def _from_file(path: str, attribute: str) -> Any:
     with _LOCK:
+        check_approved(Path(path).resolve())
         module = _module(str(Path(path).resolve()))
     if not hasattr(module, attribute):
         offered = ", ".join(n for n in vars(module) if n.isupper() or not n.startswith("_")) or "nothing"

@@ -1,0 +1,167 @@
+"""A store that somebody else made runs nothing unsaid, and replays wherever it lies."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import departing
+import pytest
+from typer.testing import CliRunner
+
+import sbt
+from sbt.cli import app
+from sbt.plugins import approval
+from sbt.plugins.approval import UntrustedError
+from sbt.workflows.running import replay_run
+
+LOUD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, str(Path(__file__).parent))
+import {helper}
+import sbt
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+MARK = Path(__file__).with_name("ran")
+MARK.touch()
+
+def odd(values):
+    return values["a"] < 2.0
+
+def scenario(*constraints):
+    space = ParameterSpace((sbt.Parameter("a", 0.0, 1.0),), constraints=constraints)
+    evaluate = lambda v, seed: {{"y": v["a"]}}
+    return LogicalScenario("loud", space, sbt.Requirement("y", high=0.1), evaluate=evaluate, metric_names=("y",))
+
+PLAIN, ODD = scenario(), scenario(("odd", odd))
+"""
+
+
+def tried(*command: object) -> tuple[int, str]:
+    done = CliRunner().invoke(app, [str(word) for word in command])
+    return done.exit_code, done.output
+
+
+@pytest.fixture
+def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Become somebody who has approved nothing."""
+
+    def become() -> None:
+        monkeypatch.setattr("sbt.plugins.approval._trusted", set())
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / os.urandom(4).hex()))
+
+    become()
+    return become
+
+
+@pytest.fixture
+def loud(tmp_path: Path, stranger: Any) -> Callable[[str], Path]:
+    """Run a campaign whose file leaves a mark when it is imported, and remove the mark."""
+
+    def run(name: str, **keys: Any) -> Path:
+        folder = tmp_path / "own"
+        folder.mkdir(exist_ok=True)
+        helper = f"helper_{os.urandom(4).hex()}"
+        (folder / f"{helper}.py").write_text("X = 1\n")
+        (folder / "loud.py").write_text(LOUD.format(helper=helper))
+        data = {"campaign": "coverage", "scenario": f"loud.py:{name}", "budget": 12, "executor": {"kind": "serial"}, "store": "s"}
+        (folder / "c.yaml").write_text(json.dumps(data | keys))
+        sbt.run(folder / "c.yaml", store=folder / "s", report=False)
+        approval._trusted.clear()  # as in another process
+        (folder / "ran").unlink()
+        return folder
+
+    return run
+
+
+def test_reading_needs_no_code_and_a_replay_without_a_trace_runs_none(loud: Any, stranger: Any, tmp_path: Path):
+    own = loud("PLAIN")
+    theirs = Path(shutil.copytree(own, tmp_path / "theirs"))
+    shutil.rmtree(own)
+    assert tried("report", theirs / "s")[0] == 0
+    for folder in (theirs, theirs):
+        for verb in ("status", "export"):
+            assert tried(verb, folder / "s")[0] == 0
+        code, said = tried("replay", folder / "s", 3, "--json")
+        assert (code, json.loads(said)["identical"]) == (0, None)
+        assert not (folder / "ran").exists()
+        stranger()
+    code, said = tried("replay", theirs / "s", 3, "--json", "--trust")
+    assert (code, json.loads(said)["identical"], (theirs / "ran").exists()) == (0, True, True)
+
+
+def test_code_that_is_needed_is_refused_until_it_is_approved_with_this_content(loud: Any, stranger: Any, tmp_path: Path):
+    own = loud("ODD")
+    assert tried("export", own / "s")[0] == 0, "one's own store asks for nothing"
+    theirs = Path(shutil.copytree(own, tmp_path / "theirs"))
+    shutil.rmtree(own)
+    assert tried("export", theirs / "s")[0] == 0, "the content is approved, wherever it lies"
+    stranger()
+    (theirs / "ran").unlink(missing_ok=True)
+    for command in (("report", theirs / "s"), ("export", theirs / "s"), ("bundle", theirs / "s")):
+        code, said = tried(*command)
+        assert code == 2
+        assert str(theirs / "loud.py") in said
+        assert "--trust" in said
+    assert not (theirs / "ran").exists()
+    with pytest.raises(sbt.InputError, match="SBT_TRUST"):
+        _ = sbt.open(theirs / "s").scenario
+    assert tried("export", theirs / "s", "--trust")[0] == 0
+    with pytest.MonkeyPatch.context() as patch:  # another process of the same user
+        patch.setattr("sbt.plugins.approval._trusted", set())
+        assert tried("export", theirs / "s")[0] == 0
+        helper = next(theirs.glob("helper_*.py"))
+        helper.write_text("X = 2\n")
+        assert tried("export", theirs / "s")[0] == 2, "a module that the file imports has changed"
+        patch.setenv("SBT_TRUST", f"{tmp_path / 'elsewhere'}{os.pathsep}{theirs}")
+        assert tried("export", theirs / "s")[0] == 0
+    stranger()
+    assert sbt.open(theirs / "s", trust=True).scenario.space.names == ("a",)
+
+
+def test_what_a_store_names_beside_its_scenario_is_asked_for_too(loud: Any, stranger: Any):
+    own = loud("PLAIN")
+    stranger()
+    with pytest.raises(UntrustedError, match=r"loud\.py"):
+        sbt.open(own / "s").study.loaded.scope.load("controllers", "loud.py:PLAIN")
+    assert replay_run(own / "s", 0).executed is False
+
+
+def test_a_bundle_replays_where_it_is_unpacked(loud: Any, stranger: Any, tmp_path: Path):
+    own = loud("PLAIN")
+    assert tried("bundle", own / "s", "--to", tmp_path / "mail.zip")[0] == 0
+    shutil.rmtree(own)
+    with zipfile.ZipFile(tmp_path / "mail.zip") as file:
+        file.extractall(tmp_path / "other")
+    stranger()
+    store = tmp_path / "other" / "mail"
+    code, said = tried("replay", store, 5, "--trust", "--json")
+    assert (code, json.loads(said)["identical"]) == (0, True)
+    assert (store / "files" / "ran").exists()
+    assert len(list(store.glob("files/*"))) == 3, "what else the process has read is not in it"
+
+
+@pytest.mark.sumo
+def test_own_files_that_are_moved_or_bundled_give_the_same_runs(tmp_path: Path, stranger: Any):
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "net.net.xml").write_text(departing.NET)
+    (own / "cars.rou.xml").write_text(f"{departing.HEAD}\n{departing.car('ego', '${p}')}{departing.car('lead', '550')}</routes>")
+    (own / "scenario.yaml").write_text(departing.YAML.format(ego="ego", more="", options=""))
+    (own / "c.yaml").write_text(json.dumps({
+        "campaign": "coverage", "scenario": str(own / "scenario.yaml"), "budget": 4, "executor": {"kind": "serial"}, "store": "s",
+    }))  # fmt: skip
+    sbt.run(own / "c.yaml", store=own / "s", report=False)
+    assert tried("bundle", own / "s", "--to", tmp_path / "mail.zip")[0] == 0
+    shutil.move(own, tmp_path / "moved")
+    with zipfile.ZipFile(tmp_path / "mail.zip") as file:
+        file.extractall(tmp_path / "other")
+    for store in (tmp_path / "moved" / "s", tmp_path / "other" / "mail"):
+        code, said = tried("replay", store, 2, "--json")
+        assert (code, json.loads(said)["identical"]) == (0, True)
