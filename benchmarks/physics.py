@@ -70,6 +70,8 @@ def main() -> None:
     for name in args.names or sbt.list("scenarios"):
         for kind, scenario in egos(ScenarioSpec(name).resolve(), [e for e in args.egos.split(",") if e]).items():
             runs = args.runs if kind == "own" else args.others
+            if runs == 0:
+                continue
             values, who, failed = measure(scenario, runs)
             limits = np.array([law.limit for law in LAWS.values()])
             broken = values > limits
