@@ -332,12 +332,12 @@ def test_a_store_keeps_words_and_gives_them_back(tmp_path):
 
 
 def test_a_campaign_speaks_in_words_and_is_the_same_with_workers_and_after_a_stop(tmp_path):
-    keys = {"campaign": "falsification", "scenario": scenario(), "seed": 3, "metamodel": "gp", "budget": 24, "report": False}
+    keys = {"campaign": "falsification", "scenario": scenario(), "seed": 3, "metamodel": "gp", "budget": 16, "report": False}
     one = sbt.run(**keys, store=str(tmp_path / "a"), executor="serial")
-    two = sbt.run(**keys, store=str(tmp_path / "b"), workers=2)
+    two = sbt.run(**keys, store=str(tmp_path / "b"), executor={"kind": "local", "workers": 1})
 
     def stop(progress):
-        if progress.done == 17:
+        if progress.done == 12:
             raise RuntimeError("stopped")
 
     with pytest.raises(RuntimeError, match="stopped"):

@@ -189,10 +189,11 @@ def test_a_scenario_is_no_campaign(study):
 
 
 @pytest.mark.sumo
-def test_check_reports_warnings_of_sumo(study):
+def test_check_reports_warnings_of_sumo_and_units_that_it_does_not_take(study):
     person = '    <person id="p" depart="0"><walk edges="road" departPos="300" arrivalPos="400"/></person>\n</routes>'
-    code, output = check(study({CARS: [("</routes>", person)]}))
+    code, output = check(study({CARS: [("</routes>", person)], YAML: [("max: 30, unit: m/s", "max: 30, unit: km/h")]}))
     assert (code, "SUMO warns: The attribute departPos is no longer supported for walks" in output) == (0, True), output
+    assert re.search(r"rou\.xml:5:5: SUMO takes departSpeed in m/s, but the input v_lead has the unit km/h: \$\{v_lead / 3\.6\}", output)
 
 
 def test_all_mistakes_are_reported_at_once(study):

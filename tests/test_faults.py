@@ -100,8 +100,8 @@ def begun(store: Path) -> bool:
     ("number", "executor"),
     [
         (signal.SIGINT, {"kind": "local", "workers": 2}),
-        (signal.SIGHUP, {"kind": "local", "workers": 2}),
-        (signal.SIGQUIT, {"kind": "serial"}),
+        pytest.param(signal.SIGHUP, {"kind": "local", "workers": 2}, marks=pytest.mark.slow),
+        pytest.param(signal.SIGQUIT, {"kind": "serial"}, marks=pytest.mark.slow),
         (signal.SIGTERM, {"kind": "local", "workers": 1}),
     ],
     ids=["INT", "HUP", "QUIT", "TERM"],
@@ -342,7 +342,7 @@ def test_a_task_may_raise_anything():
 
 
 @pytest.mark.sumo
-@pytest.mark.parametrize("kind", ["local", "serial"])
+@pytest.mark.parametrize("kind", ["local", pytest.param("serial", marks=pytest.mark.slow)])
 def test_a_campaign_leaves_no_temporary_folder(kind: str, started: Any, configured: Callable[..., Path], temporary: Path):
     executor = {"kind": kind} | ({"workers": 2} if kind == "local" else {})
     config = configured("c", campaign="coverage", budget=20, batch=20, executor=executor)
@@ -387,8 +387,9 @@ def test_a_process_is_known_by_its_identifier_and_its_start():
 @pytest.mark.parametrize(
     ("kind", "ending"),
     [
-        ("serial", "2>&-"), ("serial", ">&-"), ("serial", "2>&1 >/dev/null | head -1"), ("serial", ">&- 2>&- <&-"),
-        ("local", "2>&-"), ("local", "2>&1 | head -1"),
+        pytest.param("serial", "2>&-", marks=pytest.mark.slow), pytest.param("serial", ">&-", marks=pytest.mark.slow),
+        ("serial", "2>&1 >/dev/null | head -1"), ("serial", ">&- 2>&- <&-"),
+        pytest.param("local", "2>&-", marks=pytest.mark.slow), ("local", "2>&1 | head -1"),
     ],
 )  # fmt: skip
 def test_closed_streams_end_nothing(

@@ -91,7 +91,10 @@ def metric_of(scenario: LogicalScenario) -> Metric:
 
 
 @in_sumo
-def test_a_film_follows_the_ego_on_its_lanes_and_files_hold_who_was_there(stored: Stored, tmp_path: Path):
+def test_a_film_follows_the_ego_on_its_lanes_and_files_hold_who_was_there(
+    stored: Stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("sbt.report.film._FRAMES", 20)
     gif, out = tmp_path / "run.gif", tmp_path / "out"
     done = CliRunner().invoke(app, ["replay", str(stored.store), "1", "--gif", str(gif), "--export", str(out), "--json"])
     assert done.exit_code == 0, done.output

@@ -27,7 +27,7 @@ BUILT_IN = {
     "et paper": build(ExtraTrees, "paper"),
     "gp": GaussianProcess(),
     "gp homoscedastic": GaussianProcess(nu=2.5, input_noise=False),
-    "gp paper, cut short": build(GaussianProcess, "paper", settings={"max_epochs": 100}),
+    "gp paper, cut short": build(GaussianProcess, "paper", settings={"max_epochs": 40}),
 }
 
 

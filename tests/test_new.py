@@ -137,3 +137,5 @@ def test_placeholders_that_are_there_are_the_inputs(tmp_path):
     scenario = ScenarioSpec(str(tmp_path / "s" / "scenario.yaml")).resolve()
     ranges = {p.name: (p.low, p.high, p.unit) for p in scenario.space.parameters}
     assert ranges == {"gap": (0.0, 1.0, ""), "v": (0.0, 15.0, "m/s")}
+    again = CliRunner().invoke(app, ["new", str(tmp_path / "t"), "--from", str(tmp_path / "s" / "scenario.yaml")])
+    assert (again.exit_code, "--from must be a SUMO configuration (.sumocfg)" in again.output) == (2, True)

@@ -97,7 +97,7 @@ def test_a_motorway_is_made_of_lane_markings(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [("frame,id,x,y\n1,1,0,0\n", "width, height, xVelocity, yVelocity is missing"),
-     ("frame,id,x,y,width,height,xVelocity,yVelocity\n1,1,a,0,4,2,5,0\n", "table of numbers"),
+     ("frame,id,x,y,width,height,xVelocity,yVelocity\n1,1,a,0,4,2,5,0\n", "row 2, column x has no finite number: 'a'"),
      ("frame,id,x,y,width,height,xVelocity,yVelocity\n", "none in"),
      ("frame,id,x,y,width,height,xVelocity,yVelocity\n1,1,0,0,4,2,5,0\n1,1,0,0,4,2,5,0\n", "once per time step"),
      ("frame,id,x,y,width,height,xVelocity,yVelocity\n1,1,,0,4,2,5,0\n", "finite number")],

@@ -249,6 +249,7 @@ class ProgressDisplay:
             from tqdm import tqdm
 
             self._bar = tqdm(total=progress.budget, initial=progress.done, unit="run", file=sys.stderr)
+        self._bar.total = max(progress.budget, progress.done)  # failures are repeated beyond the budget
         self._bar.set_postfix_str(_counts(progress), refresh=False)
         self._bar.update(progress.done - self._bar.n)
         self._bar.refresh()
@@ -259,7 +260,9 @@ class ProgressDisplay:
         if progress.iteration == iteration and now - shown < _QUIET_SECONDS and progress.done < progress.budget:
             return
         self._last = (progress.iteration, now)
-        line = f"{progress.done}/{progress.budget} runs, iteration {progress.iteration}, {_counts(progress)}"
+        beyond = progress.done - progress.budget
+        done = f"{progress.done}/{progress.budget} runs" if beyond <= 0 else f"{progress.budget} runs and {beyond} more"
+        line = f"{done}, iteration {progress.iteration}, {_counts(progress)}"
         print(line, file=sys.stderr, flush=True)
 
 

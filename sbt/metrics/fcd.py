@@ -117,7 +117,9 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     data = {name: np.asarray(values, dtype=np.float64) for name, values in columns.items()}
     for name in (*_REQUIRED[2:], "time"):
         if not np.isfinite(data[name]).all():
-            raise InputError(f"{name} of every road user in a recording must be a finite number, but is not in '{path}'")
+            k = int((~np.isfinite(data[name])).argmax())
+            where = f"that of '{users[user[k]]}' at {data['time'][k]:g} s (row {k + 1} of the states) is {data[name][k]:g}"
+            raise InputError(f"{name} of every road user in a recording must be a finite number, but {where} in '{path}'")
     time, step = np.unique(data["time"], return_inverse=True)
     order = np.lexsort((step, user))
     user, step = user[order], step[order]

@@ -76,7 +76,7 @@ def read_recording(path: Path, *, length: float = 5.0, width: float = 1.8) -> Re
             if missing:
                 rule = f"tracks must have the columns {', '.join(wanted)}"
                 raise InputError(f"{rule}, but in '{path}' {', '.join(missing)} is missing")
-            return _recording(path, convert)
+            return _recording(path, wanted, convert)
     return read_fcd(path, length=length, width=width)
 
 
@@ -102,12 +102,13 @@ def read_meta(path: Path) -> RecordingMeta:
     return found
 
 
-def _recording(path: Path, convert: Callable[[Any], tuple[Any, Columns]]) -> Recording:
+def _recording(path: Path, wanted: tuple[str, ...], convert: Callable[[Any], tuple[Any, Columns]]) -> Recording:
     """Return the recording of a file of tracks, by the function that converts its columns."""
     import pandas as pd
 
     try:
         table = pd.read_csv(path, low_memory=False)
+        _check_cells(path, table, wanted)
         ids, columns = convert(table)
         columns["time"] = table["frame"].to_numpy(dtype=np.float64) / read_meta(path).frame_rate
     except (ValueError, TypeError) as error:
@@ -125,6 +126,22 @@ def _recording(path: Path, convert: Callable[[Any], tuple[Any, Columns]]) -> Rec
     recording = recording_of_columns(path, ids, person.astype(int), columns, (5.0, 1.8))
     kinds = tuple(classes.get(name, "vehicle") for name in recording.names)
     return replace(recording, kinds=tuple("person" if kind in _PERSONS else kind for kind in kinds))
+
+
+def _check_cells(path: Path, table: Any, wanted: tuple[str, ...]) -> None:
+    """Refuse the first cell that is no finite number; sizes may be empty in the columns of inD, which has none of persons."""
+    import pandas as pd
+
+    for name in (column for column in wanted if column not in ("id", "trackId")):
+        cells = table[name]
+        numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=np.float64)
+        may_be_empty = wanted == _IND and name in ("width", "length")
+        bad = np.isinf(numbers) | (np.isnan(numbers) & (cells.notna().to_numpy() | (not may_be_empty)))
+        if bad.any():
+            k = int(bad.argmax())
+            got = "nothing" if pd.isna(cells.iloc[k]) else f"'{cells.iloc[k]}'"
+            rule = f"tracks must be a table of numbers, but in '{path}' row {k + 2}, column {name} has no finite number"
+            raise InputError(f"{rule}: {got}")
 
 
 def _of_ind(table: Any) -> tuple[Any, Columns]:

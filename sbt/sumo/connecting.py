@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,14 +12,21 @@ from typing import Any
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 
-__all__ = ["traci_connection"]
+__all__ = ["start_quietly", "traci_connection"]
+
+
+def start_quietly(traci: Any, command: list[str]) -> None:
+    """Start a SUMO program without what traci prints and warns of while the program is not up yet; it raises when it gives up."""
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        traci.start(command)
 
 
 @contextlib.contextmanager
 def traci_connection(traci: Any, command: list[str], state: Path | None = None) -> Iterator[Any]:
     """Start a SUMO program, load a saved state where one is given, provide traci connected to it, and close it in the end."""
     try:
-        traci.start(command)
+        start_quietly(traci, command)
         if state is not None:
             traci.simulation.loadState(str(state))
         yield traci

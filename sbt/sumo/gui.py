@@ -13,6 +13,7 @@ from typing import Any
 
 from sbt.errors import InputError
 from sbt.problem.isolation import Isolation
+from sbt.sumo.connecting import start_quietly
 from sbt.sumo.session import session
 
 __all__ = ["gui_program", "run_in_gui"]
@@ -73,7 +74,7 @@ def run_in_gui(
 
     def start(command: list[str]) -> None:
         options = ["--start", "--quit-on-end", "--window-size", "1200,800"] if has_window else []
-        traci.start([program, *command[1:], *options])
+        start_quietly(traci, [program, *command[1:], *options])
 
     def step(*_: Any) -> None:
         if next_step:  # SUMO's own delay has no effect on steps made through TraCI

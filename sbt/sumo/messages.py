@@ -18,9 +18,12 @@ __all__ = ["explained"]
 _PREFIX = "SUMO: "
 _KINDS = {
     "vehicle": ("vehicle", "trip", "flow"), "flow": ("flow", "personFlow"), "route": ("route",), "vehicle type": ("vType",),
+    "vtype": ("vType",),
     "person": ("person", "personFlow"), "stop": ("vehicle", "trip", "flow"), "trip": ("trip",),
 }  # fmt: skip
 """Elements by the words with which SUMO speaks of them."""
+_OF_TYPE = re.compile(r"Car-Following-Model Attribute (\w+)\.|^SUMO: (\w+) must be greater than 0")
+"""Mistakes in a vType of which SUMO names the attribute, but not the type."""
 _NAMED = re.compile(rf"\b({'|'.join(sorted(_KINDS, key=len, reverse=True))})(?: with the id)?\s+'([^']+)'", re.IGNORECASE)
 
 
@@ -35,7 +38,8 @@ def explained(reason: str, files: SumoFiles) -> str:
         return reason
     known = list(elements(files))
     named = (_element(known, kind.lower(), name) for kind, name in _NAMED.findall(reason))
-    first = next((one for one in named if one is not None), None)
+    first = next((one for one in named if one is not None), None) or _faulty_type(reason, known)
+    reason = reason.replace(f"{_PREFIX}; Error: ", _PREFIX)
     remedy = ""
     for pattern, advise in _REMEDIES:
         match = pattern.search(reason)
@@ -51,6 +55,28 @@ def _element(known: list[Element], kind: str, name: str) -> Element | None:
         if found:
             return found[0]
     return None
+
+
+def _faulty_type(reason: str, known: list[Element]) -> Element | None:
+    """Return the vType with the attribute that SUMO refuses; None where it may be another one."""
+    match = _OF_TYPE.search(reason)
+    if match is None:
+        return None
+    attribute = match.group(1) or match.group(2)
+    types = [one for one in known if one.tag == "vType" and attribute in one.attributes]
+    refused = [one for one in types if _is_refused(one.attributes[attribute], reason)]
+    return next(iter(refused), types[0] if len(types) == 1 else None)
+
+
+def _is_refused(text: str, reason: str) -> bool:
+    """Return whether a value is what the reason refuses; not known of placeholders."""
+    if "${" in text:
+        return False
+    try:
+        value = float(text)
+    except ValueError:
+        return True
+    return not 0 <= value <= 1 if "[0-1]" in reason else value <= 0 if "greater than 0" in reason else False
 
 
 def _place(reason: str, first: Element, known: list[Element]) -> str:

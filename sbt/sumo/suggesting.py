@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.own_ego import Suggestion
 
-__all__ = ["suggested"]
+__all__ = ["suggested", "units_apart"]
 
 _BY_ATTRIBUTE = {
     "departSpeed": (0.0, 15.0, "m/s"), "maxSpeed": (5.0, 40.0, "m/s"), "speed": (5.0, 40.0, "m/s"), "depart": (0.0, 30.0, "s"),
@@ -16,6 +18,39 @@ _BY_ATTRIBUTE = {
     "actionStepLength": (0.1, 1.0, "s"), "scale": (0.5, 1.5, ""), "offset": (0.0, 90.0, "s"), "friction": (0.2, 1.0, ""),
 }  # fmt: skip
 """Usual ranges of an attribute that is one placeholder and nothing else."""
+
+
+_ALIKE = {
+    "m/s2": "m/s^2", "m/s²": "m/s^2", "mps": "m/s", "m s^-1": "m/s", "sec": "s", "seconds": "s", "metres": "m", "meters": "m",
+}  # fmt: skip
+"""Other ways to write SUMO's units."""
+_FACTORS = {
+    ("km/h", "m/s"): " / 3.6", ("kph", "m/s"): " / 3.6", ("mph", "m/s"): " * 0.44704", ("km", "m"): " * 1000",
+    ("cm", "m"): " / 100", ("ft", "m"): " * 0.3048", ("ms", "s"): " / 1000", ("min", "s"): " * 60", ("h", "s"): " * 3600",
+    ("g", "m/s^2"): " * 9.81",
+}  # fmt: skip
+"""What turns a number in one unit into one in another."""
+
+
+def units_apart(files: SumoFiles, units: Mapping[str, str]) -> tuple[str, ...]:
+    """Return where an input stands alone in an attribute for which SUMO takes another unit, with the formula that converts it.
+
+    Args:
+        files: the simulation.
+        units: of the inputs; those without a unit are not compared.
+    """
+    found = []
+    for hole in files.placeholders():
+        name, usual = hole.formula.text.strip(), _BY_ATTRIBUTE.get(hole.attribute)
+        unit = _ALIKE.get(units.get(name, ""), units.get(name, ""))
+        if usual is None or not usual[2] or not unit or unit.rpartition("1/")[2] == usual[2].rpartition("1/")[2]:
+            continue
+        if usual[2].startswith("1/") and unit.rpartition("/")[2] == usual[2][2:]:  # veh/h
+            continue
+        factor = _FACTORS.get((unit, usual[2]))
+        remedy = f": ${{{name}{factor}}}" if factor else ""
+        found.append(f"{hole.place}: SUMO takes {hole.attribute} in {usual[2]}, but the input {name} has the unit {unit}{remedy}")
+    return tuple(dict.fromkeys(found))
 
 
 def suggested(files: SumoFiles) -> tuple[Suggestion, ...]:

@@ -23,6 +23,8 @@ from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.seeds import run_seed
+from sbt.sumo.files import SumoFiles
+from sbt.sumo.suggesting import units_apart
 from sbt.workflows.comparing import compared_times
 from sbt.workflows.findings import Finding
 from sbt.workflows.rehearsal import rehearse
@@ -87,6 +89,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     yield run
     yield _finite(first, asked)
     yield from _warned(spec)
+    yield from _units(spec, asked.space)
     yield from rehearse(spec, asked, seed)
     if not run.ok:
         return
@@ -239,6 +242,13 @@ def _warned(spec: ScenarioSpec) -> list[Finding]:
     more = f" (and {len(lines) - _WARNINGS} more)" if len(lines) > _WARNINGS else ""
     detail = "; ".join(line.removeprefix("Warning: ") for line in lines[:_WARNINGS]) + more
     return [Finding("for information: SUMO warns", ok=True, detail=detail)] if lines else []
+
+
+def _units(spec: ScenarioSpec, space: ParameterSpace) -> list[Finding]:
+    """Return where inputs stand in attributes for which SUMO takes another unit, in a user's own SUMO files."""
+    files = getattr(spec.resolve().simulate, "files", None)
+    found = units_apart(files, {p.name: p.unit for p in space.parameters}) if isinstance(files, SumoFiles) else ()
+    return [Finding("for information: units", ok=True, detail="; ".join(found))] if found else []
 
 
 def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:

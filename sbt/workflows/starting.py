@@ -145,6 +145,9 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Writte
     """
     if (folder / "scenario.yaml").exists():
         raise InputError(f"FOLDER must not have a scenario.yaml yet, but '{folder}' has")
+    if config.suffix in (".yaml", ".yml"):
+        rule = "--from must be a SUMO configuration (.sumocfg), from which a scenario.yaml is made"
+        raise InputError(f"{rule}, but got '{config}': sumo-sbt check {config} tries a scenario.yaml that is there")
     files = SumoFiles.of(options_of_config(config), config.resolve().parent, str(config))
     if ego is not None and files.vehicle(ego) is None:
         names = files.names()
