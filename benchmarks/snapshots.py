@@ -41,7 +41,6 @@ def scenario(folder: Path, grid: int, departures: int, warm_up: float) -> Path:
     words = f"--grid --grid.number {grid} --grid.length 150 -L 2 --tls.guess --seed 1".split()
     program = shutil.which("netgenerate") or "netgenerate"
     subprocess.run([program, *words, "-o", str(folder / "grid.net.xml")], check=True, capture_output=True)
-    letters = [chr(65 + k) if k < 26 else chr(64 + k // 26) + chr(65 + k % 26) for k in range(grid)]
     net = (folder / "grid.net.xml").read_text()
     names = sorted({word.split('"')[0] for word in net.split('<edge id="')[1:] if not word.startswith(":")})
     rng = random.Random(1)
@@ -49,11 +48,9 @@ def scenario(folder: Path, grid: int, departures: int, warm_up: float) -> Path:
     trips = (f'<trip id="t{k}" type="drivers" depart="{t:.2f}" from="{rng.choice(names)}" to="{rng.choice(names)}"/>'
              for k, t in enumerate(times))  # fmt: skip
     (folder / "traffic.rou.xml").write_text(f"<routes>{TYPES}\n" + "\n".join(trips) + "\n</routes>")
-    middle, edges = letters[grid // 2], [name for name in names]
-    start = next(name for name in edges if name.startswith(f"{middle}{grid // 2}"))
     (folder / "ego.rou.xml").write_text(
         f'<routes><vType id="av" sigma="0" tau="${{tau}}" accel="${{accel}}"/><trip id="ego" type="av" depart="{warm_up:g}" '
-        f'from="{start}" to="{names[0]}" departSpeed="0" departLane="free"/></routes>'
+        f'from="{names[len(names) // 2]}" to="{names[0]}" departSpeed="0" departLane="free"/></routes>'
     )
     (folder / "scenario.yaml").write_text(
         "sumo: {net: grid.net.xml, routes: [traffic.rou.xml, ego.rou.xml]}\nego: {id: ego, delay: 30}\nduration: 10\n"

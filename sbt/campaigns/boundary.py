@@ -13,6 +13,7 @@ from sbt.campaigns.each import each_share, fits_words, independence_words, share
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.warmed import conditional_on
 from sbt.campaigns.wording import percent
 from sbt.errors import InputError
 from sbt.estimators.binomial import interval
@@ -71,7 +72,7 @@ class BoundaryConclusion:
     def sentences(self, facts: Facts) -> list[str]:
         """Return what was found in words: as measured, then as the metamodel sees it."""
         measured = self.held_out_fraction if self.held_out_fraction is not None else share_among_held_out(facts)
-        found = [*measured.sentence(), *shares_words(self.held_out_fractions)]
+        found = [*measured.sentence(), *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
         if self.critical_fraction is not None:
             where = "the parameter space" if self.failing_fraction is None else "what gives a metric"
             found.append(f"The metamodel takes {percent(self.critical_fraction)} of {where} to be critical.")

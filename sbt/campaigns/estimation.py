@@ -15,6 +15,7 @@ from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.stopping import FEWEST_BATCHES
+from sbt.campaigns.warmed import WarmTraffic, warmed_limits, warmed_traffic
 from sbt.campaigns.wording import number, percent, plural
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
@@ -63,6 +64,7 @@ class EstimationConclusion:
         gate: its verdict, where there is one.
         simulator_noise: what repeats with other seeds tell; None: none were asked for.
         requirements: of a combination, the probability of each requirement, from the same draws.
+        warmed_traffic: what the result is conditional on, where runs began with warmed traffic.
     """
 
     probability: float | None
@@ -83,6 +85,7 @@ class EstimationConclusion:
     gate: GateVerdict | None = optional()
     simulator_noise: SimulatorNoise | None = optional()
     requirements: tuple[RequirementEstimate, ...] | None = optional()
+    warmed_traffic: WarmTraffic | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -93,6 +96,7 @@ class EstimationConclusion:
         """Return the probability with its interval, or the bound where nothing was critical."""
         noise = [] if self.simulator_noise is None else self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         noise = [*estimates_words(self.requirements, self.confidence), *noise]
+        noise += [] if self.warmed_traffic is None else [self.warmed_traffic.sentence()]
         verdict = [] if self.gate is None else [f"Gate: {self.gate.verdict}; {self.gate.statement}."]
         confidence = percent(self.confidence)
         if self.exact_bound is not None:
@@ -153,11 +157,30 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         if failed:
             warning = f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
             found = replace(found, warnings=(warning, *found.warnings))
+        traffic = warmed_traffic(log, settings)
+        if traffic is not None:
+            found, limits = _on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
         gate = None if settings.gate is None else gate_verdict(limits, settings.gate, found.undetected_mass_bound)
-        return replace(found, gate=gate, simulator_noise=noise, requirements=each_estimate(log, settings)), None
+        each = each_estimate(log, settings)
+        return replace(found, gate=gate, simulator_noise=noise, requirements=each, warmed_traffic=traffic), None
 
     return Campaign((stage,), conclude)
+
+
+def _on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: WarmTraffic) -> Concluded:
+    """Return the conclusion with an interval that has the spread between warm-ups."""
+    value, error = found.probability, traffic.std_error
+    limits, tail = warmed_limits(limits, value, traffic), 0.5 * (1.0 + _CONFIDENCE)
+    cov = found.cov if not value or error is None else max(found.cov or 0.0, error / value)
+    warnings = found.warnings
+    if value and error is not None and error / value > (found.cov or 0.0):
+        more = "more warm-ups (warm_up.seeds) narrow the interval, more runs hardly do"
+        warnings = (*warnings, f"traffic differs from warm-up to warm-up: {more}")
+    elif error is None and traffic.warm_ups == 1:
+        warnings = (*warnings, "there is one warm-up: how much others differ from it is not known")
+    low, high = limits.lower(tail), limits.upper(tail)
+    return replace(found, low=low, high=high, cov=cov, warnings=warnings), limits
 
 
 def _conclusion(probability: float | None, limits: Limits, **rest: Any) -> EstimationConclusion:

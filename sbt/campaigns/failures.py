@@ -14,6 +14,7 @@ from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.warmed import conditional_on
 from sbt.campaigns.wording import percent, plural
 from sbt.errors import InputError
 from sbt.estimators.binomial import upper
@@ -130,7 +131,7 @@ class FalsificationConclusion:
         said += [*violations_words(self.violates), *independence_words(self.independence)]
         said += _rates(self.failure_modes)
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
-        return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence()]
+        return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence(), *conditional_on(facts.history)]
 
 
 class FailureSearch:

@@ -1,0 +1,73 @@
+"""Runs of one warm-up are not independent of each other: what intervals make of that."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt.estimators.binomial import interval
+from sbt.estimators.clusters import clustered_error, effective_runs, reach
+from sbt.loop.stages import Log
+from sbt.store.database import Store
+from sbt.workflows.study import Study
+
+
+def test_the_spread_between_clusters_is_covered_where_that_of_runs_alone_is_not():
+    rng, share, covered, naive = np.random.default_rng(1), 0.2, 0, 0
+    cluster = np.repeat(np.arange(20), 15)
+    for _ in range(400):
+        of_cluster = rng.beta(share * 8, (1 - share) * 8, 20)  # warm-ups differ: standard deviation .13
+        critical = (rng.random(300) < of_cluster[cluster]).astype(float)
+        hits, n = critical.sum(), 300.0
+        part = effective_runs(critical, cluster) / n
+        low, high = interval(hits * part, n * part)
+        covered += low <= share <= high
+        low, high = interval(hits, n)
+        naive += low <= share <= high
+    assert covered >= 0.93 * 400
+    assert naive < 0.85 * 400
+
+
+def test_independent_runs_in_clusters_lose_little():
+    rng = np.random.default_rng(2)
+    parts = [effective_runs((rng.random(400) < 0.3).astype(float), np.arange(400) % 20) / 400 for _ in range(50)]
+    assert 0.7 < np.median(parts) <= 1.0
+
+
+def test_a_single_cluster_tells_nothing_of_others():
+    assert clustered_error(np.array([0.1, -0.1]), np.array([3, 3])) is None
+    assert effective_runs(np.array([1.0, 0.0, 0.0]), np.zeros(3)) == 3.0
+
+
+def test_the_error_of_sums_is_that_of_their_clusters():
+    terms, cluster = np.array([0.3, 0.1, -0.2, -0.2]), np.array([0, 0, 1, 1])
+    assert clustered_error(terms, cluster) == pytest.approx(np.sqrt(2 * (0.4**2 + 0.4**2)))
+    assert reach(1.0, 2, 0.975) == pytest.approx(12.706, abs=1e-3)
+
+
+@pytest.mark.parametrize("method", ["difference", "monte_carlo"])
+def test_an_estimate_on_warm_ups_has_their_spread(tmp_path, method):
+    """A campaign whose store says that seeds are those of 20 warm-ups, which decide everything."""
+
+    def evaluate(values, seed):
+        return {"y": values["x"] + (1.5 if seed % 20 < 5 else 0.0)}
+
+    inputs = [sbt.Parameter("x", -4, 4, "", sbt.Normal(0, 1))]
+    scenario = sbt.Scenario("warm", inputs=inputs, evaluate=evaluate, requirement=sbt.Requirement("y", low=1.8))
+    common = {"campaign": "estimation", "scenario": scenario, "budget": 90, "seed": 1, "stop": {"cov": None}}
+    plain = sbt.run(**common, acquisition=method, store=tmp_path / "plain", executor={"kind": "serial"}).conclusion
+    assert plain.warmed_traffic is None
+    with Store.read(tmp_path / "plain") as store:
+        history = store.history()
+        history.columns["warm_up"][:] = history.columns["seed"] % 20
+        study = Study.from_store(store, objects={("scenarios", "object:warm"): scenario}, live=True)
+        found, _ = study.campaign.conclude(Log(history, tuple(store.iterations()), ()))
+    traffic = found.warmed_traffic
+    assert traffic.warm_ups == 20
+    assert found.low < plain.low
+    assert found.high > plain.high
+    assert "conditional on the traffic of 20 warm-ups; the interval has the spread" in traffic.sentence()
+    assert dataclasses.replace(found, warmed_traffic=None).probability == plain.probability
