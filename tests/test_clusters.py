@@ -48,7 +48,7 @@ def test_the_error_of_sums_is_that_of_their_clusters():
     assert reach(1.0, 2, 0.975) == pytest.approx(12.706, abs=1e-3)
 
 
-@pytest.mark.parametrize("method", ["difference", "monte_carlo"])
+@pytest.mark.parametrize("method", [pytest.param("difference", marks=pytest.mark.slow), "monte_carlo"])
 def test_an_estimate_on_warm_ups_has_their_spread(tmp_path, method):
     """A campaign whose store says that seeds are those of 20 warm-ups, which decide everything."""
 
@@ -57,7 +57,7 @@ def test_an_estimate_on_warm_ups_has_their_spread(tmp_path, method):
 
     inputs = [sbt.Parameter("x", -4, 4, "", sbt.Normal(0, 1))]
     scenario = sbt.Scenario("warm", inputs=inputs, evaluate=evaluate, requirement=sbt.Requirement("y", low=1.8))
-    common = {"campaign": "estimation", "scenario": scenario, "budget": 90, "seed": 1, "stop": {"cov": None}}
+    common = {"campaign": "estimation", "scenario": scenario, "budget": 150, "seed": 1, "stop": {"cov": None}}
     plain = sbt.run(**common, acquisition=method, store=tmp_path / "plain", executor={"kind": "serial"}).conclusion
     assert plain.warmed_traffic is None
     with Store.read(tmp_path / "plain") as store:
