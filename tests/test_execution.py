@@ -393,3 +393,50 @@ def test_choices_that_do_not_exist_are_told_before_any_run(analytic: Path):
     with pytest.raises(PluginError, match=r"broken.py:3 raised on import: ZeroDivisionError: division by zero"):
         ScenarioSpec("broken.py:SCENARIO", str(analytic.parent)).resolve()
     assert spec(analytic).resolve().run({"a": 0.5, "b": 0.5}, 0)["y"] == -0.3
+
+
+LEAKING = """
+import numpy as np
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+KEPT = []
+
+def leak(values, seed):
+    if values["a"] > 0.99:
+        KEPT.append(np.ones(2 ** 40 if values["a"] > 0.999 else 2 ** 27))
+    KEPT.append(np.ones(2 ** 22))
+    return {"y": values["a"]}
+
+def count(values, seed):
+    KEPT.append(1)
+    return {"y": float(len(KEPT))}
+
+SPACE = ParameterSpace((Parameter("a", 0.0, 1.0),))
+LEAK, COUNT = (
+    LogicalScenario(f.__name__, SPACE, Requirement("y", high=0.0), evaluate=f, metric_names=("y",)) for f in (leak, count)
+)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks for memory in /proc")
+def test_a_leak_costs_the_run_that_needs_too_much_and_no_other(tmp_path: Path):
+    """Each run leaves 32 MiB behind, one needs 1 GiB, one asks for 8 TiB at once."""
+    (tmp_path / "leaking.py").write_text(LEAKING)
+    leak = ScenarioSpec("leaking.py:LEAK", str(tmp_path))
+    work = [Job(k, {"a": {7: 0.995, 12: 1.0}.get(k, k / 100)}, k) for k in range(40)]
+    found = run(LocalExecutor(leak, 1, memory=768 * 2**20), work)
+    assert [k for k, o in found.items() if o.status != Status.OK] == [7, 12]
+    for k in (7, 12):
+        assert found[k].status == Status.CRASHED
+        assert found[k].reason.startswith("a worker may use 768 MiB of memory: its process was stopped, also when")
+    assert all(found[k].metrics == {"y": k / 100} for k in found if k not in (7, 12))
+
+
+def test_workers_are_replaced_after_so_many_runs(tmp_path: Path):
+    (tmp_path / "leaking.py").write_text(LEAKING)
+    work = [Job(k, {"a": k / 100}, k) for k in range(50)]
+    found = run(LocalExecutor(ScenarioSpec("leaking.py:COUNT", str(tmp_path)), 1, recycle=20), work)
+    assert len(found) == 50
+    assert 20 <= max(o.metrics["y"] for o in found.values()) <= 20 + 64 / 2

@@ -6,11 +6,10 @@ name, low < high) are checked in `sbt.config.assemble`, everything else here.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import (
@@ -25,34 +24,19 @@ from pydantic import (
     field_validator,
 )
 
+from sbt.config.executor_model import ExecutorChoice
 from sbt.config.kinds import kind_of
 from sbt.config.requirement_model import Interval, Name, RequirementChange, two_values
 from sbt.config.simulation_model import SimulationChoice
-from sbt.errors import did_you_mean
 from sbt.plugins import OBJECT
 from sbt.problem.expression import Expression
 from sbt.problem.plain import Json
 
 __all__ = [
-    "EXECUTORS", "AcquisitionChoice", "Choice", "ChoicesGiven", "Configuration",
-    "CorrelationEntry", "ExecutorChoice", "GateChoice", "InputChange", "Interval", "MetamodelChoice", "Name", "RequirementChange",
+    "AcquisitionChoice", "Choice", "ChoicesGiven", "Configuration",
+    "CorrelationEntry", "GateChoice", "InputChange", "Interval", "MetamodelChoice", "Name", "RequirementChange",
     "SimulationChoice", "StopRules", "ValidationChoice", "WarmStart",
 ]  # fmt: skip
-
-
-EXECUTORS = ("serial", "local", "dask")
-"""Where runs can be executed."""
-
-
-def _one_of(choices: tuple[str, ...]) -> Callable[[str], str]:
-    """Return a check for these values."""
-
-    def check(value: str) -> str:
-        if value in choices:
-            return value
-        raise ValueError(f"must be {' or '.join(choices)}, but got '{value}'{did_you_mean(value, choices)}")
-
-    return check
 
 
 def _formula(*, condition: bool) -> Callable[[str], str]:
@@ -81,7 +65,6 @@ def _campaign(name: str) -> str:
 
 
 CampaignName = Annotated[str, AfterValidator(_campaign)]
-ExecutorName = Annotated[str, AfterValidator(_one_of(EXECUTORS)), Field(json_schema_extra={"enum": [*EXECUTORS]})]
 Condition = Annotated[str, AfterValidator(_formula(condition=True))]
 Formula = Annotated[str, AfterValidator(_formula(condition=False))]
 
@@ -173,45 +156,11 @@ class StopRules(_Strict):
     cov: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Estimation: coefficient of variation.")
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 class GateChoice(_Strict):
     """When an estimation passes: the probability of a critical run is at most this, with this confidence."""
 
     probability: float = Field(gt=0, lt=1, description="Largest probability of a critical run that passes.")
     confidence: float = Field(default=0.95, gt=0.5, lt=1, description="Confidence of the verdict, pass or fail.")
-
-
-class ExecutorChoice(_Strict):
-    """Where runs are executed; never changes their results."""
-
-    kind: ExecutorName = Field(
-        default="local", description="serial: in this process; local: worker processes; dask: workers of a dask cluster."
-    )
-    workers: int = Field(
-        default_factory=_cores, ge=1,
-        description="Worker processes of local, and of dask without an address; default: the usable cores.",
-    )  # fmt: skip
-    address: Name | None = Field(
-        default=None, description="Of dask's scheduler, such as tcp://host:8786; null: dask workers on this machine."
-    )
-    timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped; .inf: never.")
-    isolation: Literal["auto", "fresh", "reuse", "replicas", "snapshot"] = Field(
-        default="auto",
-        description="SUMO is loaded per run (fresh), kept (reuse, replicas), or its traffic warmed up once (snapshot); auto: the "
-        "fastest allowed, snapshot where that spares much.",
-    )
-
-    @field_validator("address")
-    @classmethod
-    def _of_dask(cls, value: str | None, info: ValidationInfo) -> str | None:
-        if value is not None and info.data.get("kind", "dask") != "dask":
-            raise ValueError(f"only the executor dask takes it, but the executor is {info.data['kind']}")
-        if value is not None and "://" not in value:
-            raise ValueError(f"must be a scheduler's address such as tcp://host:8786, but got '{value}'")
-        return value
 
 
 _TRANSFERRED = 10

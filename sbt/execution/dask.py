@@ -37,6 +37,9 @@ _PATIENCE = 60
 _LARGE = 100_000
 """Size from which a carried scenario is sent to each worker once instead of with every chunk (bytes)."""
 
+_Limits = tuple[float | None, int | None, int | None]
+"""Of a worker: time of a run (s), memory (bytes), runs."""
+
 
 class DaskExecutor:
     """Runs on the workers of a dask cluster; workers may come and go.
@@ -45,7 +48,7 @@ class DaskExecutor:
         spec: the scenario; workers resolve it themselves, so its files must be where they are here.
         address: of the scheduler, `tcp://host:port`; None: a cluster on this machine for as long as it is needed.
         workers: number of workers where there is no address.
-        timeout: wall-clock seconds a run may take; None: no limit.
+        timeout, memory, recycle: limits of every worker, as of `LocalExecutor`.
 
     Raises:
         InputError: dask.distributed is not installed, or (when entered) the scheduler does not answer, or a
@@ -53,10 +56,14 @@ class DaskExecutor:
         SbtError: the scheduler is gone; what is done is done, and the campaign can be resumed.
     """
 
-    def __init__(self, spec: ScenarioSpec, address: str | None, workers: int, timeout: float | None = None):
+    def __init__(
+        self, spec: ScenarioSpec, address: str | None, workers: int, timeout: float | None = None, memory: int | None = None,
+        recycle: int | None = None,
+    ):  # fmt: skip
         if find_spec("distributed") is None:
             raise InputError("executor.kind dask needs dask.distributed: pip install 'sumo-sbt[dask]', or choose local")
-        self._spec, self._address, self._count, self._timeout = spec, address, workers, timeout
+        self._spec, self._address, self._count = spec, address, workers
+        self._limits: _Limits = (timeout, memory, recycle)
         self._cluster: Any = None
         self._client: Any = None
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
@@ -114,14 +121,14 @@ class DaskExecutor:
         from distributed import fire_and_forget
 
         for worker in self._client.nthreads():
-            fire_and_forget(self._client.submit(_end, self._spec, self._timeout, workers=[worker], pure=False))
+            fire_and_forget(self._client.submit(_end, self._spec, self._limits, workers=[worker], pure=False))
 
     def _prepare(self) -> None:
         """Start the processes below all workers at the same time."""
         from distributed import KilledWorker
 
         own = _versions(self._spec)
-        found = {w: self._client.submit(_begin, self._spec, self._timeout, workers=[w], pure=False) for w in self._workers()}
+        found = {w: self._client.submit(_begin, self._spec, self._limits, workers=[w], pure=False) for w in self._workers()}
         for worker, future in found.items():
             try:
                 of_worker = self._result(future)
@@ -160,7 +167,7 @@ class DaskExecutor:
             workers = max(len(self._workers()), 1)
             while queue and len(submitted) < 2 * workers:
                 chunk = chunk_of(queue, _TARGET / self._seconds, workers)
-                future = self._client.submit(_run, self._sent, chunk, self._timeout, pure=False)
+                future = self._client.submit(_run, self._sent, chunk, self._limits, pure=False)
                 submitted[future] = chunk
                 finished.add(future)
             future = next(finished)
@@ -188,18 +195,18 @@ class DaskExecutor:
         return SbtError(f"the dask scheduler must stay until the end, but {where} is gone; run again to resume")
 
 
-_held: list[tuple[ScenarioSpec, float | None, LocalExecutor]] = []
+_held: list[tuple[ScenarioSpec, _Limits, LocalExecutor]] = []
 """In a worker: its executor, at most one."""
 
 
-def _executor_of(spec: ScenarioSpec, timeout: float | None) -> LocalExecutor:
+def _executor_of(spec: ScenarioSpec, limits: _Limits) -> LocalExecutor:
     """Return this worker's executor; that of another campaign is stopped first."""
-    if not (_held and _held[0][:2] == (spec, timeout)):
+    if not (_held and _held[0][:2] == (spec, limits)):
         _drop()
         multiprocessing.current_process().daemon = False  # dask's workers are daemons, which may have no children
-        executor = LocalExecutor(spec, 1, timeout)
+        executor = LocalExecutor(spec, 1, *limits)
         executor.__enter__()
-        _held.append((spec, timeout, executor))
+        _held.append((spec, limits, executor))
     return _held[0][2]
 
 
@@ -208,9 +215,9 @@ def _drop() -> None:
         _held.pop()[2].__exit__()
 
 
-def _begin(spec: ScenarioSpec, timeout: float | None) -> str:
+def _begin(spec: ScenarioSpec, limits: _Limits) -> str:
     """Start a worker's process, and return the versions that it has."""
-    _executor_of(spec, timeout)
+    _executor_of(spec, limits)
     return _versions(spec)
 
 
@@ -225,12 +232,12 @@ def _same(spec: ScenarioSpec) -> ScenarioSpec:
     return spec
 
 
-def _run(spec: ScenarioSpec, jobs: list[Job], timeout: float | None) -> list[Outcome]:
+def _run(spec: ScenarioSpec, jobs: list[Job], limits: _Limits) -> list[Outcome]:
     """Run jobs in a worker."""
-    return list(_executor_of(spec, timeout).run(jobs))
+    return list(_executor_of(spec, limits).run(jobs))
 
 
-def _end(spec: ScenarioSpec, timeout: float | None) -> None:
+def _end(spec: ScenarioSpec, limits: _Limits) -> None:
     """End a worker's process, unless another campaign has taken the worker over."""
-    if _held and _held[0][:2] == (spec, timeout):
+    if _held and _held[0][:2] == (spec, limits):
         _drop()

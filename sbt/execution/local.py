@@ -13,6 +13,7 @@ from __future__ import annotations
 import gc
 import os
 import pickle
+import resource
 import signal
 import struct
 import tempfile
@@ -21,6 +22,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
+from enum import Enum, auto
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
@@ -43,10 +45,22 @@ _TARGET = 0.05
 """Target duration of a chunk of runs (s)."""
 _TICK = 0.25
 """Interval at which overdue runs are looked for (s)."""
+_TOO_LARGE = ("MemoryError", "bad_alloc", "std::bad_alloc")
+"""How the reason of a run begins that was refused memory."""
 _GRACE = 2.0
 """Time by which a run may exceed its limit before its worker is killed (s): most runs stop themselves."""
 _MARKS = "marks"
 _SCENARIO = "scenario.pickle"
+_LIMIT, _LARGE = "memory", "large-"
+"""Files of the driver's folder: the memory that a worker may use (bytes, 0: no limit), and which runs wanted more."""
+
+
+class _Cause(Enum):
+    """Why a run has no outcome."""
+
+    DIED = auto()
+    LATE = auto()
+    LARGE = auto()
 
 
 class LocalExecutor:
@@ -56,10 +70,17 @@ class LocalExecutor:
         spec: the scenario; workers resolve it themselves.
         workers: number of processes.
         timeout: wall-clock seconds a run may take; None: no limit.
+        memory: bytes that a worker may use; None: no limit. A run that needs more, also alone in a fresh worker, is crashed.
+        recycle: number of runs after which a worker is replaced by a fresh one; None: never.
     """
 
-    def __init__(self, spec: ScenarioSpec, workers: int, timeout: float | None = None):
+    def __init__(
+        self, spec: ScenarioSpec, workers: int, timeout: float | None = None, memory: int | None = None,
+        recycle: int | None = None,
+    ):  # fmt: skip
         self._spec, self._workers, self._timeout = spec, workers, timeout
+        self._memory, self._recycle = memory, recycle
+        self._started = 0  # runs since the workers were
         self._pool: Any = None
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._seconds = _TARGET
@@ -70,6 +91,7 @@ class LocalExecutor:
         self._scratch = scratch("pool")
         folder = Path(self._scratch.name)
         (folder / _SCENARIO).write_bytes(pickle.dumps((self._spec, self._timeout)))
+        (folder / _LIMIT).write_text(str(self._memory or 0))
         (folder / _MARKS).mkdir()
         try:
             self._start()
@@ -85,7 +107,7 @@ class LocalExecutor:
             self._scratch.cleanup()
 
     def _start(self) -> None:
-        self._pool = open_pool(self._workers, self._folder)
+        self._pool, self._started = open_pool(self._workers, self._folder), 0
         ready = [self._pool.submit(_prepare, self._folder, self._workers) for _ in range(self._workers)]
         wait(ready)
         for future in ready:
@@ -112,28 +134,35 @@ class LocalExecutor:
             missing, dead = yield from self._drain(deque([suspects.popleft()]) if alone else queue)
             queue = queue if alone else deque()
             for job in missing:
-                if job.index in dead and (alone or dead[job.index] == Status.TIMEOUT):
+                if job.index in dead and (alone or dead[job.index] is _Cause.LATE):
                     yield self._lost(job, dead[job.index])
                 elif job.index in dead or alone:
                     suspects.append(job)
                 else:
                     queue.append(job)
 
-    def _lost(self, job: Job, status: Status) -> Outcome:
-        if status == Status.TIMEOUT:
-            return Outcome(job.index, status, {}, f"a run must take at most {self._timeout:g} s: its process was stopped")
-        return Outcome(job.index, status, {}, "the worker process died, also when this run was tried again alone")
+    def _lost(self, job: Job, cause: _Cause) -> Outcome:
+        if cause is _Cause.LATE:
+            reason = f"a run must take at most {self._timeout:g} s: its process was stopped"
+            return Outcome(job.index, Status.TIMEOUT, {}, reason)
+        what = "the worker process died"
+        if cause is _Cause.LARGE:
+            what = f"a worker may use {(self._memory or 0) / 2**20:.0f} MiB of memory: its process was stopped"
+        return Outcome(job.index, Status.CRASHED, {}, f"{what}, also when this run was tried again alone")
 
     def _drain(self, queue: deque[Job]) -> Any:
         """Run the queued jobs; return those without an outcome after a worker died, and the runs that were in progress."""
         submitted: dict[Future[Any], list[Job]] = {}
-        overdue: dict[int, Status] = {}
-        died = False
+        stopped: dict[int, _Cause] = {}
+        died, looked = False, time.monotonic()
         while (queue or submitted) and not died:
-            while queue and len(submitted) < 2 * self._workers and not died:
+            if self._worn and not submitted:
+                self._restart()
+            while queue and len(submitted) < 2 * self._workers and not died and not self._worn:
                 chunk = chunk_of(queue, _TARGET / max(self._seconds, 1e-4), self._workers)
                 try:
                     submitted[self._pool.submit(_run_chunk, self._folder, chunk)] = chunk
+                    self._started += len(chunk)
                 except broken():
                     queue.extendleft(reversed(chunk))
                     died = True
@@ -144,13 +173,15 @@ class LocalExecutor:
                     continue
                 del submitted[future]
                 yield from self._measured(future.result())
-            if not done:
-                overdue |= self._kill_overdue()
+            if not done or time.monotonic() - looked > _TICK:
+                looked = time.monotonic()
+                stopped |= self._kill_overdue() | self._kill_large()
         if not died:
             return [], {}
         yield from self._rescued(submitted)
         missing = [job for chunk in submitted.values() for job in chunk] + list(queue)
-        dead = {index: Status.CRASHED for runs, _, _ in self._at_work() for index in runs} | overdue
+        dead = {index: _Cause.DIED for runs, _, _ in self._at_work() for index in runs} | stopped
+        dead |= {index: _Cause.LARGE for index in dead if Path(self._folder, f"{_LARGE}{index}").exists()}
         self._restart()
         return missing, dead
 
@@ -178,7 +209,22 @@ class LocalExecutor:
                     found.append((struct.unpack_from(f"<{n}q", data, _MARK.size), int(path.name), since))
         return found
 
-    def _kill_overdue(self) -> dict[int, Status]:
+    @property
+    def _worn(self) -> bool:
+        """Whether the workers have made so many runs that they are to be replaced."""
+        return self._recycle is not None and self._started >= self._recycle * self._workers
+
+    def _kill_large(self) -> dict[int, _Cause]:
+        """Kill the workers that use more memory than they may; return the runs that they were at, which are tried again."""
+        if self._memory is None:
+            return {}
+        large = [(runs, pid) for runs, pid, _ in self._at_work() if _resident(pid) > self._memory]
+        for _, pid in large:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        return {run: _Cause.LARGE for runs, _ in large for run in runs}
+
+    def _kill_overdue(self) -> dict[int, _Cause]:
         """Kill the workers whose record is older than a run may take; return the runs that timed out."""
         if self._timeout is None:
             return {}
@@ -186,7 +232,7 @@ class LocalExecutor:
         for _, pid in late:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        return {runs[0]: Status.TIMEOUT for runs, _ in late if len(runs) == 1}  # of several: repeated alone
+        return {runs[0]: _Cause.LATE for runs, _ in late if len(runs) == 1}  # of several: repeated alone
 
     def _restart(self) -> None:
         self._stop()
@@ -230,6 +276,7 @@ def _prepare(folder: str, workers: int) -> None:
     """Load the scenario in a worker, and wait until every worker does."""
     _scenario(folder)
     settle()
+    _limit_memory(folder)
     _mark(folder, ())
     marks, deadline = Path(folder, _MARKS), time.monotonic() + 20.0
     while len(os.listdir(marks)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
@@ -238,4 +285,32 @@ def _prepare(folder: str, workers: int) -> None:
 
 def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:
     """Run jobs in a worker and record which are in progress."""
-    return run_jobs(_scenario(folder), jobs, partial(_mark, folder))
+    outcomes = run_jobs(_scenario(folder), jobs, partial(_mark, folder))
+    for outcome in outcomes if _limit(folder) else ():
+        if outcome.reason.startswith(_TOO_LARGE):  # what earlier runs left may be to blame: tried again alone, as after a death
+            _mark(folder, (outcome.index,))
+            Path(folder, f"{_LARGE}{outcome.index}").touch()
+            os._exit(1)
+    return outcomes
+
+
+@cache
+def _limit(folder: str) -> int:
+    """Return the memory that a worker may use (bytes); 0: no limit."""
+    return int(Path(folder, _LIMIT).read_text())
+
+
+def _limit_memory(folder: str) -> None:
+    """Let the kernel refuse a worker more memory than it may use beyond what it has loaded: one request may be for all there is."""
+    if limit := _limit(folder):
+        with suppress(OSError, ValueError):
+            loaded = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_DATA, (loaded + limit, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+
+
+def _resident(pid: int) -> int:
+    """Return the memory that a process has in use (bytes); 0 where it has ended or the system does not tell."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+    except (OSError, ValueError, IndexError):
+        return 0

@@ -248,9 +248,10 @@ class Study:
         limit = None if choice.timeout == float("inf") else choice.timeout
         if choice.kind == "serial":
             return SerialExecutor(scenario, limit)
+        of_worker = {"memory": choice.memory, "recycle": choice.recycle}
         if choice.kind == "dask":
-            return DaskExecutor(scenario, choice.address, choice.workers, limit)
-        return LocalExecutor(scenario, choice.workers if workers is None else workers, limit)
+            return DaskExecutor(scenario, choice.address, choice.workers, limit, **of_worker)
+        return LocalExecutor(scenario, choice.workers if workers is None else workers, limit, **of_worker)
 
     def snapshot(self, shard: Shard | None = None) -> Json:
         """Return what the store remembers of the configuration: plain JSON, and the YAML to read back."""
