@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from sbt.config.assemble import acquisition_of, assemble, metamodel_of, scenario_of, spec_of
+from sbt.config.executor_model import EXECUTORS
 from sbt.config.kinds import kinds
 from sbt.config.load import ConfigError, dump, fingerprint, load, parse, resolve, resumed, schema
-from sbt.config.model import EXECUTORS
 from sbt.metamodels.extra_trees import ExtraTrees
 
 BASE = "campaign: boundary\nscenario: plugin.py:SCENARIO\n"

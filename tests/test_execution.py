@@ -405,7 +405,7 @@ KEPT = []
 
 def leak(values, seed):
     if values["a"] > 0.99:
-        KEPT.append(np.ones(2 ** 40 if values["a"] > 0.999 else 2 ** 27))
+        KEPT.append(np.ones(2 ** 40 if values["a"] > 0.999 else 75_000_000))
     KEPT.append(np.ones(2 ** 22))
     return {"y": values["a"]}
 
@@ -422,16 +422,16 @@ LEAK, COUNT = (
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks for memory in /proc")
 def test_a_leak_costs_the_run_that_needs_too_much_and_no_other(tmp_path: Path):
-    """Each run leaves 32 MiB behind, one needs 1 GiB, one asks for 8 TiB at once."""
+    """Each run leaves 32 MiB behind, one needs 600 MB, one asks for 8 TiB at once."""
     (tmp_path / "leaking.py").write_text(LEAKING)
     leak = ScenarioSpec("leaking.py:LEAK", str(tmp_path))
-    work = [Job(k, {"a": {7: 0.995, 12: 1.0}.get(k, k / 100)}, k) for k in range(40)]
-    found = run(LocalExecutor(leak, 1, memory=768 * 2**20), work)
-    assert [k for k, o in found.items() if o.status != Status.OK] == [7, 12]
-    for k in (7, 12):
+    work = [Job(k, {"a": {4: 0.995, 9: 1.0}.get(k, k / 100)}, k) for k in range(16)]
+    found = run(LocalExecutor(leak, 1, memory=400 * 2**20), work)
+    assert [k for k, o in found.items() if o.status != Status.OK] == [4, 9]
+    for k in (4, 9):
         assert found[k].status == Status.CRASHED
-        assert found[k].reason.startswith("a worker may use 768 MiB of memory: its process was stopped, also when")
-    assert all(found[k].metrics == {"y": k / 100} for k in found if k not in (7, 12))
+        assert found[k].reason.startswith("a worker may use 400 MiB of memory: its process was stopped, also when")
+    assert all(found[k].metrics == {"y": k / 100} for k in found if k not in (4, 9))
 
 
 def test_workers_are_replaced_after_so_many_runs(tmp_path: Path):

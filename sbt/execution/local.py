@@ -301,7 +301,7 @@ def _limit(folder: str) -> int:
 
 
 def _limit_memory(folder: str) -> None:
-    """Let the kernel refuse a worker more memory than it may use beyond what it has loaded: one request may be for all there is."""
+    """Let the kernel refuse a worker more than its memory beyond what it has loaded: one request may be for all there is."""
     if limit := _limit(folder):
         with suppress(OSError, ValueError):
             loaded = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
