@@ -16,6 +16,7 @@ from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.sumo import snapshot
 from sbt.sumo.demand import seconds_of
+from sbt.sumo.departures import requested_departures
 from sbt.sumo.user_simulation import UserSimulation
 from tests.warm_networks import T0, town
 
@@ -146,6 +147,52 @@ def test_a_departure_before_the_end_of_the_warm_up_is_no_row(tmp_path):
     assert found.isolation.until == T0
     with pytest.raises(RunError, match=r"'ego' must depart when the warm-up is over, at t = 42 s or later, but departs at 40 s"):
         found({**CENTRE, "t": 40.0}, 1)
+
+
+INSERTING = """sumo: {net: town.net.xml, routes: [cars.rou.xml, buses.rou.xml], additional: [stops.add.xml]}
+inputs: {v: {min: 5, max: 12}, gap: {min: 15, max: 45}}
+warm_up: WARM
+insert:
+  ego: {edge: A2B2, lane: 1, position: "${gap}", speed: "${v}", to: C3D3, type: car}
+  other: {edge: A1B1, lane: 1, position: 25, speed: 5, route: [A1B1, B1C1]MORE}
+ego: ego
+duration: 1
+metrics: [distance_min]
+requirement: {metric: distance_min, critical: [-.inf, 1.0]}
+"""
+
+
+def inserting(folder: Path, *, warm: str = "{until: 42, seeds: 1}", more: str = "") -> Path:
+    town(folder)
+    (folder / "scenario.yaml").write_text(INSERTING.replace("WARM", warm).replace("MORE", more))
+    return folder / "scenario.yaml"
+
+
+@pytest.mark.sumo
+def test_vehicles_are_inserted_beside_warmed_traffic(tmp_path):
+    found = simulation(inserting(tmp_path))
+    assert found.isolation.until == T0
+    trace = found({"v": 8.0, "gap": 40.0}, 5)
+    assert trace.actor("ego").speed[0] == pytest.approx(8.0)
+    assert found.files is not None
+    assert requested_departures(found.files, {"v": 8.0, "gap": 40.0}, "ego").keys() == {"ego", "other"}
+    fast = inserting(tmp_path / "fast")
+    fast.write_text(fast.read_text().replace("speed: 5,", "speed: 99,"))
+    with pytest.raises(RunError, match="Departure speed for vehicle 'other' is too high"):
+        simulation(fast)({"v": 8.0, "gap": 40.0}, 5)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"warm": "{until: auto}"}, "insert.ego: a vehicle must have a time"),
+        ({"more": ", to: C3D3"}, "insert.other: a vehicle must have to or route, but got both"),
+        ({"more": ", at: '${v}'"}, "'other' departs at 5 s, before the warm-up ends"),
+    ],
+)
+def test_an_insertion_that_cannot_be_is_said(tmp_path, change, reason):
+    with pytest.raises(InputError, match=reason):
+        simulation(inserting(tmp_path, **change)).isolation.warm  # noqa: B018
 
 
 def test_times_are_read_as_sumo_reads_them():

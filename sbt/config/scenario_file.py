@@ -31,6 +31,7 @@ from sbt.sumo.elements import person
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.friction import Friction, has_friction
 from sbt.sumo.guided import Participant
+from sbt.sumo.inserting import InsertedVehicle, inserted_file
 from sbt.sumo.recorded import RecordedTraffic
 from sbt.sumo.recorder import RecordingSettings
 from sbt.sumo.snapshot import WarmUp
@@ -205,8 +206,31 @@ class _Builder:
         files = self._problems.attempt(("sumo",), lambda: SumoFiles.of(self._options(entry), self._folder, "sumo"))
         if files is None:
             return None
+        inserted = self._inserted()
+        if inserted is not None:
+            files = replace(files, routes=(*files.routes, inserted), compared=tuple(self._model.insert))
         found = files
         return files if self._problems.attempt(("sumo",), lambda: found.templates) is not None else None
+
+    def _inserted(self) -> Path | None:
+        """Return the route file of the vehicles that the scenario inserts; None without any."""
+        vehicles: dict[str, InsertedVehicle] = {}
+        warm_up = self._model.warm_up
+        for name, entry in self._model.insert.items():
+            at = entry.at if entry.at is not None or warm_up is None else warm_up.end
+            if at is None:
+                self._problems.add(("insert", name), "a vehicle must have a time: at (s), or warm_up: {until: SECONDS}")
+            elif entry.to is not None and entry.route:
+                self._problems.add(("insert", name), "a vehicle must have to or route, but got both")
+            elif entry.route and entry.route[0] != entry.edge:
+                rule = f"a route must begin with the edge on which the vehicle starts, '{entry.edge}'"
+                self._problems.add(("insert", name, "route"), f"{rule}, but begins with '{entry.route[0]}'")
+            else:
+                vehicles[name] = InsertedVehicle(
+                    str(at), entry.edge, str(entry.lane), str(entry.position), str(entry.speed), entry.type or "",
+                    (entry.to,) if entry.to is not None else entry.route, known_route=entry.to is None,
+                )  # fmt: skip
+        return inserted_file(vehicles) if vehicles else None
 
     def _recorded(self) -> tuple[RecordedTraffic, ...]:
         """Return the recorded traffic, if there is any."""

@@ -190,6 +190,21 @@ class WarmUpEntry(_Strict):
         return None if self.until == "auto" else float(self.until)
 
 
+class InsertEntry(_Strict):
+    """A vehicle that the scenario inserts beside the traffic of the files; numbers may be placeholders."""
+
+    edge: Name = Field(description="Where it starts.")
+    lane: int | Name = Field(default=0, description="Index of its lane, from the right.")
+    position: float | Name = Field(description="Of its front bumper on the lane (m).")
+    speed: float | Name = Field(description="At its start (m/s).")
+    at: float | Name | None = Field(default=None, description="When it starts (s); null: at warm_up.until.")
+    to: Name | None = Field(default=None, description="Edge that it drives to by the fastest way.")
+    route: Annotated[tuple[Name, ...], Field(strict=False)] = Field(
+        default=(), description="Or all edges that it drives, the first included; neither: its own edge."
+    )
+    type: Name | None = Field(default=None, description="Vehicle type of the files; null: SUMO's default.")
+
+
 class ScenarioModel(_Strict):
     """A logical scenario of the user's own files or loop."""
 
@@ -219,6 +234,9 @@ class ScenarioModel(_Strict):
     )
     step_length: float | None = Field(
         default=None, gt=0, allow_inf_nan=False, description="SUMO's step (s); null: the files', or 0.1."
+    )
+    insert: dict[str, InsertEntry] = Field(
+        default={}, description="By id: vehicles that start beside the traffic of the files, such as the ego."
     )
     warm_up: WarmUpEntry | None = Field(
         default=None, description="Traffic is warmed up once; null: where that spares much and changes no input's effect."

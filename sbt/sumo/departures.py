@@ -71,6 +71,7 @@ def requested_departures(files: SumoFiles, values: Values, ego: str) -> dict[str
     """Return the requested departures of the ego and of every vehicle with a placeholder."""
     of_ego = files.vehicle(ego)
     compared = [(name, template) for template in files.templates for name in template.varying]
+    compared += [(name, template) for template in files.templates for name in files.compared if name in template.vehicles]
     if of_ego is not None:
         compared.append((ego if ego in of_ego[1].vehicles else ego.rpartition(".")[0], of_ego[1]))
     requested: dict[str, RequestedDeparture] = {}

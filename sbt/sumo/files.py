@@ -78,6 +78,7 @@ class SumoFiles:
         routes: route files, in order.
         additional: additional files, in order.
         places: where each option was given, for messages.
+        compared: vehicles whose departures are compared with what is requested, beside the ego and those with placeholders.
     """
 
     options: Mapping[str, str]
@@ -85,6 +86,7 @@ class SumoFiles:
     routes: tuple[Path, ...] = ()
     additional: tuple[Path, ...] = ()
     places: Mapping[str, str] = field(default_factory=dict)
+    compared: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, options: Mapping[str, str], folder: Path, place: str) -> SumoFiles:
