@@ -17,7 +17,7 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ class UserSimulation:
         participants: road users that this package moves.
         level: the isolation level that is asked for; None: snapshot where its conditions hold, else fresh.
         warm: the warm-up that is asked for; None: none.
-        space: of the inputs, for the conditions of a snapshot.
+        space: of the inputs, for the conditions of a snapshot; None: not known, and every run begins afresh.
         decided: the isolation of a campaign; None: as the conditions are.
 
     Raises:
@@ -87,7 +87,7 @@ class UserSimulation:
     participants: tuple[Participant, ...] = ()
     level: str | None = None
     warm: WarmUp | None = None
-    space: ParameterSpace = field(default_factory=lambda: ParameterSpace(()))
+    space: ParameterSpace | None = None
     decided: Isolation | None = None
 
     def __post_init__(self) -> None:
@@ -119,7 +119,7 @@ class UserSimulation:
             made.isolation_in(made.space, WARM_UPS)  # refuses what cannot be
         return made
 
-    def isolation_in(self, space: ParameterSpace, seeds: int) -> Isolation:
+    def isolation_in(self, space: ParameterSpace | None, seeds: int) -> Isolation:
         """Return the isolation level for the inputs of a space; see `sbt.problem.isolation.Warmable`."""
         if self.level == "fresh":
             return Isolation(why="it is asked for")
@@ -142,7 +142,7 @@ class UserSimulation:
         """The isolation level of the runs."""
         return self.isolation_in(self.space, WARM_UPS) if self.decided is None else self.decided
 
-    def _divided(self, space: ParameterSpace, until: float | None = None) -> Snapshot:
+    def _divided(self, space: ParameterSpace | None, until: float | None = None) -> Snapshot:
         """Return how traffic is divided between warm-ups and runs.
 
         Raises:
@@ -150,6 +150,8 @@ class UserSimulation:
         """
         if self.files is None or self.loop is not step_until_over:
             raise NoSnapshot("a loop of one's own drives the simulation from its beginning")
+        if space is None:
+            raise NoSnapshot("the inputs are not known")
         if self.participants:
             raise NoSnapshot("actors, recorded road users and friction act from the beginning of the simulation")
         if math.isnan(self.step_length):
