@@ -14,6 +14,7 @@ SMALLEST = {
     "contacts.py": "--runs 2 --nets roundabout",
     "cut_in_plane.py": "--size 4 --out {folder}/plane.png",
     "metamodels.py": "--kinds et --rows 20 --inputs 2 --points 64 --repeat 1",
+    "noise.py": "--scenarios highway_merge --seeds 1 --budget 30",
     "overhead.py": "--runs 32",
     "physics.py": "emergency_braking --runs 2 --others 1 --egos IDM",
     "proposals.py": "--runs 30 --repeats 1",
@@ -34,7 +35,7 @@ SMALLEST = {
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
-SUMO |= {"physics.py", "throughput.py", "transfer.py", "watcher.py"}
+SUMO |= {"noise.py", "physics.py", "throughput.py", "transfer.py", "watcher.py"}
 LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
 SHARED = {"street_traffic.py"}  # networks and traffic of the scripts
 

@@ -179,7 +179,7 @@ class FailureSearch:
             only = int(ok[0])
             return [Mode((only,), only, only, None)]
         u, y = scenario.space.to_unit(history.x[ok]), scenario.requirement.values(history)[ok]
-        fitted = fit_warped(self.search, u, y, stream(self.settings.seed, "modes", len(history)))
+        fitted = fit_warped(self.search.for_noise(u, y), u, y, stream(self.settings.seed, "modes", len(history)))
         return modes_of(fitted, history, scenario, noisy=self.noisy(history))
 
     def noisy(self, history: History) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import gpytorch
@@ -33,12 +33,14 @@ __all__ = ["GaussianProcess", "GaussianProcessPredictor"]
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
 _NOISE_FLOOR = 1e-8  # variance relative to that of y: condition numbers stay below 1e-6 / machine epsilon at 2,000 rows
 _LIKELY_NOISE, _NO_NOISE = -5.0, math.log(_NOISE_FLOOR)  # log variances: the mode of a noisy metric, and a deterministic one
+_HEAVY_NOISE = -0.7  # log variance: half of y's, the mode where a simulator is known to be noisy
 _LEAST_NOISE = 1e-4  # GPyTorch's own floor, where there are no priors or certainly noise
 _FOLDS = 5  # of the noise regression
 _FEWEST_FOR_NOISE = 2 * _FOLDS  # rows: two a fold
 _FOREST = ExtraTrees(trees=10, min_samples_split=20)  # of the noise: a smooth average, since squared residuals vary a lot
 _RESIDUAL_FLOOR = 1e-4  # of squared standardised residuals, before the logarithm
 _FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
+_HEAVY_LENGTH, _HEAVY_START = 0.6, 0.5  # the same where noise is heavy: from short ones the fit takes noise for structure
 _ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
 _IMPROVEMENT = 0.01  # of the mean validation log likelihood that resets the patience
 
@@ -64,6 +66,7 @@ class GaussianProcess:
         max_epochs: most epochs of Adam, >= 1.
         device: auto (CUDA where there is one), cpu or cuda.
         certainly_noisy: the prior of the noise is that of a noisy metric alone, as for labels of a class.
+        heavy_noise: the noise is large: its prior lies about half of the variance of y.
 
     Raises:
         InputError: a value outside its range; at the fit, a device that is not available.
@@ -83,6 +86,7 @@ class GaussianProcess:
     max_epochs: int = 2000
     device: str = "cpu"
     certainly_noisy: bool = False
+    heavy_noise: bool = False
 
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"nu": 0.5, "input_noise": False, "priors": False, "learning_rate": 0.1, "patience": 200}
@@ -100,6 +104,16 @@ class GaussianProcess:
             raise InputError(f"learning_rate must be > 0, but got {self.learning_rate}")
         check_device(self.device)
 
+    @property
+    def for_noise(self) -> GaussianProcess:
+        """The same process for a metric whose repetitions differ much."""
+        return replace(self, heavy_noise=True)
+
+    @property
+    def _noise_mode(self) -> float | None:
+        """Log variance about which the noise is expected; None: there may be none."""
+        return _HEAVY_NOISE if self.heavy_noise else _LIKELY_NOISE if self.certainly_noisy else None
+
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> GaussianProcessPredictor:
         """Return the process conditioned on u (n, d) and y (n,); see `Metamodel.fit`."""
         u, y = without_repetitions(*check_rows(u, y))
@@ -114,11 +128,11 @@ class GaussianProcess:
             hyper = _fit_early_stopped(self, u[training], z[training], u[validation], z[validation])
             return _condition(self, hyper, u[training], z[training], np.ones(len(z))[training], None, shift, scale)
         rows = rng.permutation(len(z))[: self.fit_rows]
-        hyper = _fit_posterior(self.nu, u[rows], z[rows], np.ones(len(rows)), None, device, noisy=self.certainly_noisy)
+        hyper = _fit_posterior(self.nu, u[rows], z[rows], np.ones(len(rows)), None, device, noise_mode=self._noise_mode)
         if not self.input_noise or len(z) < _FEWEST_FOR_NOISE:
             return _condition(self, hyper, u, z, np.ones(len(z)), None, shift, scale)
         spread, at_rows = _fit_noise_spread(hyper, u, z, rng, device)
-        hyper = _fit_posterior(self.nu, u[rows], z[rows], at_rows[rows], hyper, device, noisy=self.certainly_noisy)
+        hyper = _fit_posterior(self.nu, u[rows], z[rows], at_rows[rows], hyper, device, noise_mode=self._noise_mode)
         return _condition(self, hyper, u, z, at_rows, spread, shift, scale)
 
 
@@ -186,10 +200,10 @@ class _Model:
     likelihood: gpytorch.likelihoods.GaussianLikelihood
     floor: float
     priors: bool
-    noisy: bool
+    noise_mode: float | None
 
     @classmethod
-    def build(cls, nu: float, dimension: int, device: torch.device, *, priors: bool, noisy: bool = False) -> _Model:
+    def build(cls, nu: float, dimension: int, device: torch.device, *, priors: bool, noise_mode: float | None = None) -> _Model:
         """Return a model on the device; with priors the output scale is fixed at 1, the variance of standardised y."""
         log = {"transform": torch.exp, "inv_transform": torch.log}
         scale_prior = LogNormalPrior(math.sqrt(2.0) + 0.5 * math.log(dimension), math.sqrt(3.0))
@@ -201,9 +215,9 @@ class _Model:
         )
         kernel = gpytorch.kernels.ScaleKernel(base, outputscale_constraint=Positive(**log))
         kernel.raw_outputscale.requires_grad_(not priors)
-        floor = _NOISE_FLOOR if priors and not noisy else _LEAST_NOISE
+        floor = _NOISE_FLOOR if priors and noise_mode is None else _LEAST_NOISE
         likelihood = gpytorch.likelihoods.GaussianLikelihood(noise_constraint=GreaterThan(floor, **log))
-        return cls(kernel.double().to(device), likelihood.double().to(device), floor, priors, noisy)
+        return cls(kernel.double().to(device), likelihood.double().to(device), floor, priors, noise_mode)
 
     def parameters(self) -> list[torch.nn.Parameter]:
         both = (*self.kernel.parameters(), *self.likelihood.parameters())
@@ -239,7 +253,7 @@ class _Model:
         by_noise = torch.full_like(noise, float(diagonal(slope) @ like(spread, slope)))
         penalties = [-prior.log_prob(value_of(module)).sum() / n for _, module, prior, value_of, _ in self.kernel.named_priors()]
         if self.priors:
-            penalties.append(-_log_prior_of_noise(noise, self.noisy).sum() / n)
+            penalties.append(-_log_prior_of_noise(noise, self.noise_mode).sum() / n)
         for parameter in self.parameters():
             parameter.grad = None
         torch.autograd.backward(
@@ -249,15 +263,17 @@ class _Model:
         return sum((p.item() for p in penalties), -solved.log_likelihood / n)
 
 
-def _log_prior_of_noise(noise: torch.Tensor, certain: bool) -> torch.Tensor:
+def _log_prior_of_noise(noise: torch.Tensor, mode: float | None) -> torch.Tensor:
     """Return the log prior density of the log noise variance: half is that of noisy metrics, half is flat down to jitter.
+
+    With a mode there is noise for certain, about there.
 
     The first alone costs a deterministic metric 80 nats: 100 smooth runs were then learned with noise of 2 % of the
     standard deviation of y, too much for a critical interval that is narrower.
     """
     log_noise = noise.log()
-    noisy = -0.5 * (log_noise - _LIKELY_NOISE) ** 2 - 0.5 * math.log(2.0 * math.pi)
-    if certain:
+    noisy = -0.5 * (log_noise - (_LIKELY_NOISE if mode is None else mode)) ** 2 - 0.5 * math.log(2.0 * math.pi)
+    if mode is not None:
         return noisy
     flat = torch.nn.functional.logsigmoid(2.0 * (_LIKELY_NOISE - log_noise)) - math.log(_LIKELY_NOISE - _NO_NOISE)
     return torch.logaddexp(noisy, flat) - math.log(2.0)
@@ -271,12 +287,13 @@ def _fit_posterior(
     start: Hyperparameters | None,
     device: torch.device,
     *,
-    noisy: bool,
+    noise_mode: float | None,
 ) -> Hyperparameters:
     """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
-    model = _Model.build(nu, u.shape[1], device, priors=True, noisy=noisy)
-    first = np.full(u.shape[1], _FIRST_LENGTH * math.sqrt(u.shape[1]))
-    model.assign(start if start is not None else Hyperparameters(nu, first, 1.0, _FIRST_NOISE))
+    model = _Model.build(nu, u.shape[1], device, priors=True, noise_mode=noise_mode)
+    length, noise = (_HEAVY_LENGTH, _HEAVY_START) if noise_mode == _HEAVY_NOISE else (_FIRST_LENGTH, _FIRST_NOISE)
+    first = np.full(u.shape[1], length * math.sqrt(u.shape[1]))
+    model.assign(start if start is not None else Hyperparameters(nu, first, 1.0, noise))
     x, parameters = torch.from_numpy(u).to(device), model.parameters()
 
     def loss(vector: Vector) -> tuple[float, Vector]:

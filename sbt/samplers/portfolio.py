@@ -13,6 +13,8 @@ import numpy as np
 
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import Cube
+from sbt.samplers.drawn import propose_in_noise
+from sbt.samplers.noise import hidden_by_noise, more_repeats
 from sbt.samplers.regions import PATIENCE, Region, clusters, niches, regions
 from sbt.samplers.search import (
     Picks,
@@ -71,10 +73,13 @@ def propose(
         and the deflation were measured, see docs/falsification.md.
     """
     seen, d = search_data(search, u, y, batch, rng), u.shape[1]
-    again = seen.undecided[: math.ceil(_REPEATED * n)] if repeats and n > 1 else ()
+    again = _repeats(search, seen, u, y, n) if repeats else ()
     n -= len(again)
     if len(seen.u) < 2:
         return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n, again)
+    if repeats and seen.noisy and hidden_by_noise(u, search.margins(y)):
+        picks = propose_in_noise(search, seen, search.critical.margin(seen.y), n, rng)
+        return Picks(picks, ("drawn",) * n, again)
     model = fit_warped(search, seen.u, seen.y, rng, seen.success)
     margin = search.critical.margin(seen.y) if not seen.noisy else model.critical.margin(model(seen.u).mu)
     fresh, fills = ~seen.flank, np.ones(len(u), dtype=bool) if filling is None else filling
@@ -95,6 +100,14 @@ def propose(
     picks = _globally(model, picks, n, u, hopeful, seen.admissible, rng, search.cube)
     order = np.argsort(-model.log_probability(picks), kind="stable")
     return Picks(picks[order], tuple(why[k] for k in order), again)
+
+
+def _repeats(search: Search, seen: SearchData, u: Points, y: Vector, n: int) -> tuple[int, ...]:
+    """Return up to a tenth of n runs to repeat, and those that tell how large the noise is; of a deterministic simulator none."""
+    if not seen.noisy or n < 2:
+        return ()
+    first = more_repeats(u, search.margins(y))
+    return tuple(dict.fromkeys([*first, *seen.undecided[: math.ceil(_REPEATED * n)]]))[: n - 1]
 
 
 def _in_niches(

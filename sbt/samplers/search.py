@@ -9,7 +9,7 @@ inputs seem to matter elsewhere.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN, CombinedInterval
 from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.problem.requirement import CriticalInterval
+from sbt.samplers.noise import gives_different, hidden_by_noise
 
 __all__ = [
     "DEFLATION", "FreeRegion", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fill_uniformly", "fit_warped",
@@ -66,6 +67,15 @@ class Search:
     feasible: Callable[[Points], Mask] = lambda u: np.ones(len(u), dtype=bool)
     deflation: float = DEFLATION
     cube: Cube = CONTINUOUS
+
+    def margins(self, y: Vector) -> Vector:
+        """Return (n,) distances of y (n,) to M_c, inf where a run failed."""
+        return np.where(self.critical.known(y), self.critical.margin(y), np.inf)
+
+    def for_noise(self, u: Points, y: Vector) -> Search:
+        """Return the search whose metamodel expects much noise (its `for_noise`), where runs u (n, d), y (n,) show it."""
+        noisy: Metamodel | None = getattr(self.metamodel, "for_noise", None)
+        return replace(self, metamodel=noisy) if noisy is not None and hidden_by_noise(u, self.margins(y)) else self
 
 
 @dataclass(frozen=True)
@@ -265,14 +275,6 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
     )  # fmt: skip
 
 
-def gives_different(u: Points, y: Vector) -> bool:
-    """Say whether equal rows of u (n, d) have different values of y (n,): the simulator is noisy."""
-    if len(u) < 2:
-        return False
-    _, first, group = np.unique(u, axis=0, return_index=True, return_inverse=True)
-    return not np.allclose(y, y[first][group.reshape(-1)], rtol=1e-9, atol=0.0)
-
-
 def _decided(search: Search, u: Points, y: Vector, ok: Mask, hit: Mask, rng: np.random.Generator) -> tuple[Mask, tuple[int, ...]]:
     """Return (n,) the critical runs whose basin is deflated, and those of which a repetition decides.
 
@@ -280,7 +282,7 @@ def _decided(search: Search, u: Points, y: Vector, ok: Mask, hit: Mask, rng: np.
     run aside (it was chosen by its result), shrunk to the metamodel's P(critical) with the weight of two runs. One that was not
     repeated needs P(critical) of at least 0.9.
     """
-    model = fit_warped(search, u[ok], y[ok], rng)
+    model = fit_warped(search.for_noise(u, y), u[ok], y[ok], rng)
     prior = np.zeros(len(u))
     prior[hit] = model.probability(u[hit])
     group = np.unique(u, axis=0, return_inverse=True)[1].reshape(-1)

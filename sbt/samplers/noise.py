@@ -1,0 +1,61 @@
+"""How much noise hides: scores of ranks, and what runs of equal inputs tell of the simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from sbt.problem.arrays import Points, Vector
+
+__all__ = ["gives_different", "hidden_by_noise", "more_repeats", "scores"]
+
+_HIDDEN = 0.1  # share of the noise in the variance of the scores, from which on values of single runs mislead
+_REPEATS = 4  # of any inputs: two tell whether there is noise, four whether it is large
+
+
+def gives_different(u: Points, y: Vector) -> bool:
+    """Say whether equal rows of u (n, d) have different values of y (n,): the simulator is noisy."""
+    if len(u) < 2:
+        return False
+    _, first, group = np.unique(u, axis=0, return_index=True, return_inverse=True)
+    return not np.allclose(y, y[first][group.reshape(-1)], rtol=1e-9, atol=0.0)
+
+
+def scores(margin: Vector) -> Vector:
+    """Return (n,) logarithms of the rank's share: what is learned of margins (n,), smaller is nearer to critical.
+
+    Only the order counts, and most at the low end. If P(margin <= t | x) is a power of its mean over all runs, the mean score
+    at x is minus the inverse of that power: the order of the mean scores is that of P(critical), however rare it is.
+
+    Source:
+        Savage (1956), Annals of Mathematical Statistics 27: scores for Lehmann's alternatives.
+
+    >>> scores(np.array([2.0, 0.1, np.inf])).round(2).tolist()
+    [-0.69, -1.39, -0.29]
+    """
+    return np.log(rankdata(margin) / (len(margin) + 1.0))
+
+
+def hidden_by_noise(u: Points, margin: Vector) -> bool:
+    """Say whether noise makes up a tenth or more of the variance of the scores, by runs of equal u (n, d)."""
+    score = scores(margin)
+    group, count = _groups(u)
+    again = int((count - 1).sum())
+    if again == 0 or score.var() == 0.0:
+        return False
+    mean = np.bincount(group, score) / count
+    return float(((score - mean[group]) ** 2).sum()) / again >= _HIDDEN * float(score.var())
+
+
+def more_repeats(u: Points, margin: Vector) -> tuple[int, ...]:
+    """Return rows to run again, those of the smallest margin, until four runs of u (n, d) repeat others."""
+    group, count = _groups(u)
+    rows = [int(k) for k in np.argsort(margin, kind="stable") if count[group[k]] == 1 and np.isfinite(margin[k])]
+    return tuple(rows[: max(_REPEATS - int((count - 1).sum()), 0)])
+
+
+def _groups(u: Points) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return (n,) numbers, equal for equal rows of u (n, d), and how many rows each number has."""
+    _, group, count = np.unique(u, axis=0, return_inverse=True, return_counts=True)
+    return group.reshape(-1), count
