@@ -11,15 +11,13 @@ import math
 import numpy as np
 
 from sbt.metamodels.base import check_prediction, named_errors, sample_paths
+from sbt.metamodels.bootstrap import drawn_regression
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.noise import scores
 from sbt.samplers.search import Search, SearchData, fill_uniformly
 
 __all__ = ["propose_in_noise"]
 
-_TREES, _LEAF = 10, 4  # of a drawn forest: few trees, so that draws differ; runs in a leaf
-_RIDGE = 3.0  # penalty of a slope in runs: one of 0 is worth three more
-_EVERY = 3  # draw is of the metamodel
 _UNIFORM = 3000  # candidates
 _LOG_AMONG = math.log(50.0), math.log(800.0)  # of the number that a draw decides among
 _BEST, _STEPS, _STEP = 20, 10, 0.1  # runs of the lowest scores, steps from each, their standard deviation in the unit cube
@@ -28,8 +26,8 @@ _BEST, _STEPS, _STEP = 20, 10, 0.1  # runs of the lowest scores, steps from each
 def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, rng: np.random.Generator) -> Points:
     """Return n points (n, d), the one of the best mean score first: each is the best of a regression drawn for it.
 
-    Two draws of three give each run a random weight (the Bayesian bootstrap) and add up a line and a few random trees, fitted to
-    the scores; the third is a sample path of the metamodel. Lines learn a trend from few runs, trees thresholds, a process
+    In turn a draw is a line, a line and a few random trees, both fitted to randomly weighted scores (the Bayesian bootstrap), and
+    a sample path of the metamodel. Lines learn a trend from few runs, trees thresholds, a process
     hollows. A draw decides among 50 to 800 random candidates: the best of few looks about, that of many looks closer. Runs that
     failed have the worst score. No failure's neighbourhood is left out: its rate is to be learned, and is highest there.
 
@@ -54,23 +52,14 @@ def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, r
     mean, picks = check_prediction(process(at), len(at)).mu, []
     for k in range(n):
         among = rng.choice(len(at), min(int(np.exp(rng.uniform(*_LOG_AMONG))), len(at)), replace=False)
-        value = sample_paths(process, at[among], 1, rng)[0] if k % _EVERY == _EVERY - 1 else _drawn(inputs, score, at[among], rng)
+        points, kind = at[among], k % 3
+        if kind == 2:
+            value = sample_paths(process, points, 1, rng)[0]
+        else:
+            value = drawn_regression(inputs, score, points, rng, trees=kind == 1)
         picks.append(int(among[np.argmin(value)]))
     chosen = np.array(picks, dtype=np.intp)
     return candidates[chosen[np.argsort(mean[chosen], kind="stable")]]
-
-
-def _drawn(u: Points, score: Vector, at: Points, rng: np.random.Generator) -> Vector:
-    """Return (m,) the sum of a line and of a forest, both fitted to randomly weighted scores (n,), at `at` (m, d)."""
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    weight = rng.exponential(size=len(u))
-    forest = ExtraTreesRegressor(_TREES, min_samples_leaf=_LEAF, random_state=int(rng.integers(2**31)), n_jobs=1)
-    forest.fit(u, score, sample_weight=weight)
-    columns = np.column_stack([u - 0.5, np.ones(len(u))])
-    penalty = np.append(np.full(u.shape[1], _RIDGE), 1e-6)
-    slope = np.linalg.solve((columns.T * weight) @ columns + np.diag(penalty), columns.T @ (weight * score))[:-1]
-    return np.asarray(forest.predict(at)) + (at - 0.5) @ slope
 
 
 def _candidates(search: Search, seen: SearchData, best: Points, rng: np.random.Generator) -> Points:

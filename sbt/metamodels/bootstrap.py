@@ -1,0 +1,38 @@
+"""Regressions drawn at random: each gives every run a random weight."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sbt.problem.arrays import Points, Vector
+
+__all__ = ["drawn_regression"]
+
+_TREES, _LEAF = 10, 4  # of a drawn forest: few trees, so that draws differ; runs in a leaf
+_RIDGE = 3.0  # penalty of a slope in runs: one of 0 is worth three more
+
+
+def drawn_regression(u: Points, y: Vector, at: Points, rng: np.random.Generator, *, trees: bool) -> Vector:
+    """Return (m,) a line fitted to randomly weighted y, at points; with trees the sum of it and of a forest.
+
+    Args:
+        u: (n, d) rows.
+        y: (n,) standardised.
+        at: (m, d) points.
+        rng: of the weights and the trees.
+        trees: see above.
+
+    Source:
+        Rubin (1981), The Bayesian bootstrap.
+    """
+    weight = rng.exponential(size=len(u))
+    columns = np.column_stack([u - 0.5, np.ones(len(u))])
+    penalty = np.append(np.full(u.shape[1], _RIDGE), 1e-6)
+    slope = np.linalg.solve((columns.T * weight) @ columns + np.diag(penalty), columns.T @ (weight * y))[:-1]
+    line = np.asarray((at - 0.5) @ slope)
+    if not trees:
+        return line
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    forest = ExtraTreesRegressor(_TREES, min_samples_leaf=_LEAF, random_state=int(rng.integers(2**31)), n_jobs=1)
+    return line + np.asarray(forest.fit(u, y, sample_weight=weight).predict(at))
