@@ -238,6 +238,7 @@ class UserSimulation:
             connect = partial(self._warm, start=lambda: session().run(warmed.launch, 0, isolation, state))
             if forking:
                 session().hold(warmed.launch)
+                session().ask(lambda sumo: levels_of(sumo).warning)  # found once a network, here and not in every child
                 limit = None if self.timeout is None else self.timeout + _GRACE
                 return in_fork(partial(self._in_child, values, seed, connect), limit, "a run")
         watch = Stopwatch()
