@@ -50,6 +50,21 @@ def test_a_forked_run_is_that_of_a_process_of_its_own(tmp_path):
     assert not any(tmp_path.glob("loop.xml"))
 
 
+@pytest.mark.slow
+@pytest.mark.sumo
+def test_children_do_not_read_on_where_others_stopped_in_large_files(tmp_path):
+    """SUMO reads route files 1 MiB at a time, and forked processes share how far a file is read."""
+    path = town(tmp_path)
+    cars = (tmp_path / "cars.rou.xml").read_text().removesuffix("</routes>")
+    later = (f'<trip id="l{k}" type="mixed" depart="{60 + k / 100:.2f}" from="A1B1" to="C3D3"/>\n' for k in range(40_000))
+    (tmp_path / "cars.rou.xml").write_text(f"{cars}{''.join(later)}</routes>")
+    found = simulation(path)
+    forked = [found(CENTRE, seed) for seed in (4, 6, 4)]
+    loaded = found.isolated(replace(found.isolation, forking=False))
+    assert forked[0].identical(forked[2])
+    assert [loaded(CENTRE, seed).identical(trace) for seed, trace in zip((4, 6), forked, strict=False)] == [True, True]
+
+
 @pytest.mark.sumo
 def test_a_run_that_dies_or_hangs_costs_itself_alone(tmp_path):
     code = "import os, signal, time\nclass Dies:\n    def __init__(self, rng, set_speed, how): self.how = how\n"

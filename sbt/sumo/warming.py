@@ -14,7 +14,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -41,6 +41,8 @@ _WORDS = 624
 """Words of the state of a Mersenne Twister (std::mt19937)."""
 _FULL = 1_000_000
 """From this number of draws on SUMO saves, and reads, a generator's whole state."""
+_KEPT = 8
+"""States that a process keeps as text, some MB each."""
 _LONGEST = 3600.0
 """Wall-clock limit of a warm-up (s)."""
 
@@ -223,7 +225,7 @@ def _write(path: Path, elements: Iterable[bytes]) -> None:
     path.write_bytes(b"<routes>\n" + b"\n".join(elements) + b"\n</routes>\n")
 
 
-@cache
+@lru_cache(maxsize=_KEPT)
 def _read(path: Path) -> State:
     """Read a state; kept in this process, as most runs of a worker need one of few."""
     text = gzip.decompress(path.read_bytes()).decode()
