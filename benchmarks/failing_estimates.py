@@ -1,6 +1,7 @@
 """Do intervals of an estimation cover where runs fail, whether these count as safe or as critical?
 
     python benchmarks/failing_estimates.py [--seeds 20] [--problems overlap_d2_half,random_d3_tenth] [--table runs/failing.jsonl]
+    python benchmarks/failing_estimates.py --counts 60 --seeds 3 ...    # simulated counts instead, with the metamodels of 3 seeds
 
 Campaigns with default settings, `stop: {cov: null}`, 150 runs. The probability of both readings is known: P(critical, and the run
 gives a metric) counts failed runs as safe, P(critical, or the run fails) as critical. Finished cells are lines of the table: run
@@ -16,7 +17,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,6 +26,14 @@ import numpy as np
 from scipy.stats import multivariate_normal, norm
 
 import sbt
+from sbt.campaigns import pools
+from sbt.campaigns.counting import with_event
+from sbt.estimators.events import with_failed_runs
+from sbt.estimators.importance import BLIND, SHARES
+from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
+from sbt.estimators.mixture import wide_scales
+from sbt.estimators.surrogate import Coordinates, fit_log_probability
+from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.seeds import stream
 from sbt.testbeds import find
 
@@ -106,6 +115,72 @@ def campaign(name: str, seed: int) -> dict:
     return {"cell": name, "seed": seed, "failed": failed, "cpu": round(time.process_time() - cpu, 1), **kept}
 
 
+def counts(name: str, seed: int, n: int) -> np.ndarray:
+    """Return (n, 4) estimate and lower end with failed runs as safe, estimate and upper end with failed runs as critical."""
+    pools._POOL = 2_500
+    with tempfile.TemporaryDirectory() as folder:
+        result = sbt.run(
+            campaign="estimation", scenario=CELLS[name]().scenario, seed=seed, budget=75, stop={"cov": None}, executor="serial",
+            store=f"{folder}/store", report=False,
+        )  # fmt: skip
+        history, scenario = result.history, result.scenario
+    given_as = CELLS[name]().scenario
+    evaluate = find(name).scenario().evaluate if isinstance(given_as, str) else given_as.evaluate
+    space, requirement, rng = scenario.space, scenario.requirement, stream(seed, "counts", name)
+    at, z, y = Coordinates(space), space.to_normal(history.x), requirement.values(history)
+    rows = np.r_[np.flatnonzero(history.ok), np.flatnonzero(~history.ok)]  # those with a metric first
+    z, y, ok = z[rows], y[rows], history.ok[rows]
+    given = fit_log_probability(GaussianProcess(nu=2.5, input_noise=False), at, requirement.critical, z[ok], y[ok], rng)
+    learned, frame = with_failed_runs(given, at, z, ok, rng), pools.Frame(wide_scales(at.bounded))
+    hits = z[ok][requirement.critical.contains(y[ok])]
+    proposal = pools.fit_proposal(space, frame, learned, hits if len(hits) else None, SHARES if len(hits) else BLIND, rng)
+    found = []
+    for _ in range(n):
+        batches = [batch_of(scenario, evaluate, frame, proposal, rng) for _ in range(5)]
+        low, high = (combine_estimates([batch[k] for batch in batches]) for k in (0, 1))
+        outcomes = [np.concatenate([batch[k].critical for batch in batches]) for k in (0, 1)]
+        few = [min(each.sum(), len(each) - each.sum()) < FEW_HITS for each in outcomes]
+        if min(e.hits for e in (low, high)) == 0.0:
+            found.append((low.value, 0.0, high.value, 1.0))  # only a bound is given
+            continue
+        ends = low.limit(0.975, side=-1, few=few[0]), high.limit(0.975, side=1, few=few[1])
+        found.append((low.value, ends[0], high.value, ends[1]))
+    return np.array(found)
+
+
+def batch_of(scenario, evaluate, frame, proposal, rng) -> tuple[CountedBatch, CountedBatch]:
+    """Return a batch of 15 draws from a fresh pool, failed ones as safe and as critical."""
+    pool = pools.draw_pool(scenario.space, frame, proposal, SHARES, rng)
+    runs, kept = pools.draw_batch(scenario.space, pool, 15, rng, counts=True)
+    y = np.array([evaluate(run.inputs, int(rng.integers(2**31)))[scenario.requirement.metric] for run in runs])
+    draws, critical = kept.counted, scenario.requirement.critical.contains(y)
+    prior = kept.pool.probability if kept.method == "difference" else 0.0
+    safe = CountedBatch(
+        prior, kept.pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
+        critical.astype(np.float64),
+    )  # fmt: skip
+    worst = replace(safe, critical=(critical | np.isnan(y)).astype(np.float64))
+    return safe, worst if draws.failed_critical is None else with_event(worst, draws.failed_critical)
+
+
+def show_counts(names: list[str], seeds: int, n: int) -> None:
+    head = (
+        "problem", "counts", "low > P", "rel. RMSE", "median (P - low) / P", "high < P", "rel. RMSE (crude)",
+        "median (high - P) / P",
+    )  # fmt: skip
+    print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+    for name in names:
+        cell, found = CELLS[name](), np.vstack([counts(name, seed, n) for seed in range(seeds)])
+        crude = math.sqrt((1.0 - cell.critical) / (cell.critical * 75))
+        rmse = [np.sqrt(np.mean((found[:, k] / p - 1.0) ** 2)) for k, p in ((0, cell.safe), (2, cell.critical))]
+        print(
+            f"| {name} | {len(found)} | {(found[:, 1] > cell.safe).mean():.3f} | {rmse[0]:.3f} | "
+            f"{np.median(1.0 - found[:, 1] / cell.safe):.2f} | {(found[:, 3] < cell.critical).mean():.3f} | {rmse[1]:.3f} "
+            f"({crude:.3f}) | {np.median(found[:, 3] / cell.critical - 1.0):.2f} |",
+            flush=True,
+        )  # fmt: skip
+
+
 def finished(table: Path) -> dict[tuple[str, int], dict]:
     rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
     return {(row["cell"], row["seed"]): row for row in rows}
@@ -139,11 +214,15 @@ def main() -> None:
     parser.add_argument("--problems", default=",".join(CELLS))
     parser.add_argument("--table", type=Path, default=Path("runs/failing.jsonl"))
     parser.add_argument("--show", action="store_true")
+    parser.add_argument("--counts", type=int, help="simulate so many counts with the metamodel of each seed")
     args = parser.parse_args()
     args.table.parent.mkdir(parents=True, exist_ok=True)
     done, names = finished(args.table), args.problems.split(",")
     if unknown := set(names) - set(CELLS):
         parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join(CELLS)}")
+    if args.counts is not None:
+        show_counts(names, args.seeds, args.counts)
+        return
     for seed in range(0 if args.show else args.seeds):
         for name in names:
             if (name, seed) not in done:

@@ -9,6 +9,7 @@ import sbt
 from sbt.config.assemble import scenario_of
 from sbt.config.load import parse
 from sbt.errors import InputError
+from sbt.estimators.surrogate import fit_log_probability
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.joint import JointMetamodel, JointPrediction, joined_log_probability
 from sbt.metamodels.prediction import Prediction
@@ -212,3 +213,19 @@ def test_an_estimation_tells_the_probability_of_each_from_the_same_draws(tmp_pat
         assert one.probability <= found.probability * 1.05
     if how == "auto":
         assert found.probability == pytest.approx(union, rel=0.1)
+
+
+def test_the_noise_of_repeats_is_that_of_each_metric():
+    """An estimation whose metamodels learn no noise from the runs: what repeats tell is left to each metric alone."""
+    z = np.linspace(-2.0, 2.0, 15)[:, None]
+    y, critical = np.column_stack([z[:, 0], 3.0 * z[:, 0]]), any_of(Requirement("a", low=1.0), Requirement("b", low=3.0)).critical
+
+    def parts(noise):
+        process, rng = GaussianProcess(nu=2.5, input_noise=False), np.random.default_rng(0)
+        fitted = fit_log_probability(process, lambda at: 0.5 + at / 10.0, critical, z, y, rng, noise)
+        return [float(np.exp(part(np.array([[0.5]]))[0][0])) for part in fitted.parts]
+
+    plain, of_the_first = parts(()), parts((0.25, 0.0))
+    assert plain[0] < 1e-3
+    assert of_the_first[0] > 0.05  # (1 - 0.5) / 0.5: one standard deviation from critical
+    assert of_the_first[1] == plain[1]

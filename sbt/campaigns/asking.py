@@ -9,6 +9,7 @@ import numpy as np
 from sbt.campaigns.again import Reused
 from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.gate import Limits
+from sbt.campaigns.wording import plural
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.estimators.reweighting import ReusedBatch, WeightedShare, defended_bound, effective_size
 from sbt.problem.arrays import Points, Vector
@@ -71,7 +72,7 @@ def _from_batches(found: Reused) -> EstimationConclusion:
     def bound(count: int, confidence: float) -> float:
         return defended_bound(count, found.nominal, found.ratio, confidence)
 
-    few_low, few_high = (min(e.hits, e.misses) < FEW_HITS for e in (low, high))  # effective numbers: new weights vary a lot
+    few_low, few_high = min(hits, misses + perhaps - hits) < FEW_HITS, min(perhaps, misses) < FEW_HITS
     value, exact, warnings = min(max(low.value, 0.0), 1.0), None, []
     limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
     if not found.critical:
@@ -85,10 +86,8 @@ def _from_batches(found: Reused) -> EstimationConclusion:
         limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), bound(perhaps, c)))
         warnings.append("no counted draw was critical: only an upper bound is given")
     elif few_low or few_high:
-        least = min(low.hits, low.misses, high.hits, high.misses)
-        warnings.append(
-            f"critical or safe draws are worth {least:.2g}, fewer than {FEW_HITS}: the interval is that of so small a number"
-        )
+        met = f"{plural(hits, 'counted draw')} critical" if hits < FEW_HITS else f"{plural(misses, 'counted draw')} safe"
+        warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
     return _conclusion(value, limits, low.std_error, max(min(max(high.value, 0.0), 1.0), value), hits, missed, exact, warnings)
 
 

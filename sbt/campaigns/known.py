@@ -34,7 +34,7 @@ class Known:
         z, u, y, critical, batch: normal scores, coordinates, metric, what is critical, and the batch, of runs to learn from.
         coordinates: from normal scores to the metamodel's inputs.
         settings: of the campaign.
-        noise: standard deviation among repeats.
+        noise: of each metric of the requirement, its standard deviation among repeats.
         failed, failed_batch: (k, d) normal scores and (k,) batch of runs that gave no metric.
     """
 
@@ -45,7 +45,7 @@ class Known:
     batch: Vector
     coordinates: Coordinates
     settings: Settings
-    noise: float
+    noise: tuple[float, ...]
     failed: Points
     failed_batch: Vector
 
@@ -63,7 +63,7 @@ class Known:
             lost = np.vstack([all_first.x[~all_first.ok], lost])
             lost_batch = np.concatenate([np.full(len(lost) - len(lost_batch), -1), lost_batch])
         z, failed = (space.to_normal(rows) if len(rows) else np.empty((0, space.dimension)) for rows in (x, lost))
-        noise = simulator_noise(history, requirement).std or 0.0
+        noise = tuple(simulator_noise(history, part).std or 0.0 for part in requirement.parts)
         critical = requirement.critical.contains(y)
         return cls(z, coordinates(z), y, critical, batch, coordinates, settings, noise, failed, lost_batch)
 
@@ -104,7 +104,7 @@ class Known:
         if len(self.y) < 2 and transfer is None:
             return None
         interval, earlier = self.settings.scenario.requirement.critical, () if transfer is None else transfer.trends
-        noise = _SURE_NOISE * self.noise**2
+        noise = [_SURE_NOISE * std**2 for std in self.noise]
         given = fit_log_probability(
             metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng, noise, earlier=earlier
         )  # fmt: skip

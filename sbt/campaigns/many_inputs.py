@@ -19,6 +19,7 @@ from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.stopping import count_begins, relative_error, steadier
+from sbt.estimators.events import with_failed_runs
 from sbt.estimators.importance import BLIND, SHARES
 from sbt.estimators.mixture import wide_scales
 from sbt.estimators.subspace import find_subspace, inputs_that_matter, unit
@@ -107,12 +108,17 @@ class ManyInputsStage:
     ) -> tuple[Frame, Proposal, tuple[float, ...]]:
         """Return the subspace, the proposal and the shares of the draws, by what was known before an iteration."""
         s = self.settings
-        z, y, t = self._known(replace(log, history=log.history.where(log.history.iteration < iteration)))
+        history = log.history.where(log.history.iteration < iteration)
+        z, y, t = self._known(replace(log, history=history))
         critical = s.scenario.requirement.critical
         subspace = find_subspace(z, t, axes, other=y if y.ndim == 1 else None)
         v, hit = subspace.reduce(z), critical.contains(y)
         rows = np.r_[: min(len(v), _FIRST_ROWS), max(len(v) - _LATEST_ROWS, min(len(v), _FIRST_ROWS)) : len(v)]
-        learned = fit_log_probability(metamodel_of(s), unit, critical, v[rows], y[rows], stream(s.seed, "fit", iteration))
+        fit = stream(s.seed, "fit", iteration)
+        given = fit_log_probability(metamodel_of(s), unit, critical, v[rows], y[rows], fit)
+        lost = history.x[~history.ok]
+        every = np.vstack([v, subspace.reduce(s.scenario.space.to_normal(lost))]) if len(lost) else v
+        learned = with_failed_runs(given, unit, every, np.arange(len(every)) < len(v), fit)
         shares = BLIND if not hit.any() or hit.all() else SHARES
         frame = Frame(wide_scales(np.zeros(v.shape[1])), lift=subspace.lift)
         return frame, fit_proposal(s.scenario.space, frame, learned, v[hit], shares, rng), shares

@@ -128,7 +128,7 @@ class _Form:
 
 def fit_log_probability(
     metamodel: Metamodel, coordinates: Callable[[Points], Points], critical: CriticalInterval, z: Points, y: Vector,
-    rng: np.random.Generator, noise: float = 0.0, earlier: Sequence[Trend] = (),
+    rng: np.random.Generator, noise: Sequence[float] = (), earlier: Sequence[Trend] = (),
 ) -> LogProbability:  # fmt: skip
     """Return P(critical) as learned from n >= 2 runs at normal scores z (n, d) with metrics y (n,).
 
@@ -144,14 +144,15 @@ def fit_log_probability(
         z: normal scores of the runs.
         y: their metrics.
         rng: the only source of randomness.
-        noise: variance of y among runs of the same inputs, as repeats tell: the metamodel's is not allowed to be smaller.
+        noise: variance of each metric among runs of the same inputs, as repeats tell, that of the metamodel is not allowed to
+            be smaller; empty: nothing is known of it.
         earlier: each metric in an earlier campaign, used where runs are better predicted with it; with it no run is needed.
     """
     if isinstance(critical, CombinedInterval):
         known = np.isfinite(y)
         parts = [
             fit_log_probability(
-                metamodel, coordinates, leaf, z[known[:, k]], y[known[:, k], k], rng, earlier=earlier[k : k + 1]
+                metamodel, coordinates, leaf, z[known[:, k]], y[known[:, k], k], rng, noise[k : k + 1], earlier[k : k + 1]
             )
             for k, leaf in enumerate(critical.leaves)
         ]
@@ -161,11 +162,12 @@ def fit_log_probability(
         belief, edges = trended(metamodel, earlier[0], coordinates(z), z, warp.values(y), rng), warp.interval(critical)
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
+    least = noise[0] if noise else 0.0
     u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
     log_slope = -0.5 * np.log1p(((y - warp.edge) / warp.scale) ** 2) - np.log(warp.scale)
-    whole = _Form(t, warp.interval(critical), log_slope, noise=noise / warp.scale**2)
-    plain = _Form(y, critical, np.zeros(len(y)), noise=noise)
+    whole = _Form(t, warp.interval(critical), log_slope, noise=least / warp.scale**2)
+    plain = _Form(y, critical, np.zeros(len(y)), noise=least)
     trends = [replace(form, trend=_trend(u, form.values)) for form in (whole, plain)]
     forms = [whole, plain, *(form for form in trends if form.trend is not None)]
     every = np.arange(len(y))
