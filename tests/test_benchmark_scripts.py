@@ -32,6 +32,8 @@ SMALLEST = {
     "faults.py": "--kills 2",
     "choices.py": "--task falsification --seeds 1 --store {folder}/choices",
     "failing_runs.py": "--seeds 1 --only falsification",
+    "failing_estimates.py": "--counts 1 --seeds 1 --problems overlap_d2_half --table {folder}/failing.jsonl",
+    "asked_again.py": "--seeds 1 --table {folder}/again.jsonl",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
