@@ -181,7 +181,7 @@ class WarmUpEntry(_Strict):
         default="auto", description="Time (s) at which runs begin; auto: shortly before the ego and all that inputs change."
     )
     seeds: int | None = Field(
-        default=None, ge=1, description="Number of warm-ups; null: one for 25 runs, at most 8; of an estimation 20."
+        default=None, ge=1, description="Number of warm-ups; null: one for 50 runs, at most 8; of an estimation 20."
     )
 
     @property

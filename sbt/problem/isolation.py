@@ -15,14 +15,14 @@ __all__ = ["SNAPSHOT", "Isolation", "Warmable", "warm_ups"]
 SNAPSHOT = "snapshot"
 """Level of runs that begin with traffic which was warmed up once."""
 
-_RUNS_EACH, _MOST, _OF_ESTIMATE = 25, 8, 20
+_RUNS_EACH, _MOST, _OF_ESTIMATE = 50, 8, 20
 """Runs for which one more warm-up pays, most warm-ups of a search, and those of an estimate, whose interval rests on them."""
 
 
 def warm_ups(budget: int, *, estimating: bool) -> int:
     """Return the number of warm-ups of a campaign that states none.
 
-    >>> warm_ups(50, estimating=False), warm_ups(500, estimating=False), warm_ups(500, estimating=True)
+    >>> warm_ups(100, estimating=False), warm_ups(500, estimating=False), warm_ups(500, estimating=True)
     (2, 8, 20)
     """
     return _OF_ESTIMATE if estimating else min(_MOST, max(1, budget // _RUNS_EACH))
