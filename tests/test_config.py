@@ -7,6 +7,8 @@ from __future__ import annotations
 import json
 import math
 import pickle
+import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -380,3 +382,26 @@ def test_an_unusable_scenario_is_refused(folder: Path, scenario: str, expected: 
 def test_relative_controller_files_become_absolute(folder: Path):
     spec = spec_of(parse(BASE + "ego: {kind: 'ego.py:Ego', gain: 2}\n", folder=folder))
     assert spec.ego == {"kind": f"{folder}/ego.py:Ego", "gain": 2}
+
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefgh"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB, "at most 100000 values, those that aliases"),
+        ("a: &a [*a]\n", "at most 100000 values"),
+        (f"store: {'x' * 2**20}\n", "at most 1048576 bytes"),
+        ("budget: 1000000000000\n", "budget: must be less than or equal to 10000000"),
+        ('scenario: "a\\0b.py:X"\n', "at most 4096 printable characters, but got 8 of them: 'a\\x00b.py:X'"),
+        ("executor: {memory: 2 cats}\n", "must be bytes such as 2 GiB"),
+        ("executor: {memory: 1 KiB}\n", "greater than or equal to 268435456"),
+        ("executor: {kind: serial, recycle: 5}\n", "worker processes have it, but the executor is serial"),
+    ],
+    ids=["bomb", "endless", "long", "budget", "NUL", "cats", "little", "serial"],
+)
+def test_what_would_take_all_memory_or_time_is_refused_at_once(text: str, message: str):
+    base = "campaign: coverage\n" + ("" if text.startswith("scenario") else "scenario: cut_in\n")
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        parse(base + text)

@@ -64,7 +64,7 @@ class ExecutorChoice(_Strict):
         default="local", description="serial: in this process; local: worker processes; dask: workers of a dask cluster."
     )
     workers: int = Field(
-        default_factory=_cores, ge=1,
+        default_factory=_cores, le=4096, ge=1,
         description="Worker processes of local, and of dask without an address; default: the usable cores.",
     )  # fmt: skip
     address: Name | None = Field(

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ValidationError
 from sbt.campaigns.settings import CampaignKind
 from sbt.config.kinds import kind_of, kinds, looked_up_in
 from sbt.config.model import Configuration
-from sbt.config.source import ConfigError, Key, SourceMap, read_yaml, yaml_reader
+from sbt.config.source import LARGEST, TOO_LARGE, ConfigError, Key, SourceMap, read_yaml, yaml_reader
 from sbt.errors import did_you_mean
 from sbt.plugins import Objects, Scope
 from sbt.problem.plain import Json, JsonMapping
@@ -98,7 +98,11 @@ def read_text(path: str | Path) -> str:
         ConfigError: the file cannot be read.
     """
     try:
-        return Path(path).read_bytes().decode("utf-8-sig")
+        with Path(path).open("rb") as file:
+            data = file.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise ConfigError([f"{path}: {TOO_LARGE}, but has more"])
+        return data.decode("utf-8-sig")
     except IsADirectoryError:
         raise ConfigError([f"{path}: a configuration must be a YAML file, but this is a folder"]) from None
     except OSError as error:

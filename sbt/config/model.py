@@ -140,7 +140,7 @@ class ValidationChoice(_Strict):
     """Runs that score the metamodel and never train it."""
 
     share: float = Field(default=0.1, ge=0, lt=1, description="Share of every batch that is drawn at random and held out.")
-    reference: int = Field(default=0, ge=0, description="Extra random runs beyond the budget, only for scoring.")
+    reference: int = Field(default=0, ge=0, le=10**7, description="Extra random runs beyond the budget, only for scoring.")
 
 
 class StopRules(_Strict):
@@ -249,7 +249,7 @@ class Configuration(_Strict):
     )
     simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates; default: the scenario's.")
     seed: int = Field(default=0, ge=0, description="Seed of everything random in the campaign.")
-    budget: int = Field(default=500, ge=1, description="Runs, the initial ones included.")
+    budget: int = Field(default=500, ge=1, le=10**7, description="Runs, the initial ones included.")
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,
         description="How runs are chosen; default: that of the campaign.",

@@ -23,6 +23,9 @@ def two_values(value: Any) -> Any:
 def _not_blank(text: str) -> str:
     if not text.strip():
         raise ValueError("must not be empty")
+    if len(text) > 4096 or not text.isprintable():
+        shown = ascii(text if len(text) <= 60 else f"{text[:57]}...")
+        raise ValueError(f"must be text of at most 4096 printable characters, but got {len(text)} of them: {shown}")
     return text
 
 

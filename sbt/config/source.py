@@ -16,6 +16,8 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from sbt.errors import InputError, did_you_mean
 
 __all__ = [
+    "LARGEST",
+    "TOO_LARGE",
     "ConfigError",
     "Key",
     "Place",
@@ -25,6 +27,12 @@ __all__ = [
     "read_yaml",
     "yaml_reader",
 ]
+
+LARGEST = 2**20
+"""Most bytes of a file that is read whole as YAML."""
+TOO_LARGE = f"a configuration must have at most {LARGEST} bytes"
+_NODES, _ENDLESS = 100_000, 10**12
+"""Most values of a document, aliases counted in full; and how many count as endless."""
 
 T = TypeVar("T")
 Key = tuple[str | int, ...]
@@ -152,11 +160,14 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
     """Return the value of a YAML document, where its keys stand, and a message for each doubled key.
 
     Raises:
-        ConfigError: the text is not YAML.
+        ConfigError: the text is not YAML, is too large, or its aliases (*name) stand for too much.
     """
+    if len(text) > LARGEST:
+        raise ConfigError([f"{name}: {TOO_LARGE}, but has {len(text)}"])
     try:
         node = yaml_reader().compose(text)
-        value = yaml_reader().load(text)
+        size = _size(node, {})
+        value = yaml_reader().load(text) if size <= _NODES else None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark is not None else (1, 1)
@@ -167,6 +178,9 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
         where = str(text[: getattr(error, "position", 0)]).count("\n") + 1
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError([f"{name}:{where}:1: the file must be YAML, but {reason}"]) from None
+    if size > _NODES:
+        rule = f"a file must have at most {_NODES} values, those that aliases (*name) stand for included"
+        raise ConfigError([f"{name}:1:1: {rule}, but has {'more' if size == _ENDLESS else size}"])
     places: dict[Key, Place] = {}
     doubled: list[tuple[Key, str, bool]] = []
     texts: dict[Key, str] = {}
@@ -180,6 +194,18 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
             texts[path] = value_node.value
     source = SourceMap(name, places, texts=texts)
     return value, source, source.sorted(doubled)
+
+
+def _size(node: Node | None, known: dict[int, int]) -> int:
+    """Return how many values a node stands for, each alias counted in full; endless where it stands within itself."""
+    if node is None or isinstance(node, ScalarNode):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = _ENDLESS
+        pairs = isinstance(node, MappingNode)
+        inner = [each for pair in node.value for each in pair] if pairs else node.value
+        known[id(node)] = min(1 + sum(_size(each, known) for each in inner), _ENDLESS)
+    return known[id(node)]
 
 
 def _walk(node: Node | None, path: Key) -> Iterator[tuple[Key, Place, Node]]:

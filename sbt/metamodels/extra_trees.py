@@ -29,7 +29,7 @@ class ExtraTrees:
     mixture's mean and variance (law of total variance).
 
     Args:
-        trees: number of trees k >= 1.
+        trees: number of trees k, 1 to 10,000.
         min_samples_split: rows a node must hold to be split, >= 2.
         max_features: share of the inputs tried at a split, in (0, 1].
         sigma_floor: smallest sigma of a leaf, as a share > 0 of the standard deviation of y.
@@ -62,9 +62,10 @@ class ExtraTrees:
     }
 
     def __post_init__(self) -> None:
-        if not (self.trees >= 1 and self.min_samples_split >= 2):
+        if not (1 <= self.trees <= 10_000 and self.min_samples_split >= 2):
             raise InputError(
-                f"ExtraTrees needs trees >= 1 and min_samples_split >= 2, but got {self.trees} and {self.min_samples_split}"
+                "ExtraTrees needs trees in [1, 10000] and min_samples_split >= 2, "
+                f"but got {self.trees} and {self.min_samples_split}"
             )
         if not 0.0 < self.max_features <= 1.0:
             raise InputError(f"max_features must be in (0, 1], but got {self.max_features}")
