@@ -14,7 +14,7 @@ from sbt.errors import InputError
 from sbt.plugins import KINDS
 
 if TYPE_CHECKING:
-    from sbt.store.rescue import Diagnosis
+    from sbt.workflows.status import Diagnosis
 
 __all__ = ["doctor", "list_", "schema"]
 
@@ -87,7 +87,7 @@ def doctor(
 def _examine_store(folder: Path, target: Path | None, *, as_json: bool) -> None:
     """Print what of a store is whole, and save that where there is a target; exit 1 where something is damaged."""
     with clean_stdout():
-        from sbt.store.rescue import examine, save
+        from sbt.workflows.status import examine, save
 
         found = examine(folder)
         saved = None if target is None else save(folder, target)

@@ -7,8 +7,9 @@ from pathlib import Path
 from sbt.problem.plain import Json
 from sbt.store.database import Store
 from sbt.store.records import FitRecord
+from sbt.store.rescue import Diagnosis, examine, save
 
-__all__ = ["read_status"]
+__all__ = ["Diagnosis", "examine", "read_status", "save"]
 
 
 def read_status(folder: Path) -> Json:
