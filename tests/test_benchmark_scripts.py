@@ -38,7 +38,7 @@ SMALLEST = {
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
 SUMO |= {"noise.py", "physics.py", "throughput.py", "transfer.py", "watcher.py"}
-LONG = {"batch_size.py", "benchmark_page.py"}  # hours; draws what test_benchmark.py runs
+LONG = {"batch_size.py", "benchmark_page.py", "snapshots.py"}  # hours; draws what test_benchmark.py runs; minutes on a town
 SHARED = {"street_traffic.py"}  # networks and traffic of the scripts
 
 

@@ -292,7 +292,7 @@ def test_a_failed_run_is_told_and_ends_with_4(folder: Path, name: str, status: s
         (["--ego", "gain=2"], "--ego needs kind=NAME, but got gain"),
         (["--ego", "kind=acc"], "scenario plane offers no choice of ego or step length"),
         (["--step", "0"], "--step must be > 0 s, but got 0.0"),
-        (["--isolation", "none"], "--isolation must be auto, fresh, reuse or replicas, but got 'none'"),
+        (["--isolation", "none"], "--isolation must be auto, fresh, reuse, replicas or snapshot, but got 'none'"),
         (["--trace", "t.csv"], "a trace needs a scenario that is simulated, but plane gives its metrics directly"),
     ],
 )

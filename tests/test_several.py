@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal, norm
 
 import sbt
 from sbt.config.assemble import scenario_of
@@ -201,15 +202,16 @@ def test_boundary_and_coverage_tell_the_share_of_each(tmp_path):
 
 @pytest.mark.parametrize("how", ["auto", "monte_carlo"])
 def test_an_estimation_tells_the_probability_of_each_from_the_same_draws(tmp_path, how):
-    a, b = np.random.default_rng(0).standard_normal((2, 2_000_000))
-    truth = {"left": (a + 0.1 * b <= -1.8), "high": (b - 0.2 * a >= 2.2)}
+    sides = np.array([-1.8 / np.sqrt(1.01), -2.2 / np.sqrt(1.04)])  # of -(a + b / 10) and b - a / 5, correlated by .1
+    truth = dict(zip(("left", "high"), norm.cdf(sides), strict=True))
+    rho = 0.1 / np.sqrt(1.01 * 1.04)
+    union = truth["left"] + truth["high"] - multivariate_normal.cdf(sides, cov=[[1.0, rho], [rho, 1.0]])
     budget = 90 if how == "auto" else 2000
     found = _campaign(tmp_path, "estimation", budget, acquisition=how, stop={"cov": None}).conclusion
-    union = (truth["left"] | truth["high"]).mean()
     assert found.low < union < found.high
     assert [one.name for one in found.requirements] == ["left", "high"]
     for one in found.requirements:
-        assert one.low < truth[one.name].mean() < one.high
+        assert one.low < truth[one.name] < one.high
         assert one.probability <= found.probability * 1.05
     if how == "auto":
         assert found.probability == pytest.approx(union, rel=0.1)
