@@ -360,7 +360,7 @@ def _keep_fit(store: Store, fitted: FittedMetamodel | None, log: Log, seconds: d
 
 
 def _plan(store: Store, stage: Stage, batch: Batch, log: Log, seed: int) -> None:
-    start = store.planned
+    start = store.end
     seeds = [run_seed(seed, start + k) for k in range(len(batch.runs))]
     store.plan(log.iteration, stage.name, batch.runs, seeds, batch.proposal)
 

@@ -243,7 +243,7 @@ class Store:
             proposal: how the batch was chosen: a record (dataclass) or JSON data.
             indices: of the runs; None: they continue those of the store.
         """
-        start, names = self.planned, self._known.names
+        start, names = self.end, self._known.names
         places = range(start, start + len(runs)) if indices is None else indices
         warm_ups = int(self.configuration.get("isolation", {}).get("seeds", 0))
         rows = []
@@ -290,6 +290,11 @@ class Store:
     def planned(self) -> int:
         """Number of runs that were ever planned, finished or not."""
         return int(self._select("SELECT COUNT(*) FROM runs")[0][0])
+
+    @property
+    def end(self) -> int:
+        """Index behind the last run that was ever planned; found at once, where `planned` counts every row."""
+        return int(self._select("SELECT IFNULL(MAX(idx), -1) + 1 FROM runs")[0][0])
 
     @property
     def counts(self) -> dict[str, int]:
