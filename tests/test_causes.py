@@ -81,8 +81,8 @@ def test_a_message_names_the_cause_its_place_and_what_to_change(tmp_path: Path, 
 
 @pytest.mark.sumo
 def test_check_says_what_share_of_runs_is_invalid_and_where_the_time_goes(tmp_path: Path):
-    """A third of the range is inside another car; the ego departs after 20 s of warming up."""
-    vehicles = car("other", "100", inner=stopped("road_0", 100)) + car("ego", "${p}", depart="20", speed="1")
+    """A third of the range is inside another car; the ego departs after 100 s of warming up."""
+    vehicles = car("other", "100", inner=stopped("road_0", 100)) + car("ego", "${p}", depart="100", speed="1")
     run(tmp_path, vehicles, p=300.0)
     text = (tmp_path / "0" / "scenario.yaml").read_text().replace("{min: 0, max: 500}", "{min: 80, max: 116}")
     (tmp_path / "0" / "scenario.yaml").write_text(text)
@@ -94,4 +94,5 @@ def test_check_says_what_share_of_runs_is_invalid_and_where_the_time_goes(tmp_pa
     assert "first invalid: " in findings["for information: share of invalid runs"].detail
     phases = ("load", "warm-up", "run", "metrics")
     assert sum(spent[f"{phase}_share"] for phase in phases) == pytest.approx(1.0)
-    assert spent["warm-up_s"] > spent["run_s"] > 0 < spent["load_s"]
+    assert min(spent["warm-up_s"], spent["run_s"], spent["load_s"]) > 0
+    assert spent["warm-up_s"] > 0.5 * spent["run_s"], "five times as long, on whatever machine"
