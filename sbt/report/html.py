@@ -146,13 +146,13 @@ def _commands(found: Findings, store: Store) -> dict[str, str]:
     folder = str(found.ended.get("store") or store.folder)
     if given := _objects(found.configuration):
         return {
-            "run": f"sbt.run({f'{folder}/config.resolved.yaml'!r}, {given})",
+            "run": f"sbt.run({f'{folder}/config.resolved.yaml'!r}, {given}, store={f'{folder}-again'!r})",
             "replay": f"sbt.open({folder!r}, {given}).replay(RUN)",
             "film": f"sbt.open({folder!r}, {given}).film(RUN)",
             "export": f"sbt.open({folder!r}).export('csv')",
         }
     return {
-        "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml"]),
+        "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml", "--store", f"{folder}-again"]),
         "replay": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN",
         "film": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN --gif RUN.gif",
         "export": shlex.join(["sumo-sbt", "export", folder, "--format", "csv"]),
