@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-__all__ = ["SCRATCH", "ProcessId", "remove_abandoned", "scratch"]
+__all__ = ["SCRATCH", "ProcessId", "machine", "remove_abandoned", "scratch"]
 
 SCRATCH = "SBT_SCRATCH"
 """Variable of the environment: the folder in which a worker makes its temporary folders; its driver removes it."""
@@ -65,7 +65,7 @@ def _start(pid: int) -> int | None:
 
 
 @cache
-def _machine() -> str:
+def machine() -> str:
     """Return a name of the space in which process identifiers count: machine, its last start, container."""
     parts = [socket.gethostname()]
     with suppress(OSError):
@@ -85,7 +85,7 @@ def scratch(kind: str) -> tempfile.TemporaryDirectory[str]:
         return tempfile.TemporaryDirectory(prefix=f"{kind}-", dir=outer, ignore_cleanup_errors=True)
     _remove_once(os.getpid(), tempfile.gettempdir())
     own = ProcessId.current()
-    return tempfile.TemporaryDirectory(prefix=f"sbt-{kind}-{_machine()}-{own.pid}-{own.start}-", ignore_cleanup_errors=True)
+    return tempfile.TemporaryDirectory(prefix=f"sbt-{kind}-{machine()}-{own.pid}-{own.start}-", ignore_cleanup_errors=True)
 
 
 @cache
@@ -95,7 +95,7 @@ def _remove_once(pid: int, folder: str) -> None:
 
 def remove_abandoned(folder: Path) -> None:
     """Remove the temporary folders of this user's processes on this machine that have ended."""
-    pattern = re.compile(rf"sbt-[a-z]+-{_machine()}-(\d+)-(\d+)-\w+")
+    pattern = re.compile(rf"sbt-[a-z]+-{machine()}-(\d+)-(\d+)-\w+")
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             match = pattern.fullmatch(entry.name)

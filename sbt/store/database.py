@@ -9,7 +9,6 @@ identical result. Any number of processes may read while the driver writes.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import sqlite3
@@ -28,6 +27,7 @@ from sbt.store.connection import connected, set_journal
 from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, damaged, refuse_damage, reported
 from sbt.store.records import FitRecord, Iteration, Judgement, from_json, to_json
+from sbt.store.writer import locked, released, written
 
 __all__ = ["DATABASE", "PlannedRun", "Store"]
 
@@ -93,20 +93,21 @@ class Store:
         folder = Path(folder)
         with reported(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            lock = (folder / "campaign.lock").open("w")
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise StoreError(f"a store takes one writer, but another process is writing {folder}") from None
+            lock = locked(folder)
+            if lock is None:
+                raise StoreError(f"a store takes one writer, but another process is writing {folder}")
             db = sqlite3.connect(folder / DATABASE, isolation_level=None)
             mode = set_journal(db, durable=durable)
             store = cls(folder, db, lock)
             store._may_hurry = durable and mode == "wal"
+            finished = 0
             if db.execute("PRAGMA user_version").fetchone()[0] != 0:
                 store._check_version()
                 refuse_damage(folder, db)
+                finished = store.planned - len(store._select("SELECT idx FROM runs WHERE status = ?", (PLANNED,)))
             elif configuration is not None:
                 store.begin(configuration)
+            written(lock, finished)
             return store
 
     def begin(self, configuration: JsonMapping) -> None:
@@ -151,7 +152,8 @@ class Store:
         """Close the file and release the lock; closing twice is harmless."""
         self._db.close()
         if self._lock is not None:
-            self._lock.close()
+            released(self._lock)
+            self._lock = None
 
     def _check_version(self) -> None:
         version = self._db.execute("PRAGMA user_version").fetchone()[0]

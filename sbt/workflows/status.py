@@ -2,32 +2,55 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 from sbt.problem.plain import Json
 from sbt.store.database import Store
+from sbt.store.history import PLANNED
 from sbt.store.records import FitRecord
 from sbt.store.rescue import Diagnosis, examine, save
+from sbt.store.writer import Writer, writer_of
 
 __all__ = ["Diagnosis", "examine", "read_status", "save"]
 
 
 def read_status(folder: Path) -> Json:
-    """Return what `status --json` prints: counts, iterations, last validation and conclusion.
+    """Return what `status --json` prints: state, counts, budget, rate, iterations, last validation and conclusion.
+
+    `state` is running, finished, interrupted (it was ended in order), dead (its process was killed) or elsewhere (another
+    machine writes it, or did when it was killed); `rate` (runs a second since its process began) and `remaining` (s) are
+    those of a running one, None where nothing is known of them yet.
 
     Raises:
         StoreError: the folder holds no campaign.
     """
     with Store.read(folder) as store:
-        iterations, fits = store.iterations(), store.fits()
+        iterations, fits, counts = store.iterations(), store.fits(), store.counts
+        writer, conclusion = writer_of(folder), store.conclusion
+        done, budget = sum(counts.values()) - counts.get(PLANNED, 0), store.configuration.get("budget")
         return {
             "store": str(folder),
-            "runs": store.counts,
+            **_progress(writer, done, budget, finished=conclusion is not None),
+            "runs": counts,
             "iterations": len(iterations),
             "stage": iterations[-1].stage if iterations else None,
             "validation": _validation(fits[-1]) if fits else None,
-            "conclusion": store.conclusion,
+            "conclusion": conclusion,
         }
+
+
+def _progress(writer: Writer | None, done: int, budget: int | None, *, finished: bool) -> Json:
+    """Return the state of a campaign with so many runs done, how fast it is and how long it takes."""
+    alive = False if writer is None else writer.alive
+    state = "elsewhere" if alive is None else "dead" if writer is not None else "interrupted"
+    if alive or finished:
+        state = "running" if alive else "finished"
+    rate = remaining = None
+    if alive and writer is not None and done > writer.finished and time.time() > writer.since:
+        rate = (done - writer.finished) / (time.time() - writer.since)
+        remaining = None if budget is None else max(budget - done, 0) / rate
+    return {"state": state, "done": done, "budget": budget, "rate": rate, "remaining": remaining}
 
 
 def _validation(fit: FitRecord) -> Json:
