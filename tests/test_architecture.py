@@ -117,7 +117,7 @@ def test_rooms_know_few_rooms():
         (here, room(target)) for path, here in files for target, _, when in imports(path)
         if target.split(".")[0] == "sbt" and when != "types" and room(target) != here
     }  # fmt: skip
-    assert len(edges) <= 140, "\n".join(f"{here} -> {there}" for here, there in sorted(edges))
+    assert len(edges) <= 150, "\n".join(f"{here} -> {there}" for here, there in sorted(edges))
 
 
 def test_no_import_goes_round():

@@ -24,7 +24,7 @@ class Writer:
     Args:
         machine: that it runs on, by a name that is its own.
         pid, start: the process (see `ProcessId`).
-        since: when it opened the store (s, of the epoch).
+        since: when it opened the store (s, on the machine's monotonic clock, which counts from its start).
         finished: runs that the store had then.
     """
 
@@ -59,7 +59,7 @@ def locked(folder: Path) -> IO[str] | None:
 def written(lock: IO[str], finished: int) -> None:
     """Say in a lock's file that this process writes the store, with so many runs finished."""
     this = ProcessId.current()
-    _replace(lock, json.dumps(asdict(Writer(machine(), this.pid, this.start, time.time(), finished))))
+    _replace(lock, json.dumps(asdict(Writer(machine(), this.pid, this.start, time.monotonic(), finished))))
 
 
 def released(lock: IO[str]) -> None:

@@ -47,8 +47,8 @@ def _progress(writer: Writer | None, done: int, budget: int | None, *, finished:
     if alive or finished:
         state = "running" if alive else "finished"
     rate = remaining = None
-    if alive and writer is not None and done > writer.finished and time.time() > writer.since:
-        rate = (done - writer.finished) / (time.time() - writer.since)
+    if alive and writer is not None and done > writer.finished and time.monotonic() > writer.since:
+        rate = (done - writer.finished) / (time.monotonic() - writer.since)
         remaining = None if budget is None else max(budget - done, 0) / rate
     return {"state": state, "done": done, "budget": budget, "rate": rate, "remaining": remaining}
 
