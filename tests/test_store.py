@@ -109,7 +109,7 @@ def test_a_plan_is_all_or_nothing(tmp_path: Path):
     with Store.open(tmp_path, CONFIGURATION) as store:
         with pytest.raises(ValueError, match="Out of range"):
             store.plan(0, "s", [*BATCH[:2], PlannedRun("s", {"a": float("nan"), "b": 0.0})], [1, 2, 3], {})
-        with pytest.raises(IndexError):
+        with pytest.raises(ValueError, match="shorter"):
             store.plan(0, "s", BATCH, [1, 2], {})
         with pytest.raises(ValueError, match="Out of range"):
             store.plan(0, "s", BATCH, [1, 2, 3, 4, 5], {"acceptance": float("inf")})

@@ -23,7 +23,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
-from sbt.store.database import PlannedRun
+from sbt.store.database import PlannedPoints, PlannedRun
 from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord
 
@@ -116,10 +116,10 @@ class BatchStage:
         found = (evenly if first or n == 0 else self.choose)(s, fitted, log, n)
         stage = "initial" if first else self.name
         x = without_repetition(s.scenario, log.history, found.x) if self.repeats else found.x
-        chosen = [PlannedRun(stage, named_inputs(s.scenario, row)) for row in x]
+        chosen = PlannedPoints(stage, x, s.scenario.space.named)
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)
-        return Batch((*chosen, *again, *random), proposal, fitted)
+        return Batch((*chosen, *again, *random) if again or random else chosen, proposal, fitted)
 
 
 def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun]:

@@ -127,6 +127,11 @@ class LocalExecutor:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome a job as they finish."""
+        for outcomes in self.groups(jobs):
+            yield from outcomes
+
+    def groups(self, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
+        """Yield the outcomes as they come, those of a task together."""
         queue = deque(jobs)
         suspects: deque[Job] = deque()
         while queue or suspects:
@@ -135,7 +140,7 @@ class LocalExecutor:
             queue = queue if alone else deque()
             for job in missing:
                 if job.index in dead and (alone or dead[job.index] is _Cause.LATE):
-                    yield self._lost(job, dead[job.index])
+                    yield [self._lost(job, dead[job.index])]
                 elif job.index in dead or alone:
                     suspects.append(job)
                 else:
@@ -172,7 +177,7 @@ class LocalExecutor:
                     died = True
                     continue
                 del submitted[future]
-                yield from self._measured(future.result())
+                yield self._measured(future.result())
             if not done or time.monotonic() - looked > _TICK:
                 looked = time.monotonic()
                 stopped |= self._kill_overdue() | self._kill_large()
@@ -185,12 +190,12 @@ class LocalExecutor:
         self._restart()
         return missing, dead
 
-    def _rescued(self, submitted: dict[Future[Any], list[Job]]) -> Iterator[Outcome]:
+    def _rescued(self, submitted: dict[Future[Any], list[Job]]) -> Iterator[list[Outcome]]:
         """Yield the outcomes that had arrived before the pool broke."""
         wait(submitted, timeout=5.0)
         for future in [f for f in submitted if f.done() and not f.cancelled() and f.exception() is None]:
             del submitted[future]
-            yield from self._measured(future.result())
+            yield self._measured(future.result())
 
     def _measured(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Update the mean duration of a run; return the outcomes."""

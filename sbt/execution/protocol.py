@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, runtime_checkable
 
 from sbt import interruption
 from sbt.execution.spec import ScenarioSpec
@@ -15,7 +15,7 @@ from sbt.execution.worker import run_job, run_jobs
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.scenario import Batched
 
-__all__ = ["CHUNK", "Executor", "SerialExecutor", "chunk_of"]
+__all__ = ["CHUNK", "Executor", "Grouping", "SerialExecutor", "chunk_of", "groups_of"]
 
 CHUNK = 64
 """Largest number of runs that are started before the outcome of the first is known."""
@@ -39,6 +39,20 @@ class Executor(Protocol):
         ...
 
 
+@runtime_checkable
+class Grouping(Protocol):
+    """An executor that says which runs ended together, so that their outcomes are written together."""
+
+    def groups(self, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
+        """Yield the outcomes as they come, those that came together in one list."""
+        ...
+
+
+def groups_of(executor: Executor, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
+    """Yield the outcomes of an executor in the groups that it makes; alone where it makes none."""
+    return executor.groups(jobs) if isinstance(executor, Grouping) else ([outcome] for outcome in executor.run(jobs))
+
+
 class SerialExecutor:
     """Runs in this process, several at once where the isolation says so: the reference, and for debugging."""
 
@@ -54,7 +68,12 @@ class SerialExecutor:
         """Do nothing."""
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Yield one outcome a job, in order.
+        """Yield one outcome a job, in order; see `groups`."""
+        for outcomes in self.groups(jobs):
+            yield from outcomes
+
+    def groups(self, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
+        """Yield the outcomes in order, those of runs that take no time together.
 
         Raises:
             KeyboardInterrupt: Ctrl-C, after the run that was at work at the latest.
@@ -64,7 +83,7 @@ class SerialExecutor:
         while queue:
             with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
                 outcomes = self._together(queue) if together else self._alone(queue)
-            yield from outcomes
+            yield outcomes
 
     def _together(self, queue: deque[Job]) -> list[Outcome]:
         """Run the next jobs at once."""

@@ -7,19 +7,19 @@ that was killed and run again ends with the same rows as one that was not.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.execution.protocol import Executor
+from sbt.execution.protocol import Executor, groups_of
 from sbt.loop.learner import FittedMetamodel
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
-from sbt.seeds import run_seed
+from sbt.seeds import run_seeds
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.records import FitRecord, Iteration, to_json
@@ -30,6 +30,8 @@ __all__ = [
 ]  # fmt: skip
 
 T = TypeVar("T")
+_AT_ONCE = 10_000
+"""Planned runs that are read from the store at once."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Batch:
         fitted: the metamodel that chose them, whose scores the log keeps.
     """
 
-    runs: tuple[PlannedRun, ...]
+    runs: Sequence[PlannedRun]
     proposal: object = field(default_factory=dict)
     fitted: FittedMetamodel | None = None
 
@@ -262,10 +264,8 @@ def run_stages(
                 break
             counter.tell(f"{stage.name}: choosing")
             start = time.perf_counter()
-            batch = _proposed(stage, log)
-            spent = _keep_fit(store, batch.fitted, log, seconds)
+            spent = _plan_next(stage, store, log, seed, seconds)
             seconds["propose"] += time.perf_counter() - start - spent
-            _plan(store, stage, batch, log, seed)
     log = _log(store)
     counter.tell("concluding")
     start = time.perf_counter()
@@ -297,7 +297,7 @@ def run_shard(
     for iteration, (stage, batch) in enumerate(batches):
         mine = [index for index in range(first, first + len(batch.runs)) if index in shard]
         if iteration >= planned:
-            runs, seeds = [batch.runs[index - first] for index in mine], [run_seed(seed, index) for index in mine]
+            runs, seeds = [batch.runs[index - first] for index in mine], run_seeds(seed, mine)
             store.plan(iteration, stage, runs, seeds, batch.proposal, indices=mine)
         first += len(batch.runs)
     seconds["propose"] = time.perf_counter() - start
@@ -359,21 +359,23 @@ def _keep_fit(store: Store, fitted: FittedMetamodel | None, log: Log, seconds: d
     return fitted.seconds
 
 
-def _plan(store: Store, stage: Stage, batch: Batch, log: Log, seed: int) -> None:
-    start = store.end
-    seeds = [run_seed(seed, start + k) for k in range(len(batch.runs))]
+def _plan_next(stage: Stage, store: Store, log: Log, seed: int, seconds: dict[str, float]) -> float:
+    """Plan the stage's next batch; return the seconds of its fit."""
+    batch = _proposed(stage, log)
+    spent, start = _keep_fit(store, batch.fitted, log, seconds), store.end
+    seeds = run_seeds(seed, range(start, start + len(batch.runs)))
     store.plan(log.iteration, stage.name, batch.runs, seeds, batch.proposal)
+    return spent
 
 
 def _finish(store: Store, executor: Executor, counter: _Counter, versions: str, seconds: dict[str, float]) -> None:
     """Run everything that was planned and has no outcome yet."""
-    jobs = store.unfinished()
-    if not jobs:
-        return
-    counter.tell("simulating")
-    start = time.perf_counter()
-    for outcome in executor.run(jobs):
-        store.append(outcome, versions)
-        counter.count(outcome.status, outcome.metrics)
+    while jobs := store.unfinished(_AT_ONCE):
         counter.tell("simulating")
-    seconds["simulate"] += time.perf_counter() - start
+        start = time.perf_counter()
+        for outcomes in groups_of(executor, jobs):
+            store.append_all(outcomes, versions)
+            for outcome in outcomes:
+                counter.count(outcome.status, outcome.metrics)
+                counter.tell("simulating")
+        seconds["simulate"] += time.perf_counter() - start

@@ -10,53 +10,33 @@ identical result. Any number of processes may read while the driver writes.
 from __future__ import annotations
 
 import json
-import math
 import sqlite3
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from sbt.errors import StoreError
 from sbt.problem.description import described_choices
 from sbt.problem.outcome import Job, Outcome, Status
-from sbt.problem.plain import Json, JsonMapping, Values
+from sbt.problem.plain import Json, JsonMapping
 from sbt.store.connection import connected, set_journal
 from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, damaged, refuse_damage, reported
+from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_inputs, dump_metrics
 from sbt.store.records import FitRecord, Iteration, Judgement, from_json, to_json
 from sbt.store.writer import locked, released, written
 
-__all__ = ["DATABASE", "PlannedRun", "Store"]
+__all__ = ["DATABASE", "PlannedPoints", "PlannedRun", "Store"]
 
 _TOGETHER = 0.1
 """Seconds within which runs wait for the disk once."""
 _FIELDS = ("stage", "iteration", "seed", "seed_chosen", "level", "warm_up", "log_q", "status", "reason", "seconds", "collisions",
            "unconfirmed", "versions")  # fmt: skip
 """Columns of a row that a history holds as they are."""
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """A run that a stage asks for, before it has an index and a seed.
-
-    Args:
-        stage: what asks for it.
-        inputs: values by name, numbers in their units, choices as text.
-        log_q: log density that they were drawn with; None: they were chosen.
-        seed: where it was chosen for what it draws; None: it is drawn.
-        level: of fidelity, 0 the scenario's own.
-        warm_up: number of the warm-up to start from; None: that of its seed, where the campaign has warm-ups.
-    """
-
-    stage: str
-    inputs: Values
-    log_q: float | None = None
-    seed: int | None = None
-    level: int = 0
-    warm_up: int | None = None
+_OUTCOME_OF = f"UPDATE runs SET {', '.join(f'{name} = ?' for name in OUTCOME)}, checksum = ? WHERE idx = ?"
 
 
 class Store:
@@ -182,7 +162,7 @@ class Store:
             self._db.execute("COMMIT")
 
     def _set_meta(self, key: str, value: Any) -> None:
-        text = _dump(value)
+        text = dump(value)
         self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?, ?)", (key, text, checksum_of(key, text)))
 
     def _get_meta(self, key: str) -> Any:
@@ -245,18 +225,10 @@ class Store:
             proposal: how the batch was chosen: a record (dataclass) or JSON data.
             indices: of the runs; None: they continue those of the store.
         """
-        start, names = self.end, self._known.names
+        start = self.end
         places = range(start, start + len(runs)) if indices is None else indices
-        warm_ups = int(self.configuration.get("isolation", {}).get("seeds", 0))
-        rows = []
-        for k, (index, run) in enumerate(zip(places, runs, strict=True)):
-            inputs = _dump([run.inputs[name] for name in names])
-            chosen, seed = run.seed is not None, seeds[k] if run.seed is None else run.seed
-            log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
-            warm_up = int(seed) % warm_ups if warm_ups and run.warm_up is None else run.warm_up
-            row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, warm_up, log_q)
-            rows.append((*row, checksum_of(*row), PLANNED))
-        text = _dump(proposal if isinstance(proposal, dict) else to_json(proposal))
+        rows = self._plan_rows(iteration, zip(places, runs, seeds, strict=True))
+        text = dump(proposal if isinstance(proposal, dict) else to_json(proposal))
         with self._transaction():
             self._db.executemany(
                 f"INSERT INTO runs ({', '.join(PLAN)}, plan_checksum, status) VALUES ({', '.join('?' * (len(PLAN) + 2))})", rows
@@ -265,24 +237,36 @@ class Store:
                 "INSERT INTO iterations VALUES (?, ?, ?, ?)", (iteration, stage, text, checksum_of(iteration, stage, text))
             )
 
+    def _plan_rows(self, iteration: int, runs: Iterable[tuple[int, PlannedRun, int]]) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of planned runs with their index and their drawn seed."""
+        names, warm_ups = self._known.names, self._warm_ups
+        for index, run, drawn in runs:
+            inputs = dump_inputs([run.inputs[name] for name in names])
+            chosen, seed = run.seed is not None, drawn if run.seed is None else run.seed
+            log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
+            warm_up = int(seed) % warm_ups if warm_ups and run.warm_up is None else run.warm_up
+            row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, warm_up, log_q)
+            yield (*row, checksum_of(*row), PLANNED)
+
     def append(self, outcome: Outcome, versions: str = "") -> None:
         """Write one run's outcome."""
+        self.append_all([outcome], versions)
+
+    def append_all(self, outcomes: Sequence[Outcome], versions: str = "") -> None:
+        """Write the outcomes of runs that ended together, in one commit."""
         now = time.monotonic()
         waits = now - self._waited >= _TOGETHER
         self._waited = now if waits else self._waited
-        row = (
-            str(outcome.status), _dump_metrics(outcome.metrics), outcome.reason, float(outcome.seconds), outcome.collisions,
-            outcome.unconfirmed, versions,
-        )  # fmt: skip
+        rows = []
+        for o in outcomes:
+            row = (str(o.status), dump_metrics(o.metrics), o.reason, float(o.seconds), o.collisions, o.unconfirmed, versions)
+            rows.append((*row, checksum_of(o.index, *row), o.index))
         with self._transaction(waits=waits):
-            self._db.execute(
-                f"UPDATE runs SET {', '.join(f'{name} = ?' for name in OUTCOME)}, checksum = ? WHERE idx = ?",
-                (*row, checksum_of(outcome.index, *row), outcome.index),
-            )
+            self._db.executemany(_OUTCOME_OF, rows)
 
     def add_fit(self, fit: FitRecord) -> None:
         """Keep what is known of the metamodel that learned from the first `fit.runs` rows."""
-        text = _dump(to_json(fit))
+        text = dump(to_json(fit))
         with self._transaction():
             row = (fit.runs, fit.iteration, text, checksum_of(fit.runs, fit.iteration, text))
             self._db.execute("INSERT OR REPLACE INTO fits VALUES (?, ?, ?, ?)", row)
@@ -306,6 +290,11 @@ class Store:
             raise damaged(self.folder, f"a run has the status {min(map(repr, unknown))}")
         return found
 
+    @cached_property
+    def _warm_ups(self) -> int:
+        """Number of warm-ups that the runs of the campaign share; 0: there are none."""
+        return int(self.configuration.get("isolation", {}).get("seeds", 0))
+
     @property
     def _known(self) -> Rows:
         """The finished rows that were read so far, with the names of the inputs."""
@@ -314,9 +303,10 @@ class Store:
             self._rows = Rows(tuple(kept["names"]), described_choices(kept.get("described") or {}))
         return self._rows
 
-    def unfinished(self) -> list[Job]:
-        """Return the planned runs that have no outcome yet."""
-        rows = self._select(f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE status = ? ORDER BY idx", (PLANNED,))
+    def unfinished(self, most: int = -1) -> list[Job]:
+        """Return the planned runs that have no outcome yet; the first so many of them, where there is a `most`."""
+        query = f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE status = ? ORDER BY idx LIMIT ?"
+        rows = self._select(query, (PLANNED, most))
         for row in rows:
             self._checked(f"run {row[0]}", row[-1], *row[:-1])
         names = self._known.names
@@ -368,16 +358,3 @@ class Store:
             metrics = json.loads(f"[{','.join(columns['metrics'])}]")
             rows.append(x, {"index": columns["idx"], **{name: columns[name] for name in _FIELDS}}, metrics)
 
-
-def _dump(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False)
-
-
-def _dump_metrics(metrics: Mapping[str, float]) -> str:
-    """Return metrics as JSON, in which infinity is a number too large for a float: every reader takes it for infinity."""
-    pairs = (f"{json.dumps(name)}:{_number(value)}" for name, value in metrics.items())
-    return "{" + ",".join(pairs) + "}"
-
-
-def _number(value: float) -> str:
-    return _dump(value) if math.isfinite(value) else ("-1e999" if value < 0 else "1e999")

@@ -1,0 +1,93 @@
+"""Runs that are asked for, and how a store writes numbers: without a Python object more a run than it takes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, overload
+
+from sbt.problem.arrays import Points, Vector
+from sbt.problem.plain import Value, Values
+
+__all__ = ["PlannedPoints", "PlannedRun", "dump", "dump_inputs", "dump_metrics"]
+
+dump: Callable[[Any], str] = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+"""JSON without spaces, of finite numbers."""
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run that a stage asks for, before it has an index and a seed.
+
+    Args:
+        stage: what asks for it.
+        inputs: values by name, numbers in their units, choices as text.
+        log_q: log density that they were drawn with; None: they were chosen.
+        seed: where it was chosen for what it draws; None: it is drawn.
+        level: of fidelity, 0 the scenario's own.
+        warm_up: number of the warm-up to start from; None: that of its seed, where the campaign has warm-ups.
+    """
+
+    stage: str
+    inputs: Values
+    log_q: float | None = None
+    seed: int | None = None
+    level: int = 0
+    warm_up: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPoints(Sequence[PlannedRun]):
+    """The runs of a design, which may be a million: an array, whose rows become runs one by one.
+
+    Args:
+        stage: what asks for them.
+        x: (n, d) inputs in their units.
+        named: (d,) -> values by name.
+    """
+
+    stage: str
+    x: Points
+    named: Callable[[Vector], Mapping[str, Value]]
+
+    def __len__(self) -> int:
+        """Return the number of runs."""
+        return len(self.x)
+
+    @overload
+    def __getitem__(self, k: int) -> PlannedRun: ...
+    @overload
+    def __getitem__(self, k: slice) -> PlannedPoints: ...
+    def __getitem__(self, k: int | slice) -> PlannedRun | PlannedPoints:
+        """Return one run, or the runs of a slice."""
+        if isinstance(k, slice):
+            return PlannedPoints(self.stage, self.x[k], self.named)
+        return PlannedRun(self.stage, self.named(self.x[k]))
+
+    def __iter__(self) -> Iterator[PlannedRun]:
+        """Yield the runs."""
+        return (PlannedRun(self.stage, self.named(row)) for row in self.x)
+
+
+def dump_inputs(values: Sequence[Value]) -> str:
+    """Return the values of a run's inputs as JSON, which has finite numbers only.
+
+    >>> dump_inputs([0.1, 2.0, "left"])
+    '[0.1,2.0,"left"]'
+    """
+    if not all(type(value) is float and math.isfinite(value) for value in values):
+        return dump(values)
+    return f"[{','.join(map(repr, values))}]"  # as JSON writes them, in a third of the time
+
+
+def dump_metrics(metrics: Mapping[str, float]) -> str:
+    """Return metrics as JSON, in which infinity is a number too large for a float: every reader takes it for infinity."""
+    return f"{{{','.join([f'{dump(name)}:{_number(value)}' for name, value in metrics.items()])}}}"
+
+
+def _number(value: float) -> str:
+    if math.isfinite(value):
+        return repr(value) if type(value) is float else dump(value)
+    return "-1e999" if value < 0 else "1e999"
