@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,15 +12,16 @@ from sbt.acquisitions import even, is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
+from sbt.campaigns.place import BoundaryPlace, boundary_place
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.telling import tell_boundary
 from sbt.campaigns.warmed import conditional_on
 from sbt.campaigns.wording import percent
 from sbt.errors import InputError
-from sbt.estimators.binomial import interval
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
-from sbt.problem.arrays import Points
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Json
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
@@ -49,6 +51,7 @@ class BoundaryConclusion:
         requirements: of a combination, each as its own metamodel sees it.
         held_out_fractions: of a combination, the share of the held-out runs that violates each requirement.
         independence: of the metrics of a combination, given the inputs.
+        place: where the boundary lies; None: the metamodel sees none.
     """
 
     critical_fraction: float | None
@@ -63,6 +66,7 @@ class BoundaryConclusion:
     requirements: tuple[RequirementFit, ...] | None = optional()
     held_out_fractions: Mapping[str, CriticalShare] | None = optional()
     independence: Independence | None = optional()
+    place: BoundaryPlace | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -70,13 +74,9 @@ class BoundaryConclusion:
         return found
 
     def sentences(self, facts: Facts) -> list[str]:
-        """Return what was found in words: as measured, then as the metamodel sees it."""
+        """Return where the boundary lies, what that does not tell, what to do next, and then the details."""
         measured = self.held_out_fraction if self.held_out_fraction is not None else share_among_held_out(facts)
-        found = [*measured.sentence(), *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
-        if self.critical_fraction is not None:
-            where = "the parameter space" if self.failing_fraction is None else "what gives a metric"
-            found.append(f"The metamodel takes {percent(self.critical_fraction)} of {where} to be critical.")
-            found += self._disagreement(measured)
+        found = [*tell_boundary(self, measured, facts), *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
         if self.failing_fraction is not None:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
@@ -84,21 +84,6 @@ class BoundaryConclusion:
             found.append(f"The metamodel chose among its members: {self.chosen_because}.")
         if self.simulator_noise is not None:
             found += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
-        return found
-
-    def _disagreement(self, measured: CriticalShare) -> list[str]:
-        """Return where the held-out runs deny what the metamodel states; nothing where they do not."""
-        found = []
-        share, scores = self.critical_fraction, self.validation
-        if share is not None and not measured.low <= share <= measured.high:
-            found.append("The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more.")
-        if scores is not None and scores.error_rate is not None and self.expected_misclassified is not None:
-            least = float(interval(round(scores.error_rate * scores.n), scores.n)[0])
-            if self.expected_misclassified < least:
-                found.append(
-                    f"The metamodel is too sure: it expects {percent(self.expected_misclassified)} on the wrong side, but of the "
-                    f"held-out runs {percent(scores.error_rate)} were (at least {percent(least)} with 97.5 % confidence)."
-                )
         return found
 
 
@@ -128,13 +113,22 @@ def recipe(settings: Settings) -> Campaign:
         shares = r.critical_fraction, r.expected_misclassified, r.ambiguous_volume
         if r.critical_fraction < _SMALL and not settings.scenario.requirement.combined:
             shares = learner.fine_shares(fitted)
+        place = boundary_place(partial(_log_odds, fitted, settings), settings.scenario, settings.seed)
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
+            place,
         ), fitted  # fmt: skip
 
     stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even)
     return Campaign((stage,), conclude)
+
+
+def _log_odds(fitted: FittedMetamodel, settings: Settings, u: Points) -> Vector:
+    """Return (n,) log odds of critical at points of the unit cube."""
+    critical, uncritical = fitted.predict(u).log_probability(settings.scenario.requirement.critical)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(critical - uncritical)
 
 
 def _rule(settings: Settings) -> ChoiceRule:

@@ -9,6 +9,7 @@ from sbt.campaigns.choices import evenly
 from sbt.campaigns.each import each_share, shares_words
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share
 from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.telling import tell_share
 from sbt.campaigns.warmed import conditional_on
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
@@ -48,7 +49,7 @@ class CoverageConclusion:
     def sentences(self, facts: Facts) -> list[str]:
         """Return what was found in words."""
         whole = CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted)
-        return [*whole.sentence(), *shares_words(self.requirements), *conditional_on(facts.history)]
+        return [*tell_share(whole, facts), *shares_words(self.requirements), *conditional_on(facts.history)]
 
 
 def recipe(settings: Settings) -> Campaign:

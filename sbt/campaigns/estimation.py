@@ -15,8 +15,9 @@ from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.stopping import FEWEST_BATCHES
+from sbt.campaigns.telling import tell_estimation
 from sbt.campaigns.warmed import WarmTraffic, warmed_limits, warmed_traffic
-from sbt.campaigns.wording import number, percent, plural
+from sbt.campaigns.wording import number, plural
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.estimators.subset import combine_repeats
@@ -93,30 +94,16 @@ class EstimationConclusion:
         return found
 
     def sentences(self, facts: Facts) -> list[str]:
-        """Return the probability with its interval, or the bound where nothing was critical."""
+        """Return the probability with its interval, what it does not tell, what to do next, and then the details."""
         noise = [] if self.simulator_noise is None else self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         noise = [*estimates_words(self.requirements, self.confidence), *noise]
         noise += [] if self.warmed_traffic is None else [self.warmed_traffic.sentence()]
-        verdict = [] if self.gate is None else [f"Gate: {self.gate.verdict}; {self.gate.statement}."]
-        confidence = percent(self.confidence)
-        if self.exact_bound is not None:
-            bound = number(self.exact_bound)
-            none = f"No critical run was drawn: with {confidence} confidence, the probability of one is at most {bound}."
-            return [none, *noise, *verdict]
-        if self.probability is None:
-            return [*noise, *verdict]
-        found = [
-            f"Probability of a critical run under the inputs' distribution: {number(self.probability)}"
-            f" ({confidence} interval {number(self.low)} to {number(self.high)})."
-        ]
-        details = {"coefficient of variation": self.cov, "effective sample size": self.effective_sample_size, "hits": self.hits}
-        found.append(f"Behind it: {', '.join(f'{k} {number(v, 3)}' for k, v in details.items() if v is not None)}.")
+        details = {"coefficient of variation": self.cov, "effective sample size": self.effective_sample_size}
+        behind = [f"Behind it: {', '.join(f'{k} {number(v, 3)}' for k, v in details.items() if v is not None)}."]
+        behind = behind if self.probability is not None and self.exact_bound is None else []
         if self.failed_as_critical is not None and self.failed_as_critical != self.probability:
-            found.append(f"If every failed run were critical, it would be {number(self.failed_as_critical)}.")
-        missed = min(self.undetected_mass_bound, 1.0 - self.probability)
-        holds = f"a critical region that no run has met holds at most {number(missed, 3)} more"
-        found.append(f"With {confidence} confidence, {holds}.")
-        return [*found, *noise, *verdict]
+            behind.append(f"If every failed run were critical, it would be {number(self.failed_as_critical, 3)}.")
+        return [*tell_estimation(self, facts), *behind, *noise]
 
 
 Concluded = tuple[EstimationConclusion, Limits]

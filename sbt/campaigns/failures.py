@@ -14,6 +14,7 @@ from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.telling import tell_failures
 from sbt.campaigns.warmed import conditional_on
 from sbt.campaigns.wording import percent, plural
 from sbt.errors import InputError
@@ -117,21 +118,14 @@ class FalsificationConclusion:
 
     def sentences(self, facts: Facts) -> list[str]:
         """Return whether the requirement is falsified, and what follows from the runs."""
-        said = [self.statement] if self.statement else []
-        if self.first_critical_run is None:
-            said.insert(0, "The requirement was not falsified: no critical run was found.")
-        else:
-            modes = plural(len(self.failure_modes), "distinct failure mode")
-            said.insert(0, (
-                f"The requirement is falsified: the first critical run is run {self.first_critical_run},"
-                f" after {plural(self.runs_to_first or 0, 'run')} of the search; {modes}."
-            ))  # fmt: skip
+        said = tell_failures(self, share_among_held_out(facts), facts)
+        said += [self.statement] if self.statement and self.statement != _plain(facts.history, self) else []
         if self.simulator_noise is not None:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         said += [*violations_words(self.violates), *independence_words(self.independence)]
         said += _rates(self.failure_modes)
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
-        return [*said, *count_avoided(judged), *share_among_held_out(facts).sentence(), *conditional_on(facts.history)]
+        return [*said, *count_avoided(judged), *conditional_on(facts.history)]
 
 
 class FailureSearch:
@@ -217,9 +211,9 @@ def confirmations(history: History, x: Vector) -> Mask:
 
 
 def _rates(modes: tuple[FailureMode, ...]) -> list[str]:
-    """Return the failure rates of the first modes in words; nothing where there are none."""
+    """Return the failure rates of the first modes in words; nothing where there is one."""
     rates = [(mode.representative, mode.failure_rate) for mode in modes if mode.failure_rate is not None]
-    if not rates:
+    if len(rates) < 2:  # that of the worst is told
         return []
     told = "; ".join(
         f"run {run} {percent(r.estimate or 0.0)} of {r.runs} ({percent(r.low)} to {percent(r.high)})" for run, r in rates[:_TOLD]
@@ -253,4 +247,13 @@ def _statement(runs: History, hits: int, modes: list[FailureMode], bound: Search
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
     unsure = [m for m in modes if m.confirmed is not None and m.confirmed < 1.0]
     unconfirmed = f" {len(unsure)} of them did not fail again with every fresh seed." if unsure else ""
-    return f"{hits} of {n} runs of the search were critical, in {plural(len(modes), 'failure mode')}.{unconfirmed}{hidden}"
+    return f"{_counted(hits, n, len(modes))}{unconfirmed}{hidden}"
+
+
+def _counted(hits: int, n: int, modes: int) -> str:
+    return f"{hits} of {n} runs of the search were critical, in {plural(modes, 'failure mode')}."
+
+
+def _plain(history: History, found: FalsificationConclusion) -> str:
+    """Return the statement that says no more than the first sentence of the conclusion."""
+    return _counted(found.critical_runs, len(search_runs(history)), len(found.failure_modes))

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["NOTHING", "mixture_shares", "number", "percent", "plural"]
+from sbt.problem.combination import CombinedRequirement
+from sbt.problem.requirement import Requirement
 
+__all__ = ["NOTHING", "measured", "mixture_shares", "number", "percent", "plural", "requirement_words", "written_unit"]
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "\N{EN DASH}"
 """Stands where there is no value."""
 
@@ -41,6 +46,40 @@ def plural(n: int, noun: str) -> str:
     ('1 run', '1,200 runs')
     """
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def written_unit(unit: str) -> str:
+    """Return a unit as it is printed.
+
+    >>> written_unit("m/s^2"), written_unit("1/s^3"), written_unit("s")
+    ('m/s²', '1/s³', 's')
+    """
+    return re.sub(r"\^-?\d+", lambda power: power[0][1:].translate(_RAISED), unit)
+
+
+def measured(name: str, value: Any, unit: str = "", digits: int = 3) -> str:
+    """Return a value with its name and unit.
+
+    >>> measured("a_co", -9.7352, "m/s^2"), measured("kind", "truck")
+    ('a_co -9.74 m/s²', 'kind truck')
+    """
+    return f"{name} {number(value, digits)} {written_unit(unit)}".rstrip()
+
+
+def requirement_words(requirement: Requirement, unit: str, units: Mapping[str, str] | None = None) -> str:
+    """Return when a run is critical; `units` by metric are those of a combination's."""
+    if isinstance(requirement, CombinedRequirement):
+        joint, units = " or " if requirement.how == "any" else " and ", units or {}
+        said = [requirement_words(item, units.get(item.metric, ""), units) for item in requirement.items]
+        nested = (isinstance(item, CombinedRequirement) for item in requirement.items)
+        return joint.join(f"({words})" if inner else words for words, inner in zip(said, nested, strict=True))
+    low, high, name = requirement.critical.low, requirement.critical.high, requirement.metric
+    tail = f" {written_unit(unit)}" if unit else ""
+    if math.isinf(low):
+        return f"{name} ≤ {high:g}{tail}"
+    if math.isinf(high):
+        return f"{name} ≥ {low:g}{tail}"
+    return f"{name} in [{low:g}, {high:g}]{tail}"
 
 
 def mixture_shares(weights: Mapping[str, float]) -> str:

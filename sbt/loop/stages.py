@@ -19,6 +19,7 @@ from sbt.loop.learner import FittedMetamodel
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario
 from sbt.seeds import run_seeds
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import PLANNED, History, Rows, as_numbers
@@ -93,11 +94,20 @@ class Facts:
         history: finished runs.
         requirement: metric and critical interval.
         unit: of the metric.
+        scenario: its name.
+        units: of inputs and metrics, by name.
     """
 
     history: History
     requirement: Requirement
     unit: str = ""
+    scenario: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, history: History, scenario: LogicalScenario) -> Facts:
+        """Return the facts of a campaign with this scenario."""
+        return cls(history, scenario.requirement, scenario.unit, scenario.name, scenario.units)
 
 
 class Stage(Protocol):

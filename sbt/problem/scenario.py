@@ -254,6 +254,11 @@ class LogicalScenario:
         return next((m.unit for m in self.metrics if m.name == self.requirement.metric), "")
 
     @property
+    def units(self) -> dict[str, str]:
+        """Units of inputs and metrics, by name."""
+        return {p.name: p.unit for p in self.space.parameters} | {m.name: m.unit for m in self.metrics}
+
+    @property
     def direction(self) -> str:
         """`low` where small values of the requirement's metric are critical, `high` where large ones are."""
         return next((m.direction for m in self.metrics if m.name == self.requirement.metric), "low")

@@ -113,6 +113,7 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
         ("scenario", str(configuration.get("scenario", scenario.name)).removeprefix(OBJECT)),
         ("critical if", requirement_words(found.requirement, found.unit, found.units)),
         ("runs", runs + (f", {planned:,} planned" if planned else "")),
+        ("ended", str(found.ended.get("stopped") or NOTHING)),
         ("seed", str(configuration.get("seed", NOTHING))),
         ("store", store.folder.name),
         ("time", _time(found)),

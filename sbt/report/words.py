@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from sbt.campaigns.parts import share_among_held_out
-from sbt.campaigns.wording import number, percent
+from sbt.campaigns.wording import number, percent, requirement_words, written_unit
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Conclusion, Facts
-from sbt.problem.combination import CombinedRequirement
 from sbt.problem.outcome import Doubt
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
@@ -62,7 +60,8 @@ class Findings:
         validation: scores of the last metamodel on held-out runs; None where there is none.
         planned: runs without an outcome.
         direction: "low" where small values of the metric are bad, "high" where large ones are.
-        units: of every metric.
+        units: of inputs and metrics, by name.
+        scenario: its name.
     """
 
     history: History
@@ -75,6 +74,7 @@ class Findings:
     planned: int
     direction: str = "low"
     units: Mapping[str, str] = field(default_factory=dict)
+    scenario: str = ""
 
     @classmethod
     def of(cls, store: Store, scenario: LogicalScenario, conclusion: Conclusion | None) -> Findings:
@@ -84,7 +84,7 @@ class Findings:
         return cls(
             store.history(), scenario.requirement, scenario.unit, store.configuration, conclusion, store.conclusion or {},
             validation, store.counts.get(PLANNED, 0), scenario.direction,
-            {metric.name: metric.unit for metric in scenario.metrics},
+            scenario.units, scenario.name,
         )  # fmt: skip
 
     @property
@@ -100,27 +100,7 @@ class Findings:
     @property
     def facts(self) -> Facts:
         """What the conclusion's own sentences may refer to."""
-        return Facts(self.history, self.requirement, self.unit)
-
-
-def requirement_words(requirement: Requirement, unit: str, units: Mapping[str, str] | None = None) -> str:
-    """Return when a run is critical; `units` by metric are those of a combination's."""
-    if isinstance(requirement, CombinedRequirement):
-        joint, units = " or " if requirement.how == "any" else " and ", units or {}
-        said = [requirement_words(item, units.get(item.metric, ""), units) for item in requirement.items]
-        nested = (isinstance(item, CombinedRequirement) for item in requirement.items)
-        return joint.join(f"({words})" if inner else words for words, inner in zip(said, nested, strict=True))
-    low, high, name, tail = (
-        requirement.critical.low,
-        requirement.critical.high,
-        requirement.metric,
-        f" {unit}" if unit else "",
-    )
-    if math.isinf(low):
-        return f"{name} ≤ {high:g}{tail}"
-    if math.isinf(high):
-        return f"{name} ≥ {low:g}{tail}"
-    return f"{name} in [{low:g}, {high:g}]{tail}"
+        return Facts(self.history, self.requirement, self.unit, self.scenario, self.units)
 
 
 def distribution_words(parameter: Parameter) -> str:
@@ -138,20 +118,13 @@ def distribution_words(parameter: Parameter) -> str:
 
 
 def conclusion_sentences(found: Findings) -> list[str]:
-    """Return what the campaign found, the most important first."""
-    ok, critical = int(found.history.ok.sum()), int(found.critical.sum())
+    """Return what the campaign found, the most important first: the sentences of `run --json`, or what is known before them."""
     if found.conclusion is not None:
-        sentences = found.conclusion.sentences(found.facts)
-    else:
-        sentences = share_among_held_out(found.facts).sentence()
-    if ok:
-        sentences.append(f"{critical:,} of {ok:,} runs were critical.{_not_a_share(found)}")
-    else:
-        sentences.append("No run has given a metric yet.")
-    sentences += _about_contacts(found)
-    if found.ended.get("stopped"):
-        sentences.append(f"The campaign ended because: {found.ended['stopped']}.")
-    return sentences
+        return found.conclusion.sentences(found.facts)
+    ok, critical = int(found.history.ok.sum()), int(found.critical.sum())
+    if not ok:
+        return ["No run has given a metric yet."]
+    return [f"{critical:,} of {ok:,} runs were critical.{_not_a_share(found)}", *share_among_held_out(found.facts).sentence()]
 
 
 def _about_contacts(found: Findings) -> list[str]:
@@ -181,6 +154,7 @@ def warnings_for(found: Findings) -> list[str]:
     return [
         *_about_progress(found),
         *_about_runs(found),
+        *_about_contacts(found),
         *_about_scores(found),
         *map(str, getattr(found.conclusion, "warnings", ())),
     ]
@@ -228,8 +202,9 @@ def _about_far_side(found: Findings) -> list[str]:
     if n == 0:
         return []
     runs = "1 run has" if n == 1 else f"{n:,} runs have"
-    side, tail = "above" if high else "below", f" {found.unit}" if found.unit else ""
-    return [f"{runs} {name} {side} {end:g}{tail}, beyond the critical interval, and count as uncritical. Is that meant?"]
+    side, tail = "above" if high else "below", f" {written_unit(found.unit)}" if found.unit else ""
+    meant = "Is that meant?" if found.configuration.get("requirement") else "The scenario's own requirement has it so."
+    return [f"{runs} {name} {side} {end:g}{tail}, beyond the critical interval, and count as uncritical. {meant}"]
 
 
 def _about_scores(found: Findings) -> list[str]:

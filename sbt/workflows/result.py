@@ -258,7 +258,7 @@ class Result(Generic[C]):
         """Return what the campaign found in plain words."""
         if not self.finished:
             return [f"The campaign has not concluded: {len(self.history):,} runs are done."]
-        said = self.conclusion.sentences(Facts(self.history, self.scenario.requirement, self.scenario.unit))
+        said = self.conclusion.sentences(Facts.of(self.history, self.scenario))
         return [*said, *map(str, getattr(self.conclusion, "warnings", ())), *self._failures()]
 
     def _failures(self) -> list[str]:

@@ -166,15 +166,14 @@ def summarise(store: Store, study: Study, finished: Finished) -> Summary:
     """Return how a campaign ended."""
     history, config, scenario = store.history(), study.config, study.scenario
     ok, critical = int(history.ok.sum()), scenario.requirement.critical_runs(history)
-    units = {p.name: p.unit for p in scenario.space.parameters} | {m.name: m.unit for m in scenario.metrics}
     return Summary(
         config.campaign, config.scenario, str(Path(config.store)), len(history), ok, len(history) - ok,
         int(np.count_nonzero(critical)), len(store.iterations()), finished.stopped,
         {k: round(v, 4) for k, v in finished.seconds.items()}, finished.conclusion,
         int(np.count_nonzero(critical & history.unconfirmed)), int(np.count_nonzero(critical & history.doubtful(Doubt.STRUCK))),
         int(np.count_nonzero(history.doubtful(Doubt.OTHER_LEVEL))),
-        tuple(finished.conclusion.sentences(Facts(history, scenario.requirement, scenario.unit))),
-        scenario.requirement.told_as, units,
+        tuple(finished.conclusion.sentences(Facts.of(history, scenario))),
+        scenario.requirement.told_as, scenario.units,
     )  # fmt: skip
 
 

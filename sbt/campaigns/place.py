@@ -1,0 +1,159 @@
+"""Where the boundary lies: the inputs that it depends on most, and where along them critical meets uncritical."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit
+
+from sbt.problem.arrays import Points, Vector
+from sbt.problem.plain import Value
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.samplers.sobol import SobolSequence
+from sbt.samplers.surface import crossings
+
+__all__ = ["BoundaryPlace", "Cut", "Stretch", "boundary_place"]
+
+LogOdds = Callable[[Points], Vector]
+"""(n, d) points of the unit cube -> (n,) log P(critical) - log P(uncritical): it still differs where both are near 0 or 1."""
+Probability = Callable[[Points], Vector]
+_LOOK_FROM = 2048
+_CROSSINGS = 64
+_STEP = 0.002  # of the unit cube, to both sides, for the direction of the steepest change
+_CELLS = 400  # of a line on which edges are looked for
+_CUTS = (0.1, 0.5, 0.9)  # quantiles of the second input along the boundary
+_MOST = 1e6  # log odds beyond which nothing is told apart
+_SURE = 0.95  # outside of this and its complement the metamodel is sure of a side
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A critical stretch of an input, in its unit."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A line across the boundary.
+
+    Attributes:
+        at: value of the second input; None where there is only one.
+        critical: stretches of the first one where P(critical) > 0.5.
+        unsure: the widest part about an edge with P(critical) between 0.05 and 0.95, half of it, in the unit of the first input.
+    """
+
+    at: float | None
+    critical: tuple[Stretch, ...]
+    unsure: float
+
+
+@dataclass(frozen=True)
+class BoundaryPlace:
+    """The boundary as the metamodel sees it, along the two inputs that it depends on most.
+
+    Attributes:
+        inputs: their names, the one first across which P(critical) changes fastest.
+        low, high: ends of the range of the first.
+        cuts: lines along the first input, at values of the second.
+        fixed: what the other inputs are meanwhile: those of a point of the boundary, in the midst of it.
+        weights: of every continuous input, its mean share of the direction across the boundary, squared (unit cube).
+    """
+
+    inputs: tuple[str, ...]
+    low: float
+    high: float
+    cuts: tuple[Cut, ...]
+    fixed: Mapping[str, Value]
+    weights: Mapping[str, float]
+
+
+def boundary_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int) -> BoundaryPlace | None:
+    """Return where the boundary lies; None where the metamodel sees none, or no input is continuous."""
+    space = scenario.space
+
+    def probability(v: Points) -> Vector:
+        return np.asarray(expit(log_odds(v)), dtype=np.float64)
+
+    continuous = [k for k, p in enumerate(space.parameters) if p.kind == "continuous"]
+    u = SobolSequence(space.dimension, seed).admissible(lambda v: space.feasible(space.from_unit(v)), _LOOK_FROM, 256)
+    if not continuous or len(u) == 0:
+        return None
+    edge = space.cube.snapped(crossings(probability, space.cube.snapped(u), _CROSSINGS))
+    edge = edge[space.feasible(space.from_unit(edge))] if len(edge) else edge
+    if len(edge) == 0:
+        return None
+    weight = _weights(log_odds, edge, continuous)
+    order = sorted(range(len(continuous)), key=lambda k: -weight[k])[:2]
+    axes = [continuous[k] for k in order]
+    anchor = edge[np.argmin(np.linalg.norm(edge - np.median(edge, axis=0), axis=1))]
+    parameter = space.parameters[axes[0]]
+    values = np.quantile(edge[:, axes[1]], _CUTS) if len(axes) > 1 else np.empty(0)
+    lines = [_with(anchor, axes[1], value) for value in values] or [anchor]
+    cuts = [_cut(probability, line, axes, space) for line in lines]
+    low, high = (float(v) for v in parameter.from_unit(np.array([0.0, 1.0])))
+    cuts = [cut for cut in cuts if cut.critical and not _everywhere(cut, low, high)]
+    names, row = [space.names[k] for k in axes], space.named(space.from_unit(anchor[None])[0])
+    fixed = {name: row[name] for name in space.names if name not in names}
+    shares = {space.names[k]: float(w) for k, w in zip(continuous, weight, strict=True)}
+    return BoundaryPlace(tuple(names), low, high, tuple(cuts), fixed, shares) if cuts else None
+
+
+def _weights(log_odds: LogOdds, edge: Points, continuous: list[int]) -> Vector:
+    """Return (c,) the share of each continuous input of the direction in which P(critical) changes, squared, mean over points."""
+    change = np.empty((len(edge), len(continuous)))
+    for k, axis in enumerate(continuous):
+        up, down = (_moved(edge, axis, step) for step in (_STEP, -_STEP))
+        change[:, k] = (_finite(log_odds(up)) - _finite(log_odds(down))) / np.maximum(up[:, axis] - down[:, axis], 1e-12)
+    squared = change**2
+    total = squared.sum(axis=1, keepdims=True)
+    return np.where(total > 0, squared / np.where(total > 0, total, 1.0), 0.0).mean(axis=0)
+
+
+def _finite(log_odds: Vector) -> Vector:
+    return np.clip(np.nan_to_num(log_odds), -_MOST, _MOST)
+
+
+def _moved(points: Points, axis: int, step: float) -> Points:
+    moved = points.copy()
+    moved[:, axis] = np.clip(moved[:, axis] + step, 0.0, 1.0)
+    return moved
+
+
+def _with(point: Vector, axis: int, value: float) -> Vector:
+    moved = point.copy()
+    moved[axis] = value
+    return moved
+
+
+def _cut(probability: Probability, line: Vector, axes: list[int], space: ParameterSpace) -> Cut:
+    """Return the critical stretches of the first axis through a point."""
+    t = np.linspace(0.0, 1.0, _CELLS + 1)
+    points = np.repeat(line[None], len(t), axis=0)
+    points[:, axes[0]] = t
+    p = probability(points)
+    x = space.parameters[axes[0]].from_unit(t)
+    critical = np.flatnonzero(np.diff(np.concatenate([[0], (p > 0.5).astype(int), [0]])))
+    stretches = tuple(Stretch(_edge(x, p, a), _edge(x, p, b)) for a, b in critical.reshape(-1, 2))
+    unsure = np.flatnonzero(np.diff(np.concatenate([[0], ((p > 1 - _SURE) & (p < _SURE)).astype(int), [0]]))).reshape(-1, 2)
+    edges = [e for s in stretches for e in (s.low, s.high)]
+    step = float(x[1] - x[0])
+    wide = [float(x[b - 1] - x[a]) for a, b in unsure if any(x[a] - step <= e <= x[b - 1] + step for e in edges)]
+    at = float(space.parameters[axes[1]].from_unit(np.array([line[axes[1]]]))[0]) if len(axes) > 1 else None
+    return Cut(at, stretches, 0.5 * max([*wide, step]))
+
+
+def _edge(x: Vector, p: Vector, k: int) -> float:
+    """Return where P crosses 0.5 between grid points k - 1 and k, or the end of the range."""
+    if k in (0, len(x)):
+        return float(x[min(k, len(x) - 1)])
+    share = (0.5 - p[k - 1]) / (p[k] - p[k - 1])
+    return float(x[k - 1] + share * (x[k] - x[k - 1]))
+
+
+def _everywhere(cut: Cut, low: float, high: float) -> bool:
+    return len(cut.critical) == 1 and cut.critical[0].low <= low and cut.critical[0].high >= high

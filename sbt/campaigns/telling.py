@@ -1,0 +1,294 @@
+"""The first three sentences of every conclusion: the answer, what it does not tell, and what to do next.
+
+The first can be pasted: it names the scenario, the requirement, the interval, and what it rests on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
+from sbt.estimators.binomial import interval
+from sbt.loop.stages import Facts
+
+if TYPE_CHECKING:
+    from sbt.campaigns.boundary import BoundaryConclusion
+    from sbt.campaigns.estimation import EstimationConclusion
+    from sbt.campaigns.failures import FalsificationConclusion
+    from sbt.campaigns.modes import FailureMode
+    from sbt.campaigns.parts import CriticalShare
+    from sbt.campaigns.place import BoundaryPlace, Cut
+
+__all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
+
+_MOST_FIXED = 4  # inputs beside the two of a boundary that the sentence names
+_CONFIRM = "confirm"  # stage of the runs that repeat a failure
+_PRECISE = 0.1  # coefficient of variation that is asked for by default
+_TOO_FAR = 1e6  # a number of runs that nobody is advised to make
+_MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
+_SMALL_SHARE = 0.01  # bound of the critical share that a coverage of 300 runs without a critical one gives
+
+
+def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
+    """Return the three sentences of a coverage; nothing where no run gave a metric."""
+    if share.critical_fraction is None:
+        return []
+    where, runs = _of(facts), plural(share.counted, "run")
+    said = f"{percent(share.critical_fraction)} of the parameter space{where} is critical ({_condition(facts)}; {_ends(share)})"
+    if share.critical_fraction == 0.0:
+        most = f"at most {percent(share.high)} of the parameter space is"
+        said = f"No run{where} was critical ({_condition(facts)}): {most} ({_ends(share)})"
+        further = "campaign: falsification searches for the rare critical run; as many even runs again only halve the bound"
+    elif share.critical_fraction == 1.0:
+        further = "widen the ranges of the inputs, or the requirement: where all is critical there is no boundary to learn"
+    else:
+        further = (
+            f"campaign: boundary says where critical runs lie, campaign: estimation how probable they are; about"
+            f" {_round(3 * share.counted):,} more runs would halve this interval"
+        )
+    return [
+        f"{said}, by {runs} spread evenly over it.",
+        "This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same, nor where"
+        " they lie.",
+        f"Next: {further}.",
+    ]
+
+
+def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, facts: Facts) -> list[str]:
+    """Return the three sentences of a boundary, and how its figures of the critical share fit together."""
+    if found.critical_fraction is None:
+        return tell_share(measured_share, facts)
+    scores, learned = found.validation, len(facts.history.training)
+    tested = scores is not None and scores.n > 0 and scores.error_rate is not None
+    if tested and scores is not None and scores.error_rate is not None:
+        wrong = round(scores.error_rate * scores.n)
+        low, high = (percent(float(end)) for end in interval(wrong, scores.n))
+        sure = (
+            f"of {plural(scores.n, 'run')} that it had not seen, {wrong:,} lay on the wrong side"
+            f" ({percent(scores.error_rate)}, 95 % interval {low} to {high})"
+        )
+    else:
+        sure = "no held-out run tested it"
+    if found.place is not None:
+        where = _where(found.place, facts.units)
+        lead = f"{_of(facts, 'In').strip() or 'Here'}, a run is critical ({_condition(facts)}) where {where}"
+    else:
+        lead = f"{percent(found.critical_fraction)} of the parameter space{_of(facts)} is critical ({_condition(facts)})"
+    rests = f"the metamodel learned that from {plural(learned, 'run')}"
+    said = [
+        f"{lead}; {rests}, and {sure}.",
+        "This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same; a critical"
+        f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
+        f"Next: {_after_boundary(found, tested=tested)}.",
+    ]
+    return [*said, *_reconciled(found, measured_share), *_too_sure(found)]
+
+
+def _where(place: BoundaryPlace, units: Mapping[str, str]) -> str:
+    """Return where critical meets uncritical, in words."""
+    first, unit = place.inputs[0], units.get(place.inputs[0], "")
+    second = place.inputs[1] if len(place.inputs) > 1 else ""
+    parts = []
+    for k, cut in enumerate(place.cuts):
+        at = "" if cut.at is None else f" at {measured('' if k else second, cut.at, units.get(second, '')).strip()}"
+        parts.append(f"{' and '.join(_stretches(cut, place, unit))}{at}")
+    unsure = measured("", max(cut.unsure for cut in place.cuts), unit, 2).strip()
+    said = f"{first} is {', '.join(parts)} (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)"
+    if place.fixed:
+        names = sorted(place.fixed, key=lambda name: -place.weights.get(name, 0.0))
+        told = [measured(name, place.fixed[name], units.get(name, "")) for name in names[:_MOST_FIXED]]
+        told += [f"{len(names) - _MOST_FIXED} more inputs fixed too"] if len(names) > _MOST_FIXED else []
+        said += f", with {', '.join(told)}"
+    return said
+
+
+def _stretches(cut: Cut, place: BoundaryPlace, unit: str) -> list[str]:
+    """Return the critical stretches of the first input, without ends that are those of its range."""
+    said = []
+    for stretch in cut.critical[:3]:
+        low, high = number(stretch.low, 3), measured("", stretch.high, unit).strip()
+        if stretch.low <= place.low:
+            said.append(f"below {high}")
+        elif stretch.high >= place.high:
+            said.append(f"above {measured('', stretch.low, unit).strip()}")
+        else:
+            said.append(f"{low} to {high}")
+    return said
+
+
+def _after_boundary(found: BoundaryConclusion, *, tested: bool) -> str:
+    if not tested:
+        return "test it: validation.reference: 300 scores the metamodel on 300 more runs drawn at random"
+    scores, unsure = found.validation, found.ambiguous_volume or 0.0
+    if scores is not None and scores.n_critical < 10:
+        return (
+            f"a larger budget, or validation.reference: only {plural(scores.n_critical, 'critical run')} among the {scores.n}"
+            " held-out ones cannot tell whether a critical region is missing"
+        )
+    if found.place is None:
+        return "campaign: falsification searches for the rare critical run"
+    return (
+        f"twice the budget puts as many runs again where the metamodel is unsure, {percent(unsure)} of the space now;"
+        " campaign: estimation says how probable the critical side is"
+    )
+
+
+def _reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
+    """Return the critical share by the metamodel and by the held-out runs alone, and whether they agree."""
+    share = found.critical_fraction or 0.0
+    where = "the parameter space" if found.failing_fraction is None else "what gives a metric"
+    said = f"The metamodel takes {percent(share)} of {where} to be critical"
+    if runs.critical_fraction is None:
+        return [f"{said}; no held-out run checks that."]
+    alone = f"the {plural(runs.counted, 'held-out run')} alone say {percent(runs.critical_fraction)} ({_ends(runs)})"
+    if not runs.low <= share <= runs.high:
+        return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
+    sharper = "the metamodel's figure, which rests on all runs, is the sharper one"
+    return [f"{said}; {alone}. They agree: it lies within that interval{f'; {sharper}' if runs.counted < _MANY else ''}."]
+
+
+def _too_sure(found: BoundaryConclusion) -> list[str]:
+    """Return where the held-out runs deny the certainty that the metamodel states; nothing where they do not."""
+    scores, expected = found.validation, found.expected_misclassified
+    if scores is None or scores.error_rate is None or expected is None:
+        return []
+    least = float(interval(round(scores.error_rate * scores.n), scores.n)[0])
+    if expected >= least:
+        return []
+    return [
+        f"The metamodel is too sure: it expects {percent(expected)} on the wrong side, but of the held-out runs"
+        f" {percent(scores.error_rate)} were (at least {percent(least)} with 97.5 % confidence)."
+    ]
+
+
+def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: Facts) -> list[str]:
+    """Return the three sentences of a falsification."""
+    if found.first_critical_run is None:
+        return _nothing_found(found, facts)
+    modes = found.failure_modes
+    worst = f"; {_worst(modes[0], facts)}" if modes else ""
+    searched = int((facts.history.stage != _CONFIRM).sum())
+    said = (
+        f"The requirement{_of(facts)} is falsified: {found.critical_runs:,} of {plural(searched, 'run')} of the search"
+        f" {'was' if found.critical_runs == 1 else 'were'} critical ({_condition(facts)}), the first after"
+        f" {plural(found.runs_to_first or 0, 'run')}, in {plural(len(modes), 'distinct failure mode')}{worst}."
+    )
+    silent = "This does not tell how probable a failure is, since results chose the runs, nor that there is no other mode"
+    if random.critical_fraction is not None:
+        few = "too few to meet what is rare" if random.critical_fraction == 0.0 else "all that may be read as a share"
+        silent += (
+            f"; the {plural(random.counted, 'run')} among them drawn at random say {percent(random.critical_fraction)} of the"
+            f" parameter space ({_ends(random)}), {few}"
+        )
+    look = f"look at run {modes[0].representative} (replay) and keep it as a test (pin); " if modes else ""
+    more = f"{look}campaign: estimation says how probable failures are, a larger budget looks for more modes"
+    return [said, f"{silent}.", f"Next: {more}."]
+
+
+def _worst(mode: FailureMode, facts: Facts) -> str:
+    """Return the deepest failure and how often it came back, in words."""
+    metric = facts.requirement.told_as
+    said = f"the worst, run {mode.representative} ({measured(metric, mode.metric, facts.unit)})"
+    n = mode.confirmation_runs
+    if mode.confirmed is None or n == 0:
+        return f"{said}, was not repeated"
+    again = round(mode.confirmed * n)
+    low, high = (percent(float(end)) for end in interval(again, n))
+    return f"{said}, was critical again in {again} of {n} repetitions with fresh seeds (95 % interval {low} to {high})"
+
+
+def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
+    bound = found.bound
+    searched = plural(len(facts.history), "run")
+    said = f"The requirement{_of(facts)} was not falsified: no run of {searched} was critical ({_condition(facts)})"
+    silent = "This does not tell that there is no failure: guided runs bound nothing"
+    further = "a larger budget"
+    if bound is not None and bound.space_filling_runs:
+        share = bound.box_fraction_failed_as_critical
+        said += (
+            f"; with {percent(bound.confidence)} confidence at most {percent(share)} of the parameter space is, by the"
+            f" {plural(bound.space_filling_runs, 'space-filling run')} alone"
+        )
+        if share > _SMALL_SHARE:
+            further += f", or campaign: coverage with 300 runs, which bounds that by {percent(_SMALL_SHARE)} if none is critical"
+    closest = found.closest
+    if closest is not None:
+        near = measured(facts.requirement.told_as, closest.metric, facts.unit)
+        further += f"; look at run {closest.run}, which came closest ({near})"
+    return [f"{said}.", f"{silent}, and a failure in a small part of the space may be there.", f"Next: {further}."]
+
+
+def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
+    """Return the three sentences of an estimation."""
+    confidence, n = percent(found.confidence), len(facts.history)
+    verdict = "" if found.gate is None else f"Gate: {found.gate.verdict}; {found.gate.statement}. "
+    rests = "" if n == 0 else f", from {plural(n, 'run')}"
+    if found.counted:
+        critical = f"{found.hits:,} of them {'was' if found.hits == 1 else 'were'} critical"
+        rests += f", of which {plural(found.counted, 'random draw')} count{'s' if found.counted == 1 else ''} and {critical}"
+    subject = f"a critical run{_of(facts)} ({_condition(facts)}) under the inputs' distribution"
+    if found.exact_bound is not None:
+        most = f"with {confidence} confidence the probability of {subject} is at most {number(found.exact_bound, 3)}"
+        said = f"No critical run was drawn: {most}"
+        silent = "This does not tell that there is none: a smaller probability cannot be told from zero by so many draws"
+    elif found.probability is None:
+        said = f"The probability of {subject} is not known yet: no draw counts"
+        silent = "The critical runs so far were chosen by results, so their share is no estimate"
+    else:
+        ends = f"{confidence} interval {number(found.low, 3)} to {number(found.high, 3)}"
+        said = f"The probability of {subject} is {number(found.probability, 3)} ({ends})"
+        missed = min(found.undetected_mass_bound, 1.0 - found.probability)
+        silent = (
+            f"This does not tell of critical regions that no run has met: with {confidence} confidence they hold at most"
+            f" {number(missed, 3)} more, which bounds the unseen and is no second estimate"
+        )
+        if missed > found.high:
+            silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
+    return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_after_estimation(found, n)}."]
+
+
+def _after_estimation(found: EstimationConclusion, n: int) -> str:
+    """Return how many more runs, and which, would tell more."""
+    if found.exact_bound is not None:
+        return "campaign: falsification searches for the first critical run; ten times as many runs lower the bound tenfold"
+    if found.probability is None:
+        return f"a larger budget than {n:,} runs, so that after searching and learning some draws count"
+    if found.gate is not None and found.gate.verdict == "undecided":
+        return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
+    if found.cov is not None and found.cov > _PRECISE and found.counted:
+        more = found.counted * ((found.cov / _PRECISE) ** 2 - 1.0)
+        if more < _TOO_FAR:
+            return (
+                f"about {_round(more):,} more runs (budget: {_round(n + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
+                " fewer where the metamodel goes on to learn"
+            )
+        return "more runs than can be asked for here narrow it; change the metamodel, or the requirement to a milder one"
+    unseen = 3.0 / max(found.probability, 1e-300)
+    if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
+        return (
+            f"it is as narrow as asked; to bound the unseen by the estimate itself, draw {_round(unseen):,} runs from the inputs'"
+            " distribution (acquisition: {kind: monte_carlo})"
+        )
+    return "it is as narrow as asked; look at the critical runs in the report"
+
+
+def _condition(facts: Facts) -> str:
+    return requirement_words(facts.requirement, facts.unit, facts.units)
+
+
+def _of(facts: Facts, word: str = "of") -> str:
+    return f" {word} {facts.scenario}" if facts.scenario else ""
+
+
+def _ends(share: CriticalShare) -> str:
+    return f"{percent(share.confidence)} interval {percent(share.low)} to {percent(share.high)}"
+
+
+def _round(value: float) -> int:
+    """Return a number of runs to two digits, upwards."""
+    if value < 10:
+        return max(math.ceil(value), 1)
+    unit = 10 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit) * unit

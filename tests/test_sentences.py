@@ -1,0 +1,78 @@
+"""The sentences: the answer with its interval, what it does not tell, what to do next; the same wherever they are read."""
+
+import html
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import sbt
+from sbt.campaigns.place import boundary_place
+from sbt.campaigns.wording import measured, requirement_words, written_unit
+from sbt.cli import app
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+
+WEDGE = sbt.Scenario(
+    "wedge",
+    inputs=[sbt.Parameter("gap", 0, 10, "m"), sbt.Parameter("speed", 0, 40, "m/s"), sbt.Parameter("idle", 0, 1, "m/s^2")],
+    evaluate=lambda values, seed: {"room": values["gap"] - 2.0 - 0.1 * values["speed"]},
+    requirement=sbt.Requirement("room", high=0.0),
+)
+"""Critical where gap <= 2 + speed / 10; the third input does nothing."""
+
+
+def test_the_place_of_a_boundary_is_where_it_is_and_names_what_matters():
+    space = ParameterSpace((Parameter("idle", 0, 1), Parameter("a", 0, 10), Parameter("b", -5, 5)))
+    scenario = LogicalScenario("s", space, Requirement("y", high=0.0), evaluate=lambda v, s: {"y": 0.0})
+
+    def log_odds(u):
+        x = space.from_unit(u)
+        return 20 * (4.0 + 0.3 * x[:, 2] - x[:, 1])  # critical where a < 4 + 0.3 b
+
+    found = boundary_place(log_odds, scenario, seed=1)
+    assert found.inputs == ("a", "b")
+    assert set(found.fixed) == {"idle"}
+    assert found.weights["a"] > found.weights["b"] > found.weights["idle"] == 0.0
+    for cut in found.cuts:
+        (stretch,) = cut.critical
+        assert stretch.low == 0.0
+        assert stretch.high == pytest.approx(4.0 + 0.3 * cut.at, abs=0.01)
+        assert cut.unsure == pytest.approx(np.log(19) / 20, abs=0.03)
+    for side in (-np.inf, 50.0):
+        assert boundary_place(lambda u, p=side: np.full(len(u), p), scenario, seed=1) is None
+
+
+@pytest.mark.parametrize("campaign", ["coverage", "boundary", "falsification", "estimation"])
+def test_every_campaign_leads_with_its_answer_and_says_it_the_same_everywhere(tmp_path, campaign):
+    kind = {"metamodel": {"kind": "gp"}} if campaign == "boundary" else {}
+    result = sbt.run(
+        campaign=campaign, scenario=WEDGE, budget=30, seed=1, store=tmp_path / "s", executor="serial", **kind
+    )  # fmt: skip
+    said = result.sentences()
+    answer, silent, following = said[:3]
+    for part in ("wedge", "room ≤ 0", "95"):
+        assert part in answer.replace("\N{NO-BREAK SPACE}", " "), answer
+    assert silent.startswith("This does not tell")
+    assert following.startswith("Next: ")
+    if campaign == "boundary":
+        assert answer.startswith("In wedge, a run is critical (room ≤ 0) where gap is below")
+        assert "at speed" in answer
+    assert result.summary["sentences"] == said[: len(result.summary["sentences"])]
+    page = html.unescape(result.report().read_text(encoding="utf-8"))
+    shown = CliRunner().invoke(app, ["status", str(tmp_path / "s")])
+    stored = json.loads(CliRunner().invoke(app, ["status", str(tmp_path / "s"), "--json"]).stdout)["conclusion"]["sentences"]
+    for sentence in result.summary["sentences"]:
+        assert f"<p>{sentence}</p>" in page
+        assert " ".join(sentence.split()) in " ".join(shown.stdout.split())
+        assert sentence in stored
+    assert page.index(answer) < page.index("About this campaign")
+
+
+def test_units_are_printed_as_people_write_them():
+    assert written_unit("kg*m^2/s^-3") == "kg*m²/s⁻³"
+    assert measured("a", -9.0, "m/s^2") == "a -9 m/s²"
+    assert requirement_words(Requirement("braking", low=6.0), "m/s^2") == "braking ≥ 6 m/s²"
