@@ -264,20 +264,20 @@ def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
 @pytest.mark.parametrize(
     ("result", "expected"),
     [
-        (CoverageConclusion(0.163, 0.12, 0.21), "16.3 % (95 % interval 12 % to 21 %)"),
+        (CoverageConclusion(0.163, 0.12, 0.21), "16.3 % of the parameter space of wedge is critical (ttc_min in [-5, 0.5] s; 95 % interval 12 % to 21 %)"),
         (BoundaryConclusion(0.163, 0.01, 0.1, None), "takes 16.3 % of the parameter space"),
         (
             BoundaryConclusion(0.163, 0.01, 0.1, None, held_out_fraction=CriticalShare(0.2, 0.1, 0.3, 0.95, 50)),
-            "10 % to 30 %), from 50 runs",
+            "the 50 held-out runs alone say 20 % (95 % interval 10 % to 30 %). They agree",
         ),
         (
             FalsificationConclusion(11, 12, 5, (), None, None, "What follows."),
-            "falsified: the first critical run is run 11, after 12 runs of the search; 0 distinct failure modes",
+            "falsified: 5 of 110 runs of the search were critical (ttc_min in [-5, 0.5] s), the first after 12 runs",
         ),
         (FalsificationConclusion(None, None, 0, (), None, None, ""), "not falsified"),
         (EstimationConclusion(1.2e-5, 8e-6, 2e-5), "1.2e-05 (95 % interval 8e-06"),
         (EstimationConclusion(0.0, 0.0, 0.003, exact_bound=0.003), "at most 0.003"),
-        (BoundaryConclusion(None, None, None, None), "from 50 runs spread over it"),
+        (BoundaryConclusion(None, None, None, None), "by 50 runs spread evenly over it"),
         (None, "from 50 runs spread over it"),
     ],
 )
