@@ -264,7 +264,7 @@ def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
 @pytest.mark.parametrize(
     ("result", "expected"),
     [
-        (CoverageConclusion(0.163, 0.12, 0.21), "16.3 % of the parameter space of wedge is critical (ttc_min in [-5, 0.5] s; 95 % interval 12 % to 21 %)"),
+        (CoverageConclusion(0.163, 0.12, 0.21), "16.3 % of the parameter space of wedge is critical (ttc_min in [-5, 0.5]; 95 % interval 12 % to 21 %)"),
         (BoundaryConclusion(0.163, 0.01, 0.1, None), "takes 16.3 % of the parameter space"),
         (
             BoundaryConclusion(0.163, 0.01, 0.1, None, held_out_fraction=CriticalShare(0.2, 0.1, 0.3, 0.95, 50)),
@@ -272,7 +272,7 @@ def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
         ),
         (
             FalsificationConclusion(11, 12, 5, (), None, None, "What follows."),
-            "falsified: 5 of 110 runs of the search were critical (ttc_min in [-5, 0.5] s), the first after 12 runs",
+            "falsified: 5 of 110 runs of the search were critical (ttc_min in [-5, 0.5]), the first after 12 runs",
         ),
         (FalsificationConclusion(None, None, 0, (), None, None, ""), "not falsified"),
         (EstimationConclusion(1.2e-5, 8e-6, 2e-5), "1.2e-05 (95 % interval 8e-06"),
