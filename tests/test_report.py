@@ -264,7 +264,10 @@ def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
 @pytest.mark.parametrize(
     ("result", "expected"),
     [
-        (CoverageConclusion(0.163, 0.12, 0.21), "16.3 % of the parameter space of wedge is critical (ttc_min in [-5, 0.5]; 95 % interval 12 % to 21 %)"),
+        (
+            CoverageConclusion(0.163, 0.12, 0.21),
+            "16.3 % of the parameter space of wedge is critical (ttc_min in [-5, 0.5]; 95 % interval 12 % to 21 %)",
+        ),
         (BoundaryConclusion(0.163, 0.01, 0.1, None), "takes 16.3 % of the parameter space"),
         (
             BoundaryConclusion(0.163, 0.01, 0.1, None, held_out_fraction=CriticalShare(0.2, 0.1, 0.3, 0.95, 50)),
