@@ -26,7 +26,8 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.html import write_report
-from sbt.report.projection import influence_from_runs, influence_on_probability, most_influential_pairs, probability_plane
+from sbt.report.influence import influence_of
+from sbt.report.projection import influence_from_runs, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.words import Findings, requirement_words, warnings_for
 from sbt.store.database import PlannedRun, Store
@@ -174,7 +175,7 @@ def test_hostile_text_stays_text(tmp_path):
         store.append(Outcome(0, Status.OK, {"m": 0.1}))
         store.append(Outcome(1, Status.FAILED, {}, evil))
         page = page_of(store, scenario)
-    assert page.tags.count("script") == 1
+    assert page.tags.count("script") == 4
     assert "img" not in page.tags
     assert "{{ 7*7 }}" in page.text
     assert "simulate &#39;my; rm -rf &lt;x&gt;.yaml&#39;" in page.text
@@ -217,7 +218,7 @@ def test_thousands_of_runs_stay_a_small_file(tmp_path):
         start = time.process_time()
         path = write_report(store, scenario, predict, None)
         assert time.process_time() - start < 10
-    assert path.stat().st_size < 3_000_000
+    assert path.stat().st_size < 5_000_000
     assert "more critical runs are in the store" in path.read_text(encoding="utf-8")
 
 
@@ -307,8 +308,11 @@ def test_requirement_in_words():
 
 
 def test_influence_finds_what_matters(tmp_path):
-    assert influence_on_probability(predict, CRITICAL, 4).argmax() == 1
-    assert np.all(influence_on_probability(lambda u: predict(u * 0 + 0.5), CRITICAL, 4) == 0)
+    influence = influence_of(predict, CRITICAL, 4)
+    assert influence.relative.argmax() == 1
+    assert (influence.low <= influence.total).all()
+    assert (influence.total <= influence.high).all()
+    assert influence_of(lambda u: predict(u * 0 + 0.5), CRITICAL, 4) is None
     scenario = scenario_of(4)
     with fill(tmp_path, scenario, 400, 0) as store:
         order = influence_from_runs(store.history(), scenario.requirement)

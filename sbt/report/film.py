@@ -12,7 +12,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 from sbt.report.contacts import Contacts
-from sbt.report.scene import BICYCLE, EGO, FEW, OTHER, PERSON, ROAD, STANDING, Scenery, View, draw_lanes, view_of
+from sbt.report.scene import BICYCLE, EGO, FEW, OTHER, PERSON, ROAD, STANDING, Scenery, View, draw_lanes, is_wide, view_of
 from sbt.report.style import CRITICAL, MODEL, REGION, figure_style, label
 from sbt.report.worst import metric_so_far, worst_moment
 
@@ -71,7 +71,7 @@ def _frames(trace: Trace, metric: Metric, requirement: Requirement, lanes: Seque
     last = len(trace.time) - 1
     instants = [*range(0, last, _every(trace)), last]
     moment, opponent = worst_moment(trace, metric)
-    size = _WIDE if _is_wide(trace, opponent, moment) else _TALL
+    size = _WIDE if is_wide(trace, opponent, moment) else _TALL
     figure = Figure(figsize=size, dpi=_DPI)
     canvas: Any = FigureCanvasAgg(figure)
     above, below = _two_axes(figure, size)
@@ -120,16 +120,6 @@ def _two_axes(figure: Any, size: tuple[float, float]) -> tuple[Any, Any]:
     above.xaxis.set_visible(False)
     above.yaxis.set_visible(False)
     return above, below
-
-
-def _is_wide(trace: Trace, opponent: int | None, moment: int) -> bool:
-    """Return whether all that matters happens along the x axis, so that a wide view suits it."""
-    y = trace.y[:, [0] if opponent is None else [0, opponent]]
-    x = trace.x[:, [0] if opponent is None else [0, opponent]]
-    everybody = float(np.nanmax(trace.y) - np.nanmin(trace.y)), float(np.nanmax(trace.x) - np.nanmin(trace.x))
-    span = (float(np.nanmax(y) - np.nanmin(y)), float(np.nanmax(x) - np.nanmin(x)))
-    small = everybody[0] <= 50.0 and everybody[0] <= max(everybody[1], 30.0)
-    return small or span[0] <= 0.2 * span[1]
 
 
 def _near(lanes: Sequence[Lane], view: View) -> list[Lane]:

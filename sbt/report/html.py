@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from sbt.campaigns.asking import Sensitivity
 from sbt.campaigns.wording import NOTHING, number
@@ -15,9 +16,13 @@ from sbt.loop.stages import Conclusion
 from sbt.plugins import OBJECT
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
+from sbt.report.choosing import runs_to_film
+from sbt.report.explorer import explorer_data, library, packed, scripts, styles
 from sbt.report.gallery import Drawing, draw
+from sbt.report.influence import influence_of
 from sbt.report.modes import mode_table
-from sbt.report.projection import Predict, influence_from_runs, influence_on_probability
+from sbt.report.projection import Predict, influence_from_runs
+from sbt.report.reel import Film
 from sbt.report.tables import contact_table, critical_table, failed_table, input_table, iteration_table, sensitivity_table
 from sbt.report.words import SCORES, Findings, conclusion_sentences, requirement_words, warnings_for
 from sbt.store.database import Store
@@ -26,10 +31,13 @@ __all__ = ["REPORT", "write_report"]
 
 REPORT = "report.html"
 
+Filming = Callable[[Mapping[int, str]], tuple[Sequence[Film], str]]
+"""Indices of runs, each with the reason why it is shown, to their films and in words why some are missing."""
+
 
 def write_report(
     store: Store, scenario: LogicalScenario, predict: Predict | None, conclusion: Conclusion | None, *,
-    folder: Path | None = None, sensitivity: Sequence[Sensitivity] = (),
+    folder: Path | None = None, sensitivity: Sequence[Sensitivity] = (), film: Filming | None = None,
 ) -> Path:  # fmt: skip
     """Write `report.html` and `figures/*.svg`; works at any moment of a campaign, and gives the same bytes twice.
 
@@ -40,6 +48,7 @@ def write_report(
         conclusion: what the campaign found; None while it goes on.
         folder: where to write; None: the store's folder.
         sensitivity: of an estimated probability to the parameters of the distributions.
+        film: makes films of runs; None: the page shows none.
 
     Returns:
         The path of the page.
@@ -47,8 +56,14 @@ def write_report(
     target = Path(folder) if folder is not None else store.folder
     found, fits = Findings.of(store, scenario, conclusion), store.fits()
     critical, d = scenario.requirement.critical, scenario.space.dimension
-    weights = None if predict is None else influence_on_probability(predict, critical, d)
+    influence = None if predict is None else influence_of(predict, critical, d)
+    weights = None if predict is None else (np.zeros(d) if influence is None else influence.relative)
     order = weights if weights is not None and weights.any() else influence_from_runs(found.history, scenario.requirement)
+    films, film_note = ((), "") if film is None else film(runs_to_film(found, scenario.space))
+    commands = _commands(found, store)
+    data = explorer_data(
+        found, scenario, predict, order, influence=influence, films=films, note=film_note, commands=commands,
+    )  # fmt: skip
     drawings = draw(found, scenario.space, fits, predict, order)
     for drawing in drawings:
         write_atomically(target / "figures" / f"{drawing.name}.svg", drawing.svg)
@@ -66,10 +81,11 @@ def write_report(
         "inputs": input_table(scenario, weights),
         "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement),
         "critical": critical_table(found.history, scenario.requirement, reference, store.judgements),
-        "contacts": contact_table(found.history, scenario.requirement, _commands(found, store)["film"]),
+        "contacts": contact_table(found.history, scenario.requirement, commands["film"]),
         "failed": failed_table(found.history, reference),
         "ego": found.configuration.get("ego"),
-        "commands": _commands(found, store),
+        "commands": commands,
+        "explorer": _explorer(data, influence is not None),
         "configuration": _configuration(found),
     })  # fmt: skip
     return write_atomically(target / REPORT, page)
@@ -78,9 +94,26 @@ def write_report(
 def _render(values: JsonMapping) -> str:
     import jinja2
 
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(files("sbt.report").joinpath("template.html").read_text(encoding="utf-8"))
-    return template.render(values)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        loader=jinja2.PackageLoader("sbt.report", "."),
+    )  # fmt: skip
+    return environment.get_template("template.html").render(values)
+
+
+def _explorer(data: Json, from_metamodel: bool) -> Json:
+    """Return the explorer's parts for the template; all of them are our own text or base64."""
+    import markupsafe
+
+    note = (
+        "Total Sobol indices of the metamodel's P(critical) over the ranges; bars: 95 % intervals of the sampling."
+        if from_metamodel
+        else "How much of the rank of the metric each input explains alone in the runs, relative to the largest."
+    )  # fmt: skip
+    return {
+        "data": packed(data), "library": library(), "note": note,
+        **{name: markupsafe.Markup(text) for name, text in (("styles", styles()), ("scripts", scripts()))},
+    }  # fmt: skip
 
 
 def _inline(drawing: Drawing) -> Json:

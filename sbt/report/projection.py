@@ -23,7 +23,6 @@ __all__ = [
     "Plane",
     "Predict",
     "influence_from_runs",
-    "influence_on_probability",
     "log_probability",
     "most_influential_pairs",
     "probability",
@@ -66,26 +65,6 @@ def log_probability(predict: Predict, critical: CriticalInterval, u: Points) -> 
 def probability(predict: Predict, critical: CriticalInterval, u: Points) -> Vector:
     """Return (n,) P(critical) at n >= 1 points of the unit cube."""
     return np.exp(log_probability(predict, critical, u)[0])
-
-
-def influence_on_probability(predict: Predict, critical: CriticalInterval, dimension: int, points: int = 512) -> Vector:
-    """Return (d,) the total influence of each input on P(critical), relative to the largest.
-
-    Total Sobol indices by Jansen's formula over the ranges (uniform): the mean squared change of
-    P(critical) when one input is drawn anew. All zero where P(critical) is the same everywhere.
-
-    Source:
-        Jansen, Analysis of variance designs for model output (1999), doi 10.1016/S0010-4655(98)00154-4.
-    """
-    both = SobolSequence(2 * dimension, seed=0).points(0, points)
-    first, second = both[:, :dimension], both[:, dimension:]
-    here = probability(predict, critical, first)
-    change = np.empty(dimension)
-    for k in range(dimension):
-        moved = first.copy()
-        moved[:, k] = second[:, k]
-        change[k] = np.mean((probability(predict, critical, moved) - here) ** 2)
-    return _relative(change)
 
 
 def influence_from_runs(history: History, requirement: Requirement) -> Vector:

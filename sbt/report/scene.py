@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from sbt.sumo.nets import Lane
 
 __all__ = [
-    "BICYCLE", "EDGE", "EGO", "FEW", "OTHER", "PERSON", "ROAD", "STANDING", "Scenery", "View", "draw_lanes", "is_person",
-    "view_of",
+    "BICYCLE", "EDGE", "EGO", "FEW", "OTHER", "PERSON", "ROAD", "STANDING", "Scenery", "View", "actor_kind", "draw_lanes",
+    "is_person", "is_wide", "view_of",
 ]  # fmt: skip
 
 EGO, OTHER, STANDING, ROAD, EDGE = "#1f6fb4", "#d9822b", "#8a8f94", "#dcdfe3", "#ffffff"
@@ -54,6 +54,27 @@ _LEVEL = 3.0
 def is_person(trace: Trace, j: int) -> bool:
     """Return whether an actor is drawn and written as a person: it is as small as none but a person is."""
     return bool(max(trace.length[j], trace.width[j]) <= _PERSON_SIZE)
+
+
+def stands_still(trace: Trace, j: int) -> bool:
+    """Return whether an actor never moves."""
+    there = np.isfinite(trace.x[:, j]) & np.isfinite(trace.y[:, j])
+    x, y = trace.x[there, j], trace.y[there, j]
+    return bool(len(x) == 0 or np.ptp(x) + np.ptp(y) < 1e-6)
+
+
+def actor_kind(trace: Trace, j: int) -> str:
+    """Return what an actor is drawn as: ego, standing, person, bicycle or other."""
+    if j == 0:
+        return "ego"
+    if stands_still(trace, j):
+        return "standing"
+    if is_person(trace, j):
+        return "person"
+    return "bicycle" if trace.width[j] <= _NARROW else "other"
+
+
+_COLOURS = {"ego": EGO, "standing": STANDING, "person": PERSON, "bicycle": BICYCLE, "other": OTHER}
 
 
 def draw_lanes(axes: Axes, lanes: Sequence[Lane]) -> None:
@@ -152,6 +173,16 @@ def view_of(trace: Trace, opponent: int | None, moment: int, ratio: float) -> Vi
     return View(_smoothed(place + ahead, trace.time), half, half / ratio, follows=True)
 
 
+def is_wide(trace: Trace, opponent: int | None, moment: int) -> bool:
+    """Return whether all that matters happens along the x axis, so that a wide view suits it."""
+    y = trace.y[:, [0] if opponent is None else [0, opponent]]
+    x = trace.x[:, [0] if opponent is None else [0, opponent]]
+    everybody = float(np.nanmax(trace.y) - np.nanmin(trace.y)), float(np.nanmax(trace.x) - np.nanmin(trace.x))
+    span = (float(np.nanmax(y) - np.nanmin(y)), float(np.nanmax(x) - np.nanmin(x)))
+    small = everybody[0] <= 50.0 and everybody[0] <= max(everybody[1], 30.0)
+    return small or span[0] <= 0.2 * span[1]
+
+
 def _half_width(trace: Trace, opponent: int | None, moment: int, ratio: float) -> float:
     """Return half the width of a view that follows ego: the opponent is in it at the worst moment."""
     if opponent is None or not np.isfinite(trace.x[moment, opponent]):
@@ -198,9 +229,9 @@ class Scenery:
 
         self._trace, self._opponent = trace, opponent
         self._there = np.isfinite(trace.x) & np.isfinite(trace.y) & np.isfinite(trace.heading)
-        self._stands = [self._stands_still(j) for j in range(len(trace.actors))]
+        self._stands = [stands_still(trace, j) for j in range(len(trace.actors))]
         self._people = [is_person(trace, j) for j in range(len(trace.actors))]
-        self._colors = [self._color(j) for j in range(len(trace.actors))]
+        self._colors = [_COLOURS[actor_kind(trace, j)] for j in range(len(trace.actors))]
         self._shapes: Any = axes.add_collection(PolyCollection([], zorder=5), autolim=False)
         few = len(trace.actors) <= FEW
         self._name = axes.annotate(
@@ -224,19 +255,6 @@ class Scenery:
             self._name.xy = (x, y)
         else:
             self._name.set_text("")
-
-    def _stands_still(self, j: int) -> bool:
-        x, y = (v[self._there[:, j], j] for v in (self._trace.x, self._trace.y))
-        return bool(len(x) == 0 or np.ptp(x) + np.ptp(y) < 1e-6)
-
-    def _color(self, j: int) -> str:
-        if j == 0:
-            return EGO
-        if self._stands[j]:
-            return STANDING
-        if self._people[j]:
-            return PERSON
-        return BICYCLE if self._trace.width[j] <= _NARROW else OTHER
 
     def _rim(self, j: int) -> float:
         """Return the width of the line around an actor (pt)."""

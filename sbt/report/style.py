@@ -55,7 +55,7 @@ _STYLE: dict[Any, Any] = {
     "legend.borderaxespad": 0.2,
     "lines.linewidth": 1.6,
     "hatch.linewidth": 0.5,
-    "svg.fonttype": "path",  # the same letters in every browser, in print and in a paper
+    "svg.fonttype": "none",  # text stays text: it is searched, read aloud, and small
     "svg.hashsalt": "sumo-sbt",
 }
 

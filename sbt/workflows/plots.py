@@ -202,13 +202,14 @@ class Plots:
     @cached_property
     def _influence(self) -> Vector:
         """(d,) influence of each input: of the metamodel, or of the runs alone."""
-        from sbt.report.projection import influence_from_runs, influence_on_probability
+        from sbt.report.influence import influence_of
+        from sbt.report.projection import influence_from_runs
 
         r = self.result
         if r.study.learns and r.fitted is not None:
-            weights = influence_on_probability(r.fitted.predict, r.scenario.requirement.critical, r.scenario.space.dimension)
-            if weights.any():
-                return weights
+            found = influence_of(r.fitted.predict, r.scenario.requirement.critical, r.scenario.space.dimension)
+            if found is not None:
+                return found.relative
         return influence_from_runs(r.history, r.scenario.requirement)
 
     @property

@@ -27,6 +27,7 @@ from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import Record
 from sbt.workflows.asking import sensitivities_in
+from sbt.workflows.filming import film_runs
 from sbt.workflows.judging import judge_campaign
 from sbt.workflows.portable import write_bundle
 from sbt.workflows.study import RESOLVED, Study, changed_since
@@ -195,7 +196,8 @@ def _report(store: Store, study: Study, conclusion: Conclusion | None, fitted: F
     log = Log(store.history(), tuple(store.iterations()), ())
     told = sensitivities_in(study, log) if getattr(conclusion, "probability", None) else ()
     predict = None if fitted is None else fitted.predict
-    return write_report(store, study.scenario, predict, conclusion, sensitivity=told)
+    film = partial(film_runs, study, store.history(), folder=store.folder)
+    return write_report(store, study.scenario, predict, conclusion, sensitivity=told, film=film)
 
 
 @dataclass(frozen=True, eq=False)

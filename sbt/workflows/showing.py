@@ -9,6 +9,7 @@ from typing import Any
 from sbt.errors import InputError
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
+from sbt.workflows.filming import net_of, shown_requirement
 from sbt.workflows.running import Replay
 
 __all__ = ["net_of_run", "save_film", "show_replay", "shown_trace"]
@@ -91,16 +92,7 @@ def shown_trace(again: Replay) -> Trace:
 
 def net_of_run(again: Replay) -> Path | None:
     """Return the network in which a run took place, with its placeholders filled; None where its scenario names none."""
-    from sbt.sumo.nets import net_file
-    from sbt.sumo.session import scratch_folder
-    from sbt.sumo.template import template
-
-    simulate: Any = again.scenario.simulate
-    if hasattr(simulate, "files_of_run"):
-        files = simulate.files_of_run(again.record.inputs, again.record.seed)
-        return template(files.net).write(again.record.inputs, scratch_folder())
-    net = getattr(simulate, "net", None)
-    return None if net is None else net_file(net)
+    return net_of(again.scenario, again.record)
 
 
 def save_film(file: Path, states: Trace, scenario: LogicalScenario, title: str, net: Path | None) -> None:
@@ -111,8 +103,5 @@ def save_film(file: Path, states: Trace, scenario: LogicalScenario, title: str, 
     from sbt.report.film import write_film
     from sbt.sumo.nets import lanes
 
-    own = {m.name: m for m in scenario.metrics}
-    parts = scenario.requirement.parts
-    need = next((part for part in parts if part.is_critical({part.metric: own[part.metric].value(states)})), parts[0])
-    metric = own[need.metric]
+    need, metric = shown_requirement(scenario, states)
     write_film(file, states, metric, need, lanes=() if net is None else lanes(str(net)), title=title)

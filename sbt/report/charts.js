@@ -1,0 +1,136 @@
+// Figures by Plotly; it reads some markup in texts, which therefore are escaped.
+const PLAIN = { displaylogo: false, responsive: true, displayModeBar: false };
+const narrow = () => window.innerWidth < 700;
+const TOOLS = { ...PLAIN, displayModeBar: !narrow(), modeBarButtonsToRemove: ["toImage", "autoScale2d", "zoomIn2d", "zoomOut2d"] };
+const safe = text => shortened(String(text)).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+const webgl = (() => { try { return Boolean(document.createElement("canvas").getContext("webgl")); } catch { return false; } })();
+const SHAPES = ["circle", "triangle-up", "x"];
+const shades = () => [colour("--safe"), colour("--critical"), colour("--soft")];
+
+const look = layout => {
+  const axis = () => ({ gridcolor: colour("--line"), zeroline: false, linecolor: colour("--soft"), automargin: true });
+  return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: colour("--ink"), size: 12, family: "system-ui, sans-serif" },
+    margin: { l: 56, r: 14, t: 10, b: 48 }, hoverlabel: { bgcolor: colour("--card"), font: { color: colour("--ink") } },
+    xaxis: axis(), yaxis: axis(), ...layout };
+};
+const axisOf = column => {
+  const axis = { title: { text: safe(titled(column)) } };
+  return column.choices.length
+    ? { ...axis, tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(safe), range: [-0.5, column.choices.length - 0.5] }
+    : axis;
+};
+// Values of a column; whole numbers and choices are spread around their value, so that runs do not hide each other.
+const spread = (column, rows, index, step) => rows.map(row =>
+  column.whole ? column.values[row] + 0.5 * ((index[row] * step) % 1 - 0.5) : column.values[row]);
+
+const drawScatter = (place, data, view) => {
+  const [x, y] = [data.columns[view.x], data.columns[view.y]];
+  const kind = webgl ? "scattergl" : "scatter", dense = data.index.length > 3000;
+  const traces = VERDICTS.map((name, verdict) => {
+    const rows = view.rows.filter(row => data.verdict[row] === verdict);
+    return { type: kind, mode: "markers", name: `${name}: ${rows.length}`, rows, hoverinfo: "none",
+      x: spread(x, rows, data.index, 0.618), y: spread(y, rows, data.index, 0.414),
+      marker: { color: shades()[verdict], symbol: SHAPES[verdict], size: (dense ? 4 : 7) + (verdict === 1 ? 2 : 0),
+        opacity: verdict === 0 && dense ? 0.5 : 0.85, line: { width: dense ? 0 : 0.5, color: colour("--card") } } };
+  }).filter(trace => trace.rows.length);
+  if (view.run !== null) traces.push({ type: "scatter", mode: "markers", name: `run ${data.index[view.run]}`, rows: [view.run], hoverinfo: "none",
+    x: spread(x, [view.run], data.index, 0.618), y: spread(y, [view.run], data.index, 0.414),
+    marker: { symbol: "circle-open", size: 17, color: colour("--ink"), line: { width: 2.5 } } });
+  const frame = look({});
+  return Plotly.react(place, traces, look({ height: 460, dragmode: narrow() ? false : "select", hovermode: "closest", uirevision: `${view.x} ${view.y}`,
+    legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 }, margin: { l: 60, r: 14, t: 34, b: 52 },
+    xaxis: { ...frame.xaxis, ...axisOf(x) }, yaxis: { ...frame.yaxis, ...axisOf(y) } }), TOOLS);
+};
+
+// Parallel coordinates of runs that gave metrics; the metric first, then the inputs by influence.
+const drawParallel = (place, data, view) => {
+  const rows = [...data.index.keys()].filter(row => data.verdict[row] !== 2 && Number.isFinite(data.told.values[row]))
+    .sort((a, b) => data.verdict[a] - data.verdict[b]);
+  const columns = [data.told, ...data.ranked];
+  const dimensions = columns.map(column => {
+    const values = rows.map(row => column.values[row]);
+    let low = Infinity, high = -Infinity;
+    for (const value of values) { low = Math.min(low, value); high = Math.max(high, value); }
+    if (!(high > low)) { low -= 0.5; high += 0.5; }
+    const named = column.choices.length ? { tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(c => shortened(c, 12)) } : {};
+    return { label: shortened(titled(column), 18), values, range: [low, high], constraintrange: view.brushes.get(column.name), ...named };
+  });
+  const [safeColour, criticalColour] = shades();
+  place.style.minWidth = `${96 * columns.length}px`;
+  const trace = { type: "parcoords", dimensions, labelangle: columns.length > 9 ? -14 : 0, labelfont: { size: 11, color: colour("--ink") },
+    tickfont: { size: 10, color: colour("--ink") }, rangefont: { size: 10, color: colour("--soft") }, unselected: { line: { color: colour("--line"), opacity: 0.25 } },
+    line: { color: rows.map(row => data.verdict[row]), cmin: 0, cmax: 1, colorscale: [[0, safeColour], [1, criticalColour]], showscale: false } };
+  const drawn = Plotly.newPlot(place, [trace], look({ height: 380, margin: { l: 60, r: 40, t: 64, b: 26 } }), PLAIN);
+  place.on("plotly_restyle", () => {
+    const brushes = new Map();
+    place.data[0].dimensions.forEach((dimension, k) => {
+      const range = dimension.constraintrange;
+      if (range) brushes.set(columns[k].name, Array.isArray(range[0]) ? range : [range]);
+    });
+    view.brushed(brushes);
+  });
+  return drawn;
+};
+
+const drawInfluence = (place, data, chosen) => {
+  const known = data.inputs.some(input => input.influence);
+  const ranked = [...data.ranked].reverse();
+  const value = input => known ? input.influence[0] : data.weights[data.inputs.indexOf(input)];
+  const errors = known ? { error_x: { type: "data", symmetric: false, color: colour("--ink"), thickness: 1.2, width: 3,
+    array: ranked.map(i => Math.max(0, i.influence[2] - i.influence[0])), arrayminus: ranked.map(i => Math.max(0, i.influence[0] - i.influence[1])) } } : {};
+  const frame = look({});
+  const trace = { type: "bar", orientation: "h", x: ranked.map(value), y: ranked.map((_, k) => k), marker: { color: colour("--model") }, ...errors,
+    hovertemplate: "%{x:.3f}<extra></extra>" };
+  const title = known ? "total Sobol index of P(critical)" : "influence on the metric, relative";
+  const drawn = Plotly.react(place, [trace], look({ height: 90 + 24 * ranked.length, bargap: 0.35,
+    xaxis: { ...frame.xaxis, title: { text: title }, rangemode: "tozero" },
+    yaxis: { ...frame.yaxis, tickvals: ranked.map((_, k) => k), ticktext: ranked.map(input => safe(shortened(input.name, 22))) } }), PLAIN);
+  if (!place.known) place.on("plotly_click", event => chosen(data.inputs.indexOf(ranked[event.points[0].pointNumber])));
+  place.known = true;
+  return drawn;
+};
+
+// The slice along one input through a run: mean and band of the metric above, P(critical) below.
+const drawSlice = (place, data, row, k) => {
+  const { slices } = data, at = slices.runs.indexOf(data.index[row]), input = data.inputs[k];
+  const [mean, low, high, score] = slices.of[at][k], grid = slices.grid[k], here = input.values[row];
+  const discrete = input.whole, fine = discrete ? grid : finer(grid), mode = discrete ? "markers" : "lines";
+  const frame = look({}), model = colour("--model");
+  const traces = [
+    { x: grid, y: low, mode, line: { width: 0 }, marker: { color: model, size: 4 }, hoverinfo: "skip" },
+    { x: grid, y: high, mode, fill: discrete ? undefined : "tonexty", fillcolor: "rgba(91,155,213,.25)", line: { width: 0 }, marker: { color: model, size: 4 }, hoverinfo: "skip" },
+    { x: grid, y: mean, mode, line: { color: model, width: 2 }, marker: { color: model, size: 8 }, hoverinfo: "none" },
+    { x: [here], y: [data.told.values[row]], mode: "markers", marker: { symbol: SHAPES[data.verdict[row]], size: 10, color: shades()[data.verdict[row]] }, hoverinfo: "none" },
+    { x: fine, y: fine.map(x => normal(interpolated(grid, score, x, discrete))), mode, yaxis: "y2", line: { color: colour("--critical"), width: 2 }, marker: { color: colour("--critical"), size: 8 }, hoverinfo: "none" },
+  ].map(trace => ({ type: "scatter", ...trace }));
+  const shapes = (data.told.critical || []).filter(end => end !== null).map(end => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: end, y1: end,
+    line: { color: colour("--critical"), width: 1, dash: "dash" } }));
+  const cursor = shapes.length;
+  shapes.push({ type: "line", x0: here, x1: here, yref: "paper", y0: 0, y1: 1, line: { color: colour("--ink"), width: 1.2 } });
+  const ends = [...low, ...high, data.told.values[row]].filter(Number.isFinite), span = Math.max(...ends) - Math.min(...ends) || 1;
+  const layout = look({ height: 330, showlegend: false, shapes, hovermode: "x", margin: { l: 62, r: 14, t: 8, b: 46 },
+    xaxis: { ...frame.xaxis, ...axisOf(input), anchor: "y2" },
+    yaxis: { ...frame.yaxis, domain: [0.4, 1], range: [Math.min(...ends) - 0.06 * span, Math.max(...ends) + 0.06 * span], title: { text: safe(titled(data.told)) } },
+    yaxis2: { ...frame.yaxis, domain: [0, 0.32], range: [-0.04, 1.04], title: { text: "P(critical)" }, nticks: 4 } });
+  Plotly.react(place, traces, layout, PLAIN);
+  return value => {
+    Plotly.relayout(place, { [`shapes[${cursor}].x0`]: value, [`shapes[${cursor}].x1`]: value });
+    const [m, l, h, z] = [mean, low, high, score].map(values => interpolated(grid, values, value, discrete));
+    return [m, l, h, normal(z)];
+  };
+};
+const finer = grid => Array.from({ length: 241 }, (_, k) => grid[0] + k / 240 * (grid[grid.length - 1] - grid[0]));
+// The distribution function of the normal: Abramowitz and Stegun 26.2.17, off by less than 1e-7.
+const normal = z => {
+  const t = 1 / (1 + 0.2316419 * Math.abs(z));
+  const tail = Math.exp(-z * z / 2) / Math.sqrt(2 * Math.PI)
+    * t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))));
+  return z < 0 ? tail : 1 - tail;
+};
+const interpolated = (grid, values, x, discrete) => {
+  if (grid.length === 1) return values[0];
+  let k = 0;
+  while (k < grid.length - 2 && grid[k + 1] < x) k++;
+  const share = Math.max(0, Math.min(1, (x - grid[k]) / (grid[k + 1] - grid[k])));
+  return discrete ? values[share > 0.5 ? k + 1 : k] : values[k] + share * (values[k + 1] - values[k]);
+};

@@ -1,0 +1,196 @@
+// The explorer: one chosen run, one set of filters; scatter, parallel coordinates, slices, table and film follow them.
+const within = (ranges, value) => ranges.some(([low, high]) => value >= low && value <= high);
+
+class Explorer {
+  constructor(place, data) {
+    this.place = place;
+    this.data = data;
+    this.part = name => place.querySelector(`[data-part=${name}]`);
+    const [first, second] = data.ranked.map(input => data.columns.indexOf(input));
+    this.view = { x: first, y: second ?? data.columns.length - 1, run: null, brushes: new Map(), picked: null, rows: [...data.index.keys()] };
+    this.view.brushed = brushes => { this.view.brushes = brushes; this.filter(); };
+    this.table = new RunTable(data, row => this.choose(row, true), () => this.filter());
+    this.part("table").append(this.table.node);
+    this.table.show(this.view.rows);
+    this.axes();
+    this.filmList();
+    this.part("clear").addEventListener("click", () => this.clear());
+    this.choose(this.best(), false);
+  }
+  best() {
+    const film = this.data.films[0];
+    if (film) return this.data.rowOf.get(film.run);
+    return this.table.sorted[0] ?? null;
+  }
+  axes() {
+    for (const axis of ["x", "y"]) {
+      const select = this.part(axis);
+      select.append(...this.data.columns.map((column, k) => make("option", { value: k }, shortened(titled(column), 50))));
+      select.value = this.view[axis];
+      select.addEventListener("change", () => { this.view[axis] = Number(select.value); this.view.picked = null; this.draw(); });
+    }
+  }
+  filmList() {
+    const { films, film_note: note, films_left_out: rest } = this.data;
+    this.part("films").append(...films.map(film => make("button", { type: "button", class: "chip", onclick: () => this.choose(this.data.rowOf.get(film.run), true) },
+      `${film.role}: run ${film.run}`)));
+    this.part("film-note").textContent = [note, rest ? `${rest} more would not fit in.` : ""].join(" ").trim();
+  }
+  // Draws all figures; called once the library is there, and again when the colours change.
+  async draw() {
+    if (!window.Plotly) return;
+    const { data, view } = this, scatter = this.part("scatter");
+    await drawScatter(scatter, data, view);
+    if (!this.listening) this.listen(scatter);
+    this.listening = true;
+    drawInfluence(this.part("influence"), data, k => { this.part("x").value = k; view.x = k; this.draw(); });
+    if (!webgl) this.part("parallel").textContent = "Parallel coordinates need WebGL, which this browser does not offer.";
+    else if (!this.parallel) { this.parallel = true; await drawParallel(this.part("parallel"), data, view); }
+    this.slice();
+    this.curves();
+  }
+  listen(scatter) {
+    const tip = this.part("tip");
+    scatter.on("plotly_hover", event => this.tip(tip, this.rowAt(event.points[0]), event.event));
+    scatter.on("plotly_unhover", () => { tip.hidden = true; });
+    scatter.on("plotly_click", event => this.choose(this.rowAt(event.points[0]), true));
+    scatter.on("plotly_selected", event => {
+      this.view.picked = event && event.points.length ? new Set(event.points.map(point => this.rowAt(point))) : null;
+      this.filter(false);
+    });
+    scatter.on("plotly_deselect", () => { this.view.picked = null; this.filter(false); });
+  }
+  rowAt(point) { return point.data.rows[point.pointNumber]; }
+  tip(tip, row, event) {
+    const { data } = this, columns = [...data.metrics.slice(0, 6), ...data.ranked.slice(0, 12)];
+    tip.replaceChildren(make("b", {}, `run ${data.index[row]}, ${VERDICTS[data.verdict[row]]}`),
+      ...columns.map(column => make("div", {}, `${shortened(column.name, 28)}: ${withUnit(valueText(column, row), column.unit)}`)));
+    tip.hidden = false;
+    const box = this.place.getBoundingClientRect();
+    const left = event.clientX - box.left + 14;
+    tip.style.left = `${left + 240 > box.width ? Math.max(0, left - 270) : left}px`;
+    tip.style.top = `${event.clientY - box.top + 10}px`;
+  }
+  filter(redraw = true) {
+    const { data, view, table } = this;
+    const brushes = [...view.brushes].map(([name, ranges]) => [[data.told, ...data.columns].find(column => column.name === name), ranges]);
+    const passing = [...data.index.keys()].filter(row => table.passes(row) && brushes.every(([column, ranges]) => within(ranges, column.values[row])));
+    view.rows = passing;
+    table.show(view.picked ? passing.filter(row => view.picked.has(row)) : passing);
+    this.part("clear").hidden = passing.length === data.index.length && !view.picked;
+    if (redraw && window.Plotly) drawScatter(this.part("scatter"), data, view);
+  }
+  clear() {
+    this.view.brushes = new Map();
+    this.view.picked = null;
+    this.parallel = false;
+    this.table.clear();
+    this.filter();
+    this.draw();
+  }
+  choose(row, reveal) {
+    if (row === null || row === undefined) return;
+    this.view.run = row;
+    this.facts(row);
+    this.film(row);
+    this.table.mark(row);
+    if (window.Plotly) { drawScatter(this.part("scatter"), this.data, this.view); this.slice(); this.curves(); }
+    if (reveal) this.part("run").scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
+  }
+  facts(row) {
+    const { data } = this, run = data.index[row], verdict = VERDICTS[data.verdict[row]];
+    this.part("run-title").textContent = `Run ${run}: ${verdict}`;
+    this.part("run-title").dataset.verdict = data.verdict[row];
+    const line = column => make("tr", {}, make("th", { scope: "row" }, column.name), make("td", {}, withUnit(valueText(column, row), column.unit)));
+    const group = (name, columns) => columns.length ? [make("tr", {}, make("th", { colspan: "2", class: "group" }, name)), ...columns.map(line)] : [];
+    const reason = data.reason[row] ? [make("p", { class: "note" }, `Failed: ${data.reason[row]}`)] : [];
+    const modes = data.modes.map((mode, k) => mode.runs.includes(run) ? `failure mode ${k + 1}` : "").filter(Boolean);
+    const about = [`stage ${data.stages[data.stage[row]]}`, `iteration ${data.iteration[row]}`, `seed ${data.seed[row]}`, ...modes].join(", ");
+    this.part("facts").replaceChildren(...reason,
+      make("table", { class: "facts-of-run" }, make("tbody", {}, ...group("Metrics", data.metrics), ...group("Inputs", data.inputs))),
+      make("p", { class: "note" }, about), ...this.command(run));
+  }
+  command(run) {
+    const film = this.data.commands.film;
+    return film ? [make("pre", { tabindex: "0", "aria-label": "command that opens this run" }, film.replaceAll("RUN", String(run)))] : [];
+  }
+  film(row) {
+    const { data } = this, place = this.part("film"), run = data.index[row], raw = data.filmOf.get(run);
+    if (this.player) this.player.pause();
+    this.player = this.shown = this.moved = null;
+    if (!raw) {
+      this.part("curves").replaceChildren();
+      place.replaceChildren(make("p", { class: "note" }, data.verdict[row] === 2 ? "A failed run has no film."
+        : data.films.length ? "This run's film is not in this file; the command makes it." : data.film_note || "There are no films in this file."));
+      return;
+    }
+    this.shown = developed(raw);
+    this.laid = this.laid || data.lanes.map(outlined);
+    const label = `run ${run} from above: ${raw.role}; ${raw.contacts.length ? `contact with ${raw.contacts[0].with}` : "no contact"}`;
+    this.player = new Player([this.shown], this.laid, [label], t => { if (this.moved) this.moved(t); });
+    const rest = raw.left_out ? ` ${raw.left_out} road users far away are left out.` : "";
+    place.replaceChildren(make("p", { class: "role" }, `${raw.role}; ${raw.ended ? `ended: ${raw.ended}` : ""}`), this.player.scenes[0].canvas, this.player.bar,
+      make("p", { class: "note" }, `Dashed: the way driven in the next ${AHEAD} s. Space plays, arrow keys step.${rest}`));
+    this.player.begin();
+  }
+  async curves() {
+    if (!this.shown) return;
+    const film = this.shown, place = make("div");
+    this.part("curves").replaceChildren(place);
+    const moved = await drawCurves(Plotly, place, film, look);
+    if (film !== this.shown) return;
+    this.moved = moved;
+    moved(this.player.now);
+  }
+  slice() {
+    const { data, view } = this, place = this.part("slices");
+    if (!data.slices || view.run === null) return;
+    place.hidden = false;
+    const select = this.part("slice-input"), slider = this.part("slice-at"), says = this.part("slice-says");
+    if (!select.length) {
+      select.append(...data.ranked.map(input => make("option", { value: data.inputs.indexOf(input) }, shortened(titled(input), 50))));
+      select.addEventListener("change", () => this.slice());
+    }
+    const there = data.slices.runs.includes(data.index[view.run]);
+    this.part("slice").hidden = !there;
+    slider.disabled = !there;
+    const errors = `The table is interpolated: off by up to ${digits(data.slices.error_p, 2)} in P(critical) and ${digits(data.slices.error_mean, 2)} ${data.told.unit} in the metric.`;
+    this.part("slice-note").textContent = there ? errors : `Slices are in this file for ${data.slices.runs.length} runs: those with a film, and some evenly chosen.`;
+    says.textContent = "";
+    if (!there) return;
+    const k = Number(select.value), input = data.inputs[k], grid = data.slices.grid[k];
+    const move = drawSlice(this.part("slice"), data, view.run, k);
+    Object.assign(slider, { min: grid[0], max: grid[grid.length - 1], step: input.whole ? 1 : "any" });
+    const tell = value => {
+      const [mean, low, high, p] = move(value);
+      const written = input.choices.length ? input.choices[Math.round(value)] : withUnit(digits(value), input.unit);
+      says.textContent = `${input.name} = ${written}, else as run ${data.index[view.run]}: ${data.told.name} ${digits(mean, 3)} `
+        + `(90 % between ${digits(low, 3)} and ${digits(high, 3)} ${data.told.unit}), P(critical) ${percent(p)}`;
+    };
+    slider.value = input.values[view.run];
+    slider.oninput = () => tell(Number(slider.value));
+    tell(Number(slider.value));
+  }
+}
+
+// The library is large: it is unpacked after the page is painted.
+const withLibrary = async then => {
+  const script = document.createElement("script");
+  script.textContent = await unpacked("library");
+  document.head.append(script);
+  await then();
+};
+const begin = async () => {
+  const place = document.getElementById("explore");
+  if (!place || !window.DecompressionStream) return;
+  const data = opened(JSON.parse(await unpacked("explorer-data")));
+  place.hidden = false;
+  if (!data.index.length) { place.hidden = true; return; }
+  const explorer = new Explorer(place, data);
+  window.explorer = explorer;
+  const scheme = matchMedia("(prefers-color-scheme: dark)");
+  scheme.addEventListener("change", () => { painted.clear(); explorer.parallel = false; explorer.draw(); if (explorer.player) explorer.player.show(explorer.player.now); });
+  new ResizeObserver(() => { if (explorer.player) explorer.player.show(explorer.player.now); }).observe(place);
+  if (document.getElementById("library").textContent.trim()) setTimeout(() => withLibrary(() => explorer.draw()), 30);
+};
+begin();

@@ -1,0 +1,177 @@
+"""The data of the report's explorer: runs as columns, what the metamodel believes, films; and the script that draws them."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import importlib.util
+import json
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sbt.campaigns.failures import FalsificationConclusion
+from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Json
+from sbt.problem.scenario import LogicalScenario
+from sbt.report.influence import Influence
+from sbt.report.projection import Predict
+from sbt.report.reel import Film, Reels
+from sbt.report.slices import slices_through
+from sbt.report.words import Findings
+
+__all__ = ["explorer_data", "library", "packed", "scripts", "styles"]
+
+_MOST = 20_000
+"""Largest number of runs in the page."""
+_FILMS = 3_000_000
+"""Largest size of all films together as text (bytes), before it is packed."""
+_SLICES = 40
+"""Slices go through at most so many runs."""
+_SCRIPTS = ("data.js", "charts.js", "table.js", "film.js", "explorer.js")
+_STYLES = ("explorer.css",)
+
+
+def explorer_data(
+    found: Findings, scenario: LogicalScenario, predict: Predict | None, weights: Any, *,
+    influence: Influence | None = None, films: Sequence[Film] = (), note: str = "", commands: Mapping[str, str] | None = None,
+) -> Json:  # fmt: skip
+    """Return what the explorer shows, as plain data.
+
+    Args:
+        found: rows and requirement.
+        scenario: inputs and metrics, with their units.
+        predict: the metamodel, None where there is none.
+        weights: (d,) importance of the inputs; the two largest are the first axes.
+        influence: of the inputs on P(critical), with intervals.
+        films: runs to be shown, the most interesting first.
+        note: why films are missing.
+        commands: how a run is opened (`replay`, `film`), with RUN in place of its index.
+    """
+    history, requirement = found.history, found.requirement
+    critical = found.critical
+    keep = _kept(history.ok, critical, [film.run for film in films], history.index)
+    shown = history.where(keep)
+    verdict = np.where(~history.ok, 2, np.where(critical, 1, 0))[keep]
+    margin = requirement.margins(shown)
+    stages = sorted(set(shown.stage.tolist()))
+    limits = {part.metric: [_number(part.critical.low), _number(part.critical.high)] for part in requirement.parts}
+    reels, reeled = _within(films)
+    return {
+        "title": scenario.name, "told": requirement.told_as, "total": len(history), "critical_total": int(np.sum(critical)),
+        "inputs": [_input(p, k, influence) for k, p in enumerate(scenario.space.parameters)],
+        "metrics": [{"name": m, "unit": found.units.get(m, ""), "critical": limits.get(m)} for m in history.metrics],
+        "weights": [float(f"{w:.4g}") for w in np.asarray(weights).tolist()],
+        "order": np.argsort(-np.asarray(weights), kind="stable").tolist(),
+        "index": _whole(shown.index), "verdict": verdict.tolist(), "margin": _floats(margin),
+        "x": [_floats(shown.x[:, k]) for k in range(shown.x.shape[1])],
+        "y": [_floats(shown.y(m)) for m in history.metrics],
+        "stages": stages, "stage": [stages.index(s) for s in shown.stage.tolist()],
+        "iteration": _whole(shown.iteration), "seed": [str(s) for s in shown.seed.tolist()],
+        "reason": {str(k): str(shown.reason[k])[:300] for k in np.flatnonzero(~shown.ok)[:2000]},
+        "modes": _modes(found), "films": reeled, "lanes": reels.lanes, "film_note": note,
+        "films_left_out": len(films) - len(reeled), "commands": dict(commands or {}),
+        "slices": _slices(found, scenario, predict, [film.run for film in films]),
+    }  # fmt: skip
+
+
+def _kept(ok: Any, critical: Any, wanted: Sequence[int], index: Any) -> Any:
+    """Return (n,) which runs are in the page: all, or critical, failed and filmed ones first and the rest evenly thinned."""
+    n = len(ok)
+    if n <= _MOST:
+        return np.ones(n, dtype=bool)
+    keep = np.isin(index, wanted)
+    for mask, share in ((critical, 0.6), (~ok, 0.8), (ok & ~critical, 1.0)):
+        rows, room = np.flatnonzero(mask & ~keep), int(share * _MOST) - int(keep.sum())
+        if len(rows) and room > 0:
+            keep[rows[np.unique(np.linspace(0, len(rows) - 1, min(room, len(rows))).astype(int))]] = True
+    return keep
+
+
+def _within(films: Sequence[Film]) -> tuple[Reels, list[Json]]:
+    """Return films as data, as many as may be in a page."""
+    reels, found, room = Reels(), [], _FILMS
+    for film in films:
+        data = reels.add(film)
+        room -= len(json.dumps(data))
+        if room < 0:
+            break
+        found.append(data)
+    return reels, found
+
+
+def _input(parameter: Parameter, k: int, influence: Influence | None) -> Json:
+    low, high = parameter.bounds
+    known = {} if influence is None else {
+        "influence": [float(f"{v[k]:.4g}") for v in (influence.total, influence.low, influence.high)]
+    }  # fmt: skip
+    return {
+        "name": parameter.name, "unit": parameter.unit, "low": _number(low), "high": _number(high),
+        "choices": list(parameter.choices), "whole": parameter.discrete, "description": parameter.description, **known,
+    }  # fmt: skip
+
+
+def _modes(found: Findings) -> list[Json]:
+    if not isinstance(found.conclusion, FalsificationConclusion):
+        return []
+    return [{"representative": m.representative, "runs": list(m.runs)[:2000]} for m in found.conclusion.failure_modes]
+
+
+def _slices(found: Findings, scenario: LogicalScenario, predict: Predict | None, filmed: Sequence[int]) -> Json | None:
+    """Return slices through the runs with a film, then through runs spread evenly over the others."""
+    history = found.history
+    if predict is None or not history.ok.any():
+        return None
+    spread = history.index[history.ok]
+    spread = spread[np.unique(np.linspace(0, len(spread) - 1, _SLICES).astype(int))].tolist()
+    runs = list(dict.fromkeys([*filmed, *spread]))[:_SLICES]
+    rows = {int(index): row for row, index in enumerate(history.index)}
+    x = history.x[[rows[run] for run in runs]]
+    return slices_through(predict, found.requirement.critical, scenario.space, x, runs)
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _floats(values: Any) -> str:
+    """Return numbers as base64 of 32-bit floats: seven digits, NaN where there is none."""
+    return base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode()
+
+
+def _whole(values: Any) -> str:
+    return base64.b64encode(np.asarray(values, dtype="<i4").tobytes()).decode()
+
+
+def packed(data: Any) -> str:
+    """Return plain data as base64 of its gzipped JSON: no text in it can end the script element it lies in."""
+    text = json.dumps(data, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
+
+
+@cache
+def library() -> str:
+    """Return plotly.js as it comes with its Python package, as base64 of its gzip; "" where that is not installed."""
+    spec = importlib.util.find_spec("plotly")
+    if spec is None or not spec.submodule_search_locations:
+        return ""
+    script = Path(spec.submodule_search_locations[0]) / "package_data" / "plotly.min.js"
+    return base64.b64encode(gzip.compress(script.read_bytes(), 6, mtime=0)).decode()
+
+
+def scripts(*names: str) -> str:
+    """Return our own scripts, one after the other."""
+    return "\n".join(_own(name) for name in names or _SCRIPTS)
+
+
+def styles() -> str:
+    """Return the style sheet of the explorer."""
+    return "\n".join(_own(name) for name in _STYLES)
+
+
+def _own(name: str) -> str:
+    return files("sbt.report").joinpath(name).read_text(encoding="utf-8")

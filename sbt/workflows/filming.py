@@ -1,0 +1,97 @@
+"""Executes runs of a store again for the films of its report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from sbt.errors import SbtError
+from sbt.execution.worker import run_traced
+from sbt.plugins.approval import is_trusted
+from sbt.problem.outcome import Job
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.trace import Trace
+from sbt.report.reel import Film
+from sbt.store.history import History, Record
+from sbt.sumo.nets import Lane, lanes
+from sbt.workflows.study import Study
+
+__all__ = ["film_runs", "net_of", "shown_requirement"]
+
+
+@cache
+def _lanes(net: Path, content: bytes) -> tuple[Lane, ...]:
+    """Return the lanes of a network, which is read once as long as its file stays the same."""
+    return lanes(str(net))
+
+
+def film_runs(study: Study, history: History, chosen: Mapping[int, str], *, folder: Path) -> tuple[list[Film], str]:
+    """Execute runs again; return those that are as they were, to the last bit, and in words why others are missing.
+
+    Args:
+        study: as it was configured.
+        history: its runs.
+        chosen: indices of runs, each with the reason why it is shown.
+        folder: of the store; the code that it names runs only where the user has approved that.
+    """
+    if not chosen:
+        return [], ""
+    if study.own_code and not study.live and not is_trusted(folder):
+        return [], "Films need the scenario's own code, which runs only where the store is trusted."
+    rows = {int(index): row for row, index in enumerate(history.index)}
+    films: list[Film] = []
+    missing: dict[int, str] = {}
+    try:
+        with study.loaded.scope.naming():
+            runnable, scenario = study.runnable, study.spec.resolve()
+            if runnable.simulate is None:
+                return [], "The scenario gives its metrics directly: there is no trace to show."
+            for run, role in chosen.items():
+                record = history.record(rows[run])
+                film = _film(scenario, runnable, record, role)
+                if isinstance(film, Film):
+                    films.append(film)
+                else:
+                    missing[run] = film
+    except (SbtError, OSError) as error:
+        return films, f"Films are missing: {error}"
+    note = "; ".join(f"no film of run {run}: {reason}" for run, reason in list(missing.items())[:3])
+    return films, f"{note[:1].upper()}{note[1:]}." if note else ""
+
+
+def _film(scenario: LogicalScenario, runnable: LogicalScenario, record: Record, role: str) -> Film | str:
+    """Return the film of a run, or why there is none."""
+    outcome, trace = run_traced(scenario, Job(record.index, record.inputs, record.seed))
+    if trace is None:
+        return outcome.reason or "it has no trace"
+    if dict(outcome.metrics) != dict(record.metrics):
+        return "executed again it is another one"
+    need, metric = shown_requirement(runnable, trace)
+    net = net_of(runnable, record)
+    return Film(record.index, role, trace, metric, need, () if net is None else _lanes(net, sha256(net.read_bytes()).digest()))
+
+
+def shown_requirement(scenario: LogicalScenario, states: Trace) -> tuple[Requirement, Metric]:
+    """Return the requirement that a film shows and its metric: the first that the run violates, or else the first."""
+    own = {m.name: m for m in scenario.metrics}
+    parts = scenario.requirement.parts
+    need = next((part for part in parts if part.is_critical({part.metric: own[part.metric].value(states)})), parts[0])
+    return need, own[need.metric]
+
+
+def net_of(scenario: LogicalScenario, record: Record) -> Path | None:
+    """Return the network in which a run took place, with its placeholders filled; None where its scenario names none."""
+    from sbt.sumo.nets import net_file
+    from sbt.sumo.session import scratch_folder
+    from sbt.sumo.template import template
+
+    simulate: Any = scenario.simulate
+    if hasattr(simulate, "files_of_run"):
+        files = simulate.files_of_run(record.inputs, record.seed)
+        return template(files.net).write(record.inputs, scratch_folder())
+    net = getattr(simulate, "net", None)
+    return None if net is None else net_file(net)
