@@ -211,6 +211,7 @@ def show(rows: list[dict]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="first seed, to split them over processes with a table each")
     parser.add_argument("--problems", default=",".join(CELLS))
     parser.add_argument("--table", type=Path, default=Path("runs/failing.jsonl"))
     parser.add_argument("--show", action="store_true")
@@ -223,7 +224,7 @@ def main() -> None:
     if args.counts is not None:
         show_counts(names, args.seeds, args.counts)
         return
-    for seed in range(0 if args.show else args.seeds):
+    for seed in range(args.seeds if args.show else args.first, args.seeds):
         for name in names:
             if (name, seed) not in done:
                 done[name, seed] = campaign(name, seed)

@@ -70,6 +70,7 @@ def main() -> None:
     """Run what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--first", type=int, default=0, help="first seed, to split them over processes with a table each")
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--crude", type=int, default=40_000)
     parser.add_argument("--budget", type=int, default=300, help="runs of the earlier campaign")
@@ -89,7 +90,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             estimation(case, folder / "earlier", ego=EARLIER, seed=1000, budget=args.budget, stop={"cov": None})
-            for seed in range(args.seeds):
+            for seed in range(args.first, args.seeds):
                 for way in ("transfer", "scratch"):
                     if (way, seed) not in done:
                         keep(campaign(case, way, seed, folder / "earlier", folder))

@@ -108,16 +108,23 @@ def test_the_defence_bounds_the_weights(shares):
     assert replicate(wrong, stream(3, "bounded"), shares=shares).coefficient.max() <= 1.05 / shares[1]
 
 
-def test_every_pool_point_is_expected_as_often_as_its_probability_says():
+@pytest.mark.parametrize("once", [True, False])
+def test_every_pool_point_is_expected_as_often_as_its_probability_says(once):
+    """Also where belief is sharp: one of 60 points would be drawn three times of ten, and is drawn once where that is asked."""
     rng = stream(4, "systematic")
     z, stratum = Mixture(WIDE).sample(60, rng)
     log_h = Mixture(WIDE).log_density(z)
-    plan = plan_batch(*wrong(z), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
-    counts = np.zeros(60)
-    for _ in range(4000):
-        counts += np.bincount(draw_systematic(plan, 10, z[:, 0], rng).rows, minlength=60)
-    expected = 4000 * 10 * plan.probability
+    pi = np.where(np.arange(60) == np.argmin((z**2).sum(axis=1)), 0.5, 1e-4)
+    plan = plan_batch(np.log(pi), np.log1p(-pi), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
+    counts, most, drawn = np.zeros(60), 0, []
+    for _ in range(3000):
+        drawn.append(draw_systematic(plan, 10, z[:, 0], rng, once=once))
+        found = drawn[-1].rows
+        counts += np.bincount(found, minlength=60)
+        most = max(most, np.bincount(found[drawn[-1].nominal :]).max())
+    expected = sum(10 * each.plan.probability for each in drawn)
     assert np.all(np.abs(counts - expected) < 5 * np.sqrt(expected) + 5)
+    assert (most == 1) is once
 
 
 def test_the_mixture_has_the_density_it_claims():

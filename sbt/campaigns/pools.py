@@ -16,7 +16,7 @@ from sbt.campaigns.counting import DRAWN, LEARNED
 from sbt.campaigns.records import COUNT, LEARN, CountedDraws, EstimationProposal, EventDraws, NominalDraws, PoolSummary
 from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
 from sbt.estimators.events import Event, events
-from sbt.estimators.importance import Plan, draw_systematic, plan_batch, stated
+from sbt.estimators.importance import Draws, Plan, draw_systematic, plan_batch, stated
 from sbt.estimators.mixture import Mixture, Near, effective_size, fit_mixture, particles, reweighted
 from sbt.estimators.surrogate import LogProbability
 from sbt.metamodels.joint import LogPair
@@ -175,11 +175,16 @@ def _targets(log_probability: LogProbability, v: Points) -> list[Vector]:
 
 
 def draw_batch(
-    space: ParameterSpace, pool: Pool, n: int, rng: np.random.Generator, *, counts: bool, fallback: bool = False
-) -> tuple[tuple[PlannedRun, ...], EstimationProposal]:
-    """Return n runs drawn from a pool with known density, that count or only teach, and what the log keeps of them."""
+    space: ParameterSpace, pool: Pool, n: int, rng: np.random.Generator, *, counts: bool, once: bool = True,
+    fallback: bool = False,
+) -> tuple[tuple[PlannedRun, ...], EstimationProposal]:  # fmt: skip
+    """Return n runs drawn from a pool with known density, that count or only teach, and what the log keeps of them.
+
+    `once`: the metamodel has no point drawn twice, as where the simulator is deterministic.
+    """
     log_pi, log_not = pool.whole.safe
-    draws, plan = draw_systematic(pool.plan, n, log_pi - log_not, rng), pool.plan
+    draws = draw_systematic(pool.plan, n, log_pi - log_not, rng, once=once)
+    plan = draws.plan
     summary = PoolSummary(len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback)
     pi = tuple(np.exp(log_pi[draws.rows]).tolist())
     z, nominal = pool.z[draws.rows], NominalDraws(pi[: draws.nominal])
@@ -188,18 +193,18 @@ def draw_batch(
     log_q = space.log_density(pool.x[draws.rows]) - np.log(draws.coefficient)
     counted = CountedDraws(
         plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi,
-        tuple(_event_draws(part.safe, pool, draws.rows, part.critical) for part in pool.parts) or None,
-        None if pool.whole.critical is None else _event_draws(pool.whole.critical, pool, draws.rows),
+        tuple(_event_draws(part.safe, pool, draws, part.critical) for part in pool.parts) or None,
+        None if pool.whole.critical is None else _event_draws(pool.whole.critical, pool, draws),
     )  # fmt: skip
     kept = EstimationProposal(COUNT, plan.form, pool=summary, counted=counted, nominal=nominal)
     return planned(space, z, DRAWN, log_q), kept
 
 
-def _event_draws(event: LogPair, pool: Pool, rows: Vector, failed_critical: LogPair | None = None) -> EventDraws:
-    """Return what the log keeps of an event at the drawn rows of a pool."""
-    said = stated(event, pool.plan, pool.stratum)
-    worst = None if failed_critical is None else _event_draws(failed_critical, pool, rows)
-    return EventDraws(said.prior, said.anticipated, said.pool_variance, tuple(said.pi[rows].tolist()), worst)
+def _event_draws(event: LogPair, pool: Pool, draws: Draws, failed_critical: LogPair | None = None) -> EventDraws:
+    """Return what the log keeps of an event at the draws from a pool."""
+    said = stated(event, draws.plan, pool.stratum)
+    worst = None if failed_critical is None else _event_draws(failed_critical, pool, draws)
+    return EventDraws(said.prior, said.anticipated, said.pool_variance, tuple(said.pi[draws.rows].tolist()), worst)
 
 
 def planned(space: ParameterSpace, z: Points, stage: str, log_q: Vector | None = None) -> tuple[PlannedRun, ...]:

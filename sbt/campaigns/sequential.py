@@ -209,7 +209,10 @@ class SequentialStage:
         counts = known.one_sided or count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
         blind = not len(known.y) or self._common(log_probability, log.iteration)
         searched = 0 if blind else min(round(_SEARCH_SHARE[counts] * size), size - 1)
-        runs, kept = draw_batch(s.scenario.space, pool, size - searched, rng, counts=counts, fallback=fallback is not None)
+        noisy = simulator_noise(log.history, s.scenario.requirement).noisy is True
+        runs, kept = draw_batch(
+            s.scenario.space, pool, size - searched, rng, counts=counts, once=not noisy, fallback=fallback is not None
+        )  # fmt: skip
         return Batch((*runs, *self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)), kept)
 
     def _proposal(

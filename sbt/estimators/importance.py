@@ -14,7 +14,7 @@ Source:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,8 @@ BLIND = (0.0, 0.5, 0.1, 0.4)
 """The same while all runs are on one side of the boundary: the metamodel knows nothing of the other."""
 
 
+_LEAST_DRAWN = 1e-300
+"""Probability of a pool point that is never drawn, as a divisor: its weight is 0."""
 _LEAST_PROBABILITY = 1e-12
 """Of an event, in the coefficient of variation that draws are planned by: one that is denied must not take them all."""
 _OWN = 0.5
@@ -71,6 +73,7 @@ class Plan:
         pool_variance: of P_t through the pool, in total.
         nominal: share of the draws in proportion to the nominal distribution.
         nominal_probability: (N,) of each pool point in such a draw, sum 1.
+        moment: (N,) mean square of what a run would correct at each pool point, by the metamodel.
     """
 
     form: str
@@ -83,6 +86,13 @@ class Plan:
     pool_variance: float
     nominal: float
     nominal_probability: Vector
+    moment: Vector
+
+    def drawn_with(self, probability: Vector) -> Plan:
+        """Return the same plan with other probabilities r (N,) of the pool points."""
+        corrected = (self.weight**2 * self.moment / np.maximum(probability, _LEAST_DRAWN)).sum()
+        mean = 0.0 if self.form == "difference" else self.predicted
+        return replace(self, probability=probability, anticipated=max(float(corrected) - mean**2, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,15 +101,23 @@ class Draws:
 
     Attributes:
         rows: (n,) rows of the pool.
-        coefficient: (n,) w / (N r).
-        control_variate: (n,) pi, as the correction subtracts it.
+        plan: with the probabilities r that these draws had.
         nominal: number of the draws, the first ones, that were made in proportion to the nominal distribution.
     """
 
     rows: Vector
-    coefficient: Vector
-    control_variate: Vector
+    plan: Plan
     nominal: int
+
+    @property
+    def coefficient(self) -> Vector:
+        """(n,) w / (N r)."""
+        return np.asarray(self.plan.weight[self.rows] / self.plan.probability[self.rows])
+
+    @property
+    def control_variate(self) -> Vector:
+        """(n,) pi, as the correction subtracts it."""
+        return np.asarray(self.plan.control_variate[self.rows])
 
 
 def plan_batch(
@@ -136,23 +154,19 @@ def plan_batch(
         mean = float((w * pi).sum())
         r += shares[0] * _guided(log_spread, mean, others, w, log_w)
         r /= r.sum()
-        second = float((w**2 * pi / np.where(alive, r, 1.0)).sum())
+        variance = stratified_variance(n * w * pi, stratum)
         if name == "difference":
-            variance = float((w**2 * pi * np.exp(log_not) / np.where(alive, r, 1.0)).sum())
+            plan = Plan(name, r, pi, w, mean, mean, 0.0, variance, shares[1], nominal, pi * np.exp(log_not))
         else:
-            variance = second - mean**2
-        pool_variance = stratified_variance(n * w * pi, stratum)
-        plans.append(Plan(
-            name, r, pi if name == "difference" else np.zeros(n), w, mean if name == "difference" else 0.0, mean,
-            max(variance, 0.0), pool_variance, shares[1], nominal,
-        ))  # fmt: skip
+            plan = Plan(name, r, np.zeros(n), w, 0.0, mean, 0.0, variance, shares[1], nominal, pi)
+        plans.append(plan.drawn_with(r))
     return min(plans, key=lambda plan: plan.anticipated)
 
 
 def stated(event: LogPair, plan: Plan, stratum: Vector) -> Stated:
     """Return what is stated of an event at the points of a pool that draws are made from by this plan."""
     w, pi = plan.weight, np.exp(event[0])
-    one_draw = np.where(plan.probability > 0, w**2 * pi * np.exp(event[1]) / np.maximum(plan.probability, 1e-300), 0.0)
+    one_draw = w**2 * pi * np.exp(event[1]) / np.maximum(plan.probability, _LEAST_DRAWN)
     return Stated(pi, float((w * pi).sum()), float(one_draw.sum()), stratified_variance(len(w) * w * pi, stratum))
 
 
@@ -197,25 +211,47 @@ def stratified_variance(values: Vector, stratum: Vector) -> float:
     return total / n**2
 
 
-def draw_systematic(plan: Plan, n: int, order: Vector, rng: np.random.Generator) -> Draws:
+def draw_systematic(plan: Plan, n: int, order: Vector, rng: np.random.Generator, *, once: bool = True) -> Draws:
     """Return n draws: the nominal share independently, the others systematic along an order of the pool.
 
-    Every pool point is expected n r times, exactly. The nominal draws are independent, so that what they miss has an exact
-    bound; of the others, neighbours in the order are not drawn together more often than needed.
+    Every pool point is expected n r times, exactly, with the r of the plan that is returned. The nominal draws are
+    independent, so that what they miss has an exact bound; of the others, neighbours in the order are not drawn together more
+    often than needed.
 
     Args:
         plan: probabilities and control variates.
         n: number of draws.
         order: (N,) a number by which the pool is ordered.
         rng: the only source of randomness.
+        once: none of the systematic draws repeats a point: what a sharp belief would give it beyond certainty goes to the
+            others. A deterministic simulator tells nothing new the second time.
     """
     nominal = int(plan.nominal * n + rng.random())  # rounded at random: its expectation is exact
     known = _inverted(plan.nominal_probability, rng.random(nominal))
+    rest, others = np.maximum(plan.probability - plan.nominal * plan.nominal_probability, 0.0), n - nominal
+    if once and others:
+        expected = _at_most_one(rest, others)
+        plan, rest = plan.drawn_with((expected + nominal * plan.nominal_probability) / n), expected
     rows = np.argsort(order, kind="stable")
-    rest = np.maximum(plan.probability - plan.nominal * plan.nominal_probability, 0.0)[rows]
-    others = n - nominal
-    drawn = np.concatenate([known, rows[_inverted(rest, (np.arange(others) + rng.random()) / max(others, 1))]])
-    return Draws(drawn, plan.weight[drawn] / plan.probability[drawn], plan.control_variate[drawn], nominal)
+    drawn = rows[_inverted(rest[rows], (np.arange(others) + rng.random()) / max(others, 1))]
+    return Draws(np.concatenate([known, drawn]), plan, nominal)
+
+
+def _at_most_one(probability: Vector, n: int) -> Vector:
+    """Return (N,) how often n draws are expected to meet each point: in proportion to a probability, never above 1.
+
+    Where there are no more than n points, they are met in proportion alone.
+    """
+    certain, total = np.zeros(len(probability), dtype=bool), float(probability.sum())
+    if np.count_nonzero(probability) <= n:
+        return probability * (n / total)
+    while True:
+        left = np.where(certain, 0.0, probability)
+        expected = np.where(certain, 1.0, left * ((n - certain.sum()) / float(left.sum())))
+        beyond = expected > 1.0
+        if not beyond.any():
+            return expected
+        certain |= beyond
 
 
 def _inverted(probability: Vector, at: Vector) -> Vector:
