@@ -3,23 +3,21 @@
     python benchmarks/asked_again.py [--seeds 20] [--table runs/asked_again.jsonl]
 
 Campaigns on `linear_d2` (P = 2.3e-4 of x1 + x2 >= 3.5 sqrt(2), both standard normal), 140 runs, `stop: {cov: null}`, and the
-questions of `QUESTIONS`, with answers in closed form. Finished seeds are lines of the table: run again to go on; `--show` only
-prints.
+questions of `QUESTIONS`, with answers in closed form. Finished seeds are lines of the table: run again to go on, or split
+seeds over processes (`resumed.py`).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
 import tempfile
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from resumed import arguments, collect, seeds
 from scipy.stats import norm
 
 import sbt
@@ -57,7 +55,7 @@ def answers(seed: int) -> dict:
                 found[name] = None  # refused
                 continue
             found[name] = {"p": said.probability, "low": said.low, "high": said.high, "hits": said.hits}
-    return {"seed": seed, "answers": found}
+    return {"answers": found}
 
 
 def show(rows: list[dict]) -> None:
@@ -76,20 +74,8 @@ def show(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--table", type=Path, default=Path("runs/asked_again.jsonl"))
-    parser.add_argument("--show", action="store_true")
-    args = parser.parse_args()
-    args.table.parent.mkdir(parents=True, exist_ok=True)
-    lines = args.table.read_text().splitlines() if args.table.is_file() else []
-    rows = {row["seed"]: row for row in map(json.loads, lines)}
-    for seed in range(0 if args.show else args.seeds):
-        if seed not in rows:
-            rows[seed] = answers(seed)
-            with args.table.open("a") as file:
-                file.write(json.dumps(rows[seed]) + "\n")
-    show([rows[seed] for seed in sorted(rows) if seed < args.seeds])
+    args = arguments(__doc__, "runs/asked_again.jsonl", 20).parse_args()
+    show(collect(args, [{"seed": seed} for seed in seeds(args)], answers))
 
 
 if __name__ == "__main__":

@@ -4,22 +4,20 @@
     python benchmarks/estimation.py --cov 0.1 [--seeds 50] ...      # with the stop rule, at the default budget
 
 Every cell (problem, runs, seed) is a campaign with default settings, through the public way. Finished
-cells are lines of the table: run again to go on where it stopped; `--show` only prints what is there.
+cells are lines of the table: run again to go on where it stopped, or split seeds over processes (`resumed.py`).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
 import tempfile
 import time
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from resumed import arguments, collect, seeds
 from scipy.integrate import quad
 from scipy.stats import gamma, norm
 
@@ -71,25 +69,20 @@ LAWS = {
 KEPT = ("probability", "low", "high", "cov", "hits", "undetected_mass_bound", "warnings")
 
 
-def campaign(cell: str, seed: int, cov: float | None) -> dict:
+def campaign(cell: str, seed: int, stop: float | None) -> dict:
     name, _, runs = cell.partition("@")
-    size = {"budget": int(runs)} if cov is None else {}
+    size = {"budget": int(runs)} if stop is None else {}
     name, changed, _ = LAWS.get(cell, (f"testbed:{name}", {}, 0.0))
     with tempfile.TemporaryDirectory() as folder:
         start, cpu = time.perf_counter(), time.process_time()
         result = sbt.run(
-            campaign="estimation", scenario=name, seed=seed, stop={"cov": cov}, executor="serial",
+            campaign="estimation", scenario=name, seed=seed, stop={"cov": stop}, executor="serial",
             store=f"{folder}/store", report=False, **size, **changed,
         )  # fmt: skip
         summary = result.summary
     took = {"seconds": round(time.perf_counter() - start, 1), "cpu": round(time.process_time() - cpu, 1)}
     kept = {key: summary["conclusion"][key] for key in KEPT}
-    return {"cell": cell, "seed": seed, "stop": cov, "runs": summary["runs"], **took, **kept}
-
-
-def finished(table: Path, cov: float | None) -> dict[tuple[str, int], dict]:
-    rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
-    return {(row["cell"], row["seed"]): row for row in rows if row.get("stop") == cov}
+    return {"runs": summary["runs"], **took, **kept}
 
 
 def one_sided(row: dict) -> bool:
@@ -126,25 +119,16 @@ def show(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--first", type=int, default=0, help="first seed, to split them over processes with a table each")
+    parser = arguments(__doc__, "runs/estimation.jsonl", 50)
     parser.add_argument("--problems", default=",".join((*BARS, *LAWS)))
-    parser.add_argument("--table", type=Path, default=Path("runs/estimation.jsonl"))
     parser.add_argument("--cov", type=float, help="the stop rule; default: none, all runs of the cell are used")
-    parser.add_argument("--show", action="store_true")
     args = parser.parse_args()
-    args.table.parent.mkdir(parents=True, exist_ok=True)
-    done, cells = finished(args.table, args.cov), args.problems.split(",")
+    cells = args.problems.split(",")
     if unknown := set(cells) - {*BARS, *HARD, *LAWS}:
         parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join((*BARS, *HARD, *LAWS))}")
-    for seed in range(args.seeds if args.show else args.first, args.seeds):
-        for cell in cells:
-            if (cell, seed) not in done:
-                done[cell, seed] = campaign(cell, seed, args.cov)
-                with args.table.open("a") as file:
-                    file.write(json.dumps(done[cell, seed]) + "\n")
-    show([done[key] for cell in cells for key in done if key[0] == cell and key[1] < args.seeds])
+    jobs = [{"cell": cell, "seed": seed, "stop": args.cov} for seed in seeds(args) for cell in cells]
+    rows = collect(args, jobs, campaign)
+    show([row for cell in cells for row in rows if row["cell"] == cell])
 
 
 if __name__ == "__main__":

@@ -5,24 +5,22 @@
 
 Campaigns with default settings, `stop: {cov: null}`, 150 runs. The probability of both readings is known: P(critical, and the run
 gives a metric) counts failed runs as safe, P(critical, or the run fails) as critical. Finished cells are lines of the table: run
-again to go on; `--show` only prints what is there.
+again to go on, or split seeds over processes (`resumed.py`).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from resumed import arguments, collect, seeds
 from scipy.stats import multivariate_normal, norm
 
 import sbt
@@ -103,16 +101,16 @@ CELLS: dict[str, Callable[[], Cell]] = {
 KEPT = ("probability", "failed_as_critical", "low", "high", "cov", "hits", "warnings")
 
 
-def campaign(name: str, seed: int) -> dict:
+def campaign(cell: str, seed: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         cpu = time.process_time()
         result = sbt.run(
-            campaign="estimation", scenario=CELLS[name]().scenario, seed=seed, budget=RUNS, stop={"cov": None}, executor="serial",
+            campaign="estimation", scenario=CELLS[cell]().scenario, seed=seed, budget=RUNS, stop={"cov": None}, executor="serial",
             store=f"{folder}/store", report=False,
         )  # fmt: skip
         kept = {key: result.summary["conclusion"][key] for key in KEPT}
         failed = float((result.frame.status != "ok").mean())
-    return {"cell": name, "seed": seed, "failed": failed, "cpu": round(time.process_time() - cpu, 1), **kept}
+    return {"failed": failed, "cpu": round(time.process_time() - cpu, 1), **kept}
 
 
 def counts(name: str, seed: int, n: int) -> np.ndarray:
@@ -181,11 +179,6 @@ def show_counts(names: list[str], seeds: int, n: int) -> None:
         )  # fmt: skip
 
 
-def finished(table: Path) -> dict[tuple[str, int], dict]:
-    rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
-    return {(row["cell"], row["seed"]): row for row in rows}
-
-
 def show(rows: list[dict]) -> None:
     head = (
         "problem", "seeds", "P, failed as safe", "low > P", "rel. RMSE", "median (P - low) / P", "P, failed as critical",
@@ -209,28 +202,18 @@ def show(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0, help="first seed, to split them over processes with a table each")
+    parser = arguments(__doc__, "runs/failing.jsonl", 20)
     parser.add_argument("--problems", default=",".join(CELLS))
-    parser.add_argument("--table", type=Path, default=Path("runs/failing.jsonl"))
-    parser.add_argument("--show", action="store_true")
     parser.add_argument("--counts", type=int, help="simulate so many counts with the metamodel of each seed")
     args = parser.parse_args()
-    args.table.parent.mkdir(parents=True, exist_ok=True)
-    done, names = finished(args.table), args.problems.split(",")
+    names = args.problems.split(",")
     if unknown := set(names) - set(CELLS):
         parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join(CELLS)}")
     if args.counts is not None:
         show_counts(names, args.seeds, args.counts)
         return
-    for seed in range(args.seeds if args.show else args.first, args.seeds):
-        for name in names:
-            if (name, seed) not in done:
-                done[name, seed] = campaign(name, seed)
-                with args.table.open("a") as file:
-                    file.write(json.dumps(done[name, seed]) + "\n")
-    show([done[key] for name in names for key in done if key[0] == name and key[1] < args.seeds])
+    rows = collect(args, [{"cell": name, "seed": seed} for seed in seeds(args) for name in names], campaign)
+    show([row for name in names for row in rows if row["cell"] == name])
 
 
 if __name__ == "__main__":

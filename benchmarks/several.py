@@ -8,10 +8,10 @@ common. The truth is that of 20 million random draws.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 
 import numpy as np
+from resumed import arguments, collect, seeds
 
 import sbt
 from sbt import Requirement, all_of, any_of
@@ -68,70 +68,80 @@ def campaign(kind, need, seed, **keys):
         return found.conclusion, found.history
 
 
-def estimation(need, seeds):
+def estimation(need, seed):
+    """Return probability and interval of the combination and of each requirement."""
+    said, _ = campaign("estimation", need, seed, stop={"cov": None})
+    rows = {"combination": said, **{one.name: one for one in said.requirements or ()}}
+    return {name: (one.probability, one.low, one.high) for name, one in rows.items()}
+
+
+def falsification(need, seed):
+    """Return the failure modes and critical runs of each requirement."""
+    said, history = campaign("falsification", need, seed)
+    modes = {p.label: any(p.label in (mode.violates or {}) for mode in said.failure_modes) for p in need.parts}
+    runs = {p.label: int((p.critical_runs(history) & need.critical_runs(history)).sum()) for p in need.parts}
+    return {"modes": modes, "runs": runs, "found": len(said.failure_modes)}
+
+
+def boundary(need, seed):
+    """Return the stated shares of the space, expected error, correlation of residuals and calibration error."""
+    said, _ = campaign("boundary", need, seed)
+    shares = [said.critical_fraction, *(one.critical_fraction for one in said.requirements or ())]
+    correlation = 0.0 if said.independence is None else abs(said.independence.correlation)
+    return {"shares": shares, "rest": [said.expected_misclassified, correlation, said.validation.calibration_error]}
+
+
+def show_estimation(need, rows):
     """Print error and coverage of the combination and of each requirement."""
     known, error = truth(need)
-    found = {name: [] for name in known}
-    for seed in range(seeds):
-        said, _ = campaign("estimation", need, seed, stop={"cov": None})
-        rows = {"combination": said, **{one.name: one for one in said.requirements or ()}}
-        for name, one in rows.items():
-            found[name].append((one.probability, one.low, one.high))
     print(f"\n| {need.metric} | truth (±{100 * error:.1g} %) | rel. RMSE | mean error | covered | half width |\n|" + "---|" * 6)
-    for name, rows in found.items():
-        p, low, high = np.array(rows).T
-        t = known[name]
+    for name, t in known.items():
+        p, low, high = np.array([row[name] for row in rows]).T
         print(
             f"| {name} | {t:.4g} | {100 * np.sqrt(np.mean((p / t - 1) ** 2)):.1f} % | {100 * (p.mean() / t - 1):+.1f} % | "
-            f"{int(((low <= t) & (t <= high)).sum())} of {len(p)} | {100 * np.median((high - low) / 2 / t):.1f} % |", flush=True,
-        )  # fmt: skip
+            f"{int(((low <= t) & (t <= high)).sum())} of {len(p)} | {100 * np.median((high - low) / 2 / t):.1f} % |"
+        )
 
 
-def falsification(need, seeds):
+def show_falsification(need, rows):
     """Print in how many campaigns there is a failure mode, or a critical run, of each requirement."""
-    modes, runs, of_any = {p.label: 0 for p in need.parts}, {p.label: [] for p in need.parts}, []
-    for seed in range(seeds):
-        said, history = campaign("falsification", need, seed)
-        for part in need.parts:
-            modes[part.label] += any(part.label in (mode.violates or {}) for mode in said.failure_modes)
-            runs[part.label].append(int((part.critical_runs(history) & need.critical_runs(history)).sum()))
-        of_any.append(len(said.failure_modes))
-    each = ", ".join(f"{name}: {n} of {seeds} (median {np.median(runs[name]):.0f} runs)" for name, n in modes.items())
-    print(f"\n{need.metric}: modes that violate {each}; {np.median(of_any):.0f} modes in the median", flush=True)
+    each = ", ".join(
+        f"{p.label}: {sum(row['modes'][p.label] for row in rows)} of {len(rows)} "
+        f"(median {np.median([row['runs'][p.label] for row in rows]):.0f} runs)" for p in need.parts
+    )  # fmt: skip
+    print(f"\n{need.metric}: modes that violate {each}; {np.median([row['found'] for row in rows]):.0f} modes in the median")
 
 
-def boundary(need, seeds):
+def show_boundary(need, rows):
     """Print the error of the shares of the space, and of the classification of fresh points."""
-    rng, rows = np.random.default_rng(9), []
-    x = rng.uniform(-5.0, 5.0, (50_000, 3))
+    x = np.random.default_rng(9).uniform(-5.0, 5.0, (50_000, 3))
     runs = Measured(metrics(dict(zip("abc", x.T, strict=True)), 0))
     shares = [one.critical_runs(runs).mean() for one in (need, *need.parts)]
-    for seed in range(seeds):
-        said, _ = campaign("boundary", need, seed)
-        stated = [said.critical_fraction, *(one.critical_fraction for one in said.requirements or ())]
-        correlation = 0.0 if said.independence is None else said.independence.correlation
-        rows.append([*(np.array(stated) - shares), said.expected_misclassified, correlation, said.validation.calibration_error])
-    found = np.array(rows)
+    off = np.abs(np.array([row["shares"] for row in rows]) - shares).mean(axis=0)
     errors = ", ".join(
-        f"{name} {100 * t:.1f} % (off by {100 * np.abs(e).mean():.2f} %)"
-        for name, t, e in zip(["combination", *(p.label for p in need.parts)], shares, found.T, strict=False)
+        f"{name} {100 * t:.1f} % (off by {100 * e:.2f} %)"
+        for name, t, e in zip(["combination", *(p.label for p in need.parts)], shares, off, strict=True)
     )
+    misclassified, correlation, calibration = np.array([row["rest"] for row in rows]).mean(axis=0)
     print(
-        f"\n{need.metric}: shares {errors}; expected misclassified {100 * found[:, -3].mean():.2f} %, correlation of residuals"
-        f" {np.abs(found[:, -2]).mean():.2f} in the mean, calibration error {found[:, -1].mean():.3f}", flush=True,
-    )  # fmt: skip
+        f"\n{need.metric}: shares {errors}; expected misclassified {100 * misclassified:.2f} %, correlation of residuals"
+        f" {correlation:.2f} in the mean, calibration error {calibration:.3f}"
+    )
 
 
 def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20)
+    """Run what is missing, and print the tables."""
+    parser = arguments(__doc__, "runs/several.jsonl", 20)
     parser.add_argument("--what", nargs="+", default=list(RUNS), choices=list(RUNS))
     parser.add_argument("--needs", nargs="+", default=list(NEEDS), choices=list(NEEDS))
     args = parser.parse_args()
+    jobs = [{"what": what, "need": need, "seed": seed} for seed in seeds(args) for what in args.what for need in args.needs]
+    rows = collect(args, jobs, lambda what, need, seed: globals()[what](NEEDS[need], seed))
     for what in args.what:
-        for name in args.needs:
-            globals()[what](NEEDS[name], args.seeds)
+        for need in args.needs:
+            mine = [row for row in rows if (row["what"], row["need"]) == (what, need)]
+            if mine:
+                globals()[f"show_{what}"](NEEDS[need], mine)
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ def test_every_pool_point_is_expected_as_often_as_its_probability_says(once):
         most = max(most, np.bincount(found[drawn[-1].nominal :]).max())
     expected = sum(10 * each.plan.probability for each in drawn)
     assert np.all(np.abs(counts - expected) < 5 * np.sqrt(expected) + 5)
-    assert (most == 1) is once
+    assert bool(most == 1) is once
 
 
 def test_the_mixture_has_the_density_it_claims():
