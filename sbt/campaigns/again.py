@@ -7,7 +7,7 @@ A metamodel that knows only the runs before a batch is the control variate of it
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from sbt.campaigns.crude import NOMINAL
 from sbt.campaigns.known import Known
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.summing import counted_with, took_sum
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores, log_normal
 from sbt.estimators.events import events
@@ -95,11 +96,15 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
     x = space.sample(_RATIOS, stream(settings.seed, "ratio"))
     crude = NOMINAL in history.stage
     plain = np.flatnonzero(history.stage == NOMINAL)
-    draws = [_Draws(-1, plain, len(plain))] if crude else [*_counted(log)]
+    if took_sum(log):
+        plain, log_q = counted_with(log, old)
+        history = replace(history, columns={**history.columns, "log_q": log_q})
+    plainly = crude or took_sum(log)
+    draws = [_Draws(-1, plain, len(plain) if crude else 0)] if plainly else [*_counted(log)]
     every, reached = np.concatenate([d.rows for d in draws]), np.isfinite(space.log_density(history.x))
-    least = _least(history.where(np.isin(np.arange(len(history)), every)), old, space)
+    least = 0.0 if took_sum(log) else _least(history.where(np.isin(np.arange(len(history)), every)), old, space)
     predicted = [(_NOTHING_SAID, _NOTHING_SAID)]
-    if not crude:
+    if not plainly:
         with threadpool_limits(1):
             predicted = [*_predicted(log, settings, space, draws)]
     batches, worst = (
@@ -168,7 +173,7 @@ def _counted(log: Log) -> Iterator[_Draws]:
 def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
     """Refuse what cannot be answered from these runs."""
     history = log.history
-    if NOMINAL not in history.stage and next(_counted(log), None) is None:
+    if NOMINAL not in history.stage and not took_sum(log) and next(_counted(log), None) is None:
         rule = "only draws with known densities can be counted again, but this campaign has none that count"
         raise InputError(f"{rule}: run an estimation with acquisition.kind difference or monte_carlo")
     for metric in (part.metric for part in settings.scenario.requirement.parts):

@@ -12,6 +12,7 @@ from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion
 from sbt.campaigns.parts import CriticalShare, share_of
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.summing import summed, took_sum
 from sbt.campaigns.wording import number, percent
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.loop.stages import Log
@@ -57,10 +58,14 @@ def each_estimate(log: Log, settings: Settings, confidence: float = _CONFIDENCE)
     """Return the probability of each requirement of a combination; None where there is one, or nothing counts yet.
 
     From the draws that count; without such, of those that were made from the inputs' distribution (of subset simulation, its
-    first level).
+    first level), or summed over all combinations of inputs.
     """
     if not settings.scenario.requirement.combined:
         return None
+    if took_sum(log):
+        tail = 0.5 * (1.0 + confidence)
+        sums = [(part.label, summed(log, settings, part)) for part in settings.scenario.requirement.parts]
+        return tuple(RequirementEstimate(n, s.share.value, s.lower(tail), s.upper(tail), s.hits) for n, s in sums)
     if counted_iterations(log):
         return _from_batches(log, settings, confidence)
     stage = next((stage for stage in NOMINAL_STAGES if (log.history.stage == stage).any()), None)

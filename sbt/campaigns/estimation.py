@@ -15,6 +15,7 @@ from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.stopping import FEWEST_BATCHES
+from sbt.campaigns.summing import SummingStage, summed, sums, took_sum
 from sbt.campaigns.telling import tell_estimation
 from sbt.campaigns.warmed import WarmTraffic, warmed_limits, warmed_traffic
 from sbt.campaigns.wording import number, plural
@@ -25,7 +26,7 @@ from sbt.loop.stages import Campaign, Facts, Log, Stage
 from sbt.problem.plain import Json
 from sbt.store.records import optional, to_json
 
-__all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "recipe"]
+__all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "conclude_sum", "recipe"]
 
 _HIGH_DIMENSION = 20  # inputs from which on the metamodels learn less than the chains of subset simulation find
 _CONFIDENCE = 0.95
@@ -66,6 +67,7 @@ class EstimationConclusion:
         simulator_noise: what repeats with other seeds tell; None: none were asked for.
         requirements: of a combination, the probability of each requirement, from the same draws.
         warmed_traffic: what the result is conditional on, where runs began with warmed traffic.
+        combinations: of whole numbers and choices, where all of them were to be run and their probabilities summed.
     """
 
     probability: float | None
@@ -87,6 +89,7 @@ class EstimationConclusion:
     simulator_noise: SimulatorNoise | None = optional()
     requirements: tuple[RequirementEstimate, ...] | None = optional()
     warmed_traffic: WarmTraffic | None = optional()
+    combinations: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -112,7 +115,8 @@ Concluded = tuple[EstimationConclusion, Limits]
 def recipe(settings: Settings) -> Campaign:
     """Return the campaign: `difference` (the sequential estimator), `monte_carlo`, or `subset`.
 
-    `auto` is `subset` from 20 inputs on, `difference` below.
+    `auto` is `subset` from 20 inputs on, `difference` below; where the budget is enough to run every combination of whole
+    numbers and choices, it runs them.
 
     Raises:
         InputError: recorded rows, which have no distribution to draw from, or an unknown method.
@@ -125,6 +129,8 @@ def recipe(settings: Settings) -> Campaign:
             rule = f"warm_start.transfer needs fewer than {_HIGH_DIMENSION} inputs, or acquisition.kind difference"
             raise InputError(f"{rule}, but got {settings.scenario.space.dimension} inputs")
         return _campaign(settings, ManyInputsStage(settings), _from_either)
+    if method == "auto" and sums(settings):
+        return _campaign(settings, SummingStage(settings), conclude_sum)
     method = "difference" if method == "auto" else method
     if method == "monte_carlo":
         cov = settings.stop.get("cov")
@@ -278,6 +284,20 @@ def _from_either(log: Log, settings: Settings) -> Concluded:
 def _from_draws(log: Log, settings: Settings) -> Concluded:
     """Return what crude Monte Carlo says where noise left it to that, else the draws of pools."""
     return _from_nominal(log, settings) if took_monte_carlo(log) else _from_batches(log, settings)
+
+
+def conclude_sum(log: Log, settings: Settings) -> Concluded:
+    """Return the sum over the combinations; what draws say where a smaller budget had begun with them."""
+    if not took_sum(log):
+        return _from_draws(log, settings)
+    found = summed(log, settings)
+    value, limits = _clipped(found.share.value), Limits(found.lower, found.upper)
+    bound = limits.upper(_CONFIDENCE) if found.hits == 0 and limits.upper(_CONFIDENCE) > 0.0 else None
+    return _conclusion(
+        value, limits, cov=found.std_error / value if value > 0 else None, hits=found.hits, failed_as_safe=value,
+        failed_as_critical=_clipped(found.worst.value), effective_sample_size=float(len(found.share.weight)),
+        undetected_mass_bound=found.missing, counted=len(found.share.weight), combinations=found.combinations, exact_bound=bound,
+    ), limits  # fmt: skip
 
 
 def _from_repeats(log: Log, settings: Settings) -> Concluded:

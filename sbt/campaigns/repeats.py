@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.campaigns.wording import number, plural
+from sbt.campaigns.wording import number, percent, plural
 from sbt.problem.arrays import Points
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
@@ -16,15 +16,17 @@ from sbt.store.database import PlannedRun
 from sbt.store.history import History
 from sbt.store.records import to_json
 
-__all__ = ["REPEAT", "SimulatorNoise", "equal_inputs", "repeats_wanted", "simulator_noise", "stated_noise"]
+__all__ = ["REPEAT", "WANTED", "SimulatorNoise", "equal_inputs", "repeats_wanted", "simulator_noise", "stated_noise"]
 
 REPEAT = "repeat"
 """Stage of the early runs that repeat inputs with other seeds; metamodels learn from them."""
-_REPEATS = 2
+WANTED = 2
 """Early repeats: all that a deterministic simulator costs. A noisy one gives itself away by the first, unless the metric stands
 at an end of its range."""
 _ATTEMPTS = 4
 """Most of them, where some fail."""
+_DOUBT = 0.05
+"""That noise in some share of the pairs was met by none of them."""
 _EQUAL = 1e-9
 """Relative difference up to which two values of a metric are the same: the last digits of a sum are no noise."""
 
@@ -54,7 +56,11 @@ class SimulatorNoise:
             return []
         again = f"{plural(self.repeats, 'run')} repeated inputs with other seeds"
         if not self.noisy:
-            return [f"The simulator seems deterministic: {again} and gave the same metrics."]
+            missed = percent(1.0 - _DOUBT ** (1.0 / self.repeats))
+            pairs = "in the only pair" if self.repeats == 1 else f"in all {self.repeats} pairs"
+            said = f"No noise was met: metrics were equal {pairs} of runs with the same inputs and other seeds"
+            sure = percent(1.0 - _DOUBT)
+            return [f"{said}; with {sure} confidence, noise shows in less than {missed} of such pairs."]
         if self.std == 0.0:
             return [f"The simulator is noisy: where {again}, other metrics differed; {metric} did not."]
         spread = f"{number(self.std, 3)} {unit}".rstrip()
@@ -107,7 +113,7 @@ def repeats_wanted(history: History, scenario: LogicalScenario, most: int) -> tu
     runs = history.training
     known = simulator_noise(history, scenario.requirement).repeats
     tried = int((history.stage == REPEAT).sum())
-    n = min(_REPEATS - known, _ATTEMPTS - tried, most)
+    n = min(WANTED - known, _ATTEMPTS - tried, most)
     if scenario.pool is not None or n <= 0 or len(runs) == 0:
         return ()
     y, margin = scenario.requirement.told(runs), scenario.requirement.margins(runs)

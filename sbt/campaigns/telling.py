@@ -225,8 +225,11 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     confidence, n = percent(found.confidence), len(facts.history)
     verdict = "" if found.gate is None else f"Gate: {found.gate.verdict}; {found.gate.statement}. "
     rests = "" if n == 0 else f", from {plural(n, 'run')}"
-    if found.counted:
-        critical = f"{found.hits:,} of them {'was' if found.hits == 1 else 'were'} critical"
+    every = found.combinations is not None and found.undetected_mass_bound == 0.0
+    critical = f"{found.hits:,} of them {'was' if found.hits == 1 else 'were'} critical"
+    if every and found.counted:
+        rests += f", of which {found.counted:,} count: every one of the {found.combinations:,} combinations of inputs, and {critical}"
+    elif found.counted:
         rests += f", of which {plural(found.counted, 'random draw')} count{'s' if found.counted == 1 else ''} and {critical}"
     subject = f"a critical run{_of(facts)} ({_condition(facts)}) under the inputs' distribution"
     if found.exact_bound is not None:
@@ -244,7 +247,9 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
             f"This does not tell of critical regions that no run has met: with {confidence} confidence they hold at most"
             f" {number(missed, 3)} more, which bounds the unseen and is no second estimate"
         )
-        if missed > found.high:
+        if every:
+            silent = "It is a sum over all combinations, none of which is unseen; it does not tell of noise that repeats do not show"
+        elif missed > found.high:
             silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_after_estimation(found, n)}."]
 

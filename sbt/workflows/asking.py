@@ -7,8 +7,9 @@ from pathlib import Path
 
 from sbt.campaigns.again import reused
 from sbt.campaigns.asking import Sensitivity, answer, sensitivities
-from sbt.campaigns.estimation import EstimationConclusion
+from sbt.campaigns.estimation import EstimationConclusion, conclude_sum
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.summing import took_sum
 from sbt.config.asked import asked_space
 from sbt.errors import InputError
 from sbt.loop.stages import Facts, Log
@@ -79,7 +80,11 @@ def estimate_again(
     space = asked_space(inputs or {}, scenario.space)
     settings = _settings(study, requirement)
     found = reused(log, settings, space)
-    return Answer(folder, requirement, space, answer(found), sensitivities(found))
+    if took_sum(log):
+        said, _ = conclude_sum(log, replace(settings, scenario=replace(settings.scenario, space=space)))
+    else:
+        said = answer(found)
+    return Answer(folder, requirement, space, said, sensitivities(found))
 
 
 def sensitivities_in(study: Study, log: Log) -> tuple[Sensitivity, ...]:

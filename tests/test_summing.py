@@ -1,0 +1,115 @@
+"""Laws of estimations that run every combination: exact without noise, stratified with it, whatever was asked."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import sbt
+from sbt.campaigns.summing import Summed
+from sbt.estimators.reweighting import WeightedShare
+from sbt.problem.combination import any_of
+from sbt.seeds import stream
+
+KINDS = {"car": 0.7, "bus": 0.25, "tram": 0.05}
+LANES = {1: 0.5, 2: 0.3, 3: 0.2}
+
+
+def margin(values):
+    return values["lane"] - 1.5 + (0.8 if values["kind"] == "car" else -0.7)
+
+
+def campaign(tmp_path: Path, *, noise=0.0, fails=(), requirement=None, **keys):
+    def evaluate(values, seed):
+        y = margin(values) + noise * stream(seed, "noise").standard_normal()
+        return {"m": math.nan if values["kind"] in fails else y, "lane": values["lane"]}
+
+    inputs = [
+        sbt.Parameter("kind", choices=KINDS), sbt.Parameter("side", choices=("left", "right")),
+        sbt.Parameter("lane", 1, 3, kind="integer", distribution=sbt.Normal(1.0, 1.2)),
+    ]  # fmt: skip
+    scenario = sbt.Scenario(
+        "few", inputs=inputs, evaluate=evaluate, requirement=requirement or sbt.Requirement("m", high=0.0),
+        metrics=["m", "lane"],
+    )  # fmt: skip
+    keys = {"budget": 100, "seed": 3, "executor": "serial", "report": False} | keys
+    return sbt.run(campaign="estimation", scenario=scenario, store=tmp_path / "s", **keys)
+
+
+def lanes(mean=1.0):
+    """Probabilities of the lanes: a normal distribution, truncated, rounded."""
+    p = np.diff(norm.cdf([0.5, 1.5, 2.5, 3.5], mean, 1.2))
+    return dict(zip((1, 2, 3), p / p.sum(), strict=True))
+
+
+def truth(mean=1.0, allowed=lambda kind, lane: True):
+    share = {(k, n): KINDS[k] * p for k in KINDS for n, p in lanes(mean).items() if allowed(k, n)}
+    return sum(p for (k, n), p in share.items() if margin({"kind": k, "lane": n}) <= 0) / sum(share.values())
+
+
+def test_every_combination_is_run_once_and_the_sum_is_exact(tmp_path):
+    result = campaign(tmp_path)
+    said, runs = result.conclusion, result.history
+    assert result.summary["stopped"] == "all combinations"
+    assert len(np.unique(runs.x, axis=0)) == said.combinations == 18
+    assert len(runs) == 18 + 2  # two repeats tell of noise
+    assert said.low == said.probability == said.high == pytest.approx(truth(), rel=1e-9)
+    assert (said.cov, said.undetected_mass_bound) == (0.0, 0.0)
+    again = result.estimate({"lane": {"distribution": {"kind": "normal", "mean": 2.0, "std": 1.2}}})
+    assert again.low == again.probability == again.high == pytest.approx(truth(2.0), rel=1e-9)
+
+
+def test_constraints_leave_combinations_of_exact_probability(tmp_path):
+    said = campaign(tmp_path, constraints=["lane < 3"]).conclusion
+    assert said.combinations == 12
+    assert said.low == said.high == pytest.approx(truth(allowed=lambda kind, lane: lane < 3), rel=1e-9)
+
+
+def test_failed_combinations_widen_the_interval_by_their_probability(tmp_path):
+    said = campaign(tmp_path, fails=("tram",)).conclusion
+    known = truth() - KINDS["tram"] * sum(p for n, p in lanes().items() if margin({"kind": "tram", "lane": n}) <= 0)
+    assert (said.low, said.high) == pytest.approx((known, known + KINDS["tram"]), rel=1e-9)
+
+
+def test_each_requirement_is_summed(tmp_path):
+    both = any_of(sbt.Requirement("m", high=0.0), sbt.Requirement("lane", low=3.0))
+    said = campaign(tmp_path, requirement=both).conclusion
+    assert [each.probability for each in said.requirements] == pytest.approx([truth(), lanes()[3]], rel=1e-9)
+    assert all(each.low == each.high for each in said.requirements)
+
+
+def test_a_noisy_simulator_is_asked_again_in_proportion(tmp_path):
+    result = campaign(tmp_path, noise=0.6, stop={"cov": None}, budget=150)
+    said = result.conclusion
+    expected = sum(KINDS[k] * p * norm.cdf(-margin({"kind": k, "lane": n}) / 0.6) for k in KINDS for n, p in lanes().items())
+    assert result.summary["stopped"] == "budget"
+    assert said.low < expected < said.high
+    assert said.high - said.low < 0.25
+    kinds = result.history.x[np.isin(result.history.stage, ("combination", "replicate")), 0]
+    car, bus, tram = (int((kinds == k).sum()) for k in range(3))
+    assert car > 2 * bus > 2 * tram
+
+
+def test_a_budget_that_is_too_small_goes_on_with_draws_where_it_grows(tmp_path):
+    first = campaign(tmp_path, budget=14, initial=14, batch=6)
+    assert set(first.history.stage) == {"initial"}
+    more = campaign(tmp_path, budget=20, initial=14, batch=6)
+    assert "combination" not in more.history.stage
+    assert len(more.history) > len(first.history)
+
+
+def test_limits_of_noisy_sums_cover():
+    """Strata of unequal probability, sizes in proportion, and rates between 0 and 1."""
+    rng, p, n = stream(1, "strata"), np.array([0.5, 0.3, 0.15, 0.05]), np.array([20, 12, 6, 2])
+    weight = np.repeat(p / n * n.sum(), n)
+    for rate in ([0.1, 0.02, 0.3, 0.9], [0.9, 0.95, 1.0, 0.4]):
+        rate, missed = np.array(rate), np.zeros(2)
+        for _ in range(600):
+            share = WeightedShare(weight, (rng.random(n.sum()) < np.repeat(rate, n)).astype(float))
+            found = Summed(share, share, 0.0, 4, True)
+            missed += found.lower(0.975) > p @ rate, found.upper(0.975) < p @ rate
+        assert (missed / 600 < 0.035).all()
