@@ -228,7 +228,7 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     every = found.combinations is not None and found.undetected_mass_bound == 0.0
     critical = f"{found.hits:,} of them {'was' if found.hits == 1 else 'were'} critical"
     if every and found.counted:
-        rests += f", of which {found.counted:,} count: every one of the {found.combinations:,} combinations of inputs, and {critical}"
+        rests += f", of which {found.counted:,} count, all {found.combinations:,} combinations of the inputs, and {critical}"
     elif found.counted:
         rests += f", of which {plural(found.counted, 'random draw')} count{'s' if found.counted == 1 else ''} and {critical}"
     subject = f"a critical run{_of(facts)} ({_condition(facts)}) under the inputs' distribution"
@@ -248,7 +248,7 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
             f" {number(missed, 3)} more, which bounds the unseen and is no second estimate"
         )
         if every:
-            silent = "It is a sum over all combinations, none of which is unseen; it does not tell of noise that repeats do not show"
+            silent = "This is a sum over all combinations: none is unseen. It does not tell of noise that repeats do not show"
         elif missed > found.high:
             silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_after_estimation(found, n)}."]
