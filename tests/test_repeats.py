@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import sbt
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, repeats_wanted, simulator_noise
+from sbt.loop.stages import Facts
 from sbt.problem.outcome import Status
 from sbt.problem.requirement import Requirement
 from sbt.store.history import VALIDATION, History, Record
@@ -84,7 +84,7 @@ def test_every_guided_campaign_learns_and_says_whether_the_simulator_is_noisy(
     assert len(again) == 2  # all that it costs
     assert {tuple(x) for x in again.x} <= {tuple(x) for x in rows.x[rows.iteration == 0]}
     assert (rows.stage != "confirm").sum() <= budget
-    said = " ".join(result.conclusion.sentences(SimpleNamespace(history=rows, requirement=scenario.requirement, unit="m")))
+    said = " ".join(result.conclusion.sentences(Facts(rows, scenario.requirement, unit="m")))
     assert ("The simulator is noisy: where" in said) == (noise > 0)
     assert ("No noise was met: metrics were equal in all" in said) == (noise == 0)
 
