@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -73,3 +77,10 @@ def test_egos_of_sumo(tmp_path):
     done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both"), "--json"])
     found = json.loads(done.stdout)
     assert found["after"]["critical"] > found["before"]["critical"] > 0
+    page = Path(found["page"]).read_text(encoding="utf-8")
+    packed = re.search(r'id="explorer-data">([^<]*)<', page)
+    pairs = json.loads(gzip.decompress(base64.b64decode(packed[1])))["pairs"]
+    assert [pair["title"] for pair in pairs] == [f"new: run {each['run']}" for each in found["new"]][:6]
+    for pair in pairs:
+        assert [said.split(",")[0] for said in pair["said"]] == ["not critical", "critical"]
+        assert pair["films"][0]["actors"][0]["v"] != pair["films"][1]["actors"][0]["v"], "the films are of two egos"

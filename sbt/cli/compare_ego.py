@@ -50,4 +50,4 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         found = result[name]
         shown = ", ".join(str(f["run"]) for f in found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
         lines.append(f"  {len(found)} {name}" + (f": runs {shown}" if found else ""))
-    return [*lines, f"  {result['still']} critical with both"]
+    return [*lines, f"  {result['still']} critical with both", f"page: {result['page']}"]

@@ -7,6 +7,13 @@ const unpacked = async id => {
   const stream = new Blob([bytesOf(packed)]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).text();
 };
+// The library is large: it is unpacked after the page is painted.
+const withLibrary = async then => {
+  const script = document.createElement("script");
+  script.textContent = await unpacked("library");
+  document.head.append(script);
+  await then();
+};
 const summed = series => { let last = 0; return series.map(d => d === null ? NaN : (last += d)); };
 
 // An element with attributes (on...: a listener) and children; strings become text.

@@ -173,13 +173,6 @@ class Explorer {
   }
 }
 
-// The library is large: it is unpacked after the page is painted.
-const withLibrary = async then => {
-  const script = document.createElement("script");
-  script.textContent = await unpacked("library");
-  document.head.append(script);
-  await then();
-};
 const begin = async () => {
   const place = document.getElementById("explore");
   if (!place || !window.DecompressionStream) return;

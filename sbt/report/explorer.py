@@ -16,7 +16,7 @@ import numpy as np
 
 from sbt.campaigns.failures import FalsificationConclusion
 from sbt.problem.parameter import Parameter
-from sbt.problem.plain import Json
+from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.influence import Influence
 from sbt.report.projection import Predict
@@ -24,7 +24,7 @@ from sbt.report.reel import Film, Reels
 from sbt.report.slices import slices_through
 from sbt.report.words import Findings
 
-__all__ = ["explorer_data", "library", "packed", "scripts", "styles"]
+__all__ = ["explorer_data", "library", "packed", "render", "scripts", "styles"]
 
 _MOST = 20_000
 """Largest number of runs in the page."""
@@ -175,3 +175,14 @@ def styles() -> str:
 
 def _own(name: str) -> str:
     return files("sbt.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def render(template: str, values: JsonMapping) -> str:
+    """Return a page from a template of this folder; whatever is not ours is escaped."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        loader=jinja2.PackageLoader("sbt.report", "."),
+    )  # fmt: skip
+    return environment.get_template(template).render(values)

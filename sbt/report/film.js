@@ -128,6 +128,11 @@ class Scene {
     const bar = [1, 2, 5, 10, 20, 50].find(m => m * scale > 50 * sharp) || 100;
     c.fillRect(10 * sharp, h - 9 * sharp, bar * scale, 2 * sharp);
     write(`${bar} m`, 10 * sharp, h - 14 * sharp, "left");
+    const other = this.film.actors[this.film.opponent ?? -1], dx = other ? between(other.x, at) - mx : NaN, dy = other ? between(other.y, at) - my : NaN;
+    if (Math.abs(dx) > this.film.half[0] || Math.abs(dy) > this.film.half[1] * 1.02) {
+      const ego = this.film.actors[0], away = Math.hypot(dx + mx - between(ego.x, at), dy + my - between(ego.y, at));
+      write(`${shortened(other.name, 20)} ${away.toFixed(0)} m away`, w / 2, h - 14 * sharp, "center");
+    }
     const hits = this.film.contacts.filter(hit => hit.time <= t).map(hit => `contact with ${shortened(hit.with, 20)} at ${hit.time.toFixed(1)} s`);
     if (hits.length) { c.fillStyle = colour("--critical"); write(hits[0], w - 8 * sharp, h - 9 * sharp, "right"); }
   }
@@ -186,7 +191,7 @@ class Player {
 }
 
 // Curves over time, a panel each; returns a function that moves the line of the moment.
-const drawCurves = async (Plotly, place, film, look) => {
+const drawCurves = async (Plotly, place, film, look, end = film.time[film.time.length - 1]) => {
   const panels = [...new Set(film.curves.map(curve => curve.panel))];
   const colours = [ACTORS.ego, ACTORS.other];
   const n = panels.length, layout = look({ height: 40 + 96 * n, margin: { l: 52, r: 12, t: 8, b: 34 }, showlegend: false, shapes: [] });
@@ -204,7 +209,7 @@ const drawCurves = async (Plotly, place, film, look) => {
     for (const limit of curve.limits || []) layout.shapes.push({ type: "line", xref: "paper", x0: 0, x1: 1, y0: limit, y1: limit,
       yref: `y${p ? p + 1 : ""}`, line: { color: colour("--critical"), width: 1, dash: "dash" } });
   });
-  layout.xaxis = { ...layout.xaxis, anchor: `y${n > 1 ? n : ""}`, title: { text: "time (s)", font: { size: 11 } }, range: [0, film.time[film.time.length - 1] || 1] };
+  layout.xaxis = { ...layout.xaxis, anchor: `y${n > 1 ? n : ""}`, title: { text: "time (s)", font: { size: 11 } }, range: [0, end || 1] };
   layout.hovermode = "x unified";
   const cursor = layout.shapes.length;
   layout.shapes.push({ type: "line", xref: "x", yref: "paper", x0: 0, x1: 0, y0: 0, y1: 1, line: { color: colour("--ink"), width: 1.2 } });

@@ -17,7 +17,7 @@ from sbt.plugins import OBJECT
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.choosing import runs_to_film
-from sbt.report.explorer import explorer_data, library, packed, scripts, styles
+from sbt.report.explorer import explorer_data, library, packed, render, scripts, styles
 from sbt.report.gallery import Drawing, draw
 from sbt.report.influence import influence_of
 from sbt.report.modes import mode_table
@@ -68,7 +68,7 @@ def write_report(
     for drawing in drawings:
         write_atomically(target / "figures" / f"{drawing.name}.svg", drawing.svg)
     reference = str(found.configuration.get("scenario", scenario.name))
-    page = _render({
+    page = render("template.html", {
         "title": _title(scenario),
         "description": "\n".join(scenario.description.strip().splitlines()[1:]).strip(),
         "facts": _facts(found, scenario, store),
@@ -89,16 +89,6 @@ def write_report(
         "configuration": _configuration(found),
     })  # fmt: skip
     return write_atomically(target / REPORT, page)
-
-
-def _render(values: JsonMapping) -> str:
-    import jinja2
-
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        loader=jinja2.PackageLoader("sbt.report", "."),
-    )  # fmt: skip
-    return environment.get_template("template.html").render(values)
 
 
 def _explorer(data: Json, from_metamodel: bool) -> Json:

@@ -6,13 +6,15 @@ the same (common random numbers), so that only the runs with different verdicts 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sbt.campaigns.wording import number
 from sbt.config.load import load
 from sbt.errors import InputError
 from sbt.estimators.binomial import interval
@@ -20,14 +22,20 @@ from sbt.estimators.monte_carlo import Proportion
 from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask
 from sbt.problem.plain import Json
+from sbt.report.versus import write_versus
 from sbt.store.database import Store
 from sbt.store.history import History
+from sbt.workflows.filming import film_runs
 from sbt.workflows.running import run_study
 from sbt.workflows.study import Study
 
 __all__ = ["Pairs", "compare_egos"]
 
 _CONFIDENCE = 0.95
+_FILMED = 6
+"""Films are made of so many fixed and so many new failures ..."""
+_SECONDS = 20.0
+"""... whose runs took at most so long together when they were recorded (s)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +90,7 @@ def compare_egos(
 
     Returns:
         Probabilities with intervals, their difference with its interval, a verdict (`fell`, `rose`,
-        `undecided`), and the runs that were fixed and that are new, with inputs and seed.
+        `undecided`), the runs that were fixed and that are new, with inputs and seed, and the path of a page with their films.
 
     Raises:
         InputError: the configurations ask for different inputs, distributions or requirements.
@@ -106,7 +114,36 @@ def compare_egos(
     for study in (one, other):
         run_study(study, progress=progress, report=False)
     histories = [_history(store / name) for name in ("a", "b")]
-    return _result(histories[0], histories[1], requirement)
+    result = _result(histories[0], histories[1], requirement)
+    return {**result, "page": str(_page(store, (one, other), histories, result, f"{first.stem} and {second.stem}"))}
+
+
+def _page(store: Path, studies: Sequence[Study], histories: Sequence[History], result: Json, names: str) -> Path:
+    """Write the page of a comparison, with the films of some pairs, and return its path."""
+    scenario, kinds = studies[0].scenario, {f["run"]: kind for kind in ("fixed", "new") for f in result[kind][:_FILMED]}
+    rows = {int(index): row for row, index in enumerate(histories[0].index)}
+    took = {run: sum(float(h.seconds[rows[run]]) for h in histories) for run in kinds}
+    within = np.cumsum([took[run] for run in kinds]) <= _SECONDS
+    chosen = [run for run, short in zip(kinds, within, strict=True) if short]
+    films, notes = [], []
+    for study, history, name in zip(studies, histories, ("a", "b"), strict=True):
+        said = {run: _said(study, history, rows[run]) for run in chosen}
+        found, note = film_runs(study, history, said, folder=store / name)
+        films.append({film.run: film for film in found})
+        notes.append(note)
+    both = [(kinds[run], films[0][run], films[1][run]) for run in chosen if run in films[0] and run in films[1]]
+    commands = "\n".join(shlex.join(["sumo-sbt", "replay", str(store / name)]) + " RUN --gif RUN.gif" for name in ("a", "b"))
+    title = f"{scenario.name}: {names} on the same draws"
+    units, note = {p.name: p.unit for p in scenario.space.parameters}, " ".join(dict.fromkeys(filter(None, notes)))
+    return write_versus(store, title, result, both, units=units, commands=commands, note=note)
+
+
+def _said(study: Study, history: History, row: int) -> str:
+    """Return the verdict of a run and its metrics in words."""
+    requirement, units = study.scenario.requirement, {m.name: m.unit for m in study.scenario.metrics}
+    verdict = "critical" if requirement.critical_runs(history)[row] else "not critical"
+    metrics = dict.fromkeys(part.metric for part in requirement.parts)
+    return ", ".join([verdict, *(f"{m} {number(float(history.y(m)[row]), 3)} {units.get(m, '')}".strip() for m in metrics)])
 
 
 def _history(folder: Path) -> History:
