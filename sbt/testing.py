@@ -13,10 +13,13 @@ from sbt.workflows.contracts import (
     check_sampler,
     check_scenario,
 )
+from sbt.workflows.pinning import Pinned, PinnedRun
 from sbt.workflows.plausibility import check_physics
 
 __all__ = [
     "ContractError",
+    "Pinned",
+    "PinnedRun",
     "check_acquisition",
     "check_campaign",
     "check_metamodel",

@@ -18,7 +18,8 @@ import pytest
 from typer.testing import CliRunner
 
 from sbt.campaigns.settings import PlainConclusion
-from sbt.cli import app, console
+from sbt.cli import app, console, progress
+from sbt.cli.completion import complete_scenarios, complete_stores
 from sbt.cli.conclusion import conclusion_lines
 from sbt.errors import InputError, StoreError
 from sbt.loop.stages import Progress
@@ -443,3 +444,45 @@ def test_numbers_of_numpy_and_infinities_become_json(capsys: pytest.CaptureFixtu
 
     console.print_json({"a": np.float64(1.5), "b": [np.int64(2), float("inf")], "c": (np.nan, None, True), "d": Path("x")})
     assert json.loads(capsys.readouterr().out) == {"a": 1.5, "b": [2, None], "c": [None, None, True], "d": "x"}
+
+
+def test_progress_never_goes_beyond_its_total_and_tells_what_a_person_asks(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "120")
+    clock = iter(range(0, 1000, 2))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))
+    with console.ProgressDisplay() as show:
+        for done in (0, 4, 8):
+            show(Progress(done, 8, 1, 2, 0, "simulating"))
+            assert show._bar.tasks[0].completed <= show._bar.tasks[0].total == 8
+        show(Progress(10, 8, 1, 2, 1, "confirm: choosing"))
+        assert show._bar.tasks[0].completed == 8
+    said = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err)
+    for part in ("4/8", "/s", "2 critical", "1 failed", "s left", "confirm: choosing", "8 + 2"):
+        assert part in said, said
+
+
+def test_help_names_no_type_of_a_flag(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for verb in ("run", "simulate", "status", "pin", "list"):
+        assert "bool" not in call(verb, "--help").stdout.lower()
+    assert "bool" not in call("--help").stdout.lower()
+
+
+def test_a_shell_completes_scenarios_and_stores(folder: Path):
+    store(folder / "first")
+    (folder / "deep").mkdir()
+    (folder / "first").rename(folder / "deep" / "first")
+    assert complete_scenarios("cut") == ["cut_in"]
+    assert complete_scenarios("c.") == ["c.yaml"]
+    assert complete_stores("") == ["deep/first"]
+    assert complete_stores("deep/f") == ["deep/first"]
+    assert complete_stores("other") == []
+
+
+def test_status_says_how_far_a_campaign_is_and_watching_one_that_nobody_runs_ends(folder: Path):
+    said = call("status", str(store(folder / "s")), "--watch").stdout
+    assert re.search(r"/s: interrupted, 3 of \d+ runs$", said.splitlines()[0]), said
+    assert "not finished: it was interrupted; run it again to go on" in said

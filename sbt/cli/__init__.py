@@ -13,7 +13,9 @@ from sbt.cli.compare import compare
 from sbt.cli.compare_ego import compare_ego
 from sbt.cli.console import process, verb
 from sbt.cli.estimate_again import estimate_again
+from sbt.cli.flags import PlainFlags, PlainGroup
 from sbt.cli.new import new
+from sbt.cli.pin import pin
 from sbt.cli.predict import predict
 from sbt.cli.replay import replay
 
@@ -21,6 +23,7 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(
     name="sumo-sbt",
+    cls=PlainGroup,
     help="Scenario-based testing of automated vehicles on SUMO.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -37,16 +40,17 @@ for _verb in (
     predict,
     estimate_again,
     replay,
+    pin,
 ):
-    app.command()(verb(_verb))
-app.command()(verb(metrics.metrics))
-app.command()(verb(new))
-app.command()(verb(benchmark))
-app.command()(verb(compare))
-app.command()(verb(compare_ego))
-app.command("list")(verb(inform.list_))
-app.command()(verb(inform.schema))
-app.command()(verb(inform.doctor))
+    app.command(cls=PlainFlags)(verb(_verb))
+app.command(cls=PlainFlags)(verb(metrics.metrics))
+app.command(cls=PlainFlags)(verb(new))
+app.command(cls=PlainFlags)(verb(benchmark))
+app.command(cls=PlainFlags)(verb(compare))
+app.command(cls=PlainFlags)(verb(compare_ego))
+app.command("list", cls=PlainFlags)(verb(inform.list_))
+app.command(cls=PlainFlags)(verb(inform.schema))
+app.command(cls=PlainFlags)(verb(inform.doctor))
 
 
 def _version(value: bool) -> None:

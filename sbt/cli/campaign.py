@@ -11,17 +11,27 @@ from typing import Annotated, Any
 
 import typer
 
-from sbt.cli.conclusion import conclusion_lines, shown
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
+from sbt.cli.completion import complete_stores
+from sbt.cli.conclusion import conclusion_lines, show_conclusion, shown
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, next_command, print_json, resumable
+from sbt.cli.progress import duration
 from sbt.errors import InputError
 from sbt.plugins.approval import trust_store
 
 __all__ = ["bundle", "export", "merge", "report", "run", "status"]
 
+_EVERY = 2.0
+"""Seconds between two looks of `status --watch`."""
+_STATES = {
+    "interrupted": ": it was interrupted; run it again to go on",
+    "dead": ": its process was killed; run it again to go on, nothing is lost but the runs in flight",
+    "elsewhere": ": another machine writes it, or did when it was killed",
+}
+"""What to make of a campaign that has not concluded, by its state."""
 _SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
 """Scores of the last validation that `status` prints."""
 
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign (its store).")]
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a campaign (its store).", autocompletion=complete_stores)]
 FailOnCritical = Annotated[bool, typer.Option("--fail-on-critical", help="Exit 3 if a critical scenario was found.")]
 JUnit = Annotated[
     Path | None, typer.Option("--junit", metavar="FILE.xml", help="Write the verdict as JUnit XML, for a CI's view.")
@@ -96,7 +106,7 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
     if as_json:
         print_json(result)
     else:
-        print("\n".join(conclusion_lines(result, verbose=verbose)))
+        show_conclusion(result, verbose=verbose)
     gate = result["conclusion"].get("gate")
     if gate is not None and gate["verdict"] != "pass":
         raise fail(f"gate {gate['verdict']}: {gate['statement']}", Exit.CRITICAL)
@@ -110,23 +120,27 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
 def status(
     folder: Folder,
     *,
-    watch: Annotated[bool, typer.Option("--watch", help="Repeat until the campaign is finished.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Repeat until nobody runs the campaign any more.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the progress of a campaign, also while it runs."""
-    found = _status(folder)
+    found, told = _status(folder), ""
     try:
-        while watch and found["conclusion"] is None and not getattr(sys.stdout, "gone", False):
-            if not as_json:
-                print("\n".join(_status_lines(found)), flush=True)
-            time.sleep(2.0)
+        while watch and found["state"] == "running" and not getattr(sys.stdout, "gone", False):
+            line = _progress_line(found)
+            if not as_json and line != told:
+                print(line, flush=True)
+            told = line
+            time.sleep(_EVERY)
             found = _status(folder)
     except KeyboardInterrupt:
         pass
     if as_json:
         print_json(found)
-    else:
-        print("\n".join(_status_lines(found)))
+        return
+    print("\n".join(_status_lines(found)))
+    if found["state"] == "dead" or (found["state"] == "interrupted" and found["conclusion"] is None):
+        next_command("sumo-sbt", "run", str(folder / "config.resolved.yaml"))
 
 
 def _status(folder: Path) -> dict[str, Any]:
@@ -139,13 +153,25 @@ def _status(folder: Path) -> dict[str, Any]:
 
 def _status_lines(found: Mapping[str, Any]) -> list[str]:
     counts = ", ".join(f"{n} {name}" for name, n in sorted(found["runs"].items())) or "none planned"
-    lines = [f"{found['store']}: {counts}; {found['iterations']} iterations"]
+    lines = [_progress_line(found), f"  runs: {counts}; {found['iterations']} iterations"]
     if found["validation"] is not None:
         scores = (f"{key.replace('_', ' ')} {shown(found['validation'].get(key))}" for key in _SCORES)
         lines.append("  validation: " + ", ".join(scores))
     if found["conclusion"] is None:
-        return [*lines, "  not finished"]
+        return [*lines, f"  not finished{_STATES.get(found['state'], '')}"]
     return [*lines, *conclusion_lines(found["conclusion"])]
+
+
+def _progress_line(found: Mapping[str, Any]) -> str:
+    """Return how far a campaign is, and how long it takes."""
+    done, budget = found["done"], found["budget"]
+    told = f"{found['store']}: {found['state']}, {done:,}"
+    told += f" of {budget:,} runs" if budget is not None and done <= budget else " runs"
+    if budget is not None and done > budget:
+        told += f" ({budget:,} budgeted, {done - budget:,} that confirm failures)"
+    if found["rate"] is not None:
+        told += f", {found['rate']:.3g} a second"
+    return told + (f", {duration(found['remaining'])} left" if found["remaining"] is not None else "")
 
 
 def report(folder: Folder, *, trust: Trust = False) -> None:
@@ -155,6 +181,7 @@ def report(folder: Folder, *, trust: Trust = False) -> None:
 
         path = rebuild_report(with_store(folder, trust=trust))
     print(path)
+    next_command("sumo-sbt", "export", str(folder), "--format", "csv")
 
 
 def export(

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["conclusion_lines", "shown"]
+__all__ = ["conclusion_lines", "show_conclusion", "shown"]
 
 _MOST_INPUTS = 6
 """More inputs of a failure mode are for `--verbose` and the report."""
@@ -29,6 +29,18 @@ def conclusion_lines(result: Mapping[str, Any], *, verbose: bool = False) -> lis
     path = Path(result["store"]) / "report.html"
     lines.append(f"report: {path}" if path.is_file() else f"store: {result['store']}")
     return [*lines, *([] if verbose else _next(result))]
+
+
+def show_conclusion(result: Mapping[str, Any], *, verbose: bool = False) -> None:
+    """Print how a campaign ended: with a table and colours on a terminal, else as lines of text."""
+    from sbt.cli.screen import on_screen, show_result
+
+    if verbose or not result.get("sentences") or not on_screen():
+        print("\n".join(conclusion_lines(result, verbose=verbose)))
+        return
+    report = Path(result["store"]) / "report.html"
+    following = next((line.removeprefix("next: ") for line in _next(result)), None)
+    show_result(result, str(report if report.is_file() else report.parent), following)
 
 
 def shown(value: Any) -> str:
@@ -59,7 +71,7 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
     """Return a failure mode on one line."""
 
     def measured(name: str, value: Any) -> str:
-        return f"{name} {_short(value)} {units.get(name, '')}".rstrip()
+        return f"{name} {_short(value)} {_unit(units.get(name, ''))}".rstrip()
 
     inputs = list(mode["inputs"].items())
     told = [measured(name, value) for name, value in inputs[:_MOST_INPUTS]]
@@ -78,6 +90,12 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
 
         said.append(f"avoided {in_words(mode['preventable'])}")
     return "; ".join(said)
+
+
+def _unit(unit: str) -> str:
+    from sbt.campaigns.wording import written_unit
+
+    return written_unit(unit)
 
 
 def _short(value: Any) -> str:

@@ -7,6 +7,7 @@ import functools
 import json
 import math
 import os
+import shlex
 import signal
 import sys
 import time
@@ -14,22 +15,20 @@ import traceback
 from collections.abc import Callable, Iterator
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec
+from typing import Any, ParamSpec
 
 import typer
 
 from sbt import interruption
+from sbt.cli.progress import ProgressDisplay
 from sbt.errors import InputError, SbtError
 from sbt.execution.streams import SteadyStream, open_missing
 
-if TYPE_CHECKING:
-    from sbt import Progress
-
-__all__ = ["Exit", "ProgressDisplay", "clean_stdout", "fail", "print_json", "process", "resumable", "verb"]
+__all__ = [
+    "Exit", "ProgressDisplay", "clean_stdout", "fail", "next_command", "print_json", "process", "resumable", "verb",
+]  # fmt: skip
 
 P = ParamSpec("P")
-_QUIET_SECONDS = 10.0
-"""Without a terminal, a line of progress appears at most this often within an iteration."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _ONCE = 0.5
 """Signals within so many seconds are one: a terminal that closes, or `timeout`, sends it twice."""
@@ -214,58 +213,7 @@ def _plain(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-class ProgressDisplay:
-    """Progress on stderr: a bar on a terminal, else a line now and then, or nothing.
-
-    Use as a context manager; call it with each `Progress`.
-    """
-
-    def __init__(self, *, silent: bool = False):
-        """Decide how to show."""
-        self._silent = silent
-        self._bar: Any = None
-        self._last = (-1, -math.inf)
-
-    def __enter__(self) -> ProgressDisplay:
-        """Return the display itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Leave the last state of the bar on the screen."""
-        if self._bar is not None:
-            self._bar.close()
-
-    def __call__(self, progress: Progress) -> None:
-        """Show a state of the campaign."""
-        if self._silent:
-            return
-        if sys.stderr.isatty():
-            self._on_terminal(progress)
-        else:
-            self._on_line(progress)
-
-    def _on_terminal(self, progress: Progress) -> None:
-        if self._bar is None:
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=progress.budget, initial=progress.done, unit="run", file=sys.stderr)
-        self._bar.total = max(progress.budget, progress.done)  # failures are repeated beyond the budget
-        self._bar.set_postfix_str(_counts(progress), refresh=False)
-        self._bar.update(progress.done - self._bar.n)
-        self._bar.refresh()
-
-    def _on_line(self, progress: Progress) -> None:
-        iteration, shown = self._last
-        now = time.monotonic()
-        if progress.iteration == iteration and now - shown < _QUIET_SECONDS and progress.done < progress.budget:
-            return
-        self._last = (progress.iteration, now)
-        beyond = progress.done - progress.budget
-        done = f"{progress.done}/{progress.budget} runs" if beyond <= 0 else f"{progress.budget} runs and {beyond} more"
-        line = f"{done}, iteration {progress.iteration}, {_counts(progress)}"
-        print(line, file=sys.stderr, flush=True)
-
-
-def _counts(progress: Progress) -> str:
-    failed = f", {progress.failed} failed" if progress.failed else ""
-    return f"{progress.critical} critical{failed}, {progress.activity}"
+def next_command(*words: str) -> None:
+    """Print the command to try next, on a terminal only: what reads the output is not asked to run anything."""
+    if sys.stdout.isatty():
+        print(f"next: {shlex.join(words)}", flush=True)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sbt.cli.completion import complete_scenarios
 from sbt.cli.console import Exit, clean_stdout, fail, print_json
 from sbt.errors import InputError
 
@@ -19,7 +20,10 @@ Isolation = Annotated[str, typer.Option(metavar="auto|fresh|reuse|replicas", hel
 
 
 def simulate(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name, scenario.yaml, or file.py:NAME.")],
+    scenario: Annotated[
+        str,
+        typer.Argument(metavar="SCENARIO", help="A name, scenario.yaml, or file.py:NAME.", autocompletion=complete_scenarios),
+    ],
     inputs: Annotated[
         list[str] | None,
         typer.Argument(metavar="[NAME=VALUE]...", help="Inputs; the others are at their centre."),
@@ -88,7 +92,12 @@ def _write_trace(path: Path, run: Run) -> None:
 
 
 def check(
-    target: Annotated[str, typer.Argument(metavar="TARGET", help="CONFIG.yaml, scenario.yaml, a name, or file.py:NAME.")],
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar="TARGET", help="CONFIG.yaml, scenario.yaml, a name, or file.py:NAME.", autocompletion=complete_scenarios
+        ),
+    ],
     *,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the runs.")] = 0,
     isolation: Isolation = "auto",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from sbt.problem.plain import Json
+from sbt.problem.plain import Json, JsonMapping
 from sbt.store.database import Store
 from sbt.store.history import PLANNED
 from sbt.store.records import FitRecord
@@ -28,7 +28,7 @@ def read_status(folder: Path) -> Json:
     with Store.read(folder) as store:
         iterations, fits, counts = store.iterations(), store.fits(), store.counts
         writer, conclusion = writer_of(folder), store.conclusion
-        done, budget = sum(counts.values()) - counts.get(PLANNED, 0), store.configuration.get("budget")
+        done, budget = sum(counts.values()) - counts.get(PLANNED, 0), _budget(store.configuration)
         return {
             "store": str(folder),
             **_progress(writer, done, budget, finished=conclusion is not None),
@@ -38,6 +38,12 @@ def read_status(folder: Path) -> Json:
             "validation": _validation(fits[-1]) if fits else None,
             "conclusion": conclusion,
         }
+
+
+def _budget(configuration: JsonMapping) -> int | None:
+    """Return the number of runs, those included that only score; None where none is stated."""
+    budget = configuration.get("budget")
+    return None if budget is None else int(budget) + int((configuration.get("validation") or {}).get("reference") or 0)
 
 
 def _progress(writer: Writer | None, done: int, budget: int | None, *, finished: bool) -> Json:
