@@ -39,10 +39,15 @@ __all__ = [
 ]  # fmt: skip
 
 
+_LONGEST_FORMULA = 4096
+
+
 def _formula(*, condition: bool) -> Callable[[str], str]:
     """Return a check that the text is a formula, and one that gives a truth value or a number as wanted."""
 
     def check(text: str) -> str:
+        if len(text) > _LONGEST_FORMULA:
+            raise ValueError(f"must be a formula of at most {_LONGEST_FORMULA} characters, but got {len(text)}")
         try:
             with np.errstate(all="ignore"):
                 rule = Expression(text)
@@ -248,7 +253,7 @@ class Configuration(_Strict):
         description="The AV: a controller or SUMO's models; a setting {min, max} is an input; null: the scenario's own.",
     )
     simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates; default: the scenario's.")
-    seed: int = Field(default=0, ge=0, description="Seed of everything random in the campaign.")
+    seed: int = Field(default=0, ge=0, le=2**64 - 1, description="Seed of everything random in the campaign.")
     budget: int = Field(default=500, ge=1, le=10**7, description="Runs, the initial ones included.")
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,

@@ -5,6 +5,7 @@ YAML 1.2 is read twice by ruamel.yaml: as nodes, for positions and doubled keys,
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -37,6 +38,7 @@ _NODES, _ENDLESS = 100_000, 10**12
 T = TypeVar("T")
 Key = tuple[str | int, ...]
 """Path of keys and list positions."""
+_SURROGATE = re.compile("[\ud800-\udfff]")
 _DEPTH = 30
 """Deeper nesting is an alias that contains itself."""
 
@@ -178,6 +180,8 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
         where = str(text[: getattr(error, "position", 0)]).count("\n") + 1
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError([f"{name}:{where}:1: the file must be YAML, but {reason}"]) from None
+    if odd := _half_character(value):
+        raise ConfigError([f"{name}: a file must be Unicode text, but has half of a character in {odd!r}"])
     if size > _NODES:
         rule = f"a file must have at most {_NODES} values, those that aliases (*name) stand for included"
         raise ConfigError([f"{name}:1:1: {rule}, but has {'more' if size == _ENDLESS else size}"])
@@ -194,6 +198,20 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
             texts[path] = value_node.value
     source = SourceMap(name, places, texts=texts)
     return value, source, source.sorted(doubled)
+
+
+def _half_character(value: Any) -> str:
+    """Return a text, key or value, with a lone surrogate (as an escape can write it); "" for none."""
+    todo = [value]
+    while todo:
+        one = todo.pop()
+        if isinstance(one, str) and (odd := _SURROGATE.search(one)):
+            return one[max(odd.start() - 10, 0) : odd.end() + 10]
+        if isinstance(one, dict):
+            todo += [*one, *one.values()]
+        elif isinstance(one, list):
+            todo += one
+    return ""
 
 
 def _size(node: Node | None, known: dict[int, int]) -> int:

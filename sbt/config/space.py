@@ -112,7 +112,10 @@ def distribution_of(choice: Choice, folder: Path | None = None) -> Distribution:
     """
     given = choice.settings
     if choice.kind == "empirical" and isinstance(given.get("file"), str):
-        given["file"] = str(((folder or Path.cwd()) / Path(str(given["file"])).expanduser()).resolve())
+        try:
+            given["file"] = str(((folder or Path.cwd()) / Path(str(given["file"])).expanduser()).resolve())
+        except (ValueError, OSError, RuntimeError) as error:
+            raise InputError(f"distribution 'empirical' needs a file, but got {given['file']!r}: {error}") from None
     for name, value in given.items():
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise InputError(f"a distribution's parameters must be numbers, but got {name}: {value!r}")

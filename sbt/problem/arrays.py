@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Mask", "Points", "Vector", "as_points", "as_vector"]
+__all__ = ["FARTHEST", "NEAREST", "Mask", "Points", "Vector", "as_points", "as_vector"]
 
 Vector = NDArray[np.float64]
 """(n,) numbers, one a point."""
@@ -15,6 +15,8 @@ Points = NDArray[np.float64]
 """(n, d) coordinates, one row a point."""
 Mask = NDArray[np.bool_]
 """(n,) booleans, one a point."""
+FARTHEST, NEAREST = 1e100, 1e-100
+"""Largest magnitude of a number that means something, and smallest distance of two: beyond, squares and figures overflow."""
 
 
 def as_points(values: ArrayLike, dimension: int | None = None) -> Points:

@@ -83,7 +83,7 @@ class Distribution:
             family = getattr(stats, str(name), None)
             if not isinstance(family, stats.rv_continuous):
                 raise InputError(f"kind scipy needs the name of a continuous distribution of scipy.stats, but got {name}")
-            return self._checked(family(**given))
+            return self._built(lambda: family(**given))
         if self.kind not in KINDS:
             known = ", ".join([*KINDS, "scipy", "empirical"])
             raise InputError(f"a distribution's kind must be one of {known}, but got '{self.kind}'")
@@ -92,14 +92,19 @@ class Distribution:
             raise InputError(
                 f"distribution '{self.kind}' takes {', '.join(names) or 'no parameters'}, but got {', '.join(given) or 'none'}"
             )
-        try:
-            return self._checked(build(stats, **given))
-        except (ZeroDivisionError, ValueError) as error:
-            raise InputError(f"distribution '{self.kind}' cannot have the parameters {given}: {error}") from None
+        return self._built(lambda: build(stats, **given))
 
-    def _checked(self, distribution: Any) -> Any:
-        if distribution is not None and not np.isfinite(distribution.ppf(0.5)):
-            raise InputError(f"distribution '{self.kind}' cannot have the parameters {dict(self.parameters)}")
+    def _built(self, build: Callable[[], Any]) -> Any:
+        """Return what SciPy makes of the parameters, where that has a finite median."""
+        rule = f"distribution '{self.kind}' cannot have the parameters {dict(self.parameters)}"
+        try:
+            with np.errstate(all="ignore"):
+                distribution = build()
+                fine = distribution is None or np.isfinite(distribution.ppf(0.5))
+        except (ArithmeticError, ValueError, TypeError) as error:
+            raise InputError(f"{rule}: {error}") from None
+        if not fine:
+            raise InputError(rule)
         return distribution
 
     def truncated(self, low: float, high: float) -> TruncatedDistribution:

@@ -19,6 +19,7 @@ from scipy.special import log_ndtr, logsumexp, ndtr
 
 from sbt.errors import InputError
 from sbt.problem.arrays import Vector
+from sbt.problem.plain import check_table
 
 __all__ = ["KernelDensity", "kernel_density", "silverman"]
 
@@ -110,6 +111,7 @@ def kernel_density(given: Mapping[str, float | str]) -> KernelDensity:
 @lru_cache(maxsize=32)
 def _column(file: str, column: str) -> Vector:
     """Return the sorted numbers of one column of a CSV file."""
+    check_table(Path(file))
     try:
         with Path(file).open(newline="", encoding="utf-8-sig") as lines:
             rows = csv.DictReader(lines)
@@ -119,7 +121,7 @@ def _column(file: str, column: str) -> Vector:
             values = np.array([float(row[column]) for row in rows])
     except OSError as error:
         raise InputError(f"distribution 'empirical' needs a readable file, but {file}: {error.strerror}") from None
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, csv.Error) as error:
         raise InputError(f"distribution 'empirical': column {column} of {file} must hold numbers, but: {error}") from None
     if len(values) < _FEWEST or not np.isfinite(values).all():
         raise InputError(f"distribution 'empirical' needs at least {_FEWEST} finite numbers, but {file} has {len(values)} rows")

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from sbt.errors import InputError, did_you_mean
-from sbt.problem.arrays import Mask, Vector
+from sbt.problem.arrays import FARTHEST, NEAREST, Mask, Vector
 from sbt.problem.distribution import Distribution, TruncatedDistribution
 from sbt.problem.plain import Value
 
@@ -20,6 +20,8 @@ __all__ = ["TAIL", "Choices", "Kind", "Parameter"]
 
 TAIL = 1e-6
 """An infinite range is searched between these quantiles of its distribution."""
+_APART = 1e-12
+"""Least width of a range relative to its ends: below, its values are all the same to a metamodel and a figure."""
 _SUM = 1e-6  # by which probabilities that were written with six digits may miss 1
 
 Kind = Literal["continuous", "integer", "categorical"]
@@ -106,6 +108,11 @@ class Parameter:
             return
         if not self.low < self.high:
             raise InputError(f"input {self.name}: low < high must hold, but got low {self.low}, high {self.high}")
+        ends = [end for end in (self.low, self.high) if math.isfinite(end)]
+        near = self.high - self.low < max(NEAREST, _APART * max(map(abs, ends), default=0.0))
+        if near or any(abs(end) > FARTHEST for end in ends):
+            rule = f"ends must be within {FARTHEST:g}, {NEAREST:g} and a {1 / _APART:g}th of themselves apart"
+            raise InputError(f"input {self.name}: {rule}, but got low {self.low}, high {self.high}")
         finite = math.isfinite(self.low) and math.isfinite(self.high)
         if not finite and (self.distribution is None or self.distribution.kind == "uniform"):
             raise InputError(f"input {self.name}: an infinite range needs a distribution, but got none")

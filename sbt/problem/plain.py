@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-__all__ = ["Json", "JsonMapping", "Value", "Values", "written"]
+from sbt.errors import InputError
+
+__all__ = ["Json", "JsonMapping", "Value", "Values", "check_table", "written"]
 
 Json = dict[str, Any]
 """A JSON object."""
@@ -13,6 +16,8 @@ JsonMapping = Mapping[str, Any]
 """A JSON object that is only read."""
 Value = float | str
 """What an input has: a number, or one of its choices as text."""
+LARGEST_TABLE = 2**28
+"""Most bytes of a table that is read whole."""
 Values = Mapping[str, Any]
 """The inputs of a run by name, each a `Value`; whoever reads one knows which of the two it is."""
 
@@ -24,3 +29,18 @@ def written(values: Values) -> str:
     'v=12.5, kind=truck'
     """
     return ", ".join(f"{name}={value if isinstance(value, str) else format(value, 'g')}" for name, value in values.items())
+
+
+def check_table(path: Path) -> None:
+    """Refuse what is read whole, and is no file (a device such as /dev/zero never ends) or a very large one.
+
+    Raises:
+        InputError: it is none of this.
+    """
+    try:
+        size = path.stat().st_size if path.is_file() else -1
+    except (OSError, ValueError) as error:
+        raise InputError(f"a table must be a readable file, but '{path}' is not: {error}") from None
+    if path.exists() and not 0 <= size <= LARGEST_TABLE:
+        rule = f"a table must be a file of at most {LARGEST_TABLE // 2**20} MiB"
+        raise InputError(f"{rule}, but '{path}' " + ("is none" if size < 0 else f"has {size // 2**20} MiB"))

@@ -26,6 +26,7 @@ from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
+from sbt.problem.plain import check_table
 
 __all__ = ["DEFORMATIONS", "Curve", "Interpolation", "KnotProfile", "Profile", "RecordedProfile", "read_curve"]
 
@@ -201,11 +202,15 @@ def read_curve(path: Path, time: str, value: str, interpolate: Interpolation = "
     Raises:
         InputError: it cannot be read, lacks a column, or the times do not increase.
     """
+    check_table(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"a recorded profile must be a readable CSV file, but '{path}' is not: {error}") from None
-    rows = list(csv.reader(lines, delimiter=";" if lines and ";" in lines[0] else ","))
+    try:
+        rows = list(csv.reader(lines, delimiter=";" if lines and ";" in lines[0] else ","))
+    except csv.Error as error:
+        raise InputError(f"a recorded profile must be a readable CSV file, but '{path}' is not: {error}") from None
     header = [name.strip() for name in rows[0]] if rows else []
     for column in (time, value):
         if column not in header:

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.problem.arrays import Mask, Vector
+from sbt.problem.arrays import FARTHEST, Mask, Vector
 
 __all__ = ["CriticalInterval", "Measured", "Requirement", "within_scale"]
 
@@ -49,6 +49,9 @@ class CriticalInterval:
             raise InputError(f"a critical interval needs low <= high, but got [{self.low}, {self.high}]")
         if math.isinf(self.low) and math.isinf(self.high):
             raise InputError(f"a critical interval needs at least one finite end, but got [{self.low}, {self.high}]")
+        if any(math.isfinite(end) and abs(end) > FARTHEST for end in (self.low, self.high)):
+            rule = f"finite ends of a critical interval must be within {FARTHEST:g} (an end may be infinite)"
+            raise InputError(f"{rule}, but got [{self.low}, {self.high}]")
 
     def known(self, y: Vector) -> Mask:
         """Return (n,) booleans: y tells whether the run is critical, and how far from it."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from sbt import plugins
 from sbt.errors import InputError, RunError, did_you_mean
-from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.arrays import FARTHEST, Mask, Points, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
@@ -117,10 +117,7 @@ class Metric:
         Raises:
             RunError: the value is no number.
         """
-        value = self.value(trace)
-        if math.isnan(value):
-            raise RunError(Status.FAILED, f"metric {self.name} must be finite, inf or -inf, but got {value}")
-        return value
+        return _meaningful(self.name, self.value(trace))
 
     def value(self, trace: Trace) -> float:
         """Return its value on a trace, finite or not."""
@@ -390,6 +387,12 @@ def _finite(name: str, value: Any) -> float:
         number = None
     if number is None:
         raise RunError(Status.FAILED, f"metric {name} must be one number, but got {value!r}")
-    if math.isnan(number):
-        raise RunError(Status.FAILED, f"metric {name} must be finite, inf or -inf, but got {number}")
-    return number
+    return _meaningful(name, number)
+
+
+def _meaningful(name: str, value: float) -> float:
+    """Return a metric's value: inf, -inf, or a number whose square is still one."""
+    if abs(value) <= FARTHEST or math.isinf(value):
+        return value
+    limit = "" if math.isnan(value) else f" and within {FARTHEST:g}"
+    raise RunError(Status.FAILED, f"metric {name} must be finite{limit}, inf or -inf, but got {value}")

@@ -43,7 +43,13 @@ _OUTPUT = re.compile(
     r"|save-.*|C|(.*-)?log(-file)?|l"
 )
 """Options that make SUMO write files, their details, and their older names (of `sumo --save-template`)."""
+_NAME = re.compile(r"[A-Za-z][\w.-]*")
+_LIKE_AN_OPTION = re.compile(r"--?[A-Za-z]")
+_IDS = (".explicit", ".knownveh", "remove-vehicles")
+"""How options end whose values are ids, which may begin with a minus; SUMO never takes these for options."""
 _GUI = ("gui-settings-file", "start", "quit-on-end", "delay", "window-size", "window-pos", "tracker-interval", "S", "Q", "d", "g")
+_OF_SERVER = ("remote-port", "num-clients", "configuration-file")
+"""With these SUMO waits for a client, or reads further options by itself."""
 _NEWEST_NET_VERSION = (1, 20)
 """Version of the network files that SUMO 1.28 writes."""
 
@@ -100,10 +106,15 @@ class SumoFiles:
         Raises:
             InputError: not exactly one network is named, or a file does not exist.
         """
+        options = {_known(name, place): value for name, value in options.items()}
+        if "configuration-file" in options:
+            raise InputError(f"{place}: a configuration is named by config, but options name '{options['configuration-file']}'")
         named = {k: [_existing(k, name, folder, place) for name in _split(options.get(k, ""))] for k in _FILES}
         if len(named["net-file"]) != 1:
             raise InputError(f"{place}: a simulation needs one network (net-file), but got {len(named['net-file'])}")
         others = {k: _absolute(k, v, folder) for k, v in options.items() if k not in _FILES and not _dropped(k)}
+        for name, value in others.items():
+            _check_value(name, value, place)
         net, routes, additional = (tuple(named[k]) for k in _FILES)
         return cls(others, net[0], routes, additional, dict.fromkeys(others, place))
 
@@ -149,12 +160,18 @@ class SumoFiles:
         """
         self.templates  # noqa: B018  (checks them before SUMO reads them)
         outputs = begin_outputs(folder)
+        given = {k: fill(v, values, self.places.get(k, "")) for k, v in self.options.items()}
+        for name, value in given.items():
+            _check_value(name, value, self.places.get(name, name))
+        if "load-state" in given:  # what is in it may name outputs too
+            given["load-state"] = ",".join(
+                str(template(path).write(values, folder)) for path in map(Path, _split(given["load-state"]))
+            )
         written = {
             name: ",".join(str(template(path).write(values, folder)) for path in paths)
             for name, paths in zip(_FILES, ((self.net,), self.routes, self.additional), strict=True)
             if paths
         }
-        given = {k: fill(v, values, self.places.get(k, "")) for k, v in self.options.items()}
         step = {} if step_length is None else {"step-length": format_number(step_length)}
         options = {**_DEFAULTS, **given, **step, **FIXED_OPTIONS, **written, "device.ssm.file": str(outputs / "ssm.xml")}
         options.pop("seed", None)
@@ -180,8 +197,10 @@ def options_of_config(path: Path) -> dict[str, str]:
     options: dict[str, str] = {}
     for section in ET.parse(path).getroot().iter():
         value = section.get("value", section.get("v"))
-        name = _ALIASES.get(section.tag, section.tag)
-        if value is not None and not _dropped(name):
+        if value is None:
+            continue
+        name = _known(section.tag, str(path))
+        if not _dropped(name):
             options[name] = _absolute(name, value, path.resolve().parent)
     return options
 
@@ -201,7 +220,7 @@ def options_of_command(command: Sequence[str], folder: Path) -> dict[str, str]:
         name, equals, value = word.lstrip("-").partition("=")
         if not equals:
             value = rest.pop(0) if rest and not re.match(r"--?[A-Za-z]", rest[0]) else "true"
-        name = _ALIASES.get(name, name)
+        name = _known(name, "sumo.start")
         if name == "configuration-file":
             options = {**options_of_config((folder / value).resolve()), **options}
         elif not _dropped(name):
@@ -210,7 +229,24 @@ def options_of_command(command: Sequence[str], folder: Path) -> dict[str, str]:
 
 
 def _dropped(name: str) -> bool:
-    return _OUTPUT.fullmatch(name) is not None or name in _GUI
+    return _OUTPUT.fullmatch(name) is not None or name in _GUI or name in _OF_SERVER
+
+
+def _known(name: str, place: str) -> str:
+    """Return the long name of an option.
+
+    Raises:
+        InputError: it is no name, which SUMO could read as an option with a value.
+    """
+    if not _NAME.fullmatch(name):
+        raise InputError(f"{place}: the name of an option must be one of SUMO's, without dashes, but got '{name}'")
+    return _ALIASES.get(name, name)
+
+
+def _check_value(name: str, value: str, place: str) -> None:
+    """Refuse a value that SUMO would take for a further option, where the option before it may stand alone."""
+    if _LIKE_AN_OPTION.match(value) and not name.endswith(_IDS):
+        raise InputError(f"{place}: the value of {name} must not look like an option, but got '{value}'")
 
 
 def _split(value: str) -> list[str]:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.sax.saxutils import unescape
 
-__all__ = ["MARKS", "begin_outputs", "collect_outputs", "names_output", "output_names", "run_file"]
+__all__ = ["MARKS", "begin_outputs", "collect_outputs", "in_signals", "names_output", "output_names", "run_file"]
 
 _ATTRIBUTES = {
     **dict.fromkeys((
@@ -23,23 +23,47 @@ _ATTRIBUTES = {
     "calibrator": "output", "timedEvent": "dest", "param": "value",
 }  # fmt: skip
 """Attribute that names the file, by element (SUMO's `additional_file.xsd`)."""
-_PARAMETERS = (b"device.ssm.file", b"device.toc.file")
-MARKS = (*(b"<" + tag.encode() for tag in _ATTRIBUTES if tag != "param"), *_PARAMETERS)
-"""A file without any of these names no output."""
+_PARAMETERS = ("device.ssm.file", "device.toc.file")
+"""Keys of `<param>` whose value names a file, of whatever it is a parameter."""
+_OF_SIGNALS = ("file", "SWARMLOG")
+"""The same, where it is a parameter of a signal program (actuated, delay-based, NEMA, swarm)."""
+_WITHIN_SIGNALS = ("phase", "param", "condition", "assignment", "function")
+"""What stands within a signal program."""
+MARKS = (
+    *(b"<" + tag.encode() for tag in _ATTRIBUTES if tag != "param"), *(key.encode() for key in _PARAMETERS),
+    b'"file"', b"'file'", b"SWARMLOG", b"&#",
+)  # fmt: skip
+"""A file without any of these names no output; with `&#` any of them may be written otherwise."""
 _NOWHERE = ("nul", "NUL", "/dev/null")
 _NAMED, _UNNAMED = "outputs", "unnamed_outputs"
 """Folders of what the user's files name, by its whole path, and of the rest."""
 
 
-def names_output(tag: str) -> bool:
-    """Return whether an element may name an output."""
-    return tag in _ATTRIBUTES
+def in_signals(tag: str, *, before: bool) -> bool:
+    """Return whether an element is a signal program or in one.
+
+    Args:
+        tag: of the element.
+        before: whether the element before it is.
+    """
+    return tag == "tlLogic" or (before and tag in _WITHIN_SIGNALS)
+
+
+def names_output(tag: str, attributes: Mapping[str, str], *, signals: bool) -> bool:
+    """Return whether an element names an output.
+
+    Args:
+        tag: of the element.
+        attributes: of the element, as they are read.
+        signals: it is in a signal program.
+    """
+    if tag != "param":
+        return tag in _ATTRIBUTES
+    return (key := attributes.get("key")) in _PARAMETERS or (signals and key in _OF_SIGNALS)
 
 
 def output_names(tag: str, start_tag: bytes) -> Iterator[tuple[int, int, str]]:
-    """Yield start, end (with its quotes) and value of the attribute of a start tag that names an output."""
-    if tag == "param" and not any(name in start_tag for name in _PARAMETERS):
-        return
+    """Yield start, end (with its quotes) and value of the attribute of a start tag that names an output (`names_output`)."""
     for match in re.finditer(rb"\s%s\s*=\s*(\"[^\"]*\"|'[^']*')" % _ATTRIBUTES[tag].encode(), start_tag):
         value = unescape(match.group(1)[1:-1].decode(), {"&quot;": '"', "&apos;": "'"})
         if value and value not in _NOWHERE:

@@ -13,6 +13,7 @@ import io
 import math
 import re
 import xml.parsers.expat
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,7 +26,7 @@ from sbt.plugins import kept, noted
 from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
-from sbt.sumo.outputs import MARKS, names_output, output_names, run_file
+from sbt.sumo.outputs import MARKS, in_signals, names_output, output_names, run_file
 
 __all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
 
@@ -36,6 +37,8 @@ _START_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
 _REFERRING = ("include", "variableSpeedSign", "rerouter")
 """Elements whose `href` or `file` names another file, relative to the file that contains the element."""
+_SMALL, _TIMES_SMALLER = 2**25, 100
+"""Bytes to which any packed file may unpack, and how much larger than packed; SUMO's XML is packed to a tenth or thirtieth."""
 _VEHICLES = ("vehicle", "trip", "flow")
 _QUOTES = {'"': "&quot;", "'": "&apos;"}
 
@@ -220,9 +223,16 @@ def _read(path: Path) -> bytes:
     """Return the bytes of a file, decompressed if it is gzipped."""
     try:
         data = path.read_bytes()
-        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
-    except (OSError, EOFError) as error:
+        if data[:2] != b"\x1f\x8b":
+            return data
+        most = max(_SMALL, _TIMES_SMALLER * len(data))
+        with gzip.open(io.BytesIO(data)) as file:
+            text = file.read(most + 1)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
         raise InputError(f"a SUMO file must be readable, but {path} is not: {error}") from None
+    if len(text) > most:
+        raise InputError(f"a packed SUMO file may unpack to {_TIMES_SMALLER} times its size, but {path} unpacks to more")
+    return text
 
 
 @kept
@@ -249,7 +259,10 @@ def template(path: Path) -> Template:
     def refuse(*_: object) -> None:
         raise InputError(f"{place()}: a SUMO file must not declare a document type or entities, but it does")
 
+    signals = False
+
     def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal signals
         if not roots:
             roots.append((tag, attributes))
             if tag == "net" and not has_parts:  # networks are large, and only the root is needed
@@ -259,8 +272,12 @@ def template(path: Path) -> Template:
             varies = has_parts and any("${" in value for value in attributes.values())
             departure = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane", "begin"))
             vehicles[attributes["id"]] = Vehicle(tag, at, varies, *departure)
-        if has_parts and (tag in _REFERRING or names_output(tag) or any("${" in value for value in attributes.values())):
-            parts.extend(_parts(path, data, parser.CurrentByteIndex, tag, place()))
+        if not has_parts:
+            return
+        signals = in_signals(tag, before=signals)
+        writes = names_output(tag, attributes, signals=signals)
+        if writes or tag in _REFERRING or any("${" in value for value in attributes.values()):
+            parts.extend(_parts(path, data, parser.CurrentByteIndex, tag, place(), writes=writes))
 
     parser.StartDoctypeDeclHandler = refuse
     parser.EntityDeclHandler = refuse
@@ -272,7 +289,7 @@ def template(path: Path) -> Template:
     return Template(path, roots[0], tuple(parts), vehicles, data if parts else b"")
 
 
-def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_Part]:
+def _parts(path: Path, data: bytes, at: int, tag: str, place: str, *, writes: bool) -> Iterator[_Part]:
     """Yield the placeholders and file names of the start tag at a byte offset."""
     start_tag = _START_TAG.match(data, at)
     if start_tag is None:
@@ -287,7 +304,7 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str) -> Iterator[_
                 raise InputError(f"{place}: an included file must exist, but got '{name}'")
             if target.is_file():
                 parts.append(_Part(at + match.start(2), at + match.end(2), target=target))
-    if names_output(tag):
+    if writes:
         for start, end, name in output_names(tag, text):
             parts.append(_Part(at + start, at + end, output=name, within=placeholders(name, place)))
     outputs = [range(part.start, part.end) for part in parts if part.output is not None]

@@ -48,6 +48,8 @@ __all__ = ["Loop", "TraciProxy", "UserSimulation", "step_until_over"]
 
 WARM_UPS = 8
 """Warm-ups of a scenario that states no number, outside campaigns."""
+_LONGEST_STEP = 1000.0
+"""Longest step (s)."""
 _GRACE = 1.0
 """Time by which a run may exceed its limit before its process is ended (s): most runs stop themselves."""
 Connect = Callable[[SumoFiles, Values], AbstractContextManager[Any]]
@@ -93,8 +95,9 @@ class UserSimulation:
     def __post_init__(self) -> None:
         if self.files is None and self.loop is step_until_over:
             raise InputError("a simulation must have files or a loop, but has neither")
-        if self.step is not None and not (self.step > 0 and round(self.step * 1000) / 1000 == self.step):
-            raise InputError(f"SUMO counts time in whole milliseconds, but got step_length {self.step} s")
+        if self.step is not None and not (0 < self.step <= _LONGEST_STEP and round(self.step * 1000) / 1000 == self.step):
+            rule = f"SUMO counts time in whole milliseconds, and a step is at most {_LONGEST_STEP:g} s"
+            raise InputError(f"{rule}, but got step_length {self.step} s")
 
     @property
     def step_length(self) -> float:

@@ -255,7 +255,7 @@ def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, .
     """
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"--inputs must be a readable CSV file, but {path}: {error}") from None
     if not lines or not any(lines[0]):
         raise InputError(f"{path}:1: the first line must name the columns, but it is empty")

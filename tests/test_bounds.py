@@ -1,0 +1,73 @@
+"""Files and values that would take all memory or time, or overflow, are errors in words."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from sbt.config.load import parse
+from sbt.errors import InputError
+from sbt.execution.worker import run_job
+from sbt.problem.distribution import Distribution
+from sbt.problem.outcome import Job
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import CriticalInterval, Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+from sbt.sumo.files import SumoFiles
+from sbt.workflows.study import Study
+
+
+@pytest.mark.parametrize(
+    ("keys", "rule"),
+    [
+        ({"seed": 10**400}, "seed: must be less than or equal to"),
+        ({"inputs": {"d_t": {"min": -1e308, "max": 1e308}}}, "ends must be within 1e\\+100"),
+        ({"inputs": {"d_t": {"min": 0, "max": 1e-300}}}, "1e-100 and a 1e\\+12th of themselves apart"),
+        ({"inputs": {"d_t": {"min": 1.0, "max": 1.0000000000000002}}}, "apart"),
+        ({"requirement": {"metric": "ttc_min", "critical": [-1e308, 0]}}, "critical interval must be within"),
+        ({"inputs": {"d_t": {"distribution": {"kind": "lognormal", "mean": 1e-9, "std": 1e300}}}}, "cannot have the parameters"),
+        ({"inputs": {"d_t": {"distribution": {"kind": "scipy", "name": "skewnorm", "a": "x"}}}}, "cannot have the parameters"),
+        (
+            {"inputs": {"d_t": {"distribution": {"kind": "empirical", "file": "/dev/zero", "column": "v"}}}},
+            "a table must be a file",
+        ),
+        ({"inputs": {"d_t": {"distribution": {"kind": "empirical", "file": "a\0", "column": "v"}}}}, "needs a file"),
+        ({"simulation": {"step_length": 1e308}}, "step_length <= duration"),
+        ({"constraints": ["+".join(["d_t"] * 5000) + " < 1"]}, "at most 4096 characters"),
+        ({"store": "\ud800"}, "half of a character"),
+    ],
+)
+def test_values_beyond_what_they_can_mean_are_refused(keys: dict[str, object], rule: str):
+    with pytest.raises(InputError, match=rule) as error:
+        _ = Study(parse(json.dumps({"campaign": "coverage", "scenario": "cut_in", **keys}))).settings
+    assert len(str(error.value)) < 1000
+
+
+def test_a_packed_file_does_not_unpack_to_all_memory(tmp_path: Path):
+    (tmp_path / "n.net.xml.gz").write_bytes(gzip.compress(b'<net version="1.20">' + b" " * 2**26 + b"</net>"))
+    with pytest.raises(InputError, match="may unpack to 100 times its size"):
+        _ = SumoFiles.of({"net-file": "n.net.xml.gz"}, tmp_path, "sumo").templates
+    for name, data in (("short", gzip.compress(os.urandom(99))[:50]), ("odd", b"\x1f\x8b" + bytes(range(99)))):
+        (tmp_path / f"{name}.net.xml.gz").write_bytes(data)
+        with pytest.raises(InputError, match="must be readable"):
+            _ = SumoFiles.of({"net-file": f"{name}.net.xml.gz"}, tmp_path, "sumo").templates
+
+
+def test_a_metric_has_a_square():
+    space = ParameterSpace((Parameter("a", 0.0, 1.0),))
+    wide = LogicalScenario(
+        "wide", space, Requirement("y", high=0.0), evaluate=lambda values, seed: {"y": 1e308}, metric_names=("y",)
+    )
+    assert run_job(wide, Job(0, {"a": 0.5}, 0)).reason == "metric y must be finite and within 1e+100, inf or -inf, but got 1e+308"
+
+
+def test_ends_far_apart_are_a_range():
+    assert Parameter("a", 1e15, 1e15 + 1e4).high > 1e15
+    assert Parameter("a", 0.0, 1e-90).high == 1e-90
+    assert CriticalInterval(high=1e99).high == 1e99
+    assert Distribution.of("normal", mean=0, std=1e-9).truncated(-1, 1).mass == pytest.approx(1)
