@@ -23,7 +23,7 @@ _HASHED, _MIXED, _OUT = (0x43B0D7E5, 0x931E8875), (0xCA01F9DD, 0x4973F715), (0x8
 """Constants of NumPy's `SeedSequence`."""
 _POOL, _WORDS = 4, 8
 _PCG, _MASK_32, _MASK_64, _MASK_128 = 0x2360ED051FC65DA44385DF649FCCF645, 2**32 - 1, 2**64 - 1, 2**128 - 1
-_LEAST_AT_ONCE = 16
+_LEAST_AT_ONCE, _MOST_AT_ONCE = 16, 4096
 _REJECTED = (2**31 + 1) % (2**31 - 1)
 
 
@@ -62,6 +62,8 @@ def run_seeds(seed: int, indices: Sequence[int]) -> list[int]:
     >>> run_seeds(7, range(20)) == [run_seed(7, k) for k in range(20)]
     True
     """
+    if len(indices) > _MOST_AT_ONCE:
+        return [k for at in range(0, len(indices), _MOST_AT_ONCE) for k in run_seeds(seed, indices[at : at + _MOST_AT_ONCE])]
     if len(indices) < _LEAST_AT_ONCE or not 0 <= seed <= _MASK_32:
         return [run_seed(seed, index) for index in indices]
     digests = b"".join([_digest(f"str:run/int:{int(index)}") for index in indices])

@@ -21,7 +21,8 @@ from sbt.errors import SbtError
 from sbt.execution.protocol import SerialExecutor
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel, Learner
-from sbt.loop.stages import Batch, Campaign, Log, Progress, run_stages
+from sbt.loop.running import run_stages
+from sbt.loop.stages import Batch, Campaign, Log, Progress
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Value

@@ -151,7 +151,7 @@ def _outside(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
     points, margins, most = np.empty((0, space.dimension)), np.empty(0), config.stop.failures
     with SerialExecutor(parts.spec, limit) as executor:
         while len(margins) < config.budget and (most is None or (margins <= 0).sum() < most):
-            u = sampler.ask(min(config.batch, config.budget - len(margins)))
+            u = sampler.ask(min(config.batch_size, config.budget - len(margins)))
             x, start = space.from_unit(u), len(margins)
             jobs = [Job(start + k, space.named(row), run_seed(seed, start + k)) for k, row in enumerate(x)]
             y = np.full(len(jobs), np.nan)

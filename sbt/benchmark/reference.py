@@ -15,7 +15,8 @@ from sbt.config.load import Loaded
 from sbt.errors import InputError
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
-from sbt.loop.stages import Batch, Campaign, Log, Progress, run_stages
+from sbt.loop.running import run_stages
+from sbt.loop.stages import Batch, Campaign, Log, Progress
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.scenario import LogicalScenario
 from sbt.seeds import stream

@@ -117,7 +117,7 @@ def _typical(
     space = settings.scenario.space
     drawn = max(n, min(_DRAWN + 2 * n, _MOST_DRAWN)) if n else 0
     draw, x = _draw(settings, fitted, boundary, log, drawn, taken=taken, start=start, most=_MAX_REJECTION_CANDIDATES)
-    u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.history.x, taken])))
+    u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.planned.x, taken])))
     scale = influence_on_mean(fitted.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
     weight = np.exp(_score(settings, fitted, boundary)(u))  # a_BI once more: sharper than it was drawn
     at = space.cube.embedded
@@ -229,7 +229,7 @@ def _rows(settings: Settings, log: Log, taken: Points | None) -> PoolSequence:
     if scenario.pool is None:
         raise ValueError("only a recorded table has rows")
     u = np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0)
-    gone = scenario.pool.taken(log.history.x)
+    gone = scenario.pool.taken(log.planned.x)
     if taken is not None and len(taken):
         gone = gone | scenario.pool.taken(taken)
     return PoolSequence(u, gone, settings.seed)
@@ -243,7 +243,7 @@ def _greedy(
     rng = stream(settings.seed, "greedy", log.iteration)
     score, admissible = _score(settings, fitted, acquisition), _admissible(settings)
     scale = influence_on_mean(fitted.predict, space.dimension, rng)
-    there = np.clip(space.to_unit(np.concatenate([log.history.x, taken])), 0.0, 1.0)
+    there = np.clip(space.to_unit(np.concatenate([log.planned.x, taken])), 0.0, 1.0)
     if scenario.pool is not None:
         rows = _rows(settings, log, taken)
         u = rows.points(0, len(rows))

@@ -36,9 +36,14 @@ class MonteCarloStage:
     settings: Settings
     name: str = NOMINAL
 
+    @property
+    def ahead(self) -> int:
+        """Number of batches in flight that a proposal does not wait for: draws depend on no result."""
+        return self.settings.ahead
+
     def stop(self, log: Log) -> str | None:
         """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
-        if log.iterations and len(log.history) >= self.settings.budget:
+        if log.iterations and len(log.planned) >= self.settings.budget:
             return "budget"
         target = self.settings.stop.get("cov")
         if target is not None and log.iteration >= _FEWEST_BATCHES:
@@ -50,7 +55,7 @@ class MonteCarloStage:
     def propose(self, log: Log) -> Batch:
         """Return the next draws."""
         s, space = self.settings, self.settings.scenario.space
-        size = min(s.batch if log.iterations else s.initial, s.budget - len(log.history))
+        size = min(s.batch if log.iterations else s.initial, s.budget - len(log.planned))
         x = space.sample(size, stream(s.seed, "monte_carlo", log.iteration))
         return Batch(_runs(space, x, NOMINAL, space.log_density(x)), EstimationProposal(COUNT, "monte_carlo"))
 

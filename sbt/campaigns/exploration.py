@@ -94,5 +94,6 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
     )  # fmt: skip
     y = scenario.requirement.values(seen)
     u = np.clip(space.to_unit(seen.x), 0.0, 1.0)
-    picks = propose(search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration)
+    pending = None if log.pending is None else np.clip(space.to_unit(log.pending.x), 0.0, 1.0)
+    picks = propose(search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration, pending=pending)
     return space.from_unit(np.clip(picks.u, 1e-12, 1 - 1e-12))

@@ -71,6 +71,12 @@ class SearchStage:
     failure_search: FailureSearch
     name: str = _SEARCH
 
+    @property
+    def ahead(self) -> int:
+        """Number of batches in flight that a proposal does not wait for; none for methods whose picks would be the same again."""
+        s = self.failure_search.settings
+        return s.ahead if s.method == "portfolio" or s.acquisition is not None else 0
+
     def stop(self, log: Log) -> str | None:
         """Return `failures` or `modes` once so many are found, `budget` once it is used up."""
         s, runs = self.failure_search.settings, search_runs(log.history)
@@ -80,16 +86,18 @@ class SearchStage:
             return "failures"
         if modes is not None and critical >= modes and len(self.failure_search.modes(runs)) >= modes:
             return "modes"
-        if log.iterations and len(runs) - s.reference >= s.budget:
+        asked = search_runs(log.planned)
+        if log.iterations and len(asked) - s.reference >= s.budget:
             return "budget"
-        if s.scenario.pool is not None and len(runs) >= len(s.scenario.pool.x):
+        if s.scenario.pool is not None and len(asked) >= len(s.scenario.pool.x):
             return "no rows left"
-        return ALL_RUN if log.iterations and all_run(s.scenario, runs) else None
+        return ALL_RUN if log.iterations and all_run(s.scenario, asked) else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch, the run of largest P(critical) first."""
         s, first, runs = self.failure_search.settings, not log.iterations, search_runs(log.history)
-        spent, number = len(runs) - (0 if first else s.reference), self._number(log)
+        asked = search_runs(log.planned)
+        spent, number = len(asked) - (0 if first else s.reference), self._number(log)
         size = min(s.initial if first else s.batch, s.budget - spent)
         last = log.last(SearchProposal)
         start = 0 if last is None else last.next_position
@@ -98,15 +106,15 @@ class SearchStage:
             filled, at = self._even(size - len(known), start)
             chosen = self._snapped([(_TRANSFER, known), (_INITIAL, filled)], runs)
             return Batch((*chosen, *held_out_runs(s, 0, s.reference)), SearchProposal("even", at))
-        none = s.scenario.pool is not None or few(s.scenario, runs, s.budget)
+        none = s.scenario.pool is not None or few(s.scenario, asked, s.budget)
         held_out = 0 if none else min(_share_of(s.holdout_fraction, spent, size), size - 1)
         filling = min(_share_of(max(_FILL_SHARE - s.holdout_fraction, 0.0), spent, size), size - 1 - held_out)
-        again = repeats_wanted(runs, s.scenario, size - held_out - filling) if self._learns else ()
+        again = repeats_wanted(asked, s.scenario, size - held_out - filling) if self._learns else ()
         picks = self._guided(log, runs, size - held_out - filling - len(again))
         names, counts = np.unique(np.array(picks.why, dtype=np.str_), return_counts=True)
         criteria = {str(name): int(count) for name, count in zip(names, counts, strict=True)}
         filled, at = self._even(filling, start)
-        chosen = self._snapped([(_SEARCH, picks.u), (_EVEN, filled)], runs)
+        chosen = self._snapped([(_SEARCH, picks.u), (_EVEN, filled)], asked)
         again = (*again, *(PlannedRun(REPEAT, runs.inputs(row)) for row in picks.repeat))
         proposal = SearchProposal(s.method, at, criteria, filling, held_out, len(again) or None)
         return Batch((*chosen, *again, *held_out_runs(s, number, held_out)), proposal)
@@ -157,7 +165,9 @@ class SearchStage:
             return self._evolved(runs, u, n)
         if s.method == "portfolio":
             filling = np.isin(runs.stage, FILLING)
-            return portfolio.propose(search, u, y, n, rng, runs.iteration, filling, repeats=s.scenario.pool is None)
+            pending = None if log.pending is None else np.clip(space.to_unit(log.pending.x), 0.0, 1.0)
+            repeats = s.scenario.pool is None
+            return portfolio.propose(search, u, y, n, rng, runs.iteration, filling, repeats=repeats, pending=pending)
         return propose_by(s.method, search, u, y, n, rng, runs.iteration)
 
     def _evolved(self, runs: History, u: Points, n: int) -> Picks:
@@ -195,7 +205,7 @@ class SearchStage:
         """Return the n points of the highest scores that are far from each other and from earlier runs."""
         s, feasible = self.failure_search.settings, self.failure_search.search.feasible
         space = s.scenario.space
-        rng, existing = stream(s.seed, "greedy", log.iteration), np.clip(space.to_unit(log.history.x), 0.0, 1.0)
+        rng, existing = stream(s.seed, "greedy", log.iteration), np.clip(space.to_unit(log.planned.x), 0.0, 1.0)
         scale = influence_on_mean(fitted.predict, space.dimension, rng)
 
         def snap(v: Points) -> Points:  # integers are what will be run

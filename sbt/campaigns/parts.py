@@ -75,14 +75,19 @@ class BatchStage:
     choose: ChoiceRule
     repeats: bool = False
 
+    @property
+    def ahead(self) -> int:
+        """Number of batches in flight that a proposal does not wait for."""
+        return self.settings.ahead
+
     def stop(self, log: Log) -> str | None:
         """Return why the stage is over: `budget`, `no rows left`, `all combinations`, `stable` or `misclassified`."""
         s = self.settings
-        if log.iterations and len(log.history) - s.reference >= s.budget:
+        if log.iterations and len(log.planned) - s.reference >= s.budget:
             return "budget"
-        if s.scenario.pool is not None and len(log.history) >= len(s.scenario.pool.x):
+        if s.scenario.pool is not None and len(log.planned) >= len(s.scenario.pool.x):
             return "no rows left"
-        if log.iterations and self.repeats and all_run(s.scenario, log.history):
+        if log.iterations and self.repeats and all_run(s.scenario, log.planned):
             return ALL_RUN
         chose = [fit for fit in log.fits if fit.iteration < log.iteration]  # a concluding fit chose no batch
         stable = s.stop.get("stable")
@@ -105,17 +110,17 @@ class BatchStage:
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
         s, first = self.settings, log.iteration == 0
-        spent = len(log.history) - (0 if first else s.reference)
+        spent = len(log.planned) - (0 if first else s.reference)
         size = min(s.initial if first else s.batch, s.budget - spent)
         held_out = math.floor(s.holdout_fraction * (spent + size)) - math.floor(s.holdout_fraction * spent)
         held_out = min(held_out, size - 1) if size > 1 else 0
-        held_out = 0 if self.repeats and few(s.scenario, log.history, s.budget) else held_out
+        held_out = 0 if self.repeats and few(s.scenario, log.planned, s.budget) else held_out
         fitted = s.learner.fit(log.history) if s.learner is not None and not first else None
-        again = () if first or not self.repeats else repeats_wanted(log.history, s.scenario, size - held_out)
+        again = () if first or not self.repeats else repeats_wanted(log.planned, s.scenario, size - held_out)
         n = size - held_out - len(again)
         found = (evenly if first or n == 0 else self.choose)(s, fitted, log, n)
         stage = "initial" if first else self.name
-        x = without_repetition(s.scenario, log.history, found.x) if self.repeats else found.x
+        x = without_repetition(s.scenario, log.planned, found.x) if self.repeats else found.x
         chosen = PlannedPoints(stage, x, s.scenario.space.named)
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)

@@ -13,7 +13,7 @@ from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import PlannedRun
-from sbt.store.history import History
+from sbt.store.history import PLANNED, History
 from sbt.store.records import to_json
 
 __all__ = ["REPEAT", "WANTED", "SimulatorNoise", "equal_inputs", "repeats_wanted", "simulator_noise", "stated_noise"]
@@ -113,7 +113,8 @@ def repeats_wanted(history: History, scenario: LogicalScenario, most: int) -> tu
     runs = history.training
     known = simulator_noise(history, scenario.requirement).repeats
     tried = int((history.stage == REPEAT).sum())
-    n = min(WANTED - known, _ATTEMPTS - tried, most)
+    awaited = int(((history.stage == REPEAT) & (history.status == PLANNED)).sum())
+    n = min(WANTED - known - awaited, _ATTEMPTS - tried, most)
     if scenario.pool is not None or n <= 0 or len(runs) == 0:
         return ()
     y, margin = scenario.requirement.told(runs), scenario.requirement.margins(runs)

@@ -86,11 +86,16 @@ class SequentialStage:
     def _frame(self) -> Frame:
         return Frame(self._wide, self._choices)
 
+    @property
+    def ahead(self) -> int:
+        """Number of batches in flight that a proposal does not wait for; weights are those of the proposal that drew."""
+        return self.settings.ahead
+
     def stop(self, log: Log) -> str | None:
         """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
         if took_monte_carlo(log):
             return MonteCarloStage(self.settings).stop(log)
-        if log.iterations and len(log.history) >= self.settings.budget:
+        if log.iterations and len(log.planned) >= self.settings.budget:
             return "budget"
         return "cov" if is_precise(log, self.settings) else None
 
@@ -99,8 +104,8 @@ class SequentialStage:
         with threadpool_limits(1):
             if took_monte_carlo(log):
                 return MonteCarloStage(self.settings).propose(log)
-            s, left = self.settings, self.settings.budget - len(log.history)
-            again = repeats_wanted(log.history, s.scenario, left - 1)
+            s, left = self.settings, self.settings.budget - len(log.planned)
+            again = repeats_wanted(log.planned, s.scenario, left - 1)
             batch = self._proposed(log, max(min(s.batch, left) - len(again), 1))
             return replace(batch, runs=(*batch.runs, *again))
 
@@ -114,7 +119,7 @@ class SequentialStage:
             return MonteCarloStage(s).propose(log)
         modes = self._modes_while_searching(log, known, log_probability)
         if modes is not None:
-            rows = self._search_modes(known, log.iteration, size)
+            rows = self._search_modes(known, log, size)
             return Batch(self._runs(rows, _SEARCH_STAGE), EstimationProposal(EXPLORE, "explore", modes=modes))
         return self._drawn(log, known, log_probability, size)
 
@@ -131,7 +136,7 @@ class SequentialStage:
         z = stream(s.seed, "noise", log.iteration).standard_normal((2000, len(self._wide)))
         pi = np.exp(log_probability(z)[0])
         p, spread = float(pi.mean()), float(np.sqrt(pi * (1.0 - pi)).mean())
-        return p * (s.budget - len(log.history)) >= 1.0 and p * (1.0 - p) * SHARES[0] < _GAIN * spread**2
+        return p * (s.budget - len(log.planned)) >= 1.0 and p * (1.0 - p) * SHARES[0] < _GAIN * spread**2
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""
@@ -160,7 +165,7 @@ class SequentialStage:
         if self.settings.transfer is not None and not known.one_sided:
             return None
         proposals = [batch.read(EstimationProposal) for batch in log.iterations]
-        if len(log.history) >= _SEARCH_BUDGET * self.settings.budget or any(p.phase in (LEARN, COUNT) for p in proposals):
+        if len(log.planned) >= _SEARCH_BUDGET * self.settings.budget or any(p.phase in (LEARN, COUNT) for p in proposals):
             return None
         modes = [p.modes or 0 for p in proposals if p.phase == EXPLORE] + [known.modes(log_probability)]
         if modes[-1] > 0 and len(modes) > _QUIET and modes[-1] <= modes[-1 - _QUIET]:
@@ -172,9 +177,9 @@ class SequentialStage:
         z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
         return log_probability is not None and float(np.exp(log_probability(z)[0]).mean()) > _COMMON
 
-    def _search_modes(self, known: Known, iteration: int, n: int) -> Points:
+    def _search_modes(self, known: Known, log: Log, n: int) -> Points:
         """Return n search picks (n, d): the falsification portfolio in the cube of the wide distribution, some spread evenly."""
-        s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", iteration)
+        s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", log.iteration)
         even = round(_EVEN_SHARE * n)
         spread = rng.random((even, space.dimension))
         reach = 2.0 * float(gammainccinv(0.5 * space.dimension, _BEYOND))  # squared norm: chi^2
@@ -189,9 +194,11 @@ class SequentialStage:
                 within, cube=Cube(nominal=space.cube.nominal),
             )  # fmt: skip
             z, y, batch = known.attempts()
-            picks = portfolio.propose(search, to_cube(z, self._wide, self._choices), y, n - even, rng, batch)
+            pending = None if log.pending is None else to_cube(space.to_normal(log.pending.x), self._wide, self._choices)
+            at = to_cube(z, self._wide, self._choices)
+            picks = portfolio.propose(search, at, y, n - even, rng, batch, pending=pending)
             spread = np.vstack([picks.u, spread])
-        return self._feasible(self._scores(spread), iteration)
+        return self._feasible(self._scores(spread), log.iteration)
 
     def _scores(self, v: Points) -> Points:
         """Return normal scores of points of the cube in which the wide distribution is uniform."""
@@ -213,7 +220,7 @@ class SequentialStage:
         runs, kept = draw_batch(
             s.scenario.space, pool, size - searched, rng, counts=counts, once=not noisy, fallback=fallback is not None
         )  # fmt: skip
-        return Batch((*runs, *self._runs(self._search_modes(known, log.iteration, searched), _SEARCH_STAGE)), kept)
+        return Batch((*runs, *self._runs(self._search_modes(known, log, searched), _SEARCH_STAGE)), kept)
 
     def _proposal(
         self, log_probability: LogProbability | None, known: Known, shares: tuple[float, ...], rng: np.random.Generator

@@ -40,6 +40,7 @@ class Settings:
         seed: of the campaign.
         budget: runs, the held-out share included.
         initial, batch: runs of the first and of each further iteration.
+        ahead: number of batches in flight that a proposal does not wait for.
         holdout_fraction: share of every batch that is drawn at random and held out.
         reference: further held-out runs beyond the budget.
         learner: fits and scores the metamodel; None: no metamodel.
@@ -65,6 +66,7 @@ class Settings:
     gate: Gate | None = None
     prior_runs: History | None = None
     transfer: Transfer | None = None
+    ahead: int = 0
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
     drawn = list(pools_of(log))
     if any(batch.read(EstimationProposal).counted is not None for batch, _ in drawn):
         return True
-    spent = len(log.history)
+    spent = len(log.planned)
     if spent + size > _LATEST * settings.budget:
         return True
     if len(drawn) < (_FEWEST_LEARNED if settings.transfer is None else 1):

@@ -25,6 +25,7 @@ def conclusion_lines(result: Mapping[str, Any], *, verbose: bool = False) -> lis
     lines = [head, f"  ok {result['ok']}, failed {result['failed']}, critical {result['critical']}{_doubts(result)}"]
     conclusion = result.get("conclusion", {})
     lines += _values(conclusion) if verbose or not result.get("sentences") else _answer(result)
+    lines += _use_of_workers(result.get("seconds", {})) if verbose else []
     lines += [f"  warning: {warning}" for warning in conclusion.get("warnings", ())]
     path = Path(result["store"]) / "report.html"
     lines.append(f"report: {path}" if path.is_file() else f"store: {result['store']}")
@@ -58,6 +59,12 @@ def _doubts(result: Mapping[str, Any]) -> str:
     if passed := result.get("other_level", 0):
         words += f"; in {passed} runs roads are taken for bridges, and a contact across them is not counted"
     return words
+
+
+def _use_of_workers(seconds: Mapping[str, float]) -> list[str]:
+    """Return how much of the workers' time was used; nothing where it is not known."""
+    work, idle = seconds.get("work", 0.0), seconds.get("idle", 0.0)
+    return [f"  workers: busy {100 * work / (work + idle):.0f} % of the time from the first run to the last"] if work else []
 
 
 def _answer(result: Mapping[str, Any]) -> list[str]:

@@ -287,7 +287,7 @@ def _with(data: Any, path: tuple[str, ...], value: Any) -> Json:
 
 def _problem(error: Any, model: type[BaseModel]) -> tuple[Key, str, bool]:
     """Return path, message and whether the key is at fault, of one of pydantic's errors."""
-    path: Key = tuple(part for part in error["loc"] if part != "[key]")
+    path: Key = tuple(part for part in error["loc"] if part not in ("[key]", "[number]", "[keys]"))
     kind = error["type"]
     if kind == "extra_forbidden":
         return path, _unknown_key(path, model), True

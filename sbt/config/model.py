@@ -7,7 +7,7 @@ name, low < high) are checked in `sbt.config.assemble`, everything else here.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,8 +17,10 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     JsonValue,
+    Tag,
     ValidationInfo,
     WithJsonSchema,
     field_validator,
@@ -33,7 +35,7 @@ from sbt.problem.expression import Expression
 from sbt.problem.plain import Json
 
 __all__ = [
-    "AcquisitionChoice", "Choice", "ChoicesGiven", "Configuration",
+    "AcquisitionChoice", "BatchChoice", "Choice", "ChoicesGiven", "Configuration",
     "CorrelationEntry", "GateChoice", "InputChange", "Interval", "MetamodelChoice", "Name", "RequirementChange",
     "SimulationChoice", "StopRules", "ValidationChoice", "WarmStart",
 ]  # fmt: skip
@@ -139,6 +141,22 @@ class CorrelationEntry(_Strict):
 
     inputs: Annotated[tuple[Name, Name], BeforeValidator(two_values), Field(strict=False)] = Field(description="Two inputs.")
     value: float = Field(gt=-1, lt=1, description="Correlation of their normal scores, between -1 and 1.")
+
+
+class BatchChoice(_Strict):
+    """Runs per iteration, and whether the next ones are chosen while they run."""
+
+    size: int | None = Field(default=None, ge=1, description="Runs per iteration; default: that of the campaign.")
+    ahead: int = Field(
+        default=0, ge=0, le=4,
+        description="Batches in flight that the choice of the next one does not wait for: 1 keeps the workers busy.",
+    )  # fmt: skip
+
+
+Batch = Annotated[
+    Annotated[BatchChoice, Tag("[keys]")] | Annotated[Annotated[int, Field(ge=1)], Tag("[number]")],
+    Discriminator(lambda given: "[keys]" if isinstance(given, BatchChoice | Mapping) else "[number]"),
+]
 
 
 class ValidationChoice(_Strict):
@@ -267,11 +285,11 @@ class Configuration(_Strict):
         description="Evenly distributed runs before the first fit; default: budget / 10, at least 10; at most 10 in a "
         "falsification and 15 in an estimation with a metamodel.",
     )  # fmt: skip
-    batch: int = Field(
+    batch: Batch = Field(
         default_factory=_batch,
-        ge=1,
-        description="Runs per iteration; default: as many as initial; falsification 10, estimation with a metamodel 15.",
-    )
+        description="Runs per iteration, or {size: 50, ahead: 1}; default: as many as initial; falsification 10, estimation "
+        "with a metamodel 15.",
+    )  # fmt: skip
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(
         default_factory=_metamodel,
@@ -295,6 +313,17 @@ class Configuration(_Strict):
         if value > info.data.get("budget", value):
             raise ValueError(f"initial <= budget must hold, but got initial {value}, budget {info.data['budget']}")
         return value
+
+    @property
+    def batch_size(self) -> int:
+        """Runs per iteration."""
+        size = self.batch.size if isinstance(self.batch, BatchChoice) else self.batch
+        return _batch(vars(self)) if size is None else size
+
+    @property
+    def ahead(self) -> int:
+        """Number of batches in flight that the choice of the next one does not wait for."""
+        return self.batch.ahead if isinstance(self.batch, BatchChoice) else 0
 
     @field_validator("metamodel")
     @classmethod

@@ -56,6 +56,8 @@ class DaskExecutor:
         SbtError: the scheduler is gone; what is done is done, and the campaign can be resumed.
     """
 
+    apart = True
+
     def __init__(
         self, spec: ScenarioSpec, address: str | None, workers: int, timeout: float | None = None, memory: int | None = None,
         recycle: int | None = None,
@@ -150,11 +152,17 @@ class DaskExecutor:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome a job as they finish."""
-        suspects = yield from self._drain(deque(jobs))
-        for job in suspects:
-            if (yield from self._drain(deque([job]))):
-                reason = "the dask worker died, also when this run was tried again alone"
-                yield Outcome(job.index, Status.CRASHED, {}, reason)
+        for outcomes in self.groups(deque(jobs)):
+            yield from outcomes
+
+    def groups(self, queue: deque[Job]) -> Iterator[list[Outcome]]:
+        """Yield the outcomes as they come, those of a task together."""
+        while queue:
+            suspects = yield from self._drain(queue)
+            for job in suspects:
+                if (yield from self._drain(deque([job]))):
+                    reason = "the dask worker died, also when this run was tried again alone"
+                    yield [Outcome(job.index, Status.CRASHED, {}, reason)]
 
     def _drain(self, queue: deque[Job]) -> Any:
         """Run the queued jobs; return those whose workers died."""
@@ -179,7 +187,7 @@ class DaskExecutor:
                 continue
             for outcome in outcomes:
                 self._seconds += 0.1 * (max(outcome.seconds, 1e-4) - self._seconds)
-                yield outcome
+            yield outcomes
         return suspects
 
     def _result(self, future: Any) -> Any:

@@ -74,6 +74,8 @@ class LocalExecutor:
         recycle: number of runs after which a worker is replaced by a fresh one; None: never.
     """
 
+    apart = True
+
     def __init__(
         self, spec: ScenarioSpec, workers: int, timeout: float | None = None, memory: int | None = None,
         recycle: int | None = None,
@@ -127,17 +129,17 @@ class LocalExecutor:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome a job as they finish."""
-        for outcomes in self.groups(jobs):
+        for outcomes in self.groups(deque(jobs)):
             yield from outcomes
 
-    def groups(self, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
-        """Yield the outcomes as they come, those of a task together."""
-        queue = deque(jobs)
+    def groups(self, queue: deque[Job]) -> Iterator[list[Outcome]]:
+        """Yield the outcomes as they come, those of a task together; an empty list every quarter of a second without any."""
         suspects: deque[Job] = deque()
         while queue or suspects:
             alone = bool(suspects)
             missing, dead = yield from self._drain(deque([suspects.popleft()]) if alone else queue)
-            queue = queue if alone else deque()
+            if not alone:
+                queue.clear()  # what was not started is among the missing
             for job in missing:
                 if job.index in dead and (alone or dead[job.index] is _Cause.LATE):
                     yield [self._lost(job, dead[job.index])]
@@ -178,6 +180,8 @@ class LocalExecutor:
                     continue
                 del submitted[future]
                 yield self._measured(future.result())
+            if not done:
+                yield []
             if not done or time.monotonic() - looked > _TICK:
                 looked = time.monotonic()
                 stopped |= self._kill_overdue() | self._kill_large()

@@ -15,7 +15,7 @@ from sbt.execution.worker import run_job, run_jobs
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.scenario import Batched
 
-__all__ = ["CHUNK", "Executor", "Grouping", "SerialExecutor", "chunk_of", "groups_of"]
+__all__ = ["CHUNK", "Executor", "Grouping", "SerialExecutor", "chunk_of", "groups_of", "is_apart"]
 
 CHUNK = 64
 """Largest number of runs that are started before the outcome of the first is known."""
@@ -41,20 +41,41 @@ class Executor(Protocol):
 
 @runtime_checkable
 class Grouping(Protocol):
-    """An executor that says which runs ended together, so that their outcomes are written together."""
+    """An executor that says which runs ended together, and takes more runs while it is at work."""
 
-    def groups(self, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
-        """Yield the outcomes as they come, those that came together in one list."""
+    @property
+    def apart(self) -> bool:
+        """Whether runs leave this process idle."""
+        ...
+
+    def groups(self, queue: deque[Job]) -> Iterator[list[Outcome]]:
+        """Yield the outcomes as they come, those that came together in one list; an empty one where nothing came for a while.
+
+        The queue is emptied; what is appended to it meanwhile is run as well.
+        """
         ...
 
 
-def groups_of(executor: Executor, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
-    """Yield the outcomes of an executor in the groups that it makes; alone where it makes none."""
-    return executor.groups(jobs) if isinstance(executor, Grouping) else ([outcome] for outcome in executor.run(jobs))
+def is_apart(executor: Executor) -> bool:
+    """Return whether runs leave this process idle."""
+    return isinstance(executor, Grouping) and executor.apart
+
+
+def groups_of(executor: Executor, queue: deque[Job]) -> Iterator[list[Outcome]]:
+    """Yield the outcomes of queued runs in the groups that the executor makes; alone where it makes none."""
+    if isinstance(executor, Grouping):
+        yield from executor.groups(queue)
+    while queue:
+        jobs = list(queue)
+        queue.clear()
+        for outcome in executor.run(jobs):
+            yield [outcome]
 
 
 class SerialExecutor:
     """Runs in this process, several at once where the isolation says so: the reference, and for debugging."""
+
+    apart = False
 
     def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
         self._scenario = spec.resolve().limited(timeout)
@@ -69,16 +90,16 @@ class SerialExecutor:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome a job, in order; see `groups`."""
-        for outcomes in self.groups(jobs):
+        for outcomes in self.groups(deque(jobs)):
             yield from outcomes
 
-    def groups(self, jobs: Sequence[Job]) -> Iterator[list[Outcome]]:
+    def groups(self, queue: deque[Job]) -> Iterator[list[Outcome]]:
         """Yield the outcomes in order, those of runs that take no time together.
 
         Raises:
             KeyboardInterrupt: Ctrl-C, after the run that was at work at the latest.
         """
-        simulate, queue = self._scenario.simulate, deque(jobs)
+        simulate = self._scenario.simulate
         together = isinstance(simulate, Batched) and simulate.batched
         while queue:
             with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises

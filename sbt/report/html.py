@@ -148,7 +148,9 @@ def _time(found: Findings) -> str:
     simulated = f"{_duration(float(found.history.seconds.sum()))} of simulation, summed over workers"
     spent = found.ended.get("seconds") or {}
     other = [f"{name} {_duration(spent[name])}" for name in ("fit", "propose") if spent.get(name) is not None]
-    return ", ".join([simulated, *other])
+    work, idle = (float(spent.get(name) or 0.0) for name in ("work", "idle"))
+    used = [f"workers busy {100 * work / (work + idle):.0f} %"] if work else []
+    return ", ".join([simulated, *other, *used])
 
 
 def _duration(seconds: float) -> str:

@@ -30,7 +30,7 @@ def write_junit(path: Path, result: JsonMapping, *, fail_on_critical: bool = Fal
     if fail_on_critical:
         cases.append(("no critical run", "critical" if result["critical"] else None, f"{result['critical']} runs were critical"))
     failures = sum(kind is not None for _, kind, _ in cases)
-    seconds = f"{sum(result['seconds'].values()):.3f}"
+    seconds = f"{sum(result['seconds'][name] for name in ('simulate', 'fit', 'propose')):.3f}"
     suite = ET.Element("testsuite", name=name, tests=str(len(cases)), failures=str(failures), errors="0", time=seconds)
     for title, kind, statement in cases:
         case = ET.SubElement(suite, "testcase", classname=name, name=title)

@@ -46,7 +46,7 @@ _CLEAR_OF_RUNS = 0.2 * _CLEAR  # the metamodel knows what a finished run says of
 
 def propose(
     search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None,
-    filling: Mask | None = None, *, repeats: bool = False,
+    filling: Mask | None = None, *, repeats: bool = False, pending: Points | None = None,
 ) -> Picks:  # fmt: skip
     """Return n points where the next failure may be, away from the failures that are known.
 
@@ -63,6 +63,8 @@ def propose(
         rng: the only source of randomness.
         batch: (m,) number of the batch that each run came with; None: each run by itself.
         filling: (m,) the run fills space, whatever the results; None: all do.
+        pending: (k, d) runs in flight: further picks keep away from them as from those of their own batch; Thompson draws are
+            independent of them.
         repeats: where the simulator is noisy, up to a tenth of the n are repetitions that decide whether a basin is deflated.
 
     Returns:
@@ -94,10 +96,10 @@ def propose(
     filled = round(_FILLING_LATE * (n - len(small))) if stagnant else 0
     thompson = min(round((_THOMPSON_LATE if stagnant else _THOMPSON) * n), n - len(small) - filled)
     drawn = _thompson(model, hopeful, thompson if len(small) == 0 else min(thompson, (n - len(small)) // 2), d, rng)
-    picks = np.vstack([drawn, small])
-    picks = np.vstack([picks, spread_out(seen.admissible, np.vstack([u, picks]), filled, rng, search.cube)])
+    picks, pending = np.vstack([drawn, small]), np.empty((0, d)) if pending is None else pending
+    picks = np.vstack([picks, spread_out(seen.admissible, np.vstack([u, pending, picks]), filled, rng, search.cube)])
     why = ("thompson",) * len(drawn) + ("niche",) * len(small) + ("fill",) * filled + ("global",) * (n - len(picks))
-    picks = _globally(model, picks, n, u, hopeful, seen.admissible, rng, search.cube)
+    picks = _globally(model, picks, n, u, pending, hopeful, seen.admissible, rng, search.cube)
     order = np.argsort(-model.log_probability(picks), kind="stable")
     return Picks(picks[order], tuple(why[k] for k in order), again)
 
@@ -171,7 +173,7 @@ def _thompson(model: WarpedModel, niches: list[tuple[Region, Points]], n: int, d
 
 
 def _globally(
-    model: WarpedModel, picks: Points, n: int, u: Points, niches: list[tuple[Region, Points]],
+    model: WarpedModel, picks: Points, n: int, u: Points, pending: Points, niches: list[tuple[Region, Points]],
     admissible: Callable[[Points], Mask], rng: np.random.Generator, cube: Cube,
 ) -> Points:  # fmt: skip
     """Return the picks and further ones, n in all: the largest P(critical), every second time inflated.
@@ -184,12 +186,12 @@ def _globally(
     scores = [np.maximum(values, np.log(_HOPELESS)) for values in (model.log_probability(candidates), wide)]
     at_candidates = cube.embedded(candidates)
     away = log_repulsion(at_candidates, cube.embedded(u), _CLEAR_OF_RUNS * np.sqrt(d))
-    for point in cube.embedded(picks):
+    for point in cube.embedded(np.vstack([pending, picks])):
         away += log_repulsion(at_candidates, point[None], _CLEAR * np.sqrt(d))
     for k in range(n - len(picks)):
         at = int(np.argmax(scores[k % 2] + away))
         if scores[k % 2][at] <= np.log(_HOPELESS):
-            picks = np.vstack([picks, spread_out(admissible, np.vstack([u, picks]), 1, rng, cube)])
+            picks = np.vstack([picks, spread_out(admissible, np.vstack([u, pending, picks]), 1, rng, cube)])
             continue
         picks = np.vstack([picks, candidates[at]])
         away += log_repulsion(at_candidates, at_candidates[at][None], _CLEAR * np.sqrt(d))

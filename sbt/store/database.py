@@ -18,6 +18,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sbt.errors import StoreError
 from sbt.problem.description import described_choices
 from sbt.problem.outcome import Job, Outcome, Status
@@ -31,6 +33,8 @@ from sbt.store.writer import locked, released, written
 
 __all__ = ["DATABASE", "PlannedPoints", "PlannedRun", "Store"]
 
+_READ = 2_000
+"""Rows that are decoded at once."""
 _TOGETHER = 0.1
 """Seconds within which runs wait for the disk once."""
 _FIELDS = ("stage", "iteration", "seed", "seed_chosen", "level", "warm_up", "log_q", "status", "reason", "seconds", "collisions",
@@ -303,14 +307,32 @@ class Store:
             self._rows = Rows(tuple(kept["names"]), described_choices(kept.get("described") or {}))
         return self._rows
 
-    def unfinished(self, most: int = -1) -> list[Job]:
-        """Return the planned runs that have no outcome yet; the first so many of them, where there is a `most`."""
-        query = f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE status = ? ORDER BY idx LIMIT ?"
-        rows = self._select(query, (PLANNED, most))
+    def unfinished(self, most: int = -1, since: int = 0) -> list[Job]:
+        """Return the planned runs from index `since` on that have no outcome yet; the first `most` of them, -1: all."""
+        query = f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE status = ? AND idx >= ? ORDER BY idx LIMIT ?"
+        rows = self._select(query, (PLANNED, since, most))
         for row in rows:
             self._checked(f"run {row[0]}", row[-1], *row[:-1])
         names = self._known.names
         return [Job(row[0], dict(zip(names, json.loads(row[3]), strict=True)), row[4]) for row in rows]
+
+    @property
+    def first_unfinished(self) -> int | None:
+        """Number of the first batch with a run that has no outcome yet; None: there is none."""
+        rows = self._select("SELECT iteration FROM runs WHERE status = ? ORDER BY idx LIMIT 1", (PLANNED,))
+        return int(rows[0][0]) if rows else None
+
+    def pending(self, since: int) -> History:
+        """Return the runs from index `since` on as they were planned, whether they have an outcome or not."""
+        rows = self._select(f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE idx >= ? ORDER BY idx", (since,))
+        for row in rows:
+            self._checked(f"run {row[0]}", row[-1], *row[:-1])
+        found = Rows(self._known.names, self._known.choices)
+        columns = dict(zip(PLAN, zip(*rows, strict=True), strict=False)) if rows else {}
+        x = as_numbers([json.loads(text) for text in columns.pop("inputs", ())], found.names, found.choices)
+        columns["index"], columns["status"] = columns.pop("idx", ()), (PLANNED,) * len(rows)
+        found.append(x, columns, [{}] * len(rows))
+        return found.history()
 
     def iterations(self) -> list[Iteration]:
         """Return how each batch was chosen."""
@@ -329,15 +351,17 @@ class Store:
             self._fits.append(from_json(FitRecord, json.loads(text)))
         return list(self._fits)
 
-    def history(self) -> History:
-        """Return all finished runs as columns; what was read before is not decoded again."""
+    def history(self, until: int | None = None) -> History:
+        """Return all finished runs as columns, or those of the batches up to `until`; nothing is decoded twice."""
         with reported(self.folder):
             done = self._known
             pending = self._db.execute("SELECT MIN(idx) FROM runs WHERE status = ?", (PLANNED,)).fetchone()[0]
-            until = "" if pending is None else f" AND idx < {int(pending)}"
-            self._read_into(done, f"idx >= {self._read_up_to}{until}")
+            end = "" if pending is None else f" AND idx < {int(pending)}"
+            self._read_into(done, f"idx >= {self._read_up_to}{end}")
             if done.count:
                 self._read_up_to = int(done.history().index[-1]) + 1
+            if until is not None:  # of finished batches: none of their rows is pending
+                return done.history(int(np.searchsorted(done.history().iteration, until, side="right")))
             if pending is None:
                 return done.history()
             some = Rows(done.names, done.choices)  # rows behind one that is still being run may get neighbours later
@@ -349,7 +373,7 @@ class Store:
         query = f"SELECT {', '.join((*PLAN, *OUTCOME))}, plan_checksum, checksum FROM runs WHERE {condition} ORDER BY idx"
         cursor = self._db.execute(query)
         n = len(PLAN)
-        while found := cursor.fetchmany(10_000):
+        while found := cursor.fetchmany(_READ):
             for row in found:
                 self._checked(f"run {row[0]}", row[-2], *row[:n])
                 self._checked(f"the outcome of run {row[0]}", row[-1], row[0], *row[n:-2])

@@ -74,6 +74,8 @@ _NUMBERS: Mapping[str, tuple[Any, Callable[[Any], Any]]] = {
     "warm_up": (np.int64, lambda v: -1 if v is None else v), "seed_chosen": (np.bool_, bool),
 }  # fmt: skip
 _TEXTS = ("stage", "status", "reason", "collisions", "versions", "unconfirmed")
+_MOSTLY_ALIKE = (*_TEXTS, "log_q", "level")
+"""Columns that are kept as one value for as long as all rows have it: of a million runs most are."""
 
 
 @dataclass
@@ -90,6 +92,7 @@ class Rows:
     count: int = 0
     _columns: dict[str, NDArray[Any]] = field(default_factory=dict, repr=False)
     _texts: dict[str, str] = field(default_factory=dict, repr=False)
+    _single: set[str] = field(default_factory=lambda: set(_MOSTLY_ALIKE), repr=False)
 
     def append(self, x: Points, columns: Mapping[str, Sequence[Any]], metrics: Sequence[Mapping[str, float]]) -> None:
         """Append rows: x (k, d), the other fields of a `Record` by name, and the metrics of each row."""
@@ -115,6 +118,12 @@ class Rows:
     def _put(self, name: str, values: NDArray[Any], empty: Any) -> None:
         """Write values behind the rows there are; arrays that were handed out are never written again."""
         end = self.count + len(values)
+        if name in self._single:
+            one = self._columns.setdefault(name, values[:1].copy() if len(values) else np.array([empty], values.dtype))
+            if _alike(values, one):
+                return
+            self._single.remove(name)
+            self._columns[name] = np.repeat(one, self.count)
         there = self._columns.get(name)
         if there is None or len(there) < end:
             grown = np.empty((max(end, 64, int(1.5 * len(there)) if there is not None else 0), *values.shape[1:]), values.dtype)
@@ -122,11 +131,13 @@ class Rows:
             self._columns[name] = there = grown
         there[self.count : end] = values
 
-    def history(self) -> History:
-        """Return the rows so far."""
+    def history(self, first: int | None = None) -> History:
+        """Return the rows so far, or the first ones of them."""
         if not self._columns:
             self.append(np.empty((0, len(self.names))), {}, [])
-        return History(self.names, {name: column[: self.count] for name, column in self._columns.items()}, self.choices)
+        n = self.count if first is None else first
+        columns = {name: np.broadcast_to(c, n) if name in self._single else c[:n] for name, c in self._columns.items()}
+        return History(self.names, columns, self.choices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +338,14 @@ class History:
         data["warm_up"] = pd.arrays.IntegerArray(warm_up, warm_up < 0)
         data["unconfirmed"] = self.columns["unconfirmed"]
         return pd.DataFrame(data)
+
+
+def _alike(values: NDArray[Any], one: NDArray[Any]) -> bool:
+    """Return whether all values are the single one of an array; NaN is NaN."""
+    alike = values == one
+    if values.dtype.kind == "f":
+        alike |= np.isnan(values) & np.isnan(one)
+    return bool(np.all(alike))
 
 
 def violated_names(history: History, requirement: Requirement) -> list[str]:

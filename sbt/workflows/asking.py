@@ -100,7 +100,7 @@ def _settings(study: Study, requirement: Requirement) -> Settings:
     config = study.config
     return Settings(
         scenario=replace(study.scenario, requirement=requirement), seed=config.seed, budget=config.budget,
-        initial=config.initial, batch=config.batch, learner=study.learner if study.learns else None,
+        initial=config.initial, batch=config.batch_size, learner=study.learner if study.learns else None,
         method=config.acquisition.kind,
     )  # fmt: skip
 

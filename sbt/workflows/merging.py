@@ -14,7 +14,8 @@ from typing import Self
 
 from sbt.errors import InputError
 from sbt.files import move_atomically
-from sbt.loop.stages import Shard, run_stages
+from sbt.loop.running import run_stages
+from sbt.loop.stages import Shard
 from sbt.problem.description import is_complete
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import JsonMapping

@@ -16,7 +16,8 @@ from sbt.execution.warming import warm_up
 from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
-from sbt.loop.stages import Conclusion, Facts, Finished, Log, Progress, Shard, check_shard, run_shard, run_stages
+from sbt.loop.running import Finished, check_shard, run_shard, run_stages
+from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard
 from sbt.plugins import OBJECT, Objects, forget_files
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
@@ -50,7 +51,8 @@ class Summary:
         other_level: runs with a contact that is not counted, as roads that cross without a junction are taken for bridges.
         iterations: batches.
         stopped: why it ended.
-        seconds: of `simulate`, `fit` and `propose`.
+        seconds: of `simulate`, `fit` and `propose`; `work` and `idle` of the workers, summed over them, from the first run
+            to the last since the campaign was started, where their number is known.
         conclusion: what was found.
         sentences: the same in plain words.
         metric: that of the requirement, or what stands for it in a formula or a combination.
@@ -119,7 +121,7 @@ def run_study(
         with executor:
             _check_code(store, study, executor)
             if shard is None:
-                finished = run_stages(campaign, store, executor, budget=study.budget, **common)
+                finished = run_stages(campaign, store, executor, budget=study.budget, workers=study.workers, **common)
             else:
                 finished = run_shard(campaign, shard, store, executor, **common)
         if shard is None:

@@ -19,6 +19,7 @@ from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
 from sbt.loop.learner import FittedMetamodel, Learner
+from sbt.loop.running import ahead_of
 from sbt.loop.stages import Campaign, Conclusion, Shard
 from sbt.plugins import Objects, Scope, newer
 from sbt.problem.description import describe_scenario, is_complete, rebuild_scenario
@@ -219,23 +220,37 @@ class Study:
         """What the campaign is built from."""
         config, recorded = self.config, self.scenario.pool is not None
         return Settings(
-            scenario=self.scenario, seed=config.seed, budget=config.budget, initial=config.initial, batch=config.batch,
+            scenario=self.scenario, seed=config.seed, budget=config.budget, initial=config.initial, batch=config.batch_size,
             holdout_fraction=config.validation.share if self.learner is not None and not recorded else 0.0,
             reference=0 if recorded else config.validation.reference, learner=self.learner,
             acquisition=self._assembly.acquisition if self.live else None, method=config.acquisition.kind,
             stop=config.stop.model_dump(), gate=None if config.gate is None else Gate(**config.gate.model_dump()),
-            prior_runs=self._prior_runs(), transfer=self._transfer(),
+            prior_runs=self._prior_runs(), transfer=self._transfer(), ahead=config.ahead,
         )  # fmt: skip
 
     @cached_property
     def campaign(self) -> Campaign:
-        """The campaign itself: its stages, and what it concludes."""
-        return self.kind.recipe(self.settings)
+        """The campaign itself: its stages, and what it concludes.
+
+        Raises:
+            InputError: its batches are to be chosen ahead, but each needs all results before it.
+        """
+        found = self.kind.recipe(self.settings)
+        if self.config.ahead and not any(ahead_of(stage) for stage in found.stages):
+            kind, how = self.config.campaign, self.config.acquisition.kind
+            raise InputError(f"batch.ahead must be 0 where each batch needs all results before it, as in {kind} by {how}")
+        return found
 
     @property
     def budget(self) -> int:
         """Number of runs, those included that only score."""
         return self.config.budget + self.config.validation.reference
+
+    @property
+    def workers(self) -> int | None:
+        """Number of processes that make the runs; None: those of a cluster, which come and go."""
+        choice = self.config.executor
+        return 1 if choice.kind == "serial" else None if choice.kind == "dask" and choice.address else choice.workers
 
     def executor(self, spec: ScenarioSpec | None = None, *, workers: int | None = None) -> Executor:
         """Return what executes the runs, as configured.
