@@ -11,7 +11,7 @@ import numpy as np
 
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
 from sbt.metrics.paths import HORIZON as PATH_HORIZON
-from sbt.metrics.paths import ttc_on_paths
+from sbt.metrics.paths import smallest_ttc_on_paths, ttc_on_paths
 from sbt.metrics.planar import distance, time_behind
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
@@ -35,17 +35,10 @@ def _over_others(pairwise: Pairwise, ego: str, worst: Callable[[list[float]], fl
 def ttc_path_min(ego: str = "ego") -> Metric:
     """Return the smallest time to collision with any road user along the paths driven (s), 0 for a collision, at most 5."""
 
-    def over_time(trace: Trace) -> Vector:
-        times = np.full(len(trace.time), PATH_HORIZON)
-        for other in trace.actors:
-            if other != ego:
-                np.minimum(times, ttc_on_paths(trace, ego, other), out=times)
-        return times
-
     return Metric(
-        "ttc_path_min", lambda trace: float(over_time(trace).min()), "s", "low", PATH_HORIZON,
+        "ttc_path_min", lambda trace: smallest_ttc_on_paths(trace, ego), "s", "low", PATH_HORIZON,
         "smallest time until ego and anyone else would touch on the paths they drive at their present speeds",
-        over_time=over_time,
+        over_time=lambda trace: ttc_on_paths(trace, ego, None),
     )  # fmt: skip
 
 
