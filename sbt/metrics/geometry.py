@@ -62,7 +62,9 @@ def corners(actor: ActorTrace) -> np.ndarray:
 
 def _axes(a: ActorTrace, b: ActorTrace) -> tuple[np.ndarray, np.ndarray]:
     """Return the (t, 4) directions of the separating axes: along and across each rectangle."""
-    angle = np.stack([a.heading, a.heading + np.pi / 2, b.heading, b.heading + np.pi / 2], axis=1)
+    angle = np.empty((len(a.heading), 4))
+    angle[:, 0], angle[:, 2] = a.heading, b.heading
+    angle[:, 1::2] = angle[:, ::2] + np.pi / 2
     return np.cos(angle), np.sin(angle)
 
 
@@ -112,13 +114,14 @@ def _overlap_span(start: np.ndarray, rate: np.ndarray, reach: np.ndarray) -> tup
         rate: (t, 4) its rate of change.
         reach: (t, 4) sum of the half extents.
     """
+    signed = np.sign(rate) * reach
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        first = (-np.sign(rate) * reach - start) / rate
-        last = (np.sign(rate) * reach - start) / rate
+        first, last = (-signed - start) / rate, (signed - start) / rate
     still = rate == 0
-    outside = np.abs(start) > reach
-    first = np.where(still, np.where(outside, np.inf, -np.inf), first)
-    last = np.where(still, np.where(outside, -np.inf, np.inf), last)
+    if still.any():
+        outside = np.abs(start) > reach
+        first = np.where(still, np.where(outside, np.inf, -np.inf), first)
+        last = np.where(still, np.where(outside, -np.inf, np.inf), last)
     return first.max(axis=1), last.min(axis=1)
 
 
@@ -168,7 +171,9 @@ def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
 
 def select_instants(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:
     """Return an actor at some instants only."""
-    return select_parts((actor,), i)[0]
+    parts = select_parts(actor.parts, i) if actor.parts else ()
+    states = (getattr(actor, name)[i] for name in ("x", "y", "heading", "speed", "acceleration"))
+    return ActorTrace(*states, actor.length, actor.width, parts)
 
 
 def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:

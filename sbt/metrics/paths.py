@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sbt.metrics.around import first_contacts
 from sbt.metrics.courses import Course, near_steps
 from sbt.metrics.geometry import contact_share, rectangles
 from sbt.metrics.intervals import joint_intervals
@@ -77,8 +78,10 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str | None = "co") -> Ve
 
 def smallest_ttc_on_paths(trace: Trace, ego: str = "ego") -> float:
     """Return the smallest time of `ttc_on_paths` to anyone else, of all instants (s)."""
+    if first_contacts(trace, ego):
+        return 0.0
     met = list(_together(trace, ego, None))
-    if any(one.contact is not None for one in met):
+    if any(one.contact is not None for one in met if one.trace is not trace):
         return 0.0
     least = HORIZON
     for earliest, _, _, found in _predicted_contacts(met):

@@ -11,7 +11,9 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from sbt.metrics.around import around, first_contacts
 from sbt.metrics.geometry import contact_index, contact_share, part_pairs, rectangle_distance, select_instants, time_to_contact
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
 from sbt.problem.arrays import Vector
@@ -23,6 +25,8 @@ __all__ = [
     "ttc_2d_min",
 ]  # fmt: skip
 
+_BLOCK = 8
+"""Instants that are first looked at together."""
 _BISECTIONS = 10
 """The PET is accurate to the step of the trace divided by 2 to this power."""
 
@@ -99,15 +103,16 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
         return HORIZON
     step = float(trace.time[-1] - trace.time[0]) / (n - 1)
     for k in range(1, min(n - 1, int(HORIZON / step)) + 1):
-        found = [sign for sign in (1, -1) if _meet(*_shifted(a, b, sign * k))]
+        found = [sign for sign in (1, -1) if _meet_shifted(a, b, sign, k)]
         if found:
-            return min(HORIZON, step * min(_bisected(k, sign, partial(_shifted, a, b)) for sign in found))
+            return min(HORIZON, step * min(_bisected(k, partial(_meet_shifted, a, b, sign)) for sign in found))
     return HORIZON
 
 
 def time_behind(
-    trace: Trace, ego: str = "ego", other: str = "co", horizon: float = HORIZON, zone: tuple[float, float, float] | None = None
-) -> float:
+    trace: Trace, ego: str = "ego", other: str | None = "co", horizon: float = HORIZON,
+    zone: tuple[float, float, float] | None = None,
+) -> float:  # fmt: skip
     """Return the post-encroachment time of conflicts that the ego passes first (s), at most `horizon`; 0 for a collision.
 
     Like `post_encroachment_time`, but an ego that waits until the other has passed and then follows closely is not
@@ -116,31 +121,70 @@ def time_behind(
     Args:
         trace: of the run.
         ego: the road user that passes first.
-        other: the road user that follows.
+        other: the road user that follows; None: anyone, the soonest counts.
         horizon: value if the other does not follow within this time (s).
         zone: x, y and radius of a circle (m) in which the ego's centre must be; None: anywhere.
     """
-    a, b = trace.actor(ego), trace.actor(other)
-    if first_contact(trace, ego, other) is not None:
+    touched = first_contacts(trace, ego) if other is None else first_contact(trace, ego, other) is not None
+    if touched:
         return 0.0
+    a = trace.actor(ego)
     inside = np.arange(len(a.x)) if zone is None else np.flatnonzero(np.hypot(a.x - zone[0], a.y - zone[1]) <= zone[2])
-    if inside.size < 2 or not _paths_near(a, b):
+    if inside.size < 2:
         return horizon
     first, n = int(inside[0]), int(inside[-1]) + 1 - int(inside[0])
-    a, b = select_instants(a, slice(first, first + n)), select_instants(b, slice(first, None))
     step = float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
-    k = _smallest_shift(a, b, min(len(b.x) - 1, math.ceil(horizon / step)))
-    if k is None:
-        return horizon
-    return min(horizon, step * _bisected(k, 1, partial(_behind, a, b)))
+    least = horizon
+    others = _near_paths(trace, ego, math.ceil(horizon / step)) if other is None else [other]
+    for name in others:  # larger times than the least so far do not matter
+        b = trace.actor(name)
+        if other is None or _paths_near(a, b):
+            own, later = select_instants(a, slice(first, first + n)), select_instants(b, slice(first, None))
+            k = _smallest_shift(own, later, min(len(later.x) - 1, math.ceil(least / step)))
+            if k is not None:
+                least = min(least, step * _bisected(k, _behind(own, later, k)))
+    return least
 
 
-def _behind(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:
-    """Return the first instants of a, and those of b `shift` steps later, as far as both are recorded."""
-    padded = select_instants(b, slice(len(a.x) + int(shift) + 1))
-    _, later = _shifted(padded, padded, shift)
-    n = min(len(a.x), len(later.x))
-    return select_instants(a, slice(n)), select_instants(later, slice(n))
+def _near_paths(trace: Trace, ego: str, horizon: int) -> list[str]:
+    """Return who may come within reach of where the ego was up to so many instants before, those who come nearest first."""
+    seen, own = around(trace, ego), trace.actors.index(ego)
+    blocks = np.arange(0, len(trace.time), _BLOCK)
+    low, high = (np.stack([each.reduceat(s, blocks, axis=0) for s in (trace.x, trace.y)]) for each in (np.fmin, np.fmax))
+    moved = np.fmax.reduce(np.hypot(trace.x[1:] - trace.x[:-1], trace.y[1:] - trace.y[:-1]), axis=0, initial=0.0)
+    reach = seen.reach + moved + moved[own]
+    near = np.zeros(len(trace.actors), dtype=bool)
+    for k in range(min(len(blocks), -(-horizon // _BLOCK) + 2)):
+        n = len(blocks) - k
+        before = low[:, :n, own : own + 1], high[:, :n, own : own + 1]
+        near |= ((low[:, k:] <= before[1] + reach) & (before[0] <= high[:, k:] + reach)).all(axis=0).any(axis=0)
+    return [trace.actors[k] for k in seen.others if near[k]]
+
+
+def _behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[float], bool]:
+    """Return whether a and b touch if b comes a number of steps in (k - 1, k) earlier, as a function of this number."""
+    tests = [_rectangle_behind(p, q, k) for p, q in part_pairs(a, b)]
+    return lambda shift: any(test(shift) for test in tests)
+
+
+def _rectangle_behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[float], bool]:
+    """Return `_behind` for rectangles; circles around them select the instants."""
+    n = min(len(a.x), len(b.x) - k)
+    old, new = select_instants(b, slice(k - 1, k - 1 + n)), select_instants(b, slice(k, k + n))
+    a = select_instants(a, slice(n))
+    span = max(float(np.hypot(c.x[1:] - c.x[:-1], c.y[1:] - c.y[:-1]).max(initial=0.0)) for c in (a, old, new))
+    reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + 3.0 * span
+    rows = np.flatnonzero(np.hypot(new.x - a.x, new.y - a.y) <= reach)
+    before = np.maximum(rows - 1, 0)
+    here, start = select_instants(a, rows), select_instants(a, before)
+    ends, starts = ((select_instants(old, i), select_instants(new, i)) for i in (rows, before))
+
+    def touches(shift: float) -> bool:
+        share = shift - (k - 1)
+        end, begin = _between(*ends, share), _between(*starts, share)
+        return bool(np.isfinite(contact_share(here, end, begin.x - start.x, begin.y - start.y)).any())
+
+    return touches
 
 
 def _smallest_shift(a: ActorTrace, b: ActorTrace, limit: int) -> int | None:
@@ -150,32 +194,41 @@ def _smallest_shift(a: ActorTrace, b: ActorTrace, limit: int) -> int | None:
     """
     if a.parts or b.parts:
         return min((k for p, q in part_pairs(a, b) if (k := _smallest_shift(p, q, limit)) is not None), default=None)
-    moved = sum(float(np.hypot(np.diff(c.x), np.diff(c.y)).max(initial=0.0)) for c in (a, b))
+    if limit < 1:
+        return None
+    steps = [(u[1:] - u[:-1], v[1:] - v[:-1]) for u, v in ((a.x, b.x), (a.y, b.y))]
+    moved = np.hypot(*(max(v.max() - u.min(), u.max() - v.min()) for u, v in steps))  # the most, relative to each other
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + moved
-    near = (b.x[None, :] - a.x[:, None]) ** 2 + (b.y[None, :] - a.y[:, None]) ** 2 <= reach**2  # (t, t)
-    i, j = np.nonzero(near)
-    soon = (j > i) & (j - i <= limit)
-    i, j = i[soon], j[soon]
+    dx, dy = (_later(v, len(u), limit) - u[:, None] for u, v in ((a.x, b.x), (a.y, b.y)))  # (t, limit)
+    i, shift = (dx * dx + dy * dy <= reach * reach).nonzero()
     before = np.maximum(i - 1, 0)  # no step leads to the first instant
-    dx, dy = (v[before + j - i] - u[before] for u, v in ((a.x, b.x), (a.y, b.y)))
-    hits = np.isfinite(contact_share(select_instants(a, i), select_instants(b, j), dx, dy))
-    return int((j - i)[hits].min()) if hits.any() else None
+    ends = select_instants(a, i), select_instants(b, i + shift + 1)
+    hits = np.isfinite(contact_share(*ends, dx[before, shift], dy[before, shift]))
+    return int(shift[hits].min()) + 1 if hits.any() else None
 
 
-def _bisected(k: int, sign: int, shifted: Callable[[float], tuple[ActorTrace, ActorTrace]]) -> float:
-    """Return the smallest shift in (k - 1, k] steps with which the rectangles touch, `shifted` by it with this sign."""
+def _later(values: Vector, n: int, limit: int) -> np.ndarray:
+    """Return the values 1 to `limit` instants after each of n, (n, limit); inf after the last one."""
+    padded = np.full(n + limit, np.inf)
+    known = values[1 : n + limit]
+    padded[: len(known)] = known
+    return sliding_window_view(padded, limit)[:n]
+
+
+def _bisected(k: int, meets: Callable[[float], bool]) -> float:
+    """Return the smallest shift in (k - 1, k] steps with which the rectangles touch; they do with k."""
     apart, touching = k - 1.0, float(k)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (apart + touching)
-        if _meet(*shifted(sign * middle)):
+        if meets(middle):
             touching = middle
         else:
             apart = middle
     return touching
 
 
-def _meet(a: ActorTrace, b: ActorTrace) -> bool:
-    return contact_index(a, b) is not None
+def _meet_shifted(a: ActorTrace, b: ActorTrace, sign: int, shift: float) -> bool:
+    return contact_index(*_shifted(a, b, sign * shift)) is not None
 
 
 def _shifted(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:

@@ -5,36 +5,18 @@ Runs with background traffic have different actors every time; these metrics ref
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import numpy as np
-
-from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
+from sbt.metrics.around import first_contacts, smallest_distance
+from sbt.metrics.longitudinal import FAR, HORIZON, relative_speed_at_contact
 from sbt.metrics.paths import HORIZON as PATH_HORIZON
 from sbt.metrics.paths import smallest_ttc_on_paths, ttc_on_paths
-from sbt.metrics.planar import distance, time_behind
-from sbt.problem.arrays import Vector
+from sbt.metrics.planar import time_behind
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["any_collision", "any_impact_speed", "nearest_distance", "others_braking_max", "pet_ego_first", "ttc_path_min"]
 
-Pairwise = Callable[[Trace, str, str], float]
-
-
-def _over_others(pairwise: Pairwise, ego: str, worst: Callable[[list[float]], float], without: float) -> Callable[[Trace], float]:
-    """Return the worst of a pairwise metric over all other actors; `without` if there are none."""
-
-    def function(trace: Trace) -> float:
-        values = [pairwise(trace, ego, other) for other in trace.actors if other != ego]
-        return worst(values) if values else without
-
-    return function
-
-
 def ttc_path_min(ego: str = "ego") -> Metric:
     """Return the smallest time to collision with any road user along the paths driven (s), 0 for a collision, at most 5."""
-
     return Metric(
         "ttc_path_min", lambda trace: smallest_ttc_on_paths(trace, ego), "s", "low", PATH_HORIZON,
         "smallest time until ego and anyone else would touch on the paths they drive at their present speeds",
@@ -45,7 +27,7 @@ def ttc_path_min(ego: str = "ego") -> Metric:
 def nearest_distance(ego: str = "ego") -> Metric:
     """Return the smallest distance to any road user (m), 0 for a collision, at most 1,000."""
     return Metric(
-        "distance_min", _over_others(lambda t, a, b: float(distance(t, a, b).min()), ego, min, FAR), "m", "low", FAR,
+        "distance_min", lambda trace: smallest_distance(trace, ego), "m", "low", FAR,
         "smallest distance between ego's rectangle and anyone else's",
     )  # fmt: skip
 
@@ -58,15 +40,8 @@ def pet_ego_first(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float,
         horizon: value if no other road user follows within this time (s); runs should go on this long after the conflict.
         zone: x, y and radius of a circle (m) in which the ego must be; None: anywhere.
     """
-
-    def function(trace: Trace) -> float:
-        least = horizon
-        for other in trace.actors:  # larger times than the smallest one so far are of no interest
-            least = least if other == ego else time_behind(trace, ego, other, least, zone)
-        return least
-
     return Metric(
-        "pet_ego_first", function, "s", "low", horizon,
+        "pet_ego_first", lambda trace: time_behind(trace, ego, None, horizon, zone), "s", "low", horizon,
         "smallest time between ego leaving a spot and anyone else reaching it",
         "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions",
     )  # fmt: skip
@@ -75,15 +50,18 @@ def pet_ego_first(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float,
 def any_collision(ego: str = "ego") -> Metric:
     """Return 1 if the ego touched any road user, else 0."""
     return Metric(
-        "collision", _over_others(lambda t, a, b: float(first_contact(t, a, b) is not None), ego, max, 0.0), "", "high", 0.0,
+        "collision", lambda trace: float(bool(first_contacts(trace, ego))), "", "high", 0.0,
         "ego and anyone else touched",
     )  # fmt: skip
 
 
 def any_impact_speed(ego: str = "ego") -> Metric:
     """Return the largest relative speed at the first contact of the ego with each road user (m/s), 0 without a contact."""
+    def function(trace: Trace) -> float:
+        return max((relative_speed_at_contact(trace, ego, other) for other in first_contacts(trace, ego)), default=0.0)
+
     return Metric(
-        "impact_speed", _over_others(relative_speed_at_contact, ego, max, 0.0), "m/s", "high", 0.0,
+        "impact_speed", function, "m/s", "high", 0.0,
         "relative speed at the first contact of ego and anyone else",
     )  # fmt: skip
 
