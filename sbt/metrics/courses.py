@@ -61,11 +61,11 @@ class Course:
         return recorded if way is None else np.concatenate([recorded, way[~np.isnan(way[:, 0]), column]])
 
 
-_Steps = tuple[int, np.ndarray, np.ndarray]
-"""A pair, (n,) instants, and the (n,) steps after these in which the circles around its rectangles may touch."""
+_Steps = tuple[float, np.ndarray, np.ndarray, np.ndarray]
+"""Begin of a stride (s), and in it (n,) pairs, in order, instants and steps after these."""
 
 
-def near_steps(pairs: Sequence[tuple[Course, Course]], step: float, strides: int) -> Iterator[tuple[float, list[_Steps]]]:
+def near_steps(pairs: Sequence[tuple[Course, Course]], step: float, strides: int) -> Iterator[_Steps]:
     """Yield, stride by stride, when the circles around two rectangles may touch if both follow their paths at present speeds.
 
     Args:
@@ -74,27 +74,27 @@ def near_steps(pairs: Sequence[tuple[Course, Course]], step: float, strides: int
         strides: of 5 steps each.
 
     Yields:
-        The begin of a stride (s after the instants), and the steps in it, by pair.
+        The begin of a stride (s after the instants), and the (n,) pairs, in their order, instants and steps after these.
     """
     pair, instant, reach, pace = _near_instants(pairs, step * _STRIDE * strides)
     if not len(pair):
         return
-    paths = _Paths(list(dict.fromkeys(course for both in pairs for course in both)), step * _STRIDE * strides)
-    after = step * np.arange(_STRIDE * strides + 1)
-    sides = [_Side(paths, [both[k] for both in pairs], pair, instant) for k in (0, 1)]
-    coarse = np.abs(sides[1].at(after[::_STRIDE]) - sides[0].at(after[::_STRIDE]))  # (n, strides + 1)
-    span = step * _STRIDE * pace[:, None]
-    least = 0.5 * (coarse[:, :-1] + coarse[:, 1:] - span)  # no distance in the stride is smaller
+    after = step * np.arange(_STRIDE * strides + 1.0)
+    paths = _Paths(list(dict.fromkeys(course for both in pairs for course in both)), float(after[-1]))
+    a, b = (_Side(paths, [both[k] for both in pairs], pair, instant, after) for k in (0, 1))
+    every = np.arange(len(pair))
+    coarse = np.abs(b.at(slice(None, None, _STRIDE), every) - a.at(slice(None, None, _STRIDE), every))  # (n, strides + 1)
+    least = 0.5 * (coarse[:, :-1] + coarse[:, 1:] - (step * _STRIDE * pace)[:, None])  # no distance in the stride is smaller
     possible = least <= (reach + step * pace + _SLACK)[:, None]
     for k in range(strides):
         (rows,) = possible[:, k].nonzero()
         if len(rows):
-            times = after[_STRIDE * k : _STRIDE * (k + 1) + 1]
-            apart = sides[1].at(times, rows) - sides[0].at(times, rows)  # (rows, steps + 1)
+            steps = slice(_STRIDE * k, _STRIDE * (k + 1) + 1)
+            apart = b.at(steps, rows) - a.at(steps, rows)  # (rows, steps + 1)
             moved = np.abs(apart[:, 1:] - apart[:, :-1])
-            found, steps = (np.abs(apart[:, 1:]) <= reach[rows, None] + moved + _SLACK).nonzero()
+            found, which = (np.abs(apart[:, 1:]) <= reach[rows, None] + moved + _SLACK).nonzero()
             if len(found):
-                yield float(times[0]), _by_pair(pair[rows[found]], instant[rows[found]], _STRIDE * k + steps)
+                yield float(after[_STRIDE * k]), pair[rows[found]], instant[rows[found]], _STRIDE * k + which
 
 
 def _near_instants(pairs: Sequence[tuple[Course, Course]], horizon: float) -> tuple[np.ndarray, np.ndarray, Vector, Vector]:
@@ -114,13 +114,6 @@ def _near_instants(pairs: Sequence[tuple[Course, Course]], horizon: float) -> tu
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0)
     pair, instant, reaches, paces = (np.concatenate(column) for column in zip(*found, strict=True))
     return pair, instant, reaches, paces
-
-
-def _by_pair(pair: np.ndarray, instant: np.ndarray, steps: np.ndarray) -> list[_Steps]:
-    """Divide what is in the order of pairs."""
-    numbers, first = np.unique(pair, return_index=True)
-    parts = zip(numbers.tolist(), np.split(instant, first[1:]), np.split(steps, first[1:]), strict=True)
-    return [(k, own, of_pair) for k, own, of_pair in parts]
 
 
 class _Paths:
@@ -149,16 +142,25 @@ class _Paths:
 
 
 class _Side:
-    """One rectangle of each pair at the instants of near ones."""
+    """One rectangle of each pair, at n instants, of each of which pair and instant are given, and k times after them."""
 
-    def __init__(self, paths: _Paths, courses: list[Course], pair: np.ndarray, instant: np.ndarray) -> None:
-        self._paths = paths
-        at = np.cumsum([0, *(len(course.actor.x) for course in courses)])[pair] + instant
-        self._origin = np.array([paths.origin[course] for course in courses])[pair]
-        self._begin = self._origin + np.concatenate([course.way[: len(course.actor.x)] for course in courses])[at]
-        self._speed = np.concatenate([course.actor.speed for course in courses])[at]
+    def __init__(self, paths: _Paths, courses: list[Course], pair: np.ndarray, instant: np.ndarray, after: np.ndarray) -> None:
+        self._paths, self._after = paths, after
+        if shared := len(set(courses)) == 1:  # the ego: predicted once an instant
+            courses, self._at = courses[:1], instant
+        else:
+            self._at = np.cumsum([0, *(len(course.actor.x) for course in courses)])[pair] + instant
+        counts = [len(course.actor.x) for course in courses]
+        self._origin = np.repeat([paths.origin[course] for course in courses], counts)
+        self._begin = self._origin + np.concatenate([c.way[:n] for c, n in zip(courses, counts, strict=True)])
+        self._speed = np.concatenate([course.actor.speed for course in courses])
+        self._known = self._positions(slice(None), np.arange(len(self._begin))) if shared else None
 
-    def at(self, times: Vector, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Return (n, k) positions at k times after some instants."""
-        distance = self._begin[rows, None] + self._speed[rows, None] * times
-        return self._paths.at(np.maximum(distance, self._origin[rows, None]))
+    def at(self, steps: slice, rows: np.ndarray) -> np.ndarray:
+        """Return positions (n, k), as complex numbers, at some times after some of the instants."""
+        at = self._at[rows]
+        return self._positions(steps, at) if self._known is None else self._known[at, steps]
+
+    def _positions(self, steps: slice, at: np.ndarray) -> np.ndarray:
+        distance = self._begin[at, None] + self._speed[at, None] * self._after[steps]
+        return self._paths.at(np.maximum(distance, self._origin[at, None]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, select_parts
 
 __all__ = [
+    "Rectangles",
     "contact_index",
     "contact_part",
     "contact_share",
@@ -28,6 +30,17 @@ __all__ = [
     "swept_contact",
     "time_to_contact",
 ]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Rectangles:
+    """Any n rectangles: (n,) centres and headings, and (n, 1) lengths and widths."""
+
+    x: Vector
+    y: Vector
+    heading: Vector
+    length: np.ndarray
+    width: np.ndarray
 
 
 def rectangles(actor: ActorTrace) -> tuple[ActorTrace, ...]:
@@ -60,7 +73,7 @@ def corners(actor: ActorTrace) -> np.ndarray:
     return np.stack([x, y], axis=-1)
 
 
-def _axes(a: ActorTrace, b: ActorTrace) -> tuple[np.ndarray, np.ndarray]:
+def _axes(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles) -> tuple[np.ndarray, np.ndarray]:
     """Return the (t, 4) directions of the separating axes: along and across each rectangle."""
     angle = np.empty((len(a.heading), 4))
     angle[:, 0], angle[:, 2] = a.heading, b.heading
@@ -68,7 +81,7 @@ def _axes(a: ActorTrace, b: ActorTrace) -> tuple[np.ndarray, np.ndarray]:
     return np.cos(angle), np.sin(angle)
 
 
-def _reach(actor: ActorTrace, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+def _reach(actor: ActorTrace | Rectangles, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
     """Return the (t, 4) half extent of a rectangle along each axis."""
     c, s = np.cos(actor.heading)[:, None], np.sin(actor.heading)[:, None]
     return 0.5 * (actor.length * np.abs(c * cos + s * sin) + actor.width * np.abs(-s * cos + c * sin))
@@ -88,7 +101,7 @@ def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
     return contact_share(a, b, np.concatenate([dx[:1], dx[:-1]]), np.concatenate([dy[:1], dy[:-1]]))
 
 
-def contact_share(a: ActorTrace, b: ActorTrace, dx: Vector, dy: Vector) -> Vector:
+def contact_share(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles, dx: Vector, dy: Vector) -> Vector:
     """Return (t,) the fraction of each of t independent steps after which the rectangles touch; inf without a contact.
 
     Args:
@@ -171,9 +184,9 @@ def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
 
 def select_instants(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:
     """Return an actor at some instants only."""
-    parts = select_parts(actor.parts, i) if actor.parts else ()
-    states = (getattr(actor, name)[i] for name in ("x", "y", "heading", "speed", "acceleration"))
-    return ActorTrace(*states, actor.length, actor.width, parts)
+    a = actor
+    parts = select_parts(a.parts, i) if a.parts else ()
+    return ActorTrace(a.x[i], a.y[i], a.heading[i], a.speed[i], a.acceleration[i], a.length, a.width, parts)
 
 
 def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from sbt.metrics.around import first_contacts
 from sbt.metrics.courses import Course, near_steps
-from sbt.metrics.geometry import contact_share, rectangles
+from sbt.metrics.geometry import Rectangles, contact_share, rectangles
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import first_contact
 from sbt.problem.arrays import Vector
@@ -29,15 +30,6 @@ _TURNED = 0.02
 """A step in which a corner moves by more than this because its rectangle turns (m) is divided ..."""
 _SPLIT, _FINEST = 4, 0.02
 """... by so much, down to this (s): else the tail of a truck that turns seems to touch what it passes."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Prediction:
-    """Predicted positions and headings of one actor, (t, k): at k times after each of t instants."""
-
-    x: np.ndarray
-    y: np.ndarray
-    heading: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +60,8 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str | None = "co") -> Ve
     """
     met = list(_together(trace, ego, other))
     times = np.full(len(trace.time), HORIZON)
-    for _, first, rows, found in _predicted_contacts(met):
-        np.minimum.at(times, first + rows, found)
+    for instants, found in _predicted_contacts(met):
+        np.minimum.at(times, instants, found)
     for one in met:
         if one.contact is not None:
             times[one.first + one.contact : one.first + len(one.trace.time)] = 0.0
@@ -83,17 +75,12 @@ def smallest_ttc_on_paths(trace: Trace, ego: str = "ego") -> float:
     met = list(_together(trace, ego, None))
     if any(one.contact is not None for one in met if one.trace is not trace):
         return 0.0
-    least = HORIZON
-    for earliest, _, _, found in _predicted_contacts(met):
-        if earliest >= least:
-            break
-        least = min(least, float(found.min()))
-    return least
+    return min((float(found.min()) for _, found in _predicted_contacts(met, only_smallest=True)), default=HORIZON)
 
 
 def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
     """Yield every interval in which the ego and another, or anyone else, are both there."""
-    there = trace.present.all(axis=0)
+    there: list[bool] = np.asarray(trace.present.all(axis=0)).tolist()
     own = trace.actors.index(ego)
     for k, name in enumerate(trace.actors):
         if k == own or other not in (None, name):
@@ -105,81 +92,89 @@ def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
                 yield _Together(instants.start, part, "ego", "co")
 
 
-def _predicted_contacts(met: Sequence[_Together]) -> Iterator[tuple[float, int, np.ndarray, Vector]]:
-    """Yield when rectangles touch on their paths; what is yielded later is not earlier than the begin of its stride.
+def _predicted_contacts(met: Sequence[_Together], *, only_smallest: bool = False) -> Iterator[tuple[np.ndarray, Vector]]:
+    """Yield (n,) instants, and (n,) times until two rectangles touch on their paths from then on (s), at most the horizon.
 
-    Yields:
-        begin of the stride (s), first instant of the interval, (n,) instants in it, and (n,) times until they touch (s).
+    Args:
+        met: who is there together.
+        only_smallest: larger times than the smallest one need not be exact, or be there.
     """
     own: dict[int, list[Course]] = {}
-    pairs, first = [], []
+    pairs: list[tuple[Course, Course]] = []
+    first: list[int] = []
     for one in met:
         if id(one.trace) not in own:
             own[id(one.trace)] = [Course(each) for each in rectangles(one.trace.actor(one.ego))]
         others = [Course(each) for each in rectangles(one.trace.actor(one.other))]
         pairs += [(a, b) for a in own[id(one.trace)] for b in others]
         first += [one.first] * (len(pairs) - len(first))
-    for earliest, near in near_steps(pairs, _STEP, _STRIDES):
-        for k, rows, steps in near:
-            yield earliest, first[k], rows, _contact_times(*pairs[k], rows, _STEP * steps, _STEP)
+    begins, least = np.array(first), HORIZON
+    for begin, pair, rows, steps in near_steps(pairs, _STEP, _STRIDES):
+        if only_smallest and begin >= least:
+            break
+        found = np.minimum(_contact_times([pairs[k] for k in pair.tolist()], rows, _STEP * steps, _STEP), HORIZON)
+        least = min(least, float(found.min()))
+        yield begins[pair] + rows, found
 
 
-def _contact_times(a: Course, b: Course, rows: np.ndarray, start: np.ndarray, length: float) -> Vector:
+def _contact_times(pairs: Sequence[tuple[Course, Course]], rows: np.ndarray, start: np.ndarray, length: float) -> Vector:
     """Return the (n,) times at which the rectangles touch in steps of the prediction (s after the instants), inf where not.
 
     Args:
-        a: one actor.
-        b: the other.
+        pairs: n pairs, those of the same rectangles one after another.
         rows: (n,) instants from which is predicted.
         start: (n,) begin of the steps (s after the instants).
         length: of the steps (s).
     """
-    p, q = (_predict(course, rows, np.stack([start, start + length], axis=1)) for course in (a, b))
-    dx, dy = (q.x - p.x)[:, 0], (q.y - p.y)[:, 0]
-    every = np.arange(len(rows))
-    ends = _states(a.actor, p, every, 1), _states(b.actor, q, every, 1)
-    times: Vector = start + length * contact_share(*ends, dx, dy)
-    turned = np.zeros(len(rows))
-    for course, predicted in ((a, p), (b, q)):
-        corner = 0.5 * np.hypot(course.actor.length, course.actor.width)
-        turned = np.fmax(turned, np.abs(np.diff(predicted.heading, axis=1)[:, 0]) * corner)
-    if length <= _FINEST or not (turned > _TURNED).any():
+    after = np.stack([start, start + length], axis=1)
+    (old_a, a, turn_a), (old_b, b, turn_b) = (_predicted([both[k] for both in pairs], rows, after) for k in (0, 1))
+    dx, dy = old_b[0] - old_a[0], old_b[1] - old_a[1]
+    times: Vector = start + length * contact_share(a, b, dx, dy)
+    turned = np.fmax(turn_a, turn_b)
+    wide_turns = turned > _TURNED
+    if length <= _FINEST or not wide_turns.any():
         return times
-    wide = 2.0 * float(turned[turned > _TURNED].max())  # whatever is between the headings lies within
-    larger = [replace(end, length=end.length + wide, width=end.width + wide) for end in ends]
-    inside = np.flatnonzero((turned > _TURNED) & np.isfinite(contact_share(larger[0], larger[1], dx, dy)))
-    times[turned > _TURNED] = np.inf
+    wide = 2.0 * float(turned[wide_turns].max())  # whatever is between the headings lies within
+    larger = [replace(end, length=end.length + wide, width=end.width + wide) for end in (a, b)]
+    inside = np.flatnonzero(wide_turns & np.isfinite(contact_share(larger[0], larger[1], dx, dy)))
+    times[wide_turns] = np.inf
     if len(inside):
         fine = length / _SPLIT
         begins = (start[inside, None] + fine * np.arange(_SPLIT)).ravel()
-        finer = _contact_times(a, b, np.repeat(rows[inside], _SPLIT), begins, fine)
+        again = [pairs[k] for k in inside.tolist() for _ in range(_SPLIT)]
+        finer = _contact_times(again, np.repeat(rows[inside], _SPLIT), begins, fine)
         times[inside] = finer.reshape(-1, _SPLIT).min(axis=1)
     return times
 
 
-def _predict(course: Course, rows: np.ndarray, after: Vector) -> _Prediction:
-    """Return the prediction for the times `after` (s), (k,) or (n, k), each of the n instants `rows`; NaN once it has left."""
-    way = course.way
-    travelled = way[rows, None] + course.actor.speed[rows, None] * after
-    beyond = np.maximum(travelled - way[-1], 0.0)
-    if course.leaves:
-        beyond[beyond > 0.0] = np.nan
-    heading = course.heading
-    return _Prediction(
-        np.interp(travelled, way, course.x) + beyond * np.cos(heading[-1]),
-        np.interp(travelled, way, course.y) + beyond * np.sin(heading[-1]),
-        np.interp(travelled, way, heading),
-    )
+_Motion = tuple[tuple[Vector, Vector], Rectangles, Vector]
+"""x and y before a step, the rectangles after it, and how far their corners move because they turn (m), (n,) each."""
+
+
+def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -> _Motion:
+    """Return how n rectangles move between two times (s), `after` (n, 2), after n instants; NaN once one has left the road."""
+    parts, sizes = [], []
+    ends = [k + 1 for k in range(len(courses) - 1) if courses[k] is not courses[k + 1]]
+    for begin, end in pairwise([0, *ends, len(courses)]):
+        course = courses[begin]
+        way, heading = course.way, course.heading
+        travelled = way[rows[begin:end], None] + course.actor.speed[rows[begin:end], None] * after[begin:end]
+        beyond = np.maximum(travelled - way[-1], 0.0)
+        if course.leaves:
+            beyond[beyond > 0.0] = np.nan
+        x = np.interp(travelled, way, course.x) + beyond * np.cos(heading[-1])
+        y = np.interp(travelled, way, course.y) + beyond * np.sin(heading[-1])
+        parts.append((x, y, np.interp(travelled, way, heading)))
+        sizes.append(np.broadcast_to([course.actor.length, course.actor.width], (end - begin, 2)))
+    x, y, headings = (np.concatenate(column) for column in zip(*parts, strict=True))
+    size = np.concatenate(sizes)
+    turned = np.abs(headings[:, 1] - headings[:, 0]) * (0.5 * np.hypot(size[:, 0], size[:, 1]))
+    now = Rectangles(x[:, 1], y[:, 1], headings[:, 1], size[:, :1], size[:, 1:])
+    return (x[:, 0], y[:, 0]), now, turned
+
 
 
 def path_of(actor: ActorTrace) -> tuple[Vector, Vector, Vector]:
     """Return x, y and heading along the path of an actor, which is there all the time, and along its way after that."""
     course = Course(actor)
     return course.x, course.y, course.heading
-
-
-def _states(actor: ActorTrace, prediction: _Prediction, rows: np.ndarray, step: int) -> ActorTrace:
-    """Return the predicted states at the given rows and step, one after another."""
-    still = np.zeros(len(rows))
-    x, y, heading = (field[rows, step] for field in (prediction.x, prediction.y, prediction.heading))
-    return ActorTrace(x, y, heading, still, still, actor.length, actor.width)

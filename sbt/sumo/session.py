@@ -14,6 +14,7 @@ often written to file descriptor 2 only. This module handles all three. There ar
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import io
 import os
@@ -21,7 +22,8 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
+from itertools import starmap
 from pathlib import Path
 from typing import Any, Protocol
 from xml.sax.saxutils import quoteattr
@@ -41,6 +43,8 @@ __all__ = [
 INVALID_DOUBLE = -1073741824.0
 """SUMO's INVALID_DOUBLE_VALUE: what its getters return for an actor that is not on the road."""
 
+_XML_BEGIN = "_ZN11xercesc_3_216XMLPlatformUtils10InitializeEPKcS2_PNS_12PanicHandlerEPNS_13MemoryManagerE"
+"""xercesc::XMLPlatformUtils::Initialize of Xerces 3.2, the locale its default."""
 _DEFAULTS = {"minGap": "0", "maxSpeed": "100", "speedFactor": "1", "speedDev": "0", "sigma": "0",
              "accel": "10", "decel": "10", "emergencyDecel": "10"}  # fmt: skip
 _OPTIONS = (
@@ -55,7 +59,20 @@ def libsumo() -> Any:
     """Import libsumo once (0.8 s), without its message on standard output."""
     with contextlib.redirect_stdout(io.StringIO()):
         import libsumo as module
+    _keep_xml(module)
     return module
+
+
+def _keep_xml(module: Any) -> None:
+    """Keep the tables of SUMO's XML reader, which it would make again in every load: half the time of a small one.
+
+    The reader (Xerces) counts who has begun to use it, and drops them with the last; this is one that never ends. Where its
+    function has another name nothing is kept.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        begin = getattr(ctypes.CDLL(module.libsumo._libsumo.__file__), _XML_BEGIN)
+        begin.argtypes, begin.restype = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p, ctypes.c_void_p], None
+        begin(b"en_US", None, None, None)
 
 
 def unwrapped(sumo: Any, domain: str, name: str) -> Any:
@@ -126,10 +143,16 @@ def _types_file(types: tuple[tuple[str, VehicleType], ...]) -> str:
     for name, kind in types:
         size = {"length": format_number(kind.length), "width": format_number(kind.width)}
         attributes = {**_DEFAULTS, **size, **dict(kind.attributes)}
-        lines.append(f"<vType id={quoteattr(name)} " + " ".join(f"{k}={quoteattr(v)}" for k, v in attributes.items()) + "/>")
+        lines.append(f"<vType id={quoteattr(name)} " + " ".join(starmap(_attribute, attributes.items())) + "/>")
     path = scratch_folder() / "types.add.xml"
+    path.unlink(missing_ok=True)  # to truncate it would wait for the disk
     path.write_text("<additional>\n" + "\n".join(lines) + "\n</additional>\n")
     return str(path)
+
+
+@lru_cache(maxsize=4096)
+def _attribute(name: str, value: str) -> str:
+    return f"{name}={quoteattr(value)}"
 
 
 @kept

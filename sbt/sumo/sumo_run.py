@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,16 +18,14 @@ from sbt.sumo.appearances import refuse_overlap_at_start
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, unconfirmed_contact
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
-from sbt.sumo.session import INVALID_DOUBLE, unwrapped
+from sbt.sumo.reading import ROW, Onlooker, observer, table
+from sbt.sumo.session import unwrapped
 
 __all__ = ["SumoRun"]
 
-_COLUMNS = 5
 _SLACK = 1e-6
 """Below this distance (m) of two rectangles the quick separation tests do not decide, but the exact one."""
 _START_REMEDY = "change where the actors start, or keep the inputs apart by constraints"
-_ROW = struct.Struct(f"={_COLUMNS}d")
-"""x, y, heading, speed, acceleration of one actor; lists of floats would take four times the memory."""
 
 
 class SumoRun:
@@ -49,11 +47,12 @@ class SumoRun:
     def __init__(self, sumo: Any, scene: Scene, dt: float, duration: float, prefix: str = ""):
         self._scene, self._dt = scene, float(dt)
         self._last = round(duration / self._dt)
-        self._rows = bytearray((self._last + 1) * len(scene.actors) * _ROW.size)
+        self._rows = bytearray((self._last + 1) * len(scene.actors) * ROW.size)
         self._signals: list[tuple[float, ...]] = []
         self._collisions: list[str] = []
         self._listed: dict[frozenset[str], float] = {}
         self._unconfirmed: tuple[str, ...] = ()
+        self._onlooker: Onlooker | None = None
         self._ended = ""
         self.advance, self.recorded = self._functions(sumo, prefix)
 
@@ -63,11 +62,17 @@ class SumoRun:
         states = [State(a.name, float(a.type.length), float(a.type.width), dt) for a in scene.actors]
         for actor, state in zip(scene.actors, states, strict=True):
             state.steered = None if actor.pose is None else float(actor.speed)
-        by_name = {s.name: s for s in states}
         until, probes = scene.until, tuple(scene.signals.values())
-        observe = _observer(sumo, scene.actors, states, dt, prefix, rows)
         control = _control(sumo, scene.actors, states, dt, prefix)
-        touching = _contact_test(states, [k for k, a in enumerate(scene.actors) if not a.person][1:], rows, dt)
+        touching = _contact_test(states, rows, dt)
+        solid = [k for k, a in enumerate(scene.actors) if not a.person][1:]
+        by_name: Mapping[str, State]
+        if probes or any(a.driver is not None for a in scene.actors):  # they look at states
+            by_name, look = {s.name: s for s in states}, None
+            observe = observer(sumo, scene.actors, states, dt, prefix, rows)
+        else:
+            self._onlooker = by_name = look = Onlooker(sumo, scene.actors, states, dt, prefix, rows)
+            observe = look.observe
         k = -1
 
         def advance() -> bool:
@@ -76,8 +81,10 @@ class SumoRun:
             t = k * dt
             observe(k)
             if k == 0:
+                for state in states:
+                    by_name[state.name]
                 refuse_overlap_at_start(states[0], (*states[1:], *map(_standing, scene.obstacles)), _START_REMEDY)
-            touched = touching(k)
+            touched = touching(k, solid if look is None else look.near(k, solid))
             if touched is not None:
                 self._judge(sumo, prefix, t, touched)
             ended = "collision" if touched is not None else until(t, by_name) if until is not None else None
@@ -113,17 +120,18 @@ class SumoRun:
     def trace(self) -> Trace:
         """Return the recorded trace, with the obstacles as standing actors."""
         scene, actors = self._scene, self._scene.actors
-        table = _table(self._rows, 0, self.recorded(), len(actors)).copy()
+        seen = self._onlooker
+        states = table(self._rows, 0, self.recorded(), len(actors)).copy() if seen is None else seen.table()
         sizes = [(a.type.length, a.type.width) for a in actors]
         names = [a.name for a in actors]
         if scene.obstacles:
             standing = np.array([(*o.pose, 0.0, 0.0) for o in scene.obstacles])
-            table = np.concatenate([table, np.broadcast_to(standing, (len(table), *standing.shape))], axis=1)
+            states = np.concatenate([states, np.broadcast_to(standing, (len(states), *standing.shape))], axis=1)
             sizes += [(o.length, o.width) for o in scene.obstacles]
             names += [o.name for o in scene.obstacles]
-        x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
+        x, y, heading, speed, acceleration = np.moveaxis(states, 2, 0)
         return Trace(
-            np.arange(len(table), dtype=np.float64) * self._dt,
+            np.arange(len(states), dtype=np.float64) * self._dt,
             tuple(names),
             x,
             y,
@@ -196,77 +204,23 @@ def _change_lane(sumo: Any, actor: Actor, name: str, lane: int) -> None:
     sumo.vehicle.changeLane(name, int(lane), LANE_REQUEST_DURATION)
 
 
-def _observer(
-    sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str, rows: bytearray
-) -> Callable[[int], None]:
-    """Return the function that reads all actors from SUMO and writes their states as row k.
-
-    SUMO's reference position is the front bumper of a vehicle and the centre of a person; ours is the centre.
-    """
-    getters = {
-        person: tuple(
-            unwrapped(sumo, "person" if person else "vehicle", name) for name in ("getPosition", "getAngle", "getSpeed")
-        )
-        for person in {a.person for a in actors}
-    }
-    read = [
-        (s, prefix + s.name, 0.0 if a.person else 0.5 * s.length, *getters[a.person]) for a, s in zip(actors, states, strict=True)
-    ]
-    rate, size, write = 1.0 / dt, _ROW.size, _ROW.pack_into
-
-    def observe(k: int) -> None:
-        at = k * len(read) * size
-        for state, name, half, position, angle_of, speed_of in read:
-            try:
-                x, y = position(name)
-            except Exception as error:  # the class depends on the client: libsumo or traci
-                if "is not known" in str(error):
-                    raise _left(state, k * dt) from None
-                raise
-            if x == INVALID_DOUBLE:
-                raise _left(state, k * dt)
-            angle = angle_of(name)
-            if angle != state.angle:
-                state.turn(angle)
-            speed = speed_of(name) if state.steered is None else state.steered
-            state.x = x = x - half * state.cos
-            state.y = y = y - half * state.sin
-            state.acceleration = acceleration = (speed - state.speed) * rate if k else 0.0
-            state.speed = speed
-            write(rows, at, x, y, state.heading, speed, acceleration)
-            at += size
-
-    return observe
-
-
-def _left(state: State, t: float) -> RunError:
-    reason = f"{state.name} must stay on the road, but it was gone at t = {t:g} s (its route ended, or SUMO took it away)"
-    return RunError(Status.FAILED, reason)
-
-
-def _table(rows: bytearray, first: int, last: int, actors: int) -> np.ndarray:
-    """Return a view of the (last - first, m, 5) states at some instants."""
-    numbers = actors * _COLUMNS
-    return np.frombuffer(rows, np.float64, (last - first) * numbers, first * numbers * 8).reshape(-1, actors, _COLUMNS)
-
-
 _Touch = tuple[str, ActorTrace, ActorTrace]
 """Who touched the ego, and the rectangles that touch: the ego's and the other's."""
 
 
-def _contact_test(states: list[State], solid: list[int], rows: bytearray, dt: float) -> Callable[[int], _Touch | None]:
-    """Return the function that tells which rectangle the first actor, the ego, touched in the step to row k; None for none.
+def _contact_test(states: list[State], rows: bytearray, dt: float) -> Callable[[int, list[int]], _Touch | None]:
+    """Return the function that tells which of some rectangles the first actor, the ego, touched in the step to row k, or None.
 
     The exact test is left to pairs that are neither far apart nor separated by an axis of the ego's rectangle.
     """
     ego, near = states[0], 2.0 * max(s.length for s in states)
-    width, place = _ROW.size * len(states), struct.Struct("=2d").unpack_from
-    others = [(s, j, _ROW.size * j) for j, s in ((j, states[j]) for j in solid)]
+    width, place = ROW.size * len(states), struct.Struct("=2d").unpack_from
+    columns = [(s, j, ROW.size * j) for j, s in enumerate(states)]
     length, breadth = 0.5 * ego.length + _SLACK, 0.5 * ego.width + _SLACK
 
-    def touching(k: int) -> _Touch | None:
+    def touching(k: int, others: list[int]) -> _Touch | None:
         x, y, speed = ego.x, ego.y, ego.speed
-        for other, j, column in others:
+        for other, j, column in [columns[j] for j in others]:
             dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
             if -reach < dx < reach and -reach < dy < reach:
                 (x_0, y_0), (u_0, v_0) = place(rows, max(k - 1, 0) * width), place(rows, max(k - 1, 0) * width + column)
@@ -280,7 +234,7 @@ def _contact_test(states: list[State], solid: list[int], rows: bytearray, dt: fl
                 left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
                 if (left > across and left_0 > across) or (left < -across and left_0 < -across):
                     continue
-                step = _table(rows, max(k - 1, 0), k + 1, len(states))
+                step = table(rows, max(k - 1, 0), k + 1, len(states))
                 found = contact_part(_track(step, 0, ego), _track(step, j, other))
                 if found is not None:
                     return other.name, found[1], found[2]

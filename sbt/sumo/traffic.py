@@ -99,7 +99,7 @@ class TrafficStream:
         cars: list[Actor] = []
         position = first - pace * mean * rng.random()
         while position > last:
-            factor = min(1.0 + self.spread * float(np.clip(rng.standard_normal(), -2.0, 2.0)), self.fastest / speed)
+            factor = min(1.0 + self.spread * min(max(rng.standard_normal(), -2.0), 2.0), self.fastest / speed)
             attributes = dict(self.type.attributes) | {"speedFactor": format_number(speed * factor / self.limit)}
             kind = VehicleType(self.type.length, self.type.width, tuple(attributes.items()))
             own = min(pace * factor, self._safe_speed(cars[-1], position)) if cars else pace * factor

@@ -1,0 +1,75 @@
+"""Everyone around the ego at once: who can be how near, and who touches it, before pairs are looked at one by one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.metrics.cache import per_trace
+from sbt.metrics.geometry import rectangle_distance, select_instants
+from sbt.metrics.longitudinal import FAR, first_contact
+from sbt.problem.arrays import Vector
+from sbt.problem.trace import States, Trace
+
+__all__ = ["Around", "around", "first_contacts", "smallest_distance"]
+
+_SLACK = 1e-6
+"""By how much farther away than necessary those must be who are passed over (m): more than rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Around:
+    """Centres of m actors relative to the ego at t instants; NaN while one of the two is not there.
+
+    Attributes:
+        dx, dy: (t, m) from the ego's centre (m).
+        apart: (t, m) distance of the centres (m).
+        reach: (m,) distance of the centres from which on the rectangles cannot touch (m).
+        others: columns of all but the ego, those that come nearest first.
+    """
+
+    dx: States
+    dy: States
+    apart: States
+    reach: Vector
+    others: tuple[int, ...]
+
+
+@per_trace
+def around(trace: Trace, ego: str) -> Around:
+    """Return where everyone is."""
+    own = trace.actors.index(ego)
+    dx, dy = trace.x - trace.x[:, own : own + 1], trace.y - trace.y[:, own : own + 1]
+    bent = np.array([name in trace.parts for name in trace.actors])
+    radius = np.where(bent, 1.5, 0.5) * np.hypot(trace.length, trace.width)
+    reach = radius + radius[own] + _SLACK
+    apart = np.hypot(dx, dy)
+    order = np.argsort(np.fmin.reduce(apart, axis=0) - reach, kind="stable")
+    return Around(dx, dy, apart, reach, tuple(k for k in order.tolist() if k != own))
+
+
+@per_trace
+def first_contacts(trace: Trace, ego: str) -> dict[str, int]:
+    """Return the index of the first contact with everyone who touches the ego, by name."""
+    seen = around(trace, ego)
+    moved = np.hypot(*(np.fmax.reduce(np.abs(d[1:] - d[:-1]), axis=0, initial=0.0) for d in (seen.dx, seen.dy)))
+    near = np.fmin.reduce(seen.apart, axis=0) <= seen.reach + moved
+    found = ((trace.actors[k], first_contact(trace, ego, trace.actors[k])) for k in seen.others if near[k])
+    return {name: k for name, k in found if k is not None}
+
+
+def smallest_distance(trace: Trace, ego: str) -> float:
+    """Return the smallest distance of the ego's rectangle to anyone else's (m), 0 for a contact, at most 1,000."""
+    if first_contacts(trace, ego):
+        return 0.0
+    seen, least, own = around(trace, ego), FAR, trace.actor(ego)
+    for k in seen.others:
+        (rows,) = (seen.apart[:, k] - seen.reach[k] < least).nonzero()
+        if len(rows):
+            name, apart = trace.actors[k], seen.apart[rows, k]
+            if name not in trace.parts and ego not in trace.parts:  # no rectangle is farther away than its centre
+                rows = rows[apart - seen.reach[k] <= apart.min()]
+            distance = rectangle_distance(select_instants(own, rows), select_instants(trace.actor(name), rows))
+            least = min(least, float(np.fmin.reduce(distance)))
+    return least
