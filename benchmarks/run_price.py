@@ -2,9 +2,9 @@
 
     python benchmarks/run_price.py [--runs 64] [--repeats 3] [--only NAME ...]
 
-Runs take turns with bare ones in another process: the same network, types and options are loaded by `libsumo.load`, the same actors
-inserted, and the same number of steps made, with nothing read. Only their load and their steps count; drawing the scene, writing its
-types and inserting its actors are the price of the run. CPU time of the processes, median of the repeats.
+Runs take turns with bare ones in another process: the same network, types and options are loaded by `libsumo.load`, the
+same actors inserted, and the same number of steps made, with nothing read. Only their load and their steps count; drawing the
+scene, writing its types and inserting its actors are the price of the run. CPU time of the processes, median of the repeats.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing import get_context
 
 from throughput import points
@@ -74,7 +74,7 @@ def whole(scenario: LogicalScenario, jobs: list[Job]) -> float:
     return time.process_time() - begun
 
 
-def priced(apart: ProcessPoolExecutor, scenario: LogicalScenario, jobs: list[Job], steps: list[int]) -> tuple[float, float, float]:
+def priced(apart: Executor, scenario: LogicalScenario, jobs: list[Job], steps: list[int]) -> tuple[float, float, float]:
     """Return means of the CPU times of a run with its metrics, of the load alone and of the steps alone (s)."""
     taken = load = stepping = 0.0
     for first in range(0, len(jobs), BLOCK):
@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--only", nargs="+", choices=SCENARIOS, default=SCENARIOS)
     asked = parser.parse_args()
-    print("| scenario | a run, ms CPU | load | steps | run / (load + steps) | steps / run |\n|---|---|---|---|---|---|", flush=True)
+    print("| scenario | a run, ms CPU | load | steps | run / (load + steps) | steps / run |\n" + "|---" * 6 + "|", flush=True)
     for name in asked.only:
         scenario = ScenarioSpec(name).resolve()
         simulate = scenario.simulate

@@ -176,6 +176,18 @@ def test_a_vehicle_that_leaves_the_road_fails_the_run():
     assert healthy().identical(healthy())
 
 
+@pytest.mark.parametrize("name", ["highway_merge", "crossing_pedestrian"])
+def test_states_that_nobody_looks_at_during_a_run_are_read_as_those_that_are(name: str):
+    """Where SUMO drives everyone states are computed at the end; a signal makes a run look at them at every step."""
+    scenario = plugins.load("scenarios", name)
+    simulation, space = scenario.simulate, scenario.space
+    values = space.named(space.from_unit(np.full((1, space.dimension), 0.4))[0])
+    watched = replace(simulation, scene=lambda *given: replace(simulation.scene(*given), signals={"one": lambda: 1.0}))
+    one, other = simulation(values, 3), watched(values, 3)
+    assert len(other.signals["one"]) == len(one.time)
+    assert one.identical(replace(other, signals={}))
+
+
 @pytest.mark.parametrize("lane", [99, -1, 3, 0.5])
 def test_a_lane_that_the_edge_does_not_have_fails_the_run(lane: Any):
     found = outcome(driving(car(act=Action(speed=20.0, lane=lane))))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from itertools import chain
+from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,11 @@ from sbt.sumo.session import INVALID_DOUBLE, unwrapped
 
 __all__ = ["ROW", "Onlooker", "observer", "table"]
 
+_Getters = tuple[Callable[[str], tuple[float, float]], Callable[[str], float], Callable[[str], float]]
+"""SUMO's functions that give position (m), angle (degrees) and speed (m/s)."""
 _COLUMNS = 5
 ROW = struct.Struct(f"={_COLUMNS}d")
 """x, y, heading, speed, acceleration of one actor; lists of floats would take four times the memory."""
-_DEGREE = math.pi / 180.0
 
 
 def table(rows: bytearray, first: int, last: int, actors: int) -> np.ndarray:
@@ -85,8 +86,13 @@ class Onlooker(Mapping[str, State]):
     def __init__(
         self, sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str, rows: bytearray
     ) -> None:
-        getters = [(prefix + a.name, _getters(sumo, a)) for a in actors]
-        self._positions, self._angles, self._speeds = ([(of[k], name) for name, of in getters] for k in range(3))
+        self._order = sorted(range(len(actors)), key=lambda j: actors[j].person)
+        self._slots = [self._order.index(j) for j in range(len(actors))]
+        self._groups: list[tuple[_Getters, list[str]]] = []
+        for _, group in groupby(self._order, key=lambda j: actors[j].person):
+            some = list(group)
+            self._groups.append((_getters(sumo, actors[some[0]]), [prefix + actors[j].name for j in some]))
+        self._solid = [slot for slot, j in enumerate(self._order) if j and not actors[j].person]
         self._states, self._dt, self._rows = states, dt, rows
         self._half = [0.0 if a.person else 0.5 * s.length for a, s in zip(actors, states, strict=True)]
         self._index = {state.name: k for k, state in enumerate(states)}
@@ -105,23 +111,29 @@ class Onlooker(Mapping[str, State]):
 
     def observe(self, k: int) -> None:
         """Read all actors after step k."""
+        positions: list[tuple[float, float]] = []
+        angles: list[float] = []
+        speeds: list[float] = []
         try:
-            positions = [position(name) for position, name in self._positions]
+            for (position, angle, speed), names in self._groups:
+                positions.extend(map(position, names))
+                angles.extend(map(angle, names))
+                speeds.extend(map(speed, names))
         except Exception as error:  # the class depends on the client: libsumo or traci
             if "is not known" in str(error):
-                raise self._missing(k) from None
+                raise _left(self._states[self._order[len(positions)]], k * self._dt) from None
             raise
-        angles, speeds = [angle(name) for angle, name in self._angles], [speed(name) for speed, name in self._speeds]
         self._read.append((positions, angles, speeds))
 
-    def near(self, k: int, solid: list[int]) -> list[int]:
-        """Return which of some may have touched the first actor in the step to row k; their states and its are written."""
+    def near(self, k: int) -> list[int]:
+        """Return which vehicles may have touched the first actor in the step to row k; their states and its are written."""
         positions, _, speeds = self._read[k]
-        (x, y), reach = positions[0], self._reach + (speeds[0] + max(speeds)) * self._dt
+        own = self._slots[0]
+        (x, y), reach = positions[own], self._reach + (speeds[own] + max(speeds)) * self._dt
         left, right = x - reach, x + reach
-        found = [j for j in solid if left < positions[j][0] < right]
-        found = [j for j in found if -reach < positions[j][1] - y < reach] if found else found
+        found = [s for s in self._solid if left < positions[s][0] < right and -reach < positions[s][1] - y < reach]
         if found:
+            found = [self._order[s] for s in found]
             for j in (0, *found):
                 if k and self._at[j] < k - 1:
                     self.look(k - 1, j)
@@ -134,11 +146,12 @@ class Onlooker(Mapping[str, State]):
         if self._at[j] == k:
             return state
         positions, angles, speeds = self._read[k]
-        if angles[j] != state.angle:
-            state.turn(angles[j])
-        (x, y), half = positions[j], self._half[j]
-        state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speeds[j]
-        state.acceleration = (speeds[j] - self._read[k - 1][2][j]) * (1.0 / self._dt) if k else 0.0
+        slot, half = self._slots[j], self._half[j]
+        if angles[slot] != state.angle:
+            state.turn(angles[slot])
+        x, y = positions[slot]
+        state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speeds[slot]
+        state.acceleration = (speeds[slot] - self._read[k - 1][2][slot]) * (1.0 / self._dt) if k else 0.0
         self._at[j] = k
         at = (k * len(self._states) + j) * ROW.size
         ROW.pack_into(self._rows, at, state.x, state.y, state.heading, state.speed, state.acceleration)
@@ -151,36 +164,45 @@ class Onlooker(Mapping[str, State]):
             RunError: an actor was not on the road.
         """
         n, m = len(self._read), len(self._states)
-        flat = chain.from_iterable
-        places = np.fromiter(flat(flat(each[0] for each in self._read)), np.float64, 2 * n * m).reshape(n, m, 2)
+        flat, slots = chain.from_iterable, self._slots
+        places = np.fromiter(flat(flat(each[0] for each in self._read)), np.float64, 2 * n * m).reshape(n, m, 2)[:, slots]
         if (gone := np.argwhere(places[:, :, 0] == INVALID_DOUBLE)).size:
             raise _left(self._states[gone[0, 1]], float(gone[0, 0]) * self._dt)
-        angles, speeds = (np.fromiter(flat(each[c] for each in self._read), np.float64, n * m).reshape(n, m) for c in (1, 2))
-        states = np.empty((n, m, _COLUMNS))
-        heading = (90.0 - angles) * _DEGREE
+        angles, speeds = (
+            np.fromiter(flat(each[c] for each in self._read), np.float64, n * m).reshape(n, m)[:, slots] for c in (1, 2)
+        )
+        heading, cos, sin = _directions(angles)
         half = np.array(self._half)
-        directions = {h: (math.cos(h), math.sin(h)) for h in set(heading.ravel().tolist())}  # not numpy's: other last digits
-        turned = np.fromiter(flat(map(directions.__getitem__, heading.ravel().tolist())), np.float64, 2 * n * m).reshape(n, m, 2)
-        states[:, :, :2] = places - half[:, None] * turned
+        states = np.empty((n, m, _COLUMNS))
+        states[:, :, 0], states[:, :, 1] = places[:, :, 0] - half * cos, places[:, :, 1] - half * sin
         states[:, :, 2], states[:, :, 3] = heading, speeds
         states[0, :, 4] = 0.0
         states[1:, :, 4] = (speeds[1:] - speeds[:-1]) * (1.0 / self._dt)
         return states
 
-    def _missing(self, k: int) -> RunError:
-        """Return the error that names who is not there any more."""
-        for (position, name), state in zip(self._positions, self._states, strict=True):
-            try:
-                position(name)
-            except Exception:
-                return _left(state, k * self._dt)
-        raise RuntimeError("everyone is there")
+
+def _directions(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return headings (rad), their cosines and sines (t, m) of SUMO's angles, by the functions that `State.turn` uses.
+
+    numpy's have other last digits. Most angles are those of the step before.
+    """
+    new = np.ones(angles.shape, dtype=bool)
+    new[1:] = angles[1:] != angles[:-1]
+    at = np.maximum.accumulate(np.where(new, np.arange(len(angles))[:, None], 0), axis=0)
+    headings = [math.radians(90.0 - angle) for angle in angles[new].tolist()]
+    found = []
+    for values in (headings, map(math.cos, headings), map(math.sin, headings)):
+        whole = np.empty(angles.shape)
+        whole[new] = list(values)
+        found.append(np.take_along_axis(whole, at, axis=0))
+    heading, cos, sin = found
+    return heading, cos, sin
 
 
-def _getters(sumo: Any, actor: Actor) -> tuple[Callable[[str], Any], ...]:
+def _getters(sumo: Any, actor: Actor) -> _Getters:
     """Return SUMO's functions that give position, angle and speed of an actor."""
     domain = "person" if actor.person else "vehicle"
-    return tuple(unwrapped(sumo, domain, name) for name in ("getPosition", "getAngle", "getSpeed"))
+    return unwrapped(sumo, domain, "getPosition"), unwrapped(sumo, domain, "getAngle"), unwrapped(sumo, domain, "getSpeed")
 
 
 def _left(state: State, t: float) -> RunError:

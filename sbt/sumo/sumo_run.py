@@ -84,7 +84,7 @@ class SumoRun:
                 for state in states:
                     by_name[state.name]
                 refuse_overlap_at_start(states[0], (*states[1:], *map(_standing, scene.obstacles)), _START_REMEDY)
-            touched = touching(k, solid if look is None else look.near(k, solid))
+            touched = touching(k, solid if look is None else look.near(k))
             if touched is not None:
                 self._judge(sumo, prefix, t, touched)
             ended = "collision" if touched is not None else until(t, by_name) if until is not None else None
