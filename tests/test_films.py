@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.config.load import parse
+from sbt.errors import InputError
 from sbt.metrics.fcd import Recording, read_fcd
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.planar import DISTANCE_MIN
@@ -30,6 +31,7 @@ from sbt.report.contacts import Contacts, contacts_of
 from sbt.report.film import write_film
 from sbt.report.scene import EGO, ROAD, view_of
 from sbt.report.style import CRITICAL
+from sbt.report.video import check_format, write_video
 from sbt.report.worst import metric_so_far, worst_moment
 from sbt.sumo.gui import run_in_gui
 from sbt.workflows.running import replay_run, run_study
@@ -241,3 +243,23 @@ def test_a_run_that_cannot_be_shown_says_why(tmp_path: Path):
     done = CliRunner().invoke(app, ["replay", str(tmp_path / "store"), "0", "--gif", str(tmp_path / "a.gif")])
     assert (done.exit_code, (tmp_path / "a.gif").exists()) == (2, False)
     assert "only a run with a trace can be shown, but run 0 has none: the ego 'ego' must stay for the duration" in done.output
+
+
+def test_a_film_has_the_format_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from PIL import Image
+
+    shown, times = [Image.new("RGB", (21, 11), (50 * k, 0, 0)).quantize(8) for k in range(4)], [80, 80, 80, 1200]
+    write_video(tmp_path / "a.webp", shown, times)
+    with Image.open(tmp_path / "a.webp") as film:
+        assert film.n_frames == 4
+    with pytest.raises(InputError, match=r"must end in one of \.gif, .*\.webm, but got 'a\.avi'"):
+        check_format(Path("a.avi"))
+    program = tmp_path / "ffmpeg"
+    program.write_text('#!/bin/sh\nfor last; do :; done\nwc -c > "$last"\n')
+    program.chmod(0o755)
+    monkeypatch.setattr("sbt.report.video._ffmpeg", lambda: str(program))
+    write_video(tmp_path / "a.mp4", shown, times)
+    assert int((tmp_path / "a.mp4").read_text()) == (4 + 14) * 21 * 11 * 3, "every picture, and the last one for 1.2 s"
+    monkeypatch.setattr("sbt.report.video._ffmpeg", lambda: "")
+    with pytest.raises(InputError, match=r"\.mp4 needs ffmpeg, which is not there: pip install"):
+        check_format(Path("a.mp4"))

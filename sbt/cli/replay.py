@@ -22,7 +22,10 @@ def replay(
     run: Annotated[int, typer.Argument(metavar="RUN", help="Index of the run, as in the report.")],
     *,
     gui: Annotated[bool, typer.Option("--gui", help="Watch it in sumo-gui.")] = False,
-    gif: Annotated[Path | None, typer.Option(metavar="FILE.gif", help="Draw it from above, with the metric over time.")] = None,
+    gif: Annotated[
+        Path | None,
+        typer.Option("--film", "--gif", metavar="FILE", help="Draw it from above, with the metric: .gif, .webp, .mp4, .webm."),
+    ] = None,
     export: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Write network, trajectories (FCD, CSV) and a scene for sumo-gui.")
     ] = None,
@@ -54,6 +57,7 @@ def replay(
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),
             "metrics": dict(outcome.metrics), "identical": same if again.executed else None, "reason": outcome.reason,
             "ended": states.ended if states is not None else "",
+            **({} if gif is None else {"film": str(gif.resolve())}),
             **({"unconfirmed": outcome.unconfirmed} if outcome.unconfirmed else {}),
             **({"preventable": [vars(each) for each in judgements]} if judgements else {}),
         })  # fmt: skip
@@ -65,6 +69,8 @@ def replay(
         if outcome.unconfirmed:
             print(f"  doubtful: {outcome.unconfirmed}")
         print(_compared(again))
+        if gif is not None:
+            print(f"film: {gif.resolve()}")
         if judgements:
             print("\n".join(["with a reference driver in the place of ego:", *map(judgement_line, judgements)]))
     if not same:

@@ -23,6 +23,14 @@ const axisOf = column => {
 const spread = (column, rows, index, step) => rows.map(row =>
   column.whole ? column.values[row] + 0.5 * ((index[row] * step) % 1 - 0.5) : column.values[row]);
 
+// The ring around the chosen run; as a shape it moves without a redraw of all runs.
+const ring = (data, { run, x, y }) => {
+  if (run === null) return [];
+  const at = [spread(data.columns[x], [run], data.index, 0.618)[0], spread(data.columns[y], [run], data.index, 0.414)[0]];
+  if (!at.every(Number.isFinite)) return [];
+  return [{ type: "circle", xsizemode: "pixel", ysizemode: "pixel", xanchor: at[0], yanchor: at[1], x0: -9, x1: 9, y0: -9, y1: 9,
+    line: { color: colour("--ink"), width: 2.5 } }];
+};
 const drawScatter = (place, data, view) => {
   const [x, y] = [data.columns[view.x], data.columns[view.y]];
   const kind = webgl ? "scattergl" : "scatter", dense = data.index.length > 3000;
@@ -33,19 +41,21 @@ const drawScatter = (place, data, view) => {
       marker: { color: shades()[verdict], symbol: SHAPES[verdict], size: (dense ? 4 : 7) + (verdict === 1 ? 2 : 0),
         opacity: verdict === 0 && dense ? 0.5 : 0.85, line: { width: dense ? 0 : 0.5, color: colour("--card") } } };
   }).filter(trace => trace.rows.length);
-  if (view.run !== null) traces.push({ type: "scatter", mode: "markers", name: `run ${data.index[view.run]}`, rows: [view.run], hoverinfo: "none",
-    x: spread(x, [view.run], data.index, 0.618), y: spread(y, [view.run], data.index, 0.414),
-    marker: { symbol: "circle-open", size: 17, color: colour("--ink"), line: { width: 2.5 } } });
   const frame = look({});
-  return Plotly.react(place, traces, look({ height: 460, dragmode: narrow() ? false : "select", hovermode: "closest", uirevision: `${view.x} ${view.y}`,
+  return Plotly.react(place, traces, look({ height: 460, dragmode: narrow() ? false : "select", hovermode: "closest", uirevision: `${view.x} ${view.y}`, shapes: ring(data, view),
     legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 }, margin: { l: 60, r: 14, t: 34, b: 52 },
     xaxis: { ...frame.xaxis, ...axisOf(x) }, yaxis: { ...frame.yaxis, ...axisOf(y) } }), TOOLS);
 };
 
-// Parallel coordinates of runs that gave metrics; the metric first, then the inputs by influence.
+// Parallel coordinates of runs that gave metrics; the metric first, then the inputs by influence. Of very many runs some,
+// evenly: first of the critical ones, which lie on top.
+const LINES = 3000;
+const thinned = (rows, most) => rows.length <= most ? rows : Array.from({ length: most }, (_, k) => rows[Math.floor(k * rows.length / most)]);
 const drawParallel = (place, data, view) => {
-  const rows = [...data.index.keys()].filter(row => data.verdict[row] !== 2 && Number.isFinite(data.told.values[row]))
-    .sort((a, b) => data.verdict[a] - data.verdict[b]);
+  const all = [...data.index.keys()].filter(row => data.verdict[row] !== 2 && Number.isFinite(data.told.values[row]));
+  const critical = thinned(all.filter(row => data.verdict[row] === 1), LINES / 2);
+  const rows = [...thinned(all.filter(row => data.verdict[row] === 0), LINES - critical.length), ...critical];
+  place.dataset.lines = rows.length < all.length ? `Shown are ${rows.length} of ${all.length} runs; ranges filter all.` : "";
   const columns = [data.told, ...data.ranked];
   const dimensions = columns.map(column => {
     const values = rows.map(row => column.values[row]);

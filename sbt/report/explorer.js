@@ -45,9 +45,23 @@ class Explorer {
     this.listening = true;
     drawInfluence(this.part("influence"), data, k => { this.part("x").value = k; view.x = k; this.draw(); });
     if (!webgl) this.part("parallel").textContent = "Parallel coordinates need WebGL, which this browser does not offer.";
-    else if (!this.parallel) { this.parallel = true; await drawParallel(this.part("parallel"), data, view); }
+    else if (!this.parallel) this.parallelLater();
     this.slice();
     this.curves();
+  }
+  // Parallel coordinates are drawn when they come into view: they take longest.
+  parallelLater() {
+    const place = this.part("parallel");
+    this.parallel = true;
+    if (this.watch) this.watch.disconnect();
+    this.watch = new IntersectionObserver(seen => { if (seen.some(each => each.isIntersecting)) this.parallelNow(); }, { rootMargin: "300px" });
+    this.watch.observe(place);
+  }
+  parallelNow() {
+    const place = this.part("parallel");
+    this.watch.disconnect();
+    drawParallel(place, this.data, this.view);
+    this.part("parallel-note").textContent = place.dataset.lines;
   }
   listen(scatter) {
     const tip = this.part("tip");
@@ -94,7 +108,12 @@ class Explorer {
     this.facts(row);
     this.film(row);
     this.table.mark(row);
-    if (window.Plotly) { drawScatter(this.part("scatter"), this.data, this.view); this.slice(); this.curves(); }
+    setTimeout(() => {  // the film is there first
+      if (!window.Plotly || this.view.run !== row) return;
+      if (this.listening) Plotly.relayout(this.part("scatter"), { shapes: ring(this.data, this.view) });
+      this.slice();
+      this.curves();
+    });
     if (reveal) this.part("run").scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
   }
   facts(row) {
@@ -154,7 +173,7 @@ class Explorer {
     const there = data.slices.runs.includes(data.index[view.run]);
     this.part("slice").hidden = !there;
     slider.disabled = !there;
-    const errors = `The table is interpolated: off by up to ${digits(data.slices.error_p, 2)} in P(critical) and ${digits(data.slices.error_mean, 2)} ${data.told.unit} in the metric.`;
+    const errors = `The table is interpolated: off by up to ${digits(data.slices.error_p, 2)} in P(critical) and ${withUnit(digits(data.slices.error_mean, 2), data.told.unit)} in the metric.`;
     this.part("slice-note").textContent = there ? errors : `Slices are in this file for ${data.slices.runs.length} runs: those with a film, and some evenly chosen.`;
     says.textContent = "";
     if (!there) return;
@@ -165,7 +184,7 @@ class Explorer {
       const [mean, low, high, p] = move(value);
       const written = input.choices.length ? input.choices[Math.round(value)] : withUnit(digits(value), input.unit);
       says.textContent = `${input.name} = ${written}, else as run ${data.index[view.run]}: ${data.told.name} ${digits(mean, 3)} `
-        + `(90 % between ${digits(low, 3)} and ${digits(high, 3)} ${data.told.unit}), P(critical) ${percent(p)}`;
+        + `(90 % between ${digits(low, 3)} and ${withUnit(digits(high, 3), data.told.unit)}), P(critical) ${percent(p)}`;
     };
     slider.value = input.values[view.run];
     slider.oninput = () => tell(Number(slider.value));

@@ -1,4 +1,4 @@
-"""A run as an animated GIF: the scene from above, and below it the metric of the run so far."""
+"""A run as a film: the scene from above, and below it the metric of the run so far."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from sbt.problem.trace import Trace
 from sbt.report.contacts import Contacts
 from sbt.report.scene import BICYCLE, EGO, FEW, OTHER, PERSON, ROAD, STANDING, Scenery, View, draw_lanes, is_wide, view_of
 from sbt.report.style import CRITICAL, MODEL, REGION, figure_style, label
+from sbt.report.video import check_format, write_video
 from sbt.report.worst import metric_so_far, worst_moment
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ _COLORS = 48
 def write_film(
     file: Path, trace: Trace, metric: Metric, requirement: Requirement, *, lanes: Sequence[Lane] = (), title: str = ""
 ) -> None:
-    """Write a run as an animated GIF in real time.
+    """Write a run as a film in real time: .gif, .webp, .mp4 or .webm.
 
     Args:
         file: to be written.
@@ -46,12 +47,13 @@ def write_film(
         lanes: of the network.
         title: above the scene.
     """
+    check_format(file)
     with figure_style():
         images = _frames(trace, metric, requirement, lanes, title)
     step = _every(trace)
     shown = [max(round(100 * step * _dt(trace)), 2) * 10] * len(images)
     shown[-1] += round(1000 * _HOLD)
-    images[0].save(file, save_all=True, append_images=images[1:], duration=shown, loop=0, optimize=True, disposal=1)
+    write_video(file, images, shown)
 
 
 def _dt(trace: Trace) -> float:

@@ -37,7 +37,7 @@ from sbt.workflows.study import Study, changed_since
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Film", "Result"]
+__all__ = ["Film", "Page", "Result"]
 
 C = TypeVar("C", bound=Conclusion, covariant=True)
 
@@ -254,6 +254,16 @@ class Result(Generic[C]):
         """Write the runs as csv, parquet, dsiod or boundary points into the store's folder, and return the path."""
         return export_store(self.store, form, objects=self.objects)
 
+    def explore(self, height: int = 900) -> Page:
+        """Return the report as a page that a notebook shows in place, with its interactive figures and films.
+
+        Args:
+            height: of the frame (px).
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            path = rebuild_report(self.store, objects=self.objects, target=Path(folder))
+            return Page(path.read_text(encoding="utf-8"), height)
+
     def sentences(self) -> list[str]:
         """Return what the campaign found in plain words."""
         if not self.finished:
@@ -293,6 +303,24 @@ class Result(Generic[C]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class Page:
+    """A page of its own that a notebook shows in a frame.
+
+    Args:
+        text: HTML.
+        height: of the frame (px).
+    """
+
+    text: str
+    height: int = 900
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame; its scripts and styles stay inside."""
+        inside = html.escape(self.text)
+        return f'<iframe title="report" srcdoc="{inside}" style="width:100%;height:{self.height}px;border:0"></iframe>'
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Film:
     """A run from above, with its metric over time.
 
@@ -309,14 +337,12 @@ class Film:
     net: Path | None = None
 
     def save(self, path: str | Path) -> Path:
-        """Write the film as an animated GIF in real time, and return its path.
+        """Write the film in real time as .gif, .webp, .mp4 or .webm, and return its path.
 
         Raises:
-            InputError: the name does not end in .gif.
+            InputError: the name ends otherwise, or ffmpeg is needed and not there.
         """
         file = Path(path)
-        if file.suffix.lower() != ".gif":
-            raise InputError(f"a film must be saved as .gif, but got '{path}'")
         save_film(file, self.states, self.scenario, self.title, self.net)
         return file
 

@@ -180,8 +180,13 @@ def summarise(store: Store, study: Study, finished: Finished) -> Summary:
     )  # fmt: skip
 
 
-def rebuild_report(folder: Path, *, objects: Objects | None = None) -> Path:
+def rebuild_report(folder: Path, *, objects: Objects | None = None, target: Path | None = None) -> Path:
     """Write the report of a store again, also while its campaign runs; without a metamodel whose code is not at hand.
+
+    Args:
+        folder: of the store.
+        objects: what was given in Python when it was made.
+        target: folder to write to; None: the store's.
 
     Raises:
         StoreError: the folder holds no campaign.
@@ -189,17 +194,19 @@ def rebuild_report(folder: Path, *, objects: Objects | None = None) -> Path:
     with Store.read(folder) as store:
         study, ended = Study.from_store(store, objects=objects), store.conclusion
         conclusion = None if ended is None else study.conclusion(ended["conclusion"])
-        return _report(store, study, conclusion, study.fit(store.history()) if study.learns else None)
+        return _report(store, study, conclusion, study.fit(store.history()) if study.learns else None, target)
 
 
-def _report(store: Store, study: Study, conclusion: Conclusion | None, fitted: FittedMetamodel | None) -> Path:
+def _report(
+    store: Store, study: Study, conclusion: Conclusion | None, fitted: FittedMetamodel | None, target: Path | None = None
+) -> Path:
     from sbt.report.html import write_report
 
     log = Log(store.history(), tuple(store.iterations()), ())
     told = sensitivities_in(study, log) if getattr(conclusion, "probability", None) else ()
     predict = None if fitted is None else fitted.predict
     film = partial(film_runs, study, store.history(), folder=store.folder)
-    return write_report(store, study.scenario, predict, conclusion, sensitivity=told, film=film)
+    return write_report(store, study.scenario, predict, conclusion, folder=target, sensitivity=told, film=film)
 
 
 @dataclass(frozen=True, eq=False)

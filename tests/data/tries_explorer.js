@@ -8,7 +8,9 @@ const part = name => document.querySelector(`[data-part=${name}]`);
 const picture = () => part("film").querySelector("canvas").toDataURL();
 (async () => {
   try {
-    await wait(() => window.explorer && window.Plotly && part("scatter").querySelector(".main-svg") && part("parallel").querySelector(".parcoords"));
+    await wait(() => window.explorer && window.Plotly && part("scatter").querySelector(".main-svg"));
+    window.explorer.parallelNow();  // nothing scrolls into view without a screen
+    await wait(() => part("parallel").querySelector(".parcoords"));
     const { explorer } = window, scatter = part("scatter");
     const trace = scatter.data.find(each => each.name.startsWith("critical")), at = trace.rows.findIndex(row => explorer.data.filmOf.has(explorer.data.index[row]));
     scatter.emit("plotly_hover", { points: [{ data: trace, pointNumber: at }], event: { clientX: 0, clientY: 0 } });
