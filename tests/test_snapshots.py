@@ -193,7 +193,7 @@ def test_vehicles_are_inserted_beside_warmed_traffic(tmp_path):
     assert requested_departures(found.files, {"v": 8.0, "gap": 40.0}, "ego").keys() == {"ego", "other"}
     fast = inserting(tmp_path / "fast")
     fast.write_text(fast.read_text().replace("speed: 5,", "speed: 99,"))
-    with pytest.raises(RunError, match="Departure speed for vehicle 'other' is too high"):
+    with pytest.raises(RunError, match=r"scenario\.yaml:6:10: insert\.other: .*Departure speed for vehicle 'other' is too high"):
         simulation(fast)({"v": 8.0, "gap": 40.0}, 5)
 
 
@@ -202,7 +202,7 @@ def test_vehicles_are_inserted_beside_warmed_traffic(tmp_path):
     [
         ({"warm": "{until: auto}"}, "insert.ego: a vehicle must have a time"),
         ({"more": ", to: C3D3"}, "insert.other: a vehicle must have to or route, but got both"),
-        ({"more": ", at: '${v}'"}, "'other' departs at 5 s, before the warm-up ends"),
+        ({"more": ", at: '${v}'"}, r"scenario\.yaml:6:10: insert\.other: 'other' departs at 5 s, before the warm-up ends"),
     ],
 )
 def test_an_insertion_that_cannot_be_is_said(tmp_path, change, reason):

@@ -230,7 +230,8 @@ class _Builder:
                     str(at), entry.edge, str(entry.lane), str(entry.position), str(entry.speed), entry.type or "",
                     (entry.to,) if entry.to is not None else entry.route, known_route=entry.to is None,
                 )  # fmt: skip
-        return inserted_file(vehicles) if vehicles else None
+        places = {name: self._problems.source.located(("insert", name), "").rstrip(": ") for name in vehicles}
+        return inserted_file(vehicles, places) if vehicles else None
 
     def _recorded(self) -> tuple[RecordedTraffic, ...]:
         """Return the recorded traffic, if there is any."""

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from sbt.plugins import kept
 from sbt.problem.plain import Values
+from sbt.sumo.places import place_in
 from sbt.sumo.template import Template, fill, template
 
 __all__ = ["Equipment", "Piece", "excerpts", "expected_departures", "pieces_of", "seconds_of", "without_pieces"]
@@ -122,7 +123,7 @@ def pieces_of(file: Template) -> tuple[tuple[Piece, ...], tuple[Equipment, ...]]
         if depth == 1:
             names.clear()
             defines.clear()
-            place = f"{file.path}:{parser.CurrentLineNumber}:{parser.CurrentColumnNumber + 1}"
+            place = place_in(file.path, parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
             begun = (parser.CurrentByteIndex, tag, attributes, place)
         if depth >= 1:
             names.update(name for key in _NAMING if key in attributes for name in (attributes[key], *attributes[key].split()))

@@ -20,6 +20,7 @@ from sbt.problem.plain import Values
 from sbt.sumo.absence import why_absent
 from sbt.sumo.elements import person
 from sbt.sumo.files import SumoFiles
+from sbt.sumo.places import place_in
 from sbt.sumo.template import fill
 from sbt.sumo.waiting import why_held_back
 
@@ -83,7 +84,7 @@ def requested_departures(files: SumoFiles, values: Values, ego: str) -> dict[str
         requested[ego] = RequestedDeparture(walker.place, depart, position, None, None, of_flow=of_flow, on_foot=True)
     for name, template in compared:
         vehicle = template.vehicles[name]
-        place = f"{template.path}:{vehicle.place[0]}:{vehicle.place[1]}: "
+        place = f"{place_in(template.path, *vehicle.place)}: "
         if vehicle.tag != "flow":
             start = (vehicle.depart, vehicle.position, vehicle.speed, vehicle.lane)
             depart, position, speed, lane = (number_or_none(fill(value or "", values, place)) for value in start)

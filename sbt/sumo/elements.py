@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from sbt.plugins import kept
 from sbt.sumo.files import SumoFiles
+from sbt.sumo.places import place_in
 from sbt.sumo.template import Template
 
 __all__ = ["PEOPLE", "Element", "element", "elements", "person"]
@@ -39,7 +40,7 @@ class Element:
     @property
     def place(self) -> str:
         """`file:line:column: `, as messages begin."""
-        return f"{self.file}:{self.line}:{self.column}: "
+        return f"{place_in(self.file, self.line, self.column)}: "
 
     @property
     def depart(self) -> str | None:

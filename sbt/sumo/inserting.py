@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+from sbt.sumo.places import stands_for
 from sbt.sumo.session import scratch_folder
 
 __all__ = ["InsertedVehicle", "inserted_file"]
@@ -38,14 +39,19 @@ class InsertedVehicle:
     known_route: bool = True
 
 
-def inserted_file(vehicles: Mapping[str, InsertedVehicle]) -> Path:
+def inserted_file(vehicles: Mapping[str, InsertedVehicle], places: Mapping[str, str]) -> Path:
     """Write the route file of some vehicles by id to a temporary folder of this process, and return it.
+
+    Args:
+        vehicles: by id.
+        places: where the user wrote them, for messages.
 
     SUMO does not check the insertion, since it would delay it: where a start is not clear of others, the run is invalid.
     """
     lines = [_element(name, vehicle) for name, vehicle in vehicles.items()]
     text = "<routes>\n" + "\n".join(lines) + "\n</routes>\n"
-    path = scratch_folder() / f"insert-{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}.rou.xml"
+    path = scratch_folder() / f"insert-{hashlib.blake2b((text + repr(places)).encode(), digest_size=8).hexdigest()}.rou.xml"
+    stands_for(path, {line: places[name] for line, name in enumerate(vehicles, 2)})
     if not path.exists():
         path.write_text(text, encoding="utf-8")
     return path

@@ -27,6 +27,7 @@ from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.sumo.outputs import MARKS, in_signals, names_output, output_names, run_file
+from sbt.sumo.places import place_in
 
 __all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
 
@@ -254,7 +255,7 @@ def template(path: Path) -> Template:
     has_parts = any(mark in data for mark in marks)
 
     def place() -> str:
-        return f"{path}:{parser.CurrentLineNumber}:{parser.CurrentColumnNumber + 1}"
+        return place_in(path, parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
 
     def refuse(*_: object) -> None:
         raise InputError(f"{place()}: a SUMO file must not declare a document type or entities, but it does")
