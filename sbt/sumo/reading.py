@@ -80,7 +80,7 @@ class Onlooker(Mapping[str, State]):
         states: of the actors.
         dt: SUMO's step (s).
         prefix: of the names of the actors in SUMO.
-        rows: where the states that somebody has looked at are written.
+        rows: where the states of those who are near each other are written.
     """
 
     def __init__(
@@ -135,13 +135,14 @@ class Onlooker(Mapping[str, State]):
         if found:
             found = [self._order[s] for s in found]
             for j in (0, *found):
-                if k and self._at[j] < k - 1:
-                    self.look(k - 1, j)
-                self.look(k, j)
+                for row in (k - 1, k) if k else (k,):
+                    state = self.look(row, j)
+                    at = (row * len(self._states) + j) * ROW.size
+                    ROW.pack_into(self._rows, at, state.x, state.y, state.heading, state.speed, state.acceleration)
         return found
 
     def look(self, k: int, j: int) -> State:
-        """Return the state of an actor in row k, which is written."""
+        """Return the state of an actor in row k."""
         state = self._states[j]
         if self._at[j] == k:
             return state
@@ -153,8 +154,6 @@ class Onlooker(Mapping[str, State]):
         state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speeds[slot]
         state.acceleration = (speeds[slot] - self._read[k - 1][2][slot]) * (1.0 / self._dt) if k else 0.0
         self._at[j] = k
-        at = (k * len(self._states) + j) * ROW.size
-        ROW.pack_into(self._rows, at, state.x, state.y, state.heading, state.speed, state.acceleration)
         return state
 
     def table(self) -> np.ndarray:
