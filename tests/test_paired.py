@@ -58,6 +58,32 @@ BETTER = scenario(better)
     assert ": rose" in again.stdout
 
 
+@pytest.mark.slow
+def test_rare_failures_are_compared_by_two_estimations(configured, tmp_path):
+    """A disc of 2e-3 shrinks to a fourth: crude pairs would need thousands of runs."""
+    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + '''
+
+def rare(values, seed):
+    return {"y": disc(values, seed)["y"] + 0.3 - 0.0252, "noise": 0.0}
+
+
+def better(values, seed):
+    return {"y": disc(values, seed)["y"] + 0.3 - 0.0126, "noise": 0.0}
+
+
+RARE, BETTER = scenario(rare), scenario(better)
+''')
+    a, b = (configured(*each, budget=150, metamodel={"kind": "gp"}) for each in (("a", "RARE"), ("b", "BETTER")))
+    done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--rare", "--store", str(tmp_path / "both"), "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    truth = np.pi * np.array([0.0252, 0.0126]) ** 2
+    assert all(found[k]["low"] <= p <= found[k]["high"] for k, p in zip(("before", "after"), truth, strict=True))
+    assert found["low"] <= truth[1] - truth[0] <= found["high"] < 0
+    assert found["verdict"] == "fell"
+    assert max(found[k]["runs"] for k in ("before", "after")) <= 150
+
+
 def test_different_questions_are_refused(configured, tmp_path):
     a, b = configured("a"), configured("b", requirement={"critical": [-1.0, -0.1]})
     done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both")])

@@ -21,20 +21,23 @@ def compare_ego(
     *,
     store: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of both campaigns.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Pairs of runs; default: the budget of A.")] = None,
+    rare: Annotated[
+        bool, typer.Option("--rare", help="Critical runs are rare: estimate each probability, B's by what A's campaign taught.")
+    ] = False,
     fail_if_rose: Annotated[bool, typer.Option("--fail-if-rose", help="Exit 3 if the probability rose.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
     """Run both on the same draws: did the probability fall, which failures were fixed, which are new."""
     folder = store if store is not None else Path("runs") / f"compare_{first.stem}_{second.stem}"
     with resumable("*/campaign.sqlite") as work, clean_stdout(), ProgressDisplay(silent=as_json) as show:
-        from sbt.workflows.paired import compare_egos
+        from sbt.workflows.paired import compare_egos, compare_rare
 
         work.folder = folder
-        result = compare_egos(first, second, store=folder, runs=runs, progress=show)
+        result = (compare_rare if rare else compare_egos)(first, second, store=folder, runs=runs, progress=show)
     if as_json:
         print_json(result)
     else:
-        print("\n".join(_lines(result)))
+        print("\n".join(_rare_lines(result) if rare else _lines(result)))
     if fail_if_rose and result["verdict"] == "rose":
         raise fail("the probability of a critical run rose", Exit.CRITICAL)
 
@@ -51,3 +54,14 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         shown = ", ".join(str(f["run"]) for f in found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
         lines.append(f"  {len(found)} {name}" + (f": runs {shown}" if found else ""))
     return [*lines, f"  {result['still']} critical with both", f"page: {result['page']}"]
+
+
+def _rare_lines(result: Mapping[str, Any]) -> list[str]:
+    """Return the comparison of two estimations for people."""
+    lines = [f"two estimations, the second learned from the first; {result['confidence']:.0%} intervals"]
+    for name in ("before", "after"):
+        s = result[name]
+        p = "unknown" if s["probability"] is None else f"{s['probability']:.4g}"
+        lines.append(f"  {name:<8}{p} ({s['low']:.4g} to {s['high']:.4g}), {s['runs']} runs, {s['failed']} failed")
+    by = "unknown" if result["difference"] is None else f"{result['difference']:+.4g}"
+    return [*lines, f"  change  {by} ({result['low']:+.4g} to {result['high']:+.4g}): {result['verdict']}"]

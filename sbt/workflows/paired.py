@@ -2,12 +2,15 @@
 
 Both configurations run as crude Monte Carlo with one seed: draws of the inputs and seeds of the runs are
 the same (common random numbers), so that only the runs with different verdicts tell the egos apart.
+
+Where critical runs are rare, pairs tell nothing. Then each ego has an estimation of its own, and the second learns from the
+first: its metamodel is a trend. No run of the first is counted for the second, so that the errors are independent.
 """
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,16 +29,18 @@ from sbt.report.versus import write_versus
 from sbt.store.database import Store
 from sbt.store.history import History
 from sbt.workflows.filming import film_runs
-from sbt.workflows.running import run_study
+from sbt.workflows.running import Summary, run_study
 from sbt.workflows.study import Study
 
-__all__ = ["Pairs", "compare_egos"]
+__all__ = ["Pairs", "compare_egos", "compare_rare"]
 
 _CONFIDENCE = 0.95
 _FILMED = 6
 """Films are made of so many fixed and so many new failures ..."""
 _SECONDS = 20.0
 """... whose runs took at most so long together when they were recorded (s)."""
+_PRECISE = 0.1
+"""Coefficient of variation with which the estimations of rare critical runs end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,19 +107,12 @@ def compare_egos(
         "campaign": "estimation", "acquisition": {"kind": "monte_carlo"}, "metamodel": {"kind": "gp"}, "stop": {"cov": None},
         "gate": None, "warm_start": None, "seed": config.seed, "budget": budget, "initial": size, "batch": size,
     }  # fmt: skip
-    one, other = (
-        Study.from_file(path, changes={**common, "store": str(store / name)}) for path, name in ((first, "a"), (second, "b"))
-    )
-    if one.scenario.space != other.scenario.space:
-        raise InputError(f"compare-ego needs the same inputs and distributions, but {first} and {second} differ in them")
-    requirement = one.scenario.requirement
-    if requirement != other.scenario.requirement:
-        found = f"{requirement} in {first}, {other.scenario.requirement} in {second}"
-        raise InputError(f"compare-ego needs one requirement, but got {found}")
+    one, other = (_study(path, store / name, common) for path, name in ((first, "a"), (second, "b")))
+    _check(one, other, (first, second))
     for study in (one, other):
         run_study(study, progress=progress, report=False)
     histories = [_history(store / name) for name in ("a", "b")]
-    result = _result(histories[0], histories[1], requirement)
+    result = _result(histories[0], histories[1], one.scenario.requirement)
     return {**result, "page": str(_page(store, (one, other), histories, result, f"{first.stem} and {second.stem}"))}
 
 
@@ -146,6 +144,75 @@ def _said(study: Study, history: History, row: int) -> str:
     return ", ".join([verdict, *(f"{m} {number(float(history.y(m)[row]), 3)} {units.get(m, '')}".strip() for m in metrics)])
 
 
+def compare_rare(
+    first: Path, second: Path, *, store: Path, runs: int | None = None, progress: Callable[[Progress], None] | None = None
+) -> Json:
+    """Estimate the probability with each ego, the second by transfer from the first, and compare them.
+
+    Args:
+        first: configuration with the ego before.
+        second: configuration with the ego after; same scenario, inputs and requirement.
+        store: folder; the campaigns are its subfolders a and b.
+        progress: called after every run.
+        runs: of each estimation at most; None: the budget of the first. They end at a coefficient of variation of 10 %.
+
+    Returns:
+        Probabilities with intervals, runs, their difference with its interval, and a verdict (`fell`, `rose`, `undecided`).
+
+    Raises:
+        InputError: as `compare_egos` does.
+
+    Source:
+        Zou and Donner (2008), doi 10.1002/sim.3095: the interval of a difference from those of independent estimates.
+    """
+    config = load(first).config
+    budget = config.budget if runs is None else runs
+    common = {
+        "campaign": "estimation", "acquisition": {"kind": "auto"}, "gate": None, "warm_start": None, "seed": config.seed,
+        "budget": budget, "stop": {"cov": _PRECISE},
+    }  # fmt: skip
+    one, other = (_study(path, store / name, common) for path, name in ((first, "a"), (second, "b")))
+    _check(one, other, (first, second))
+    before = _estimated(run_study(one, progress=progress, report=False), store / "a")
+    warm = {"warm_start": {"store": str(store / "a"), "transfer": True}}
+    other = _study(second, store / "b", common | warm)
+    after = _estimated(run_study(other, progress=progress, report=False), store / "b")
+    p, q = before["probability"], after["probability"]
+    if p is None or q is None:
+        low, high = after["low"] - before["high"], after["high"] - before["low"]
+    else:
+        low = q - p - float(np.hypot(q - after["low"], before["high"] - p))
+        high = q - p + float(np.hypot(after["high"] - q, p - before["low"]))
+    return {
+        "confidence": _CONFIDENCE, "before": before, "after": after, "difference": None if p is None or q is None else q - p,
+        "low": low, "high": high, "verdict": _verdict(low, high),
+    }  # fmt: skip
+
+
+def _study(path: Path, store: Path, changes: Mapping[str, Any]) -> Study:
+    return Study.from_file(path, changes={**changes, "store": str(store)})
+
+
+def _check(one: Study, other: Study, paths: tuple[Path, Path]) -> None:
+    """Refuse to compare answers to different questions."""
+    if one.scenario.space != other.scenario.space:
+        raise InputError(f"compare-ego needs the same inputs and distributions, but {paths[0]} and {paths[1]} differ in them")
+    if one.scenario.requirement != other.scenario.requirement:
+        found = f"{one.scenario.requirement} in {paths[0]}, {other.scenario.requirement} in {paths[1]}"
+        raise InputError(f"compare-ego needs one requirement, but got {found}")
+
+
+def _estimated(summary: Summary, folder: Path) -> Json:
+    """Return what an estimation found."""
+    found, history = summary.to_dict()["conclusion"], _history(folder)
+    kept = {key: found[key] for key in ("probability", "low", "high", "undetected_mass_bound")}
+    return {**kept, "runs": len(history), "critical": found["hits"], "failed": int((~history.ok).sum())}
+
+
+def _verdict(low: float, high: float) -> str:
+    return "fell" if high < 0 else "rose" if low > 0 else "undecided"
+
+
 def _history(folder: Path) -> History:
     with Store.read(folder) as store:
         return store.history()
@@ -168,7 +235,7 @@ def _result(first: History, second: History, requirement: Any) -> Json:
             for name, s in zip(("before", "after"), shares, strict=True)
         },
         "difference": shares[1].value - shares[0].value, "low": low, "high": high,
-        "verdict": "fell" if high < 0 else "rose" if low > 0 else "undecided",
+        "verdict": _verdict(low, high),
         "fixed": _listed(first, pairs.fixed), "new": _listed(first, pairs.new),
         "still": int((pairs.before & pairs.after).sum()),
     }  # fmt: skip
