@@ -28,6 +28,7 @@ from sbt.samplers.portfolio import propose
 from sbt.samplers.search import Search
 from sbt.seeds import stream
 from sbt.testbeds import find, values
+from sbt.testbeds.search import WELLS
 
 CASES = {
     "hartmann6_1e-3": ("testbed:hartmann6_1e-3", None, (45, 65)),
@@ -66,40 +67,56 @@ def first_failures(args: argparse.Namespace, case: str) -> None:
     print(f"\n{case}" + (f", bar {bar[0]} / {bar[1]}" if bar else "") + f"\n\n{table(cells)}", flush=True)
 
 
-def _basin(x: np.ndarray) -> int:
-    """Return which minimum a descent from x ends in."""
-    ends = minimize(lambda v: float(values("hartmann6_1e-3", v[None])[0]), x, bounds=[(0, 1)] * 6, method="L-BFGS-B").x
-    return int(np.abs(ends - MINIMA).max(axis=1).argmin())
+def _hartmann_modes(x: np.ndarray) -> np.ndarray:
+    """Return (n,) which minimum a descent from each of x (n, d) ends in."""
+
+    def end(v: np.ndarray) -> np.ndarray:
+        return minimize(lambda w: float(values("hartmann6_1e-3", w[None])[0]), v, bounds=[(0, 1)] * 6, method="L-BFGS-B").x
+
+    return np.array([int(np.abs(end(v) - MINIMA).max(axis=1).argmin()) for v in x], dtype=int)
 
 
-def both_modes(args: argparse.Namespace) -> None:
-    """Seeds in which both modes of hartmann6_1e-3 are among the critical runs, and what the campaign counts."""
-    path = args.into / "modes.jsonl"
+def _needle_modes(x: np.ndarray) -> np.ndarray:
+    """Return (n,) in which of the five balls each of x (n, d) lies."""
+    return np.argmin([np.sqrt(((x - np.array(c)) ** 2).sum(axis=1)) - radius for c, radius, _ in WELLS], axis=0)
+
+
+MODES = {"hartmann6_1e-3": (300, 2, 2, _hartmann_modes), "multi_needle_d4": (400, 5, 4, _needle_modes)}
+"""Testbed: runs, how many modes there are, how many are asked for, and which mode critical inputs belong to."""
+
+
+def all_modes(args: argparse.Namespace, case: str) -> None:
+    """Seeds in which the modes of a testbed are among the critical runs, and what the campaign counts."""
+    path = args.into / f"modes_{case}.jsonl"
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = {r["seed"]: r for r in map(json.loads, path.read_text().splitlines())} if path.is_file() else {}
-    for seed in range(args.seeds):
+    budget, there, wanted, which = MODES[case]
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    for seed in seeds:
         if seed in rows:
             continue
         with tempfile.TemporaryDirectory() as folder:
             result = sbt.run(
-                campaign="falsification", scenario=CASES["hartmann6_1e-3"][0], budget=300, seed=seed, executor="serial",
+                campaign="falsification", scenario=f"testbed:{case}", budget=budget, seed=seed, executor="serial",
                 store=f"{folder}/store", report=False,
             )  # fmt: skip
-            history, found = result.history, result.conclusion
+            history, found, critical = result.history, result.conclusion, result.scenario.requirement
         runs = history.where(history.stage != CONFIRM)
-        hits = np.flatnonzero(runs.y("y") <= -2.4)
-        basin = np.array([_basin(runs.x[k]) for k in hits], dtype=int)
-        first = [hits[basin == k][:1] for k in (0, 1)]
-        both = int(max(f[0] for f in first)) + 1 if all(len(f) for f in first) else None
-        rows[seed] = {"seed": seed, "both": both, "counted": len(found.failure_modes),
-                      "critical": found.critical_runs, "seconds": result.summary["seconds"]}  # fmt: skip
+        hits = np.flatnonzero(critical.critical_runs(runs))
+        mode = which(runs.x[hits])
+        first = sorted(int(hits[mode == k][0]) + 1 for k in range(there) if (mode == k).any())
+        rows[seed] = {"seed": seed, "first": first, "counted": len(found.failure_modes), "critical": found.critical_runs,
+                      "seconds": result.summary["seconds"]}  # fmt: skip
         with path.open("a") as file:
             file.write(json.dumps(rows[seed]) + "\n")
-    found = [rows[k]["both"] for k in range(args.seeds) if rows[k]["both"] is not None]
-    counted = [rows[k]["counted"] for k in range(args.seeds)]
+        print(json.dumps(rows[seed]), flush=True)
+    enough = [rows[k]["first"][wanted - 1] for k in seeds if len(rows[k]["first"]) >= wanted]
+    mean = np.mean([len(rows[k]["first"]) for k in seeds])
     print(
-        f"\nboth modes of hartmann6_1e-3 within 300 runs: {len(found)} of {args.seeds} seeds, median at {np.median(found):.0f};"
-    )
+        f"\n{case}: {wanted} of {there} modes within {budget} runs in {len(enough)} of {len(seeds)} seeds"
+        + (f", median at {np.median(enough):.0f}" if enough else "") + f"; {mean:.1f} in the mean"
+    )  # fmt: skip
+    counted = [rows[k]["counted"] for k in seeds]
     print(f"failure modes the campaign counts: median {np.median(counted):.0f}, {min(counted)} to {max(counted)}")
 
 
@@ -121,6 +138,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--into", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=0, help="of the modes")
+    parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--only", default=",".join([*CASES, "modes", "cost"]))
     parser.add_argument("--samplers", default="portfolio,random,sobol,cma_es,tpe")
     args = parser.parse_args()
@@ -128,7 +147,8 @@ def main() -> None:
         parser.error(f"--only: {', '.join(sorted(unknown))} is none of {', '.join((*CASES, 'modes', 'cost'))}")
     for case in args.only.split(","):
         if case == "modes":
-            both_modes(args)
+            for name in args.modes.split(","):
+                all_modes(args, name)
         elif case == "cost":
             cost()
         else:

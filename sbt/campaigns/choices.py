@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.acquisitions import boundary, even, log_scores
-from sbt.campaigns.exploration import EXPLORATION_SHARE, explore, should_explore
+from sbt.campaigns.exploration import exploration_share, explore, should_explore
 from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
@@ -88,11 +88,12 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
     least uncertainty far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
     nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
-    the mean P(critical) is below 1 %, half of the batch explores first (see `explore`).
+    the mean P(critical) is below 1 %, half of the batch explores first (see `explore`), or more (see `exploration_share`).
     """
     if fitted is None:
         return evenly(settings, fitted, log, n)
-    looking = explore(settings, log, _rounded(EXPLORATION_SHARE * n, log) if should_explore(settings, fitted, log) else 0)
+    share = exploration_share(settings, log) if should_explore(settings, fitted, log) else 0.0
+    looking = explore(settings, log, min(_rounded(share * n, log), n))
     filling = min(_rounded(max(_FILLING - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])

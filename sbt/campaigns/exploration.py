@@ -16,15 +16,16 @@ from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.metamodels.base import simplest
 from sbt.problem.arrays import Mask, Points
+from sbt.samplers.plateaus import plateau
 from sbt.samplers.portfolio import propose
 from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION
 
-__all__ = ["EXPLORATION_SHARE", "explore", "fruitless_runs", "should_explore", "space_filling"]
+__all__ = ["exploration_share", "explore", "fruitless_runs", "should_explore", "space_filling"]
 
-EXPLORATION_SHARE = 0.5
-"""Share of a batch that explores."""
+_SHARE, _SHARE_HIDDEN, _SHARE_UNKNOWN = 0.5, 0.75, 0.9
+"""Shares of a batch that explore; where plateaus may hide regions; and there before the first critical run."""
 _RARE = 0.01  # critical share of the space below which a region is easily missed
 _PATIENCE = 0.2  # of the budget: exploratory runs without a new region that end the exploration
 
@@ -42,6 +43,19 @@ def should_explore(settings: Settings, fitted: FittedMetamodel, log: Log) -> boo
     n, hits = int(runs.ok.sum()), int(settings.scenario.requirement.critical_runs(runs).sum())
     believed = fitted.record.critical_fraction < _RARE and float(interval(hits, n)[0]) <= _RARE
     return (hits <= _RARE * n or believed) and fruitless_runs(settings, log) < _PATIENCE * settings.budget
+
+
+def exploration_share(settings: Settings, log: Log) -> float:
+    """Return the share of the next batch that explores, if it does: where plateaus hide regions most of it until one is known."""
+    if not _hidden(settings, log):
+        return _SHARE
+    return _SHARE_HIDDEN if settings.scenario.requirement.critical_runs(log.history).any() else _SHARE_UNKNOWN
+
+
+def _hidden(settings: Settings, log: Log) -> bool:
+    """Return whether many runs share the best uncritical value: beneath such a plateau there may be critical regions."""
+    margin = settings.scenario.requirement.margins(log.history)
+    return bool(plateau(np.where(log.history.ok, margin, np.inf)).any())
 
 
 def space_filling(log: Log) -> Mask:

@@ -18,6 +18,7 @@ from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
+from sbt.metamodels.stepped import better_stepped
 from sbt.metamodels.torch_tools import check_device
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -43,7 +44,8 @@ class Auto:
     it fell into (see `Bins`). The process leaves out one row at a time, in closed form; the others learn from 80 % of the
     rows, 90 % from 1,000 rows on. The first model, `gp` with nu 2.5 and one noise, is taken alone unless the mixture is
     better by three standard errors, and better over the space, too (rows crowd at the edge, where a mixture that hedges
-    looks better than it is). Where it leaves next to nothing to gain, the others are not even tried.
+    looks better than it is). Where the metric jumps at the edge, `gp` learns a widened jump if that predicts the sides better
+    (see `stepped`). Where it leaves next to nothing to gain, the others are not even tried.
 
     Args:
         folds: of the cross-validation, >= 2.
@@ -120,9 +122,9 @@ class Auto:
     def _fit_at_edge(self, u: Points, y: Vector, rng: np.random.Generator, bins: Bins) -> MixturePredictor:
         """Return the process alone, or the mixture where it is better for where the runs fell, at the edge and over the space."""
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
-        process = self.simplest.fit(u, y, rng)
+        plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
+        process = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng) or plain
         own = bins.log_score(process.leave_one_out(u, y), y)
-        shares = cell_shares(u, rng)
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             left = f"of {n} rows, each predicted from all others, {-own.mean():.1g}: others could add no more"
             reason = f"100 % gp: it misses a mean log likelihood {left}"

@@ -15,6 +15,7 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import Cube
 from sbt.samplers.drawn import propose_in_noise
 from sbt.samplers.noise import hidden_by_noise, more_repeats
+from sbt.samplers.plateaus import beneath_plateaus
 from sbt.samplers.regions import PATIENCE, Region, clusters, niches, regions
 from sbt.samplers.search import (
     Picks,
@@ -31,6 +32,7 @@ from sbt.samplers.search import (
 
 __all__ = ["Region", "propose", "regions"]
 
+_BENEATH = 0.55  # share of the picks that look beneath a plateau, where there is one
 _HOPELESS = 1e-4  # largest inflated P(critical) in a region that is given up, and below which all candidates are alike
 _INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a fit to few runs is too sure; measured
 _THOMPSON = 0.6  # share of the picks; 75 % and 30 % were measured, see docs/falsification.md
@@ -52,7 +54,8 @@ def propose(
 
     About 60 % are Thompson draws in up to three trust regions, the others are global picks of
     P(critical) that repel each other; where nothing promises anything, they fill the space. Runs that lie far below what
-    the metamodel expects without them get a few picks about them (niches). After 60 runs without a better one two fifths of
+    the metamodel expects without them get a few picks about them (niches). Where many runs share the best uncritical value,
+    half of the picks look beneath that plateau, instead of Thompson draws. After 60 runs without a better one two fifths of
     the picks fill space instead of two thirds of the Thompson draws. The caller adds a share of space-filling runs (about 10 %).
 
     Args:
@@ -92,13 +95,17 @@ def propose(
     )  # fmt: skip
     hopeful = _hopeful(model, found, seen.admissible, rng, search.cube)
     stagnant = not seen.noisy and seen.runs_since(margin) >= _STAGNANT  # noise hides what is better
-    small = _in_niches(model, seen, margin, [region for region, _ in hopeful], n - 2, rng, search.cube)
-    filled = round(_FILLING_LATE * (n - len(small))) if stagnant else 0
+    pending = np.empty((0, d)) if pending is None else pending
+    under = beneath_plateaus(search, seen, u, y, round(_BENEATH * n), rng, pending)
+    small = _in_niches(model, seen, margin, [region for region, _ in hopeful], n - max(2, len(under)), rng, search.cube)
+    filled = round(_FILLING_LATE * (n - len(small))) if stagnant and len(under) == 0 else 0
     thompson = min(round((_THOMPSON_LATE if stagnant else _THOMPSON) * n), n - len(small) - filled)
-    drawn = _thompson(model, hopeful, thompson if len(small) == 0 else min(thompson, (n - len(small)) // 2), d, rng)
-    picks, pending = np.vstack([drawn, small]), np.empty((0, d)) if pending is None else pending
+    thompson = thompson if len(small) == 0 else min(thompson, (n - len(small)) // 2)
+    drawn = _thompson(model, hopeful, max(thompson - len(under), 0), d, rng)
+    picks = np.vstack([drawn, small, under])
     picks = np.vstack([picks, spread_out(seen.admissible, np.vstack([u, pending, picks]), filled, rng, search.cube)])
-    why = ("thompson",) * len(drawn) + ("niche",) * len(small) + ("fill",) * filled + ("global",) * (n - len(picks))
+    why = ("thompson",) * len(drawn) + ("niche",) * len(small) + ("beneath",) * len(under) + ("fill",) * filled
+    why += ("global",) * (n - len(picks))
     picks = _globally(model, picks, n, u, pending, hopeful, seen.admissible, rng, search.cube)
     order = np.argsort(-model.log_probability(picks), kind="stable")
     return Picks(picks[order], tuple(why[k] for k in order), again)

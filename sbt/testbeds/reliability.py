@@ -18,7 +18,6 @@ from sbt.testbeds.problem import NEGATIVE, Input, Problem, Truth, lognormal, nor
 __all__ = ["PROBLEMS"]
 
 
-
 def _standard(d: int) -> tuple[Parameter, ...]:
     """Return d independent standard-normal inputs x1 ... xd."""
     return parameters_of({f"x{k + 1}": normal(0.0, 1.0) for k in range(d)})

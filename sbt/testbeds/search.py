@@ -16,7 +16,7 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.testbeds.problem import NEGATIVE, Function, Problem, Truth, parameters_of
 
-__all__ = ["PROBLEMS"]
+__all__ = ["PROBLEMS", "WELLS"]
 
 _WEIGHT = np.array([1.0, 1.2, 3.0, 3.2])
 _STEEPNESS = np.array([
@@ -80,7 +80,7 @@ def needle(x: Points, centre: NDArray[np.float64], radius: float, reach: float) 
     return np.where(distance <= radius, np.minimum(y, -0.05), np.maximum(y, 0.05))
 
 
-_WELLS = (
+WELLS = (
     ((0.2, 0.2, 0.2, 0.2), 0.12, 0.20),
     ((0.8, 0.2, 0.7, 0.3), 0.10, 0.16),
     ((0.25, 0.8, 0.75, 0.75), 0.10, 0.14),
@@ -98,7 +98,7 @@ def multi_needle(x: Points) -> Vector:
     """
     y = 0.5 + 0.3 * np.cos(3.0 * np.pi * x[:, 0]) * np.cos(2.0 * np.pi * x[:, 1]) + 0.2 * x[:, 2]
     inside = np.zeros(len(x), dtype=bool)
-    for centre, radius, reach in _WELLS:
+    for centre, radius, reach in WELLS:
         distance = np.sqrt(((x - np.array(centre)) ** 2).sum(axis=1))
         y = y - 2.0 * _well(distance, radius, reach)
         inside |= distance <= radius
@@ -187,7 +187,7 @@ def _needle(centre: tuple[float, ...], reach: float) -> Problem:
     return _uniform(f"needle_d{d}_1e-3", f"A needle in {d} dimensions", d, function, NEGATIVE, share, 0.0, 1)
 
 
-_FIVE_BALLS = sum(ball_volume(4, radius) for _, radius, _ in _WELLS)
+_FIVE_BALLS = sum(ball_volume(4, radius) for _, radius, _ in WELLS)
 _SMALL = 0.0178
 
 PROBLEMS = (

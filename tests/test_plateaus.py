@@ -1,0 +1,81 @@
+"""Plateaus at the critical edge: what lies beneath is found, and a jump is learned as one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.persistence import load, save
+from sbt.metamodels.stepped import Step, SteppedPredictor, better_stepped
+from sbt.problem.requirement import CriticalInterval
+from sbt.samplers.plateaus import beneath_plateaus, plateau
+from sbt.samplers.search import Search, search_data
+from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import stream
+
+LOW = CriticalInterval(high=0.0)
+CENTRE = np.array([0.35, 0.6])
+PROCESS = GaussianProcess(nu=2.5, input_noise=False)
+
+
+def floor(u):
+    """A funnel, cut off at 0.02 within 0.3 of its middle; critical is a disc of radius 0.06 there."""
+    distance = np.sqrt(((u - CENTRE) ** 2).sum(axis=1))
+    return np.where(distance < 0.06, -1.0, np.maximum(distance - 0.3, 0.0) + 0.02)
+
+
+def test_a_plateau_is_a_value_shared_next_to_the_edge_and_slopes_around_it():
+    slope = np.linspace(0.1, 1.0, 20)
+    assert plateau(np.r_[np.full(4, 0.02), slope, np.inf, -1.0]).tolist() == [True] * 4 + [False] * 22
+    assert not plateau(np.r_[np.full(3, 0.02), slope]).any()  # by chance
+    assert not plateau(np.r_[np.full(30, 0.02), np.full(30, 1.0)]).any()  # no slopes: nothing to follow
+    assert not plateau(np.r_[slope, np.full(30, 2.0)]).any()  # far from the edge
+
+
+def test_picks_lie_beneath_the_middle_of_a_plateau_until_a_failure_explains_it():
+    u = SobolSequence(2, 1).points(0, 40)
+    u = u[np.sqrt(((u - CENTRE) ** 2).sum(axis=1)) > 0.09]
+    search, rng = Search(LOW, PROCESS), stream(0, "plateau")
+    seen = search_data(search, u, floor(u), None, rng)
+    picks = beneath_plateaus(search, seen, u, floor(u), 3, rng)
+    assert len(picks) == 3
+    assert np.sqrt(((picks[0] - CENTRE) ** 2).sum()) < 0.12  # of 0.3
+    found = np.vstack([u, CENTRE])
+    seen = search_data(search, found, floor(found), None, rng)
+    assert len(beneath_plateaus(search, seen, found, floor(found), 3, rng)) == 0
+
+
+@pytest.mark.parametrize("critical", [LOW, CriticalInterval(low=0.0)])
+def test_a_widened_jump_keeps_the_sides_and_comes_back(critical: CriticalInterval, tmp_path: Path):
+    rng = stream(3, "step")
+    u, y = rng.random((30, 2)), rng.standard_normal(30)
+    step = Step(0.0, 1.5, critical)
+    assert (critical.contains(step.moved(y)) == critical.contains(y)).all()
+    np.testing.assert_allclose(step.back(step.moved(y)), y, atol=2e-3)
+    stepped = SteppedPredictor(PROCESS.fit(u, step.moved(y), rng), step)
+    at = rng.random((50, 2))
+    p = stepped(at).probability(critical)
+    np.testing.assert_allclose(p, stepped.process(at).probability(critical), rtol=1e-6, atol=1e-12)
+    low, high = stepped.probability_bounds(at, critical)
+    assert ((low <= p + 1e-9) & (p <= high + 1e-9)).all()
+    save(stepped, tmp_path / "m.sbtmodel")
+    np.testing.assert_array_equal(load(tmp_path / "m.sbtmodel")(at).mean, stepped(at).mean)
+
+
+def test_a_jump_is_widened_only_where_that_predicts_the_sides_better():
+    rng = stream(4, "jump")
+    u = np.vstack([SobolSequence(2, 2).points(0, 60), CENTRE + 0.05 * rng.uniform(-1, 1, (3, 2))])
+    shares, at = np.full(len(u), 1.0 / len(u)), rng.random((2000, 2))
+    wrong = []
+    for predictor in (
+        PROCESS.fit(u, floor(u), rng),
+        better_stepped(PROCESS, PROCESS.fit(u, floor(u), rng), LOW, u, floor(u), shares, rng),
+    ):
+        assert predictor is not None
+        wrong.append(np.mean((predictor(at).probability(LOW)) * (floor(at) > 0)))
+    assert wrong[1] < 0.5 * wrong[0]
+    smooth = np.sin(5.0 * u[:, 0]) + u[:, 1] - 0.5
+    assert better_stepped(PROCESS, PROCESS.fit(u, smooth, rng), LOW, u, smooth, shares, rng) is None
