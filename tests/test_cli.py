@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sbt.campaigns.settings import PlainConclusion
-from sbt.cli import app, console, progress
+from sbt.cli import app, console, listing, progress
 from sbt.cli.completion import complete_scenarios, complete_stores
 from sbt.cli.conclusion import conclusion_lines
 from sbt.errors import InputError, StoreError
@@ -157,6 +157,18 @@ def test_wrong_configuration_is_told_with_its_place(folder: Path):
         "bad.yaml:3:1: bugdet: unknown key (did you mean 'budget'?)",
         "bad.yaml:4:8: batch: must be a whole number, but got 'two'",
     ]
+
+
+def test_what_only_the_scenario_tells_is_reported_with_the_wrong_keys(folder: Path):
+    text = "campaign: boundary\nscenario: plane.py:SCENARIO\nbugdet: 10\ninputs: {gab: {max: 2.0}}\n"
+    text += "requirement: {metric: margni}\n"
+    (folder / "bad.yaml").write_text(text)
+    done = call("run", "bad.yaml")
+    lines = done.stderr.splitlines()
+    assert done.exit_code == 2
+    assert len(lines) == 3, lines
+    for line, part in zip(lines, ("bugdet: unknown key", "gab", "margni"), strict=True):
+        assert part in line, lines
 
 
 def test_run_prints_one_json_object_and_nothing_else(folder: Path, campaign: list[Any]):
@@ -462,6 +474,18 @@ def test_progress_never_goes_beyond_its_total_and_tells_what_a_person_asks(
     said = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err)
     for part in ("4/8", "/s", "2 critical", "1 failed", "s left", "confirm: choosing", "8 + 2"):
         assert part in said, said
+
+
+def test_a_list_is_remembered_until_something_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = call("list", "acquisitions").stdout
+    assert "boundary" in first
+    (kept,) = (tmp_path / "sumo-sbt").glob("acquisitions.*.json")
+    kept.write_text(json.dumps({"remembered": "a line"}))
+    assert "a line" in call("list", "acquisitions").stdout
+    monkeypatch.setattr(listing, "__version__", "another")
+    assert call("list", "acquisitions").stdout == first
+    assert call("list", "acquisition").exit_code == 2
 
 
 def test_help_names_no_type_of_a_flag(monkeypatch: pytest.MonkeyPatch):

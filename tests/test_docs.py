@@ -42,7 +42,7 @@ def small(config: Path) -> list[str]:
 
 
 def test_there_are_configurations_and_examples():
-    assert ROOT / "configs" / "cut_in_boundary.yaml" in CONFIGS
+    assert ROOT / "configs" / "high_speed_crash.yaml" in CONFIGS
     assert len(EXAMPLES) > 5
 
 
@@ -83,7 +83,7 @@ def test_commands_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         if (ROOT / folder).is_dir():
             (tmp_path / folder).symlink_to(ROOT / folder)
     for (program, *args), _ in (command for block in blocks_of(ROOT / "README.md", "bash") for command in commands_of(block)):
-        if program in ("scripts/test", "scripts/run"):  # scripts/run: configs/cut_in_boundary.yaml, which runs above
+        if program in ("scripts/test", "scripts/run"):  # scripts/run: configs/high_speed_crash.yaml, which runs above
             continue
         assert program == "sumo-sbt", f"the README says '{program}', which this test does not know"
         if args[0] == "run":

@@ -25,10 +25,12 @@ from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
+from sbt.report.gallery import _lines_of
 from sbt.report.html import write_report
 from sbt.report.influence import influence_of
 from sbt.report.projection import influence_from_runs, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
+from sbt.report.tables import critical_table
 from sbt.report.words import Findings, requirement_words, warnings_for
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import VALIDATION
@@ -384,3 +386,26 @@ def test_user_settings_of_matplotlib_are_left_alone():
         with figure_style():
             assert mpl.rcParams["font.size"] < 12
         assert mpl.rcParams["font.size"] == 31.0
+
+
+def test_of_runs_with_the_same_margin_the_hardest_impact_comes_first(tmp_path):
+    """A metric that saturates at a contact says nothing of how bad the contact is."""
+    runs = {"a": np.linspace(0.0, 1.0, 4)}
+    scenario = LogicalScenario(
+        "s", ParameterSpace((Parameter("a", 0, 1),)), Requirement("ttc_min", high=0.1), evaluate=lambda v, s: {},
+        metric_names=("ttc_min", "impact_speed"),
+    )  # fmt: skip
+    with Store.open(tmp_path, {"names": ["a"], "scenario": "s", "campaign": "coverage"}) as store:
+        store.plan(0, "even", [PlannedRun("even", {"a": float(a)}) for a in runs["a"]], [1, 2, 3, 4], {})
+        for k, speed in enumerate((3.0, 9.0, 6.0, 0.0)):
+            store.append(Outcome(k, Status.OK, {"ttc_min": 0.0 if speed else 2.0, "impact_speed": speed}))
+        table = critical_table(store.history(), scenario.requirement, "s")
+    assert [row[0].text for row in table.rows] == ["1", "2", "0"]
+
+
+def test_a_caption_speaks_of_the_lines_there_are():
+    assert "no line is drawn" in _lines_of(np.full((3, 3), 0.02), whole=True)
+    both = _lines_of(np.array([[0.0, 1.0]]), whole=True)
+    assert "Solid: P = 0.5" in both
+    assert "dashed: 0.1 and 0.9" in both
+    assert _lines_of(np.array([[0.0, 0.3]]), whole=False) == " Dashed: 0.1."

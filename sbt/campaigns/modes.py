@@ -129,6 +129,16 @@ class FailureMode:
     failure_rate: FailureRate | None = optional()
 
 
+def severity(history: History) -> Vector:
+    """Return (n,) how bad runs are among those with the same margin, as of a metric that saturates: the speed of impact.
+
+    0 where none was measured.
+    """
+    if "impact_speed" not in history.metrics:
+        return np.zeros(len(history))
+    return np.nan_to_num(history.y("impact_speed"))
+
+
 def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
 
@@ -182,7 +192,7 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
         return []
     u, cube = scenario.space.to_unit(history.x), scenario.space.cube
     at = cube.embedded(u)
-    depth = critical.margin(y)
+    depth, worse = critical.margin(y), severity(history)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
     kind = _kind(history, cube.choices(u))
     group = connected(fitted, u[chosen], kind[chosen], noisy=noisy)
@@ -196,11 +206,11 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
     found = []
     for name in np.unique(label):
         rows = hits[label == name]
-        representative = int(rows[np.lexsort((depth[rows], unlikely[rows]))[0]])
+        representative = int(rows[np.lexsort((-worse[rows], depth[rows], unlikely[rows]))[0]])
         likely = int(rows[np.argmax(log_p[label == name])])
         safe = int(uncritical[cdist(at[[representative]], at[uncritical])[0].argmin()]) if len(uncritical) else None
         found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
-    return sorted(found, key=lambda mode: (depth[mode.representative], mode.representative))
+    return sorted(found, key=lambda mode: (depth[mode.representative], -worse[mode.representative], mode.representative))
 
 
 def _kind(history: History, choices: Points) -> Vector:

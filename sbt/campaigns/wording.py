@@ -12,6 +12,7 @@ from sbt.problem.requirement import Requirement
 
 __all__ = ["NOTHING", "measured", "mixture_shares", "number", "percent", "plural", "requirement_words", "written_unit"]
 
+_NIL = 1e-30  # a rounding error of what is zero
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "\N{EN DASH}"
 """Stands where there is no value."""
@@ -27,6 +28,7 @@ def number(value: Any, digits: int = 4) -> str:
         return NOTHING
     if isinstance(value, (bool, str)):
         return str(value)
+    value = 0.0 if isinstance(value, float) and abs(value) < _NIL else value
     return f"{value:,}" if isinstance(value, int) else f"{value:.{digits}g}"
 
 

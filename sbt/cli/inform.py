@@ -26,9 +26,9 @@ def list_(
 ) -> None:
     """List what is installed, with a line on each."""
     with clean_stdout():
-        from sbt.workflows.front import installed
+        from sbt.cli.listing import listed
 
-        found = {each: installed(each) for each in ([kind] if kind is not None else KINDS)}
+        found = {each: listed(each) for each in ([kind] if kind is not None else KINDS)}
     if as_json:
         print_json({each: [{"name": n, "summary": s} for n, s in entries.items()] for each, entries in found.items()})
         return

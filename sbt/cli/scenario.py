@@ -65,13 +65,19 @@ def _print_run(run: Run) -> None:
     if run.critical is None:
         print(f"  {run.status}: {run.reason}")
         return
-    units = {metric.name: metric.unit for metric in run.scenario.metrics}
+    from sbt.campaigns.wording import written_unit
+
+    units = {metric.name: written_unit(metric.unit) for metric in run.scenario.metrics}
     for name, value in run.metrics.items():
         print(f"  {name:<24}{value:g} {units.get(name, '')}".rstrip())
     need = run.scenario.requirement
     verdict = "critical" if run.critical else "not critical"
     each = "; ".join(f"{part.metric} critical in [{part.low:g}, {part.high:g}]" for part in need.parts)
     print(f"{verdict} ({need.metric}: {each})" if need.combined else f"{verdict} ({each})")
+    asked = {part.metric for part in need.parts}
+    for metric in run.scenario.metrics:
+        if metric.name in asked and metric.description:
+            print(f"  {metric.name}: {metric.description}")
     if run.unconfirmed:
         print(f"doubtful: {run.unconfirmed}")
 

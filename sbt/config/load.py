@@ -127,6 +127,7 @@ def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wr
 def parse(
     text: str, overrides: Sequence[str] = (), *, name: str = "<text>", folder: Path | None = None,
     changes: JsonMapping | None = None, objects: Objects | None = None, store: Path | None = None,
+    without: Collection[str] = (),
 ) -> Loaded:  # fmt: skip
     """Check a configuration given as text; like `load`.
 
@@ -138,10 +139,11 @@ def parse(
         changes: as for `load`.
         objects: what was given in Python, by kind and name.
         store: folder of the store that it was read from; None: the user gives it, and so approves the code that it names.
+        without: keys at the top that are passed over.
     """
     scope = Scope(folder or Path.cwd(), objects or {}, store)
     with looked_up_in(scope):
-        config, source = checked(Configuration, text, overrides, name, changes or {})
+        config, source = checked(Configuration, text, overrides, name, changes or {}, without)
     return Loaded(config, source, scope)
 
 
@@ -165,7 +167,8 @@ def from_mapping(data: JsonMapping, *, name: str, scope: Scope) -> Loaded:
 
 
 def checked(
-    model: type[M], text: str, overrides: Sequence[str], name: str, changes: JsonMapping | None = None
+    model: type[M], text: str, overrides: Sequence[str], name: str, changes: JsonMapping | None = None,
+    without: Collection[str] = (),
 ) -> tuple[M, SourceMap]:
     """Return YAML text as a checked model, and where its keys stand.
 
@@ -182,7 +185,7 @@ def checked(
         rule = "a configuration must name a campaign, but this is a scenario"
         raise ConfigError([f"{name}:1:1: {rule}; run one with scenario: {name}"])
     data, source, wrong = _overridden({**data, **(changes or {})}, source, overrides)
-    wrong = doubled + wrong
+    data, wrong = {key: value for key, value in data.items() if key not in without}, [] if without else doubled + wrong
     try:
         config = model.model_validate(data)
     except ValidationError as error:

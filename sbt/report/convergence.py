@@ -36,9 +36,9 @@ def plot_convergence(conclusion: EstimationConclusion, ax: Axes) -> Axes:
 
 
 def drawing_of_convergence(found: Findings) -> Iterator[tuple[str, str]]:
-    """Yield caption and SVG of the figure; nothing where no batch has counted."""
+    """Yield caption and SVG of the figure; nothing before two batches have counted."""
     conclusion = found.conclusion
-    if not isinstance(conclusion, EstimationConclusion) or not conclusion.convergence:
+    if not isinstance(conclusion, EstimationConclusion) or len(conclusion.convergence or ()) < 2:  # one point is no course
         return
     figure = new_figure(5.4, 3.7)
     plot_convergence(conclusion, figure.subplots())

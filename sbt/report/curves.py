@@ -43,6 +43,8 @@ PANELS: Mapping[str, tuple[tuple[str, str], ...]] = {
     "calibration error": (("calibration_error", ""),),
 }
 """The panels of `plot_validation`: label of the ordinate, and (key of a fit, name of the curve) pairs."""
+_LEAST_AXIS = 1e-3
+"""An axis of errors reaches at least so far: what is smaller is zero to a reader."""
 _CURVE = 400
 """A curve over the runs is drawn at no more places than this."""
 
@@ -59,7 +61,7 @@ def plot_validation(fits: Sequence[FitRecord], panel: str, ax: Axes, *, unit: st
         ax.legend(loc="best")
     ax.set(xlabel="runs learned from", ylabel=label(panel, unit if "RMSE" in panel else ""))
     if "RMSE" in panel or "error" in panel:
-        ax.set_ylim(bottom=0.0)
+        ax.set_ylim(bottom=0.0, top=max(ax.get_ylim()[1], _LEAST_AXIS))
     elif "precision" in panel:
         ax.set_ylim(-0.03, 1.03)
     return ax

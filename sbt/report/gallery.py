@@ -82,8 +82,11 @@ def _runs(found: Findings, space: ParameterSpace, predict: Predict | None, weigh
     if any(parameter.discrete for parameter in space.parameters):
         caption += " Runs of whole-number inputs and of choices are spread around their value."
     if columns > 1:
-        chosen = "all pairs of inputs" if space.dimension == 3 else "the pairs of the four most influential inputs"
-        caption += f" Shown are {chosen}, most influential first; the other inputs vary unseen, so that verdicts overlap."
+        told = bool(weights.any())
+        some = "the pairs of the four most influential inputs" if told else "some pairs of inputs"
+        chosen = "all pairs of inputs" if space.dimension == 3 else some
+        first = ", most influential first" if told else ""
+        caption += f" Shown are {chosen}{first}; the other inputs vary unseen, so that verdicts overlap."
     yield Drawing("runs", "Runs in input space", caption, to_svg(figure, "runs"), wide=columns > 1)
 
 
@@ -127,10 +130,20 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
             " or that the other inputs decide."
         )
     if len(pair) == 2:
-        caption += " Solid: P = 0.5" + (", the boundary as the metamodel sees it" if space.dimension == 2 else "")
-        caption += "; dashed: 0.1 and 0.9."
-        caption += " The gap between the dashed lines is its uncertainty." if space.dimension == 2 else ""
+        caption += _lines_of(plane.probability, whole=space.dimension == 2)
     yield Drawing("probability", "Where critical runs are expected", caption, to_svg(figure, "probability"))
+
+
+def _lines_of(probability: Vector, *, whole: bool) -> str:
+    """Return what the lines of a map mean, as far as there are any."""
+    low, high = float(np.nanmin(probability)), float(np.nanmax(probability))
+    solid, dashed = low < 0.5 < high, [level for level in (0.1, 0.9) if low < level < high]
+    said = " Solid: P = 0.5" + (", the boundary as the metamodel sees it" if whole else "") if solid else ""
+    if dashed:
+        said += f"{';' if solid else ' Dashed:'}{' dashed:' if solid else ''} {' and '.join(f'{level:g}' for level in dashed)}"
+    if not said:
+        return f" P is {low:.2g} to {high:.2g} all over: no line is drawn."
+    return f"{said}." + (" The gap between the dashed lines is its uncertainty." if whole and len(dashed) == 2 else "")
 
 
 def _maps_by_choice(
@@ -195,7 +208,7 @@ def _validation(found: Findings, fits: Sequence[FitRecord]) -> Iterator[Drawing]
     """Yield the scores over the campaign."""
     panels = [
         panel for panel, lines in curves.PANELS.items()
-        if any(fit.score(key) is not None for fit in fits for key, _ in lines)
+        if any(sum(fit.score(key) is not None for fit in fits) > 1 for key, _ in lines)  # one point is no course
     ]  # fmt: skip
     if not panels:
         return

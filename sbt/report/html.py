@@ -134,7 +134,7 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
     return [
         ("campaign", str(configuration.get("campaign", NOTHING)).removeprefix(OBJECT)),
         ("scenario", str(configuration.get("scenario", scenario.name)).removeprefix(OBJECT)),
-        ("critical if", requirement_words(found.requirement, found.unit, found.units)),
+        ("critical if", requirement_words(found.requirement, found.unit, found.units) + _meaning(found, scenario)),
         ("runs", runs + (f", {planned:,} planned" if planned else "")),
         ("ended", str(found.ended.get("stopped") or NOTHING)),
         ("seed", str(configuration.get("seed", NOTHING))),
@@ -144,10 +144,17 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
     ]
 
 
+def _meaning(found: Findings, scenario: LogicalScenario) -> str:
+    """Return what the metrics of the requirement are, where that is known."""
+    asked = {part.metric for part in found.requirement.parts}
+    told = [f"{m.name}: {m.description}" for m in scenario.metrics if m.name in asked and m.description]
+    return f" ({'; '.join(told)})" if told else ""
+
+
 def _time(found: Findings) -> str:
     simulated = f"{_duration(float(found.history.seconds.sum()))} of simulation, summed over workers"
     spent = found.ended.get("seconds") or {}
-    other = [f"{name} {_duration(spent[name])}" for name in ("fit", "propose") if spent.get(name) is not None]
+    other = [f"{name} {_duration(spent[name])}" for name in ("fit", "propose") if spent.get(name)]
     work, idle = (float(spent.get(name) or 0.0) for name in ("work", "idle"))
     used = [f"workers busy {100 * work / (work + idle):.0f} %"] if work else []
     return ", ".join([simulated, *other, *used])

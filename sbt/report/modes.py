@@ -10,11 +10,11 @@ import numpy as np
 from sbt.campaigns.failures import FalsificationConclusion
 from sbt.campaigns.modes import FailureMode
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
-from sbt.campaigns.wording import NOTHING, number, percent
+from sbt.campaigns.wording import NOTHING, number, percent, written_unit
 from sbt.problem.arrays import Vector
 from sbt.problem.space import ParameterSpace
 from sbt.report.figures import whole_ticks
-from sbt.report.style import new_figure, to_svg
+from sbt.report.style import label, new_figure, to_svg
 from sbt.report.tables import Cell, Table
 from sbt.report.words import Findings
 
@@ -73,7 +73,7 @@ def _change(mode: FailureMode, space: ParameterSpace) -> str:
     if safe is None:
         return "no uncritical run"
     spans = {p.name: p.bounds[1] - p.bounds[0] for p in space.parameters}
-    units = {p.name: p.unit for p in space.parameters}
+    units = {p.name: written_unit(p.unit) for p in space.parameters}
     sizes = {k: math.inf if isinstance(v, str) else abs(v) / spans[k] for k, v in safe.change.items()}  # another choice first
     ranked = sorted(safe.change.items(), key=lambda item: -sizes[item[0]])[:3]
     changes = ", ".join(
@@ -115,7 +115,7 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
                 "", (history.x[to, across], vertical[to]), (history.x[at, across], vertical[at]), zorder=3,
                 arrowprops={"arrowstyle": "->", "color": _COLOURS[k], "lw": 1.2},
             )  # fmt: skip
-    names = [f"{p.name} ({p.unit})" if p.unit else p.name for p in space.parameters]
+    names = [label(p.name, p.unit) for p in space.parameters]
     ax.set_xlabel(names[across])
     ax.set_ylabel(found.requirement.told_as if up is None else names[up])
     whole_ticks(ax, space.parameters[across], *(() if up is None else (space.parameters[up],)))

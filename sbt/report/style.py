@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from sbt.campaigns.wording import written_unit
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -82,10 +84,10 @@ def new_figure(width: float = 5.4, height: float = 4.0) -> Figure:
 def label(name: str, unit: str = "") -> str:
     """Return an axis label; a dollar sign stays a dollar sign.
 
-    >>> label("d_t", "s")
-    'd_t (s)'
+    >>> label("a_co", "m/s^2")
+    'a_co (m/s²)'
     """
-    return (f"{name} ({unit})" if unit else name).replace("$", r"\$")
+    return (f"{name} ({written_unit(unit)})" if unit else name).replace("$", r"\$")
 
 
 def to_svg(figure: Figure, name: str) -> str:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from sbt.campaigns.asking import Sensitivity
+from sbt.campaigns.modes import severity
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
-from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent
+from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent, written_unit
 from sbt.plugins import OBJECT
 from sbt.problem.arrays import Vector
 from sbt.problem.outcome import doubts
@@ -97,7 +98,7 @@ def _input(parameter: Parameter) -> tuple[Cell, ...]:
     return (
         Cell(parameter.name),
         Cell(", ".join(parameter.choices) or f"[{parameter.low:g}, {parameter.high:g}]{whole}"),
-        Cell(parameter.unit or NOTHING),
+        Cell(written_unit(parameter.unit) or NOTHING),
         Cell(distribution_words(parameter)),
         Cell(parameter.description),
     )
@@ -177,7 +178,7 @@ def critical_table(
     for each in judgements:
         judged.setdefault(each.run, []).append(each)
     margin = requirement.margins(history)
-    found = [int(k) for k in np.argsort(margin, kind="stable") if margin[k] <= 0]
+    found = [int(k) for k in np.lexsort((-severity(history), margin)) if margin[k] <= 0]
     metrics = sorted(history.metrics, key=lambda name: name not in [part.metric for part in requirement.parts])
     rows = []
     for k in found[:_MOST]:

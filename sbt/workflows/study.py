@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,7 +14,8 @@ from sbt.campaigns.transferring import transfer_of
 from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of, spec_of
 from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, read_text, resumed
 from sbt.config.model import Configuration, WarmStart
-from sbt.errors import InputError, PluginError
+from sbt.config.source import ConfigError
+from sbt.errors import InputError, PluginError, SbtError
 from sbt.execution.dask import DaskExecutor
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
@@ -47,6 +49,10 @@ def changed_since(folder: Path) -> str:
     return f"; changed since: {', '.join(names)}" if names else ""
 
 
+_AT_KEY = re.compile(r"(?:--set |.*?:\d+:\d+: )(?P<key>\w+)")
+"""The key at the top that an error of a configuration is about."""
+
+
 @dataclass(frozen=True, eq=False)
 class Study:
     """A campaign as it is configured.
@@ -75,7 +81,10 @@ class Study:
             with Store.read(place.parent) as store:
                 folder, _ = place_of(store.configuration, store.folder)
             return cls(parse(read_text(place), overrides, name=str(path), folder=folder, **more))
-        return cls(load(path, overrides, **more))
+        try:
+            return cls(load(path, overrides, **more))
+        except ConfigError as error:
+            raise ConfigError([*error.errors, *_further(place, overrides, error)]) from None
 
     @classmethod
     def from_mapping(cls, data: JsonMapping, *, name: str, scope: Scope) -> Study:
@@ -357,3 +366,17 @@ class Study:
         ego = None if config.ego is None else config.ego.model_dump()
         friction = config.simulation.friction
         return (name, ego, config.simulation.step_length, *(() if friction is None else (friction.min, friction.max)))
+
+
+def _further(path: Path, overrides: Sequence[str], error: ConfigError) -> list[str]:
+    """Return what only the scenario can tell to be wrong with a configuration, beside what is wrong with its keys."""
+    keys = {found["key"] for found in map(_AT_KEY.match, error.errors) if found}
+    if not keys or keys & {"campaign", "scenario"}:
+        return []
+    try:
+        assemble(parse(read_text(path), overrides, name=str(path), folder=path.resolve().parent, without=keys))
+    except ConfigError as more:
+        return [line for line in more.errors if line not in error.errors]
+    except SbtError:
+        return []
+    return []
