@@ -10,7 +10,8 @@ const shades = () => [colour("--safe"), colour("--critical"), colour("--soft")];
 const look = layout => {
   const axis = () => ({ gridcolor: colour("--line"), zeroline: false, linecolor: colour("--soft"), automargin: true });
   return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: colour("--ink"), size: 12, family: "system-ui, sans-serif" },
-    margin: { l: 56, r: 14, t: 10, b: 48 }, hoverlabel: { bgcolor: colour("--card"), font: { color: colour("--ink") } },
+    margin: { l: 56, r: 14, t: 10, b: 48 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("--soft"), activecolor: colour("--accent") },
+    hoverlabel: { bgcolor: colour("--card"), font: { color: colour("--ink") } },
     xaxis: axis(), yaxis: axis(), ...layout };
 };
 const axisOf = column => {
@@ -55,6 +56,7 @@ const drawParallel = (place, data, view) => {
   const all = [...data.index.keys()].filter(row => data.verdict[row] !== 2 && Number.isFinite(data.told.values[row]));
   const critical = thinned(all.filter(row => data.verdict[row] === 1), LINES / 2);
   const rows = [...thinned(all.filter(row => data.verdict[row] === 0), LINES - critical.length), ...critical];
+  if (!rows.length) { place.textContent = "No run gave a number to draw."; return undefined; }
   place.dataset.lines = rows.length < all.length ? `Shown are ${rows.length} of ${all.length} runs; ranges filter all.` : "";
   const columns = [data.told, ...data.ranked];
   const dimensions = columns.map(column => {

@@ -41,7 +41,7 @@ const digits = (value, n = 4) => {
 };
 const withUnit = (text, unit) => unit ? `${text} ${unit.replace("^2", "\u00b2")}` : text;
 const titled = column => withUnit(column.name, column.unit ? `(${column.unit})` : "");
-const percent = p => `${digits(100 * p, 3)} %`;
+const percent = p => p < 1e-6 ? "below 0.0001 %" : p > 1 - 1e-6 ? "above 99.9999 %" : `${digits(100 * p, 3)} %`;
 const VERDICTS = ["not critical", "critical", "failed"];
 
 // Data as the page uses them: columns (inputs, then metrics) with values a row, verdicts, films by run.

@@ -7,7 +7,7 @@ class Explorer {
     this.data = data;
     this.part = name => place.querySelector(`[data-part=${name}]`);
     const [first, second] = data.ranked.map(input => data.columns.indexOf(input));
-    this.view = { x: first, y: second ?? data.columns.length - 1, run: null, brushes: new Map(), picked: null, rows: [...data.index.keys()] };
+    this.view = { x: first, y: second ?? Math.max(data.columns.indexOf(data.told), 0), run: null, brushes: new Map(), picked: null, rows: [...data.index.keys()] };
     this.view.brushed = brushes => { this.view.brushes = brushes; this.filter(); };
     this.table = new RunTable(data, row => this.choose(row, true), () => this.filter());
     this.part("table").append(this.table.node);
@@ -161,32 +161,38 @@ class Explorer {
     this.moved = moved;
     moved(this.player.now);
   }
+  // The chosen run, or the nearest one whose slices are in the file.
+  nearestSlice() {
+    const { data, view } = this, rows = data.slices.runs.map(run => data.rowOf.get(run)).filter(row => row !== undefined);
+    const away = row => data.inputs.reduce((sum, { values, low, high }) => {
+      const span = high - low;
+      return sum + (span > 0 ? ((values[row] - values[view.run]) / span) ** 2 : 0);
+    }, 0);
+    return rows.reduce((best, row) => away(row) < away(best) ? row : best, rows[0]);
+  }
   slice() {
     const { data, view } = this, place = this.part("slices");
-    if (!data.slices || view.run === null) return;
+    if (!data.slices || !data.slices.runs.length || view.run === null) return;
     place.hidden = false;
     const select = this.part("slice-input"), slider = this.part("slice-at"), says = this.part("slice-says");
     if (!select.length) {
       select.append(...data.ranked.map(input => make("option", { value: data.inputs.indexOf(input) }, shortened(titled(input), 50))));
       select.addEventListener("change", () => this.slice());
     }
-    const there = data.slices.runs.includes(data.index[view.run]);
-    this.part("slice").hidden = !there;
-    slider.disabled = !there;
+    const row = this.nearestSlice(), run = data.index[row];
     const errors = `The table is interpolated: off by up to ${digits(data.slices.error_p, 2)} in P(critical) and ${withUnit(digits(data.slices.error_mean, 2), data.told.unit)} in the metric.`;
-    this.part("slice-note").textContent = there ? errors : `Slices are in this file for ${data.slices.runs.length} runs: those with a film, and some evenly chosen.`;
-    says.textContent = "";
-    if (!there) return;
+    this.part("slice-title").textContent = row === view.run ? "The metamodel through this run" : `The metamodel through run ${run}, the nearest of ${data.slices.runs.length} runs with slices in this file`;
+    this.part("slice-note").textContent = errors;
     const k = Number(select.value), input = data.inputs[k], grid = data.slices.grid[k];
-    const move = drawSlice(this.part("slice"), data, view.run, k);
+    const move = drawSlice(this.part("slice"), data, row, k);
     Object.assign(slider, { min: grid[0], max: grid[grid.length - 1], step: input.whole ? 1 : "any" });
     const tell = value => {
       const [mean, low, high, p] = move(value);
       const written = input.choices.length ? input.choices[Math.round(value)] : withUnit(digits(value), input.unit);
-      says.textContent = `${input.name} = ${written}, else as run ${data.index[view.run]}: ${data.told.name} ${digits(mean, 3)} `
+      says.textContent = `${input.name} = ${written}, else as run ${run}: ${data.told.name} ${digits(mean, 3)} `
         + `(90 % between ${digits(low, 3)} and ${withUnit(digits(high, 3), data.told.unit)}), P(critical) ${percent(p)}`;
     };
-    slider.value = input.values[view.run];
+    slider.value = input.values[row];
     slider.oninput = () => tell(Number(slider.value));
     tell(Number(slider.value));
   }

@@ -32,6 +32,8 @@ _FILMS = 3_000_000
 """Largest size of all films together as text (bytes), before it is packed."""
 _SLICES = 40
 """Slices go through at most so many runs."""
+_WORST = 8
+"""... so many of the most critical ones among them."""
 _SCRIPTS = ("data.js", "charts.js", "table.js", "film.js", "explorer.js")
 _STYLES = ("explorer.css",)
 
@@ -122,13 +124,15 @@ def _modes(found: Findings) -> list[Json]:
 
 
 def _slices(found: Findings, scenario: LogicalScenario, predict: Predict | None, filmed: Sequence[int]) -> Json | None:
-    """Return slices through the runs with a film, then through runs spread evenly over the others."""
+    """Return slices through the runs with a film, the most critical ones, and others spread evenly."""
     history = found.history
     if predict is None or not history.ok.any():
         return None
     spread = history.index[history.ok]
     spread = spread[np.unique(np.linspace(0, len(spread) - 1, _SLICES).astype(int))].tolist()
-    runs = list(dict.fromkeys([*filmed, *spread]))[:_SLICES]
+    margin = np.where(history.ok, found.requirement.margins(history), np.inf)
+    worst = history.index[np.argsort(margin, kind="stable")[: min(_WORST, len(spread))]].tolist()
+    runs = list(dict.fromkeys([*filmed, *worst, *spread]))[:_SLICES]
     rows = {int(index): row for row, index in enumerate(history.index)}
     x = history.x[[rows[run] for run in runs]]
     return slices_through(predict, found.requirement.critical, scenario.space, x, runs)
