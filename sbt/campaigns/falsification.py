@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +20,11 @@ from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Batch, Campaign, Log
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.covariates import Covariates
 from sbt.samplers import evolution, portfolio
 from sbt.samplers.criteria import CRITERIA, propose_by
 from sbt.samplers.greedy import influence_on_mean, propose_greedily
+from sbt.samplers.pairs import propose_pairs
 from sbt.samplers.roi import rejection
 from sbt.samplers.search import Picks, fill_uniformly
 from sbt.samplers.sobol import SobolSequence
@@ -39,6 +41,8 @@ _INITIAL, _SEARCH, _EVEN = "initial", "search", "even"
 _TRANSFER = "transfer"
 """Stage of runs that were critical in an earlier campaign of another setup."""
 _FILL_SHARE = 0.1  # of every batch that fills space, held-out runs included: what it finds is independent of the metamodel
+PAIR = "pair"
+"""Criterion of the runs whose inputs and seed were chosen together."""
 _REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
 _MOST_REPEATS, _REPEATS_IN_ALL = 10, 30  # of a noisy simulator, whose modes have a failure rate
 _MOST_CONFIRMED = 10  # modes, the deepest first
@@ -114,7 +118,7 @@ class SearchStage:
         names, counts = np.unique(np.array(picks.why, dtype=np.str_), return_counts=True)
         criteria = {str(name): int(count) for name, count in zip(names, counts, strict=True)}
         filled, at = self._even(filling, start)
-        chosen = self._snapped([(_SEARCH, picks.u), (_EVEN, filled)], asked)
+        chosen = [*self._seeded(picks), *self._snapped([(_SEARCH, picks.u[len(picks.seeds) :]), (_EVEN, filled)], asked)]
         again = (*again, *(PlannedRun(REPEAT, runs.inputs(row)) for row in picks.repeat))
         proposal = SearchProposal(s.method, at, criteria, filling, held_out, len(again) or None)
         return Batch((*chosen, *again, *held_out_runs(s, number, held_out)), proposal)
@@ -163,12 +167,30 @@ class SearchStage:
             return Picks(self._scored(log, n), ())
         if s.method == "cma_es":
             return self._evolved(runs, u, n)
+        if s.method == "portfolio" and s.covariates is not None and len(runs.training) > 1:
+            return self._pairs(s.covariates, runs, u, y, n, rng)
         if s.method == "portfolio":
             filling = np.isin(runs.stage, FILLING)
             pending = None if log.pending is None else np.clip(space.to_unit(log.pending.x), 0.0, 1.0)
             repeats = s.scenario.pool is None
             return portfolio.propose(search, u, y, n, rng, runs.iteration, filling, repeats=repeats, pending=pending)
         return propose_by(s.method, search, u, y, n, rng, runs.iteration)
+
+    def _pairs(self, covariates: Covariates, runs: History, u: Points, y: Vector, n: int, rng: np.random.Generator) -> Picks:
+        """Return n points with the seeds whose traffic promises most there."""
+        space = self.failure_search.settings.scenario.space
+
+        def draw(points: Points, seeds: Sequence[int]) -> Points:
+            return covariates.at(space.from_unit(points), seeds)
+
+        found = propose_pairs(self.failure_search.search, draw, u, runs.seed.tolist(), y, n, rng)
+        return Picks(found.u, (PAIR,) * len(found.u), seeds=found.seeds)
+
+    def _seeded(self, picks: Picks) -> list[PlannedRun]:
+        """Return the runs whose seed was chosen, too."""
+        scenario = self.failure_search.settings.scenario
+        rows = scenario.space.from_unit(picks.u[: len(picks.seeds)])
+        return [PlannedRun(_SEARCH, named_inputs(scenario, x), seed=seed) for x, seed in zip(rows, picks.seeds, strict=True)]
 
     def _evolved(self, runs: History, u: Points, n: int) -> Picks:
         """Return the next generation of CMA-ES, which starts at the best run of the even start."""

@@ -74,7 +74,7 @@ def equal_inputs(x: Points) -> NDArray[np.intp]:
 
 def simulator_noise(history: History, requirement: Requirement) -> SimulatorNoise:
     """Return what these runs tell of the simulator's noise, in the requirement's metric and in all others."""
-    runs = history.where(history.ok & (history.columns["level"] == 0))
+    runs = history.where(history.ok & history.drawn & (history.columns["level"] == 0))
     if len(runs) < 2:
         return SimulatorNoise(0, None, None)
     group = equal_inputs(runs.x)

@@ -12,6 +12,7 @@ from sbt.loop.learner import Learner
 from sbt.loop.stages import Campaign, Conclusion, Facts
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Vector
+from sbt.problem.covariates import Covariates
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import LogicalScenario
@@ -50,6 +51,7 @@ class Settings:
         gate: what an estimation has to show; None: no verdict.
         prior_runs: runs of another campaign to learn from, never to count.
         transfer: what a campaign of another setup tells, as a trend.
+        covariates: what the seed draws, known before the run; None: seeds are not looked at.
     """
 
     scenario: LogicalScenario
@@ -67,6 +69,7 @@ class Settings:
     prior_runs: History | None = None
     transfer: Transfer | None = None
     ahead: int = 0
+    covariates: Covariates | None = None
 
 
 @dataclass(frozen=True)

@@ -86,11 +86,13 @@ class Picks:
         u: (n, d) in the unit cube, the one of largest P(critical) first.
         why: (n,) by which criterion, such as `thompson` or `global`.
         repeat: critical runs to repeat with other seeds, beside these points, as numbers of rows.
+        seeds: (n,) where they were chosen with the points; empty: they are drawn.
     """
 
     u: Points
     why: tuple[str, ...]
     repeat: tuple[int, ...] = ()
+    seeds: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

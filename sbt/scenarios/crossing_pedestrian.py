@@ -17,6 +17,7 @@ from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State, VehicleType
 from sbt.sumo.ego import Ego
+from sbt.sumo.projecting import arrivals_at, driver_value, gaps
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
 
@@ -52,6 +53,8 @@ PASSED = 10.0
 """Distance behind the crossing at which the ego has passed it (m)."""
 CROSSING = (297.46, 285.96)
 """x, y of the centre of the crossing (m)."""
+ONCOMING_WAY = 110.0
+"""From the beginning of the oncoming cars' street to the crossing (m)."""
 DURATION = 23.0
 """Longest simulated time (s)."""
 EGO = Ego.of("sumo", jmCrossingGap={"min": 0.0, "max": 10.0}, decel={"min": 2.5, "max": 5.0})
@@ -91,6 +94,23 @@ def end_condition(t: float, states: Mapping[str, State]) -> str | None:
     return "passed" if ahead < -PASSED else None
 
 
+def covariates(values: Mapping[str, float], scene: Scene) -> dict[str, float]:
+    """Return when the pedestrian, as fast as drawn, gets to kerb and lane relative to the ego, and who else comes there."""
+    ego, walker = scene.actors[0], next(a for a in scene.actors if a.name == "ped")
+    speed, way = values["v_ego"] / 3.6, BLOCK - walker.position
+    arrives, kerb = DISTANCE / speed, way / walker.speed
+    braking = 0.5 * speed**2 / driver_value(ego, "decel", 4.5)
+    found = {
+        "pace": walker.speed, "relative_pace": walker.speed / values["v_ped"], "kerb": kerb - arrives,
+        "lane": (way + 3.0) / walker.speed - arrives, "across": (way + 6.0) / walker.speed - arrives,
+        "ahead_at_kerb": DISTANCE - speed * kerb, "to_stop": braking, "left_to_stop": DISTANCE - speed * kerb - braking,
+    }  # fmt: skip
+    cars = [a for a in scene.actors if a.name.startswith(ONCOMING.name)]
+    found |= {f"oncoming_{name}": value for name, value in gaps(arrivals_at(ONCOMING_WAY, cars, LIMIT), kerb, (4.0,), 2).items()}
+    beyond = [abs(a.position + a.speed * (kerb + 4.0)) for a in scene.actors if a.person and a.route == PAVEMENTS[1]]
+    return found | {"walkers_beyond": float(len(beyond)), "nearest_beyond": min(beyond, default=BLOCK)}
+
+
 SCENARIO = LogicalScenario(
     name="crossing_pedestrian",
     description=(
@@ -108,7 +128,8 @@ SCENARIO = LogicalScenario(
         )
     ),
     simulate=SumoSimulation(
-        net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",), options=STRIPES
+        net="town", scene=scene, duration=DURATION, step_length=0.05, ego=EGO, isolations=("fresh",), options=STRIPES,
+        covariates=covariates,
     ),
     metrics=(ttc_path_min(), nearest_distance(), any_collision(), any_impact_speed()),
     requirement=Requirement("ttc_path_min", high=0.5),

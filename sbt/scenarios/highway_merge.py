@@ -13,6 +13,7 @@ from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
 from sbt.sumo.ego import Ego
+from sbt.sumo.projecting import arrivals_at, beside, driver_value, time_to_reach
 from sbt.sumo.road_ahead import on_road
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
@@ -32,6 +33,10 @@ NEAREST, FARTHEST = 890.0, 250.0
 """Range of the initial positions of the cars on the motorway (m); the nose is at 900 m."""
 LANE_CHANGE = 3.0
 """Duration of a lane change (s)."""
+NOSE = 900.0
+"""Position of the nose on the motorway, prolonged (m)."""
+ALONG = (0.0, 60.0, 130.0, 200.0)
+"""Places along the acceleration lane (m behind the nose) at which the covariates tell who is beside the ego."""
 MERGED = 400.0
 """x at which the ego is well past the acceleration lane (m), which ends at 250 m."""
 WAITS, LAST, EDGE = 3.0, 200.0, -7.5
@@ -68,6 +73,20 @@ def end_condition(t: float, states: Mapping[str, State]) -> str | None:
     return "merged" if ego.x > MERGED else None
 
 
+def covariates(values: Mapping[str, float], scene: Scene) -> dict[str, float]:
+    """Return who is beside the ego at the nose and along the acceleration lane, if it goes on as if it were alone."""
+    speed, accel = values["v_ego"] / 3.6, driver_value(scene.actors[0], "accel", 2.6)
+    way = DISTANCE + np.array(ALONG)
+    times, speeds = time_to_reach(way, speed, DESIRED, accel), np.minimum(np.sqrt(speed**2 + 2.0 * accel * way), DESIRED)
+    right, left = ([a for a in scene.actors if a.name.startswith(lane.name)] for lane in LANES)
+    found = {"nose": float(times[0])}
+    for k, place in enumerate(ALONG):
+        there = beside(arrivals_at(NOSE + place, right, LIMIT), float(times[k]), float(speeds[k]), 2 if k == 0 else 1)
+        found |= {f"right_{place:g}_{name}": value for name, value in there.items()}
+    there = beside(arrivals_at(NOSE, left, LIMIT), float(times[0]), float(speeds[0]))
+    return found | {f"left_{name}": value for name, value in there.items()}
+
+
 SCENARIO = LogicalScenario(
     name="highway_merge",
     description=(
@@ -90,6 +109,7 @@ SCENARIO = LogicalScenario(
         step_length=0.1,
         ego=EGO,
         isolations=("fresh",),
+        covariates=covariates,
         lane_change_duration=LANE_CHANGE,
     ),
     metrics=(

@@ -5,7 +5,7 @@ A compact roundabout with one lane, whose centre line has a radius of 18 m (insc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, Scene, State
 from sbt.sumo.ego import Ego
+from sbt.sumo.projecting import Arrivals, arrivals_at, driver_value, first_gap, gaps
 from sbt.sumo.road_ahead import on_road
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
@@ -44,6 +45,12 @@ HORIZON = 5.0
 """Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 27.0
 """Longest simulated time (s); even the fastest car has not arrived by then."""
+YIELD, YIELDING = 56.0, 4.0
+"""From the ego's start to its yield line (m), and its speed there (m/s)."""
+BEND, BEND_SPEED, RING_WAY = 9.8, 5.1, 20.0
+"""Of the entry of the cars from the west: its length (m), its largest speed (m/s), and from there to the ego's entry (m)."""
+ENTERING = 2.2
+"""Time that entering takes (s)."""
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5},
              jmSigmaMinor=1.0)  # fmt: skip
 RING = ("ring_south_east", "ring_east_north", "out_north")
@@ -70,6 +77,43 @@ def end_condition(t: float, states: Mapping[str, State]) -> str | None:
     return "passed" if states["ego"].y > CLEAR else None
 
 
+def covariates(values: Mapping[str, float], scene: Scene) -> dict[str, float]:
+    """Return the gaps between the cars that pass the ego's entry, from when it is at its yield line, and who leaves before."""
+    ego, cars = scene.actors[0], scene.actors[1:]
+    ready = _at_yield_line(values["v_ego"] / 3.6, driver_value(ego, "accel", 2.6), driver_value(ego, "decel", 4.5))
+    every = _at_entry(cars)
+    leaves = np.array([car.route == LEAVING for car in cars], dtype=bool)
+    passing = every.where(~leaves)
+    found = {"ready": ready, **gaps(passing, ready, (3.0, 4.0, 5.0, 6.0))}
+    found |= {f"with_leaving_{name}": value for name, value in gaps(every, ready, (4.0,), 2).items()}
+    coming = leaves[every.time > ready]
+    found |= {f"leaves_{k + 1}": float(coming[k]) if k < len(coming) else -1.0 for k in range(3)}
+    need = ENTERING + driver_value(ego, "jmTimegapMinor", 1.0)
+    for k, spare in enumerate((-1.0, 0.0, 1.0)):
+        first = first_gap(passing, ready, need + spare)
+        found |= {f"accepted_{k}_{name}": value for name, value in first.items()} | {f"accepted_{k}_spare": first["gap"] - need}
+    return found
+
+
+def _at_yield_line(speed: float, accel: float, braking: float) -> float:
+    """Return when the ego is at its yield line (s): it accelerates up to the limit and brakes in time."""
+    square = (2.0 * accel * braking * YIELD + braking * speed**2 + accel * YIELDING**2) / (accel + braking)
+    peak = max(min(np.sqrt(square), LIMIT), speed)
+    even = YIELD - (peak**2 - speed**2) / (2.0 * accel) - (peak**2 - YIELDING**2) / (2.0 * braking)
+    return float((peak - speed) / accel + (peak - YIELDING) / braking + max(even, 0.0) / peak)
+
+
+def _at_entry(cars: Sequence[Actor]) -> Arrivals:
+    """Return when the cars from the west would pass the ego's entry; each slows down for the bend of its own one."""
+    arm = arrivals_at(ARM - 23.0, cars, LIMIT, delay=0.4)
+    factor = np.array([driver_value(car, "speedFactor", 1.0) for car in cars])
+    bend, ring = BEND_SPEED * factor, np.minimum(RING_LIMIT * factor, RING_LIMIT)
+    time = arm.time + (LIMIT * factor - bend) ** 2 / (2.0 * 4.5 * LIMIT * factor) + BEND / bend + RING_WAY / ring
+    for k in range(1, len(cars)):
+        time[k] = max(time[k], time[k - 1] + driver_value(cars[k], "tau", 1.0) + (cars[k].type.length + 2.0) / bend[k])
+    return Arrivals(time, ring)
+
+
 SCENARIO = LogicalScenario(
     name="roundabout_entry",
     description=(
@@ -88,7 +132,7 @@ SCENARIO = LogicalScenario(
             *EGO.inputs,
         )
     ),
-    simulate=SumoSimulation(net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
+    simulate=SumoSimulation(net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",), covariates=covariates),
     metrics=(
         pet_ego_first(horizon=HORIZON, zone=ENTRY),
         ttc_path_min(),

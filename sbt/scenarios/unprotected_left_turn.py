@@ -17,6 +17,7 @@ from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, EndCondition, Scene, State
 from sbt.sumo.ego import Ego
+from sbt.sumo.projecting import arrivals_at, driver_value, gaps
 from sbt.sumo.road_ahead import on_road
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
@@ -38,6 +39,12 @@ HORIZON = 5.0
 """Post-encroachment time from which on there is no conflict (s)."""
 DURATION = 38.0
 """Longest simulated time (s); even the fastest oncoming car has not arrived by then."""
+CONFLICT = 900.0
+"""Position on the eastern arm, prolonged, at which the oncoming cars meet the ego's path (m)."""
+ENTRY, ACROSS = 68.5, 13.0
+"""From the ego's start to the stop line, and from where it waits inside the junction until it is across (m)."""
+TURNING = 5.8
+"""Largest speed in the turn, of a driver whose speed factor is 1 (m/s)."""
 ROUTE = ("in_west", "out_north")
 EGO = Ego.of("sumo", impatience={"min": 0.0, "max": 1.0}, jmTimegapMinor={"min": 0.0, "max": 2.0}, accel={"min": 1.5, "max": 3.5})
 ONCOMING = TrafficStream("oncoming", ("in_east", "out_west"), 0, LIMIT)
@@ -64,6 +71,14 @@ def end_condition() -> EndCondition:
     return over
 
 
+def covariates(values: Mapping[str, float], scene: Scene) -> dict[str, float]:
+    """Return the gaps in the oncoming stream from when the ego is at the junction, and how long it takes across."""
+    speed, accel = values["v_ego"] / 3.6, driver_value(scene.actors[0], "accel", 2.6)
+    turning = TURNING * speed / LIMIT
+    across = ACROSS / turning + 0.5 * turning / accel
+    return {"across": across, **gaps(arrivals_at(CONFLICT, scene.actors[1:], LIMIT), ENTRY / speed)}
+
+
 SCENARIO = LogicalScenario(
     name="unprotected_left_turn",
     description=(
@@ -79,7 +94,7 @@ SCENARIO = LogicalScenario(
             *EGO.inputs,
         )
     ),
-    simulate=SumoSimulation(net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",)),
+    simulate=SumoSimulation(net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",), covariates=covariates),
     metrics=(
         pet_ego_first(horizon=HORIZON),
         ttc_path_min(),

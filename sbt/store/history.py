@@ -294,13 +294,18 @@ class History:
 
     @property
     def training(self) -> History:
-        """Runs that a metamodel may learn from: finished well and not held out."""
-        return self.where(self.ok & (self.stage != VALIDATION))
+        """Runs that a metamodel of the inputs may learn from: finished well, not held out, of a seed that was drawn."""
+        return self.where(self.ok & (self.stage != VALIDATION) & self.drawn)
+
+    @property
+    def drawn(self) -> Mask:
+        """(n,) the seed was drawn without a look at what it draws: only such runs tell how often something happens."""
+        return ~self.columns["seed_chosen"]
 
     @property
     def finished(self) -> History:
-        """All runs that finished well: what the final answer of a campaign learns from, once it has been scored."""
-        return self.where(self.ok)
+        """All runs of drawn seeds that finished well: what the final answer of a campaign learns from, once it has been scored."""
+        return self.where(self.ok & self.drawn)
 
     @property
     def held_out(self) -> History:

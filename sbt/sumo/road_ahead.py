@@ -15,7 +15,7 @@ from sbt.sumo.actors import Action, Controller, State
 from sbt.sumo.dynamics import next_speed
 from sbt.sumo.nets import net_file
 
-__all__ = ["RoadAhead", "on_road"]
+__all__ = ["RoadAhead", "on_road", "path_of"]
 
 LATERAL_MAX = 4.0
 """Lateral acceleration at which a controller is slowed down in bends (m/s^2), the upper end of what drivers do."""
@@ -40,7 +40,7 @@ class RoadAhead:
     """
 
     def __init__(self, net: str, route: tuple[str, ...], lane: int):
-        shapes, ends = _path(str(net_file(net)), route, lane)
+        shapes, ends = path_of(str(net_file(net)), route, lane)
         points = np.concatenate([shape if k == 0 else shape[1:] for k, shape in enumerate(shapes)])
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         self._s = np.arange(0.0, along[-1] + _SPACING, _SPACING)
@@ -109,7 +109,7 @@ def _road(net: str, route: tuple[str, ...], lane: int) -> RoadAhead:
     return RoadAhead(net, route, lane)
 
 
-def _path(file: str, route: tuple[str, ...], lane: int) -> tuple[list[Points], bool]:
+def path_of(file: str, route: tuple[str, ...], lane: int) -> tuple[list[Points], bool]:
     """Return the shapes of the lanes along a route, junctions included, and whether the last lane ends before the route does."""
     root = ET.parse(Path(file)).getroot()
     shapes = {

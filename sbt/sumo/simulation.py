@@ -28,6 +28,8 @@ from sbt.sumo.sumo_run import SumoRun
 
 __all__ = ["CLOCK_STEPS", "SumoSimulation"]
 
+Covariates = Callable[[Values, Scene], Mapping[str, float]]
+"""Values of the inputs and the drawn scene to named numbers, which are known before the run."""
 SceneBuilder = Callable[[Values, Ego, np.random.Generator], Scene]
 """Values of the inputs, the ego, and the random generator of the run to the scene."""
 
@@ -52,6 +54,7 @@ class SumoSimulation:
         options: further SUMO options.
         timeout: wall-clock limit of a run (s); None: none.
         friction: of the road, which bounds accelerations of vehicles on lanes by mu g, also as an input; None: no bound.
+        covariates: what is known of a drawn scene before the run; None: nothing is told.
 
     Raises:
         InputError: step and duration do not fit, or the isolation level is not allowed.
@@ -69,6 +72,7 @@ class SumoSimulation:
     options: tuple[str, ...] = ()
     timeout: float | None = None
     friction: Parameter | float | None = None
+    covariates: Covariates | None = None
 
     def __post_init__(self) -> None:
         if not (self.duration > 0 and 0 < self.step_length <= self.duration):
@@ -184,6 +188,17 @@ class SumoSimulation:
             return scene
         mu = self.friction
         return replace(scene, friction=float(values[mu.name]) if isinstance(mu, Parameter) else mu)
+
+    def known_before(self, values: Values, seed: int) -> Mapping[str, float] | None:
+        """Return the covariates of a concrete scenario, at no simulation; None where the scenario has none."""
+        values = plain_values(values)
+        return None if self.covariates is None else self.covariates(values, self.build_scene(values, seed))
+
+    def telling_all(self) -> SumoSimulation:
+        """Return a copy that tells the general covariates, or its own where it has some."""
+        from sbt.sumo.general_covariates import general
+
+        return self if self.covariates is not None else replace(self, covariates=general(self.net))
 
     def setup(self, scene: Scene, replicas: int = 1) -> Setup:
         """Return what SUMO is loaded from for a scene."""

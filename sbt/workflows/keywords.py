@@ -45,6 +45,7 @@ class CampaignKeys(TypedDict, total=False):
     stop: JsonMapping
     gate: Mapping[str, float] | None
     warm_start: JsonMapping | str | Path | None
+    covariates: bool | str | None
     judges: Sequence[str] | None
     executor: Setting
     store: str | Path

@@ -24,6 +24,7 @@ from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.running import ahead_of
 from sbt.loop.stages import Campaign, Conclusion, Shard
 from sbt.plugins import Objects, Scope, newer
+from sbt.problem.covariates import Covariates, telling_all
 from sbt.problem.description import describe_scenario, is_complete, rebuild_scenario
 from sbt.problem.isolation import Isolation, Warmable, warm_ups
 from sbt.problem.plain import Json, JsonMapping
@@ -39,6 +40,8 @@ __all__ = ["RESOLVED", "Study", "changed_since"]
 
 STATES = "snapshots"
 """Folder of the warmed states in that of a store."""
+COVARIATES = "covariate_names"
+"""Key under which a store remembers that seeds are looked at."""
 RESOLVED = "config.resolved.yaml"
 """The configuration with its defaults, in a store's folder."""
 
@@ -206,6 +209,26 @@ class Study:
         decided = simulate.isolation_in(self.scenario.space, warm_ups(self.config.budget, estimating=self.kind.takes_gate))
         return replace(decided, states=states)
 
+    @cached_property
+    def covariates(self) -> Covariates | None:
+        """What the seed draws, known before the run; None: seeds are not looked at.
+
+        A store that was begun without goes on without.
+
+        Raises:
+            InputError: covariates are asked for, but the scenario cannot tell any.
+        """
+        asked = self.config.covariates
+        if asked is False or (self.kept and COVARIATES not in self.kept):
+            return None
+        found = Covariates.of(telling_all(self.scenario) if asked else self.scenario) if self.live else None
+        if asked and found is None and self.live:
+            raise InputError(
+                f"covariates: true needs a scenario whose traffic is drawn before the run (a scene of SumoSimulation), but"
+                f" {self.scenario.name} has none"
+            )
+        return found
+
     @property
     def learns(self) -> bool:
         """Whether there is a metamodel, and its code is at hand."""
@@ -235,6 +258,7 @@ class Study:
             acquisition=self._assembly.acquisition if self.live else None, method=config.acquisition.kind,
             stop=config.stop.model_dump(), gate=None if config.gate is None else Gate(**config.gate.model_dump()),
             prior_runs=self._prior_runs(), transfer=self._transfer(), ahead=config.ahead,
+            covariates=self.covariates,
         )  # fmt: skip
 
     @cached_property
@@ -287,8 +311,13 @@ class Study:
             "described": described, **where_it_is(self.loaded.folder, Path(config.store)),
             "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
+            **({COVARIATES: list(self.covariates.names)} if self.live and self.covariates is not None else self._kept(COVARIATES)),
             **({"isolation": self.isolation.described()} if self.isolation is not None and self.isolation.warm else {}),
         }  # fmt: skip
+
+    def _kept(self, key: str) -> Json:
+        """Return what the store remembers under a key, where it does."""
+        return {key: self.kept[key]} if key in self.kept else {}
 
     def conclusion(self, data: JsonMapping) -> Conclusion:
         """Return a conclusion from the JSON in the store; values by name where the campaign's own type is not at hand."""

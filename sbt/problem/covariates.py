@@ -1,0 +1,95 @@
+"""What the seed of a run draws, where it is known before the run: named numbers of a pair of inputs and seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from sbt.errors import InputError
+from sbt.problem.arrays import Points, Vector
+from sbt.problem.plain import Values, written
+from sbt.problem.scenario import LogicalScenario, Simulate
+
+__all__ = ["Covariates", "DrawsAhead", "telling_all"]
+
+
+@runtime_checkable
+class DrawsAhead(Protocol):
+    """A `Simulate` that can tell what it draws for a seed, without running."""
+
+    def known_before(self, values: Values, seed: int) -> Mapping[str, float] | None:
+        """Return the covariates of a concrete scenario by name, always the same names; None: it tells none."""
+        ...
+
+
+@runtime_checkable
+class TellsAll(Protocol):
+    """A `DrawsAhead` that has a general set of covariates, where it has none of its own."""
+
+    def telling_all(self) -> Simulate:
+        """Return a copy that tells the general set, or its own."""
+        ...
+
+
+def telling_all(scenario: LogicalScenario) -> LogicalScenario:
+    """Return the scenario with the general covariates, where it has none of its own and its traffic is drawn before the run."""
+    simulate = scenario.simulate
+    return replace(scenario, simulate=simulate.telling_all()) if isinstance(simulate, TellsAll) else scenario
+
+
+@dataclass(frozen=True, eq=False)
+class Covariates:
+    """The covariates of a scenario.
+
+    Args:
+        scenario: whose `simulate` is a `DrawsAhead`.
+        names: of the covariates.
+    """
+
+    scenario: LogicalScenario
+    names: tuple[str, ...]
+    _known: dict[tuple[bytes, int], Vector] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, scenario: LogicalScenario) -> Covariates | None:
+        """Return the covariates of a scenario, None where it tells none.
+
+        Raises:
+            InputError: they are not finite.
+        """
+        if not isinstance(scenario.simulate, DrawsAhead):
+            return None
+        centre = scenario.space.named(np.array([p.centre for p in scenario.space.parameters], dtype=np.float64))
+        found = scenario.simulate.known_before(centre, 0)
+        return None if not found else cls(scenario, tuple(found))
+
+    def at(self, x: Points, seeds: Sequence[int]) -> Points:
+        """Return the (n, c) covariates of inputs (n, d), in their units, with a seed each.
+
+        Raises:
+            InputError: they are not finite, or have other names than elsewhere in the space.
+        """
+        rows = np.empty((len(x), len(self.names)))
+        for k, (row, seed) in enumerate(zip(x, seeds, strict=True)):
+            key = row.tobytes(), int(seed)
+            if key not in self._known:
+                self._known[key] = self._drawn(row, int(seed))
+            rows[k] = self._known[key]
+        return rows
+
+    def _drawn(self, row: Vector, seed: int) -> Vector:
+        values, simulate = self.scenario.space.named(row), self.scenario.simulate
+        found = simulate.known_before(values, seed) if isinstance(simulate, DrawsAhead) else None
+        if found is None or set(found) != set(self.names):
+            raise InputError(
+                f"covariates must have the same names everywhere ({', '.join(self.names)}), but at {written(values)}, seed {seed}"
+                f" they are {', '.join(found or ()) or 'none'}"
+            )
+        for name, value in found.items():
+            if not math.isfinite(value):
+                raise InputError(f"covariate {name} must be finite, but is {value} at {written(values)}, seed {seed}")
+        return np.array([found[name] for name in self.names], dtype=np.float64)
