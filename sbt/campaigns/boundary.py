@@ -11,6 +11,7 @@ import numpy as np
 from sbt.acquisitions import even, is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
+from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
@@ -67,6 +68,7 @@ class BoundaryConclusion:
     held_out_fractions: Mapping[str, CriticalShare] | None = optional()
     independence: Independence | None = optional()
     place: BoundaryPlace | None = optional()
+    explained: ExplainedVariance | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -84,6 +86,8 @@ class BoundaryConclusion:
             found.append(f"The metamodel chose among its members: {self.chosen_because}.")
         if self.simulator_noise is not None:
             found += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
+        if self.explained is not None:
+            found.append(self.explained.sentence(facts.requirement.told_as))
         return found
 
 
@@ -117,7 +121,7 @@ def recipe(settings: Settings) -> Campaign:
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
-            place,
+            place, explained_variance(settings, log.history),
         ), fitted  # fmt: skip
 
     stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even)

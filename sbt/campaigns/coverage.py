@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from sbt.campaigns.choices import evenly
 from sbt.campaigns.each import each_share, shares_words
+from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_share
@@ -31,6 +32,7 @@ class CoverageConclusion:
         counted: runs.
         validation: scores of the metamodel on held-out runs, where one is configured.
         requirements: of a combination, the share that violates each.
+        explained: what inputs and drawn traffic explain of the metric; None: it is not known.
     """
 
     critical_fraction: float | None
@@ -40,6 +42,7 @@ class CoverageConclusion:
     counted: int = 0
     validation: Validation | None = optional()
     requirements: Mapping[str, CriticalShare] | None = optional()
+    explained: ExplainedVariance | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -48,8 +51,9 @@ class CoverageConclusion:
 
     def sentences(self, facts: Facts) -> list[str]:
         """Return what was found in words."""
+        told = [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
         whole = CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted)
-        return [*tell_share(whole, facts), *shares_words(self.requirements), *conditional_on(facts.history)]
+        return [*tell_share(whole, facts), *shares_words(self.requirements), *conditional_on(facts.history), *told]
 
 
 def recipe(settings: Settings) -> Campaign:
@@ -61,7 +65,7 @@ def recipe(settings: Settings) -> Campaign:
         validation = None if fitted is None else fitted.record.validation
         found = CoverageConclusion(
             share.critical_fraction, share.low, share.high, share.confidence, share.counted, validation,
-            each_share(log.history, settings.scenario.requirement),
+            each_share(log.history, settings.scenario.requirement), explained_variance(settings, log.history),
         )  # fmt: skip
         return found, fitted
 

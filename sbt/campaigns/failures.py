@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sbt.campaigns.each import independence_words, violations_words
+from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
@@ -97,6 +98,7 @@ class FalsificationConclusion:
         simulator_noise: what repeats with other seeds tell; None: recorded rows.
         violates: of a combination, how many critical runs violate each requirement.
         independence: of the metrics of a combination, given the inputs.
+        explained: what inputs and drawn traffic explain of the metric; None: it is not known.
     """
 
     first_critical_run: int | None
@@ -110,6 +112,7 @@ class FalsificationConclusion:
     simulator_noise: SimulatorNoise | None = optional()
     violates: Mapping[str, int] | None = optional()
     independence: Independence | None = optional()
+    explained: ExplainedVariance | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -124,6 +127,7 @@ class FalsificationConclusion:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         said += [*violations_words(self.violates), *independence_words(self.independence)]
         said += _rates(self.failure_modes)
+        said += [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
         return [*said, *count_avoided(judged), *conditional_on(facts.history)]
 
@@ -196,7 +200,7 @@ class FailureSearch:
             bound, None if len(hits) else _closest(searched, margin, scenario.requirement),
             _statement(searched, len(hits), modes, bound), None if fit is None else fit.validation,
             stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
-            None if fit is None else fit.independence,
+            None if fit is None else fit.independence, explained_variance(self.settings, history),
         )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, SbtError, described
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Values, written
 from sbt.problem.scenario import LogicalScenario, Simulate
@@ -19,7 +19,7 @@ __all__ = ["Covariates", "DrawsAhead", "telling_all"]
 
 @runtime_checkable
 class DrawsAhead(Protocol):
-    """A `Simulate` that can tell what it draws for a seed, without running."""
+    """A `simulate` or `evaluate` that can tell what it draws for a seed, without running."""
 
     def known_before(self, values: Values, seed: int) -> Mapping[str, float] | None:
         """Return the covariates of a concrete scenario by name, always the same names; None: it tells none."""
@@ -46,11 +46,13 @@ class Covariates:
     """The covariates of a scenario.
 
     Args:
-        scenario: whose `simulate` is a `DrawsAhead`.
+        scenario: whose inputs they take.
+        source: its `simulate` or `evaluate`.
         names: of the covariates.
     """
 
     scenario: LogicalScenario
+    source: DrawsAhead
     names: tuple[str, ...]
     _known: dict[tuple[bytes, int], Vector] = field(default_factory=dict, repr=False)
 
@@ -61,11 +63,12 @@ class Covariates:
         Raises:
             InputError: they are not finite.
         """
-        if not isinstance(scenario.simulate, DrawsAhead):
+        source = scenario.simulate if scenario.evaluate is None else scenario.evaluate
+        if not isinstance(source, DrawsAhead):
             return None
         centre = scenario.space.named(np.array([p.centre for p in scenario.space.parameters], dtype=np.float64))
-        found = scenario.simulate.known_before(centre, 0)
-        return None if not found else cls(scenario, tuple(found))
+        found = _told(source, centre, 0)
+        return None if not found else cls(scenario, source, tuple(found))
 
     def at(self, x: Points, seeds: Sequence[int]) -> Points:
         """Return the (n, c) covariates of inputs (n, d), in their units, with a seed each.
@@ -82,8 +85,8 @@ class Covariates:
         return rows
 
     def _drawn(self, row: Vector, seed: int) -> Vector:
-        values, simulate = self.scenario.space.named(row), self.scenario.simulate
-        found = simulate.known_before(values, seed) if isinstance(simulate, DrawsAhead) else None
+        values = self.scenario.space.named(row)
+        found = _told(self.source, values, seed)
         if found is None or set(found) != set(self.names):
             raise InputError(
                 f"covariates must have the same names everywhere ({', '.join(self.names)}), but at {written(values)}, seed {seed}"
@@ -93,3 +96,15 @@ class Covariates:
             if not math.isfinite(value):
                 raise InputError(f"covariate {name} must be finite, but is {value} at {written(values)}, seed {seed}")
         return np.array([found[name] for name in self.names], dtype=np.float64)
+
+
+def _told(source: DrawsAhead, values: Values, seed: int) -> Mapping[str, float] | None:
+    """Return the covariates of a pair; an error of the scenario's own code says where."""
+    try:
+        return source.known_before(values, seed)
+    except SbtError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"covariates must be known before the run, but at {written(values)}, seed {seed} computing them raised {described(error)}"
+        ) from error

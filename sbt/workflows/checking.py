@@ -26,6 +26,7 @@ from sbt.seeds import run_seed
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.suggesting import units_apart
 from sbt.workflows.comparing import compared_times
+from sbt.workflows.drawn import covariates_first
 from sbt.workflows.findings import Finding
 from sbt.workflows.rehearsal import rehearse
 from sbt.workflows.snapshots import snapshot_findings, which_isolation
@@ -84,6 +85,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     yield from which_isolation(spec)
     points = list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
+    drawn = covariates_first(asked, jobs)
     first = _runs(spec, jobs)
     run = _all_ok(first, points)
     yield run
@@ -95,6 +97,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
         return
     again = _runs(spec, jobs[::-1])[::-1]
     yield _equal("same seed, same trace", first, again, points)
+    yield from drawn()
     yield _in_worker(spec, jobs, first, points)
     yield from _isolations(spec, jobs, points)
     yield from snapshot_findings(spec, points, seed, _digest)

@@ -1,0 +1,55 @@
+"""What `check` proves of covariates: they are known before the run, finite, and the same whatever has been run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sbt.errors import SbtError
+from sbt.problem.arrays import Points
+from sbt.problem.covariates import Covariates
+from sbt.problem.plain import Values
+from sbt.problem.scenario import LogicalScenario
+from sbt.workflows.findings import Finding
+
+__all__ = ["covariates_first"]
+
+_RULE = "covariates are known before the run"
+
+
+def covariates_first(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> Callable[[], list[Finding]]:
+    """Compute the covariates of runs that are still to be executed; what is returned computes them again, and compares.
+
+    Args:
+        scenario: as configured.
+        jobs: values and seed of each run.
+    """
+    before, names, problem = _computed(scenario, jobs)
+
+    def afterwards() -> list[Finding]:
+        if problem:
+            return [Finding(_RULE, ok=False, detail=problem)]
+        if before is None:
+            return []
+        after, _, failed = _computed(scenario, jobs)
+        if failed or after is None:
+            return [Finding(_RULE, ok=False, detail=f"after the runs: {failed or 'there are none'}")]
+        differ = [name for k, name in enumerate(names) if (before[:, k] != after[:, k]).any()]
+        if differ:
+            return [Finding(_RULE, ok=False, detail=f"after the runs were executed, {', '.join(differ)} of the same pairs differ")]
+        return [Finding(_RULE, ok=True, detail=f"{len(names)} covariates of {len(jobs)} pairs, the same before and after the runs")]
+
+    return afterwards
+
+
+def _computed(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> tuple[Points | None, tuple[str, ...], str]:
+    """Return the covariates (n, c) of these pairs and their names, or why they cannot be computed; None: the scenario has none."""
+    try:
+        found = Covariates.of(scenario)
+        if found is None:
+            return None, (), ""
+        x = np.array([[p.number(values[p.name]) for p in scenario.space.parameters] for values, _ in jobs])
+        return found.at(x, [seed for _, seed in jobs]), found.names, ""
+    except SbtError as error:
+        return None, (), str(error)

@@ -1,0 +1,163 @@
+"""What the seed draws is known before the run: projections, pairs of inputs and seed, and what stays honest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt.errors import InputError
+from sbt.plugins import Scope, load
+from sbt.problem.covariates import Covariates, telling_all
+from sbt.seeds import stream
+from sbt.sumo.actors import Actor, VehicleType
+from sbt.sumo.projecting import Arrivals, arrivals_at, crossing_of, first_gap, gaps, time_to_reach
+from sbt.workflows.drawn import covariates_first
+from sbt.workflows.study import Study
+
+NAMES = ("crossing_pedestrian", "highway_merge", "roundabout_entry", "unprotected_left_turn")
+
+
+def car(k: int, position: float, speed: float, **attributes: float) -> Actor:
+    return Actor(f"car_{k}", ("a",), 0, position, speed, type=VehicleType(attributes=tuple((n, str(v)) for n, v in attributes.items())))
+
+
+def test_time_to_reach_solves_the_motion() -> None:
+    for d in (0.0, 5.0, 40.0, 300.0):
+        t = float(time_to_reach(d, 8.0, 20.0, 2.0))
+        rise = min(t, 6.0)
+        assert 8.0 * rise + rise**2 + 20.0 * (t - rise) == pytest.approx(d)
+    assert float(time_to_reach(100.0, 20.0, 10.0, 2.0)) == 10.0, "a lower speed is taken at once"
+    assert float(time_to_reach(-20.0, 10.0, 20.0, 2.0)) == -2.0
+
+
+def test_who_is_faster_queues_behind_who_is_slower_and_leaves_the_foremost_alone() -> None:
+    slow, fast = car(0, 100.0, 10.0, speedFactor=0.7, sigma=0), car(1, 60.0, 20.0, speedFactor=1.5, sigma=0, tau=1)
+    alone = arrivals_at(900.0, [slow], 14.0)
+    both = arrivals_at(900.0, [slow, fast], 14.0)
+    assert both.time[0] == alone.time[0]
+    assert both.time[1] - both.time[0] >= 1.0
+    assert both.speed[1] == both.speed[0]
+
+
+def test_the_first_gap_is_the_first_one_that_is_long_enough() -> None:
+    rng = stream(3, "gaps")
+    for _ in range(50):
+        arrivals = Arrivals(np.sort(rng.uniform(-10.0, 40.0, 8)), rng.uniform(5.0, 20.0, 8))
+        ready, length = rng.uniform(-5.0, 20.0), rng.uniform(1.0, 9.0)
+        found = first_gap(arrivals, ready, length)
+        begin = ready + found["wait"]
+        inside = (arrivals.time > begin + 1e-9) & (arrivals.time < begin + min(found["gap"], length) - 1e-9)
+        assert not inside.any()
+        assert begin == pytest.approx(ready) or np.isclose(arrivals.time, begin).any()
+        earlier = [ready, *arrivals.time[(arrivals.time > ready) & (arrivals.time < begin - 1e-9)]]
+        ends = [min(t for t in arrivals.time if t > s + 1e-12) for s in earlier] if found["wait"] > 0 else []
+        assert all(end - start <= length + 1e-9 for start, end in zip(earlier, ends, strict=False))
+        assert found["closing"] in (0.0, *arrivals.speed)
+    assert gaps(Arrivals(np.empty(0), np.empty(0)), 5.0)["since"] == 30.0, "nobody comes"
+
+
+def test_paths_cross_where_they_come_near_and_oncoming_lanes_do_not() -> None:
+    s = np.arange(0.0, 100.0)
+    east, north = np.column_stack([s, 0 * s]), np.column_stack([0 * s + 40.0, s - 50.0])
+    west = np.column_stack([100.0 - s, 0 * s + 3.5])
+    found = crossing_of(east, north, lambda cosine: 2.5)
+    assert found is not None
+    assert found == pytest.approx((38.0, 50.0), abs=3.0)
+    assert crossing_of(east, west, lambda cosine: 1.5 if cosine < 0 else 4.5) is None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_covariates_are_finite_numbers_of_the_pair_alone(name: str) -> None:
+    scenario = load("scenarios", name)
+    x = scenario.space.from_unit(stream(1, name).random((12, scenario.space.dimension)))
+    general = telling_all(replace(scenario, simulate=replace(scenario.simulate, covariates=None)))
+    for told in (scenario, general) if name != "crossing_pedestrian" else (scenario,):  # persons are not in the general set
+        found, again = Covariates.of(told), Covariates.of(told)
+        assert found is not None
+        assert again is not None
+        here = found.at(x, range(12))
+        assert np.array_equal(here, again.at(x[::-1], range(12)[::-1])[::-1])
+        assert (here.std(axis=0) > 0).any()
+        assert (found.at(x[[0] * 8], range(8)).std(axis=0) > 0).any(), "the seed draws something"
+
+
+class Crossing:
+    """Critical where `a` is near 0.7 and the one car that the seed draws comes within a tenth of the time."""
+
+    def __call__(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        late, noise = stream(seed, "car").random(), 0.02 * stream(seed, "driver").standard_normal()
+        return {"gap": 4.0 * abs(values["a"] - 0.7) + 3.0 * abs(late - 0.5) + noise - 0.2}
+
+    def known_before(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        return {"late": stream(seed, "car").random()}
+
+
+def scenario_of(source: object) -> sbt.Scenario:
+    inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]
+    return sbt.Scenario("one_car", inputs, sbt.Requirement("gap", high=0.0), evaluate=source)
+
+
+def run(folder: Path, **keys: object) -> sbt.Result:
+    given = {"campaign": "falsification", "scenario": scenario_of(Crossing()), "seed": 1, "budget": 80, "metamodel": "et", "report": False}
+    return sbt.run(**{**given, "executor": "serial", "store": folder, **keys})
+
+
+def test_pairs_find_more_distinct_traffic_and_only_drawn_seeds_tell_rates(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole", budget=40)
+    pairs, history = whole.frame, whole.history
+    searched = pairs[pairs.stage != "confirm"]
+    random = [Crossing()({"a": stream(5, k).random(), "b": 0.0}, k)["gap"] <= 0.0 for k in range(2000)]
+    assert int(searched.critical.sum()) >= 5 * max(40 * np.mean(random), 1.0)
+    assert searched.seed.is_unique
+    assert set(pairs[pairs.seed_chosen].stage) == {"search"}
+    assert not history.training.columns["seed_chosen"].any()
+    assert whole.conclusion.simulator_noise.noisy
+    run(tmp_path / "parts", budget=20)
+    parts = run(tmp_path / "parts", budget=40).frame
+    early = (frame[(frame.iteration < 2) & (frame.stage != "confirm")] for frame in (parts, pairs))
+    first, same = (frame[["x.a", "seed", "y.gap", "seed_chosen"]] for frame in early)
+    assert first.equals(same), "a search that stopped and went on has the same pairs"
+
+
+def test_seeds_are_not_looked_at_where_that_is_switched_off_or_a_store_was_begun_without(tmp_path: Path) -> None:
+    off = run(tmp_path / "off", budget=20, covariates=False)
+    assert not off.frame.seed_chosen.any()
+    found = Study.from_mapping({"campaign": "falsification", "scenario": "unprotected_left_turn"}, name="", scope=Scope(tmp_path))
+    assert found.covariates is not None
+    assert replace(found, kept={"names": []}).covariates is None
+    assert replace(found, kept={"covariate_names": list(found.covariates.names)}).covariates is not None
+
+
+def test_what_cannot_be_told_is_said(tmp_path: Path) -> None:
+    plain = scenario_of(lambda values, seed: {"gap": values["a"]})
+    with pytest.raises(InputError, match="covariates: true needs a scenario whose traffic is drawn before the run"):
+        run(tmp_path / "plain", scenario=plain, covariates=True)
+    endless = Crossing()
+    endless.known_before = lambda values, seed: {"late": float("inf")}  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="covariate late must be finite, but is inf at a="):
+        run(tmp_path / "endless", scenario=scenario_of(endless))
+
+
+def test_check_finds_covariates_that_depend_on_what_was_run() -> None:
+    jobs = [({"a": 0.1 * k, "b": 0.5}, k) for k in range(4)]
+    good, seen = Crossing(), Crossing()
+    ran: list[int] = []
+    seen.known_before = lambda values, seed: {"late": float(seed in ran)}  # type: ignore[method-assign]
+    for source, ok in ((good, True), (seen, False)):
+        ran.clear()
+        again = covariates_first(scenario_of(source), jobs)
+        ran.extend(seed for _, seed in jobs)
+        (finding,) = again()
+        assert finding.ok is ok
+    assert "late of the same pairs differ" in finding.detail
+
+
+def test_a_coverage_states_what_inputs_and_traffic_explain(tmp_path: Path) -> None:
+    found = run(tmp_path / "even", campaign="coverage", budget=150).conclusion.explained
+    assert found.inputs + found.traffic + found.rest == pytest.approx(1.0)
+    assert 0.2 < found.traffic < 0.7
+    assert found.rest < 0.1
