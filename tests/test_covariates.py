@@ -22,7 +22,8 @@ NAMES = ("crossing_pedestrian", "highway_merge", "roundabout_entry", "unprotecte
 
 
 def car(k: int, position: float, speed: float, **attributes: float) -> Actor:
-    return Actor(f"car_{k}", ("a",), 0, position, speed, type=VehicleType(attributes=tuple((n, str(v)) for n, v in attributes.items())))
+    kind = VehicleType(attributes=tuple((name, str(value)) for name, value in attributes.items()))
+    return Actor(f"car_{k}", ("a",), 0, position, speed, type=kind)
 
 
 def test_time_to_reach_solves_the_motion() -> None:
@@ -75,7 +76,8 @@ def test_covariates_are_finite_numbers_of_the_pair_alone(name: str) -> None:
     scenario = load("scenarios", name)
     x = scenario.space.from_unit(stream(1, name).random((12, scenario.space.dimension)))
     general = telling_all(replace(scenario, simulate=replace(scenario.simulate, covariates=None)))
-    for told in (scenario, general) if name != "crossing_pedestrian" else (scenario,):  # persons are not in the general set
+    persons = name == "crossing_pedestrian"  # of whom the general set does not tell
+    for told in (scenario,) if persons else (scenario, general):
         found, again = Covariates.of(told), Covariates.of(told)
         assert found is not None
         assert again is not None
@@ -102,8 +104,8 @@ def scenario_of(source: object) -> sbt.Scenario:
 
 
 def run(folder: Path, **keys: object) -> sbt.Result:
-    given = {"campaign": "falsification", "scenario": scenario_of(Crossing()), "seed": 1, "budget": 80, "metamodel": "et", "report": False}
-    return sbt.run(**{**given, "executor": "serial", "store": folder, **keys})
+    given = {"campaign": "falsification", "scenario": scenario_of(Crossing()), "seed": 1, "budget": 80, "report": False}
+    return sbt.run(**{**given, "executor": "serial", "metamodel": "et", "store": folder, **keys})
 
 
 def test_pairs_find_more_distinct_traffic_and_only_drawn_seeds_tell_rates(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import percent, plural
-from sbt.problem.arrays import Points, Vector
+from sbt.metamodels.bootstrap import out_of_bag
 from sbt.seeds import stream
 from sbt.store.history import History
 
@@ -16,8 +16,6 @@ __all__ = ["ExplainedVariance", "explained_variance"]
 
 _FEWEST = 100
 """Runs of drawn seeds from which on shares are stated: of fewer a forest explains too little."""
-_TREES = 200
-
 
 @dataclass(frozen=True)
 class ExplainedVariance:
@@ -38,8 +36,9 @@ class ExplainedVariance:
     def sentence(self, metric: str) -> str:
         """Return the shares in words."""
         return (
-            f"Of the variance of {metric}, inputs explain {percent(self.inputs)} and the drawn traffic {percent(self.traffic)} more;"
-            f" {percent(self.rest)} is left to what drivers do during the run and to what {plural(self.runs, 'run')} do not teach."
+            f"Of the variance of {metric}, inputs explain {percent(self.inputs)} and the drawn traffic {percent(self.traffic)}"
+            f" more; {percent(self.rest)} is left to what drivers do during the run and to what {plural(self.runs, 'run')} do not"
+            " teach."
         )
 
 
@@ -55,15 +54,6 @@ def explained_variance(settings: Settings, history: History) -> ExplainedVarianc
         return None
     inputs = space.metamodel_inputs(np.clip(space.to_unit(runs.x), 0.0, 1.0))
     both = np.column_stack([inputs, covariates.at(runs.x, runs.seed.tolist())])
-    alone = _out_of_bag(inputs, y, settings.seed)
-    whole = max(_out_of_bag(both, y, settings.seed), alone)
+    alone = out_of_bag(inputs, y, stream(settings.seed, "explained", len(y)))
+    whole = max(out_of_bag(both, y, stream(settings.seed, "explained", len(y))), alone)
     return ExplainedVariance(alone, whole - alone, 1.0 - whole, len(runs))
-
-
-def _out_of_bag(u: Points, y: Vector, seed: int) -> float:
-    """Return the share of the variance of y (n,) that a forest on u (n, d) explains of rows its trees did not learn, at least 0."""
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    state = int(stream(seed, "explained", len(y)).integers(2**31))
-    forest = ExtraTreesRegressor(_TREES, min_samples_split=4, bootstrap=True, oob_score=True, random_state=state, n_jobs=1)
-    return max(float(forest.fit(u, y).oob_score_), 0.0)

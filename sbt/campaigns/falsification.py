@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from sbt.acquisitions import even, is_greedy, log_scores
@@ -180,10 +181,10 @@ class SearchStage:
         """Return n points with the seeds whose traffic promises most there."""
         space = self.failure_search.settings.scenario.space
 
-        def draw(points: Points, seeds: Sequence[int]) -> Points:
-            return covariates.at(space.from_unit(points), seeds)
+        def draw(points: Points, seeds: NDArray[np.int64]) -> Points:
+            return covariates.at(space.from_unit(points), seeds.tolist())
 
-        found = propose_pairs(self.failure_search.search, draw, u, runs.seed.tolist(), y, n, rng)
+        found = propose_pairs(self.failure_search.search, draw, u, runs.seed, y, n, rng)
         return Picks(found.u, (PAIR,) * len(found.u), seeds=found.seeds)
 
     def _seeded(self, picks: Picks) -> list[PlannedRun]:

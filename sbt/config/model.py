@@ -306,8 +306,8 @@ class Configuration(_Strict):
         default=None, description="Estimation: pass, fail or undecided about a largest probability; null: no verdict."
     )
     covariates: Annotated[bool | None, BeforeValidator(_unless_auto)] = Field(
-        default=None, description="Look at what the seed draws, before the run: auto (null), where the scenario tells it; true: also by "
-        "a general set, an error where nothing can be told; false: never.",
+        default=None, description="Look at what the seed draws, before the run: auto (null), where the scenario tells it; "
+        "true: also by a general set, an error where nothing can be told; false: never.",
     )  # fmt: skip
     judges: Annotated[tuple[Name, ...] | None, Field(strict=False)] = Field(
         default=None, description="Egos to run failures again with; default: falsification, the four reference drivers.",

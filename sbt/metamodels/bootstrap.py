@@ -6,9 +6,10 @@ import numpy as np
 
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["drawn_regression"]
+__all__ = ["drawn_regression", "out_of_bag"]
 
 _TREES, _LEAF = 10, 4  # of a drawn forest: few trees, so that draws differ; runs in a leaf
+_BAGGED = 200  # trees, each of which leaves out a third of the rows
 _RIDGE = 3.0  # penalty of a slope in runs: one of 0 is worth three more
 
 
@@ -36,3 +37,12 @@ def drawn_regression(u: Points, y: Vector, at: Points, rng: np.random.Generator,
 
     forest = ExtraTreesRegressor(_TREES, min_samples_leaf=_LEAF, random_state=int(rng.integers(2**31)), n_jobs=1)
     return line + np.asarray(forest.fit(u, y, sample_weight=weight).predict(at))
+
+
+def out_of_bag(u: Points, y: Vector, rng: np.random.Generator) -> float:
+    """Return the share of the variance of y (n,) that a forest on u (n, d) explains of rows its trees did not see, at least 0."""
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    state = int(rng.integers(2**31))
+    forest = ExtraTreesRegressor(_BAGGED, min_samples_split=4, bootstrap=True, oob_score=True, random_state=state, n_jobs=1)
+    return max(float(forest.fit(u, y).oob_score_), 0.0)

@@ -106,5 +106,6 @@ def _told(source: DrawsAhead, values: Values, seed: int) -> Mapping[str, float] 
         raise
     except Exception as error:
         raise InputError(
-            f"covariates must be known before the run, but at {written(values)}, seed {seed} computing them raised {described(error)}"
+            f"covariates must be known before the run, but at {written(values)}, seed {seed} computing them raised"
+            f" {described(error)}"
         ) from error

@@ -6,7 +6,7 @@ promising inputs, and the best of them with other inputs beside the same traffic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,13 +19,13 @@ from sbt.samplers.search import Search, fill_uniformly
 
 __all__ = ["PairPicks", "propose_pairs"]
 
-Draw = Callable[[Points, Sequence[int]], Points]
+Draw = Callable[[Points, NDArray[np.int64]], Points]
 """(n, d) unit-cube points and their n seeds to (n, c) covariates."""
 
 _FOREST = ExtraTrees(trees=60)
 _SCREENED = 2000  # uniform points, of which inputs alone choose
 _PROMISING, _ANY = 200, 100  # points that are given traffic: the best of them, and any
-_BEST, _STEPS, _STEP = 20, 5, 0.1  # runs and pairs of the lowest scores, steps from each, their standard deviation in the unit cube
+_BEST, _STEPS, _STEP = 20, 5, 0.1  # runs and pairs of the lowest scores, steps from each, their std in the unit cube
 _LARGEST = 2**31 - 1  # a seed is below
 _DARING = 5  # of so many picks one is the best by a few trees alone
 _FEW_TREES = 8
@@ -45,7 +45,7 @@ class PairPicks:
 
 
 def propose_pairs(
-    search: Search, draw: Draw, u: Points, seeds: Sequence[int], y: Vector, n: int, rng: np.random.Generator
+    search: Search, draw: Draw, u: Points, seeds: NDArray[np.int64], y: Vector, n: int, rng: np.random.Generator
 ) -> PairPicks:
     """Return n pairs of the lowest expected score, each with traffic that no other run has.
 
@@ -63,11 +63,11 @@ def propose_pairs(
     pairs = _FOREST.fit(np.column_stack([inputs, draw(u, seeds)]), score, rng)
     alone = _FOREST.fit(inputs, score, rng)
 
-    def expected(points: Points, theirs: Sequence[int]) -> Points:
+    def expected(points: Points, theirs: NDArray[np.int64]) -> Points:
         return _by_tree(pairs, np.column_stack([search.columns(points), draw(points, theirs)]))
 
     points = _inputs(search, alone, u[np.argsort(score, kind="stable")[:_BEST]], rng)
-    drawn = _fresh(len(points), rng, set(seeds))
+    drawn = _fresh(len(points), rng, set(seeds.tolist()))
     found = expected(points, drawn)
     best = np.argsort(found.mean(axis=0), kind="stable")[:_BEST]
     moved = _steps(search, points[best], rng)

@@ -132,7 +132,9 @@ SCENARIO = LogicalScenario(
             *EGO.inputs,
         )
     ),
-    simulate=SumoSimulation(net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",), covariates=covariates),
+    simulate=SumoSimulation(
+        net=NET, scene=scene, duration=DURATION, step_length=0.1, ego=EGO, isolations=("fresh",), covariates=covariates
+    ),
     metrics=(
         pet_ego_first(horizon=HORIZON, zone=ENTRY),
         ttc_path_min(),

@@ -304,7 +304,7 @@ class History:
 
     @property
     def finished(self) -> History:
-        """All runs of drawn seeds that finished well: what the final answer of a campaign learns from, once it has been scored."""
+        """All runs of drawn seeds that finished well: what the final answer of a campaign learns from, after its scoring."""
         return self.where(self.ok & self.drawn)
 
     @property

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.sumo.actors import Actor
 
 __all__ = ["FAR", "Arrivals", "arrivals_at", "beside", "crossing_of", "driver_value", "first_gap", "gaps", "time_to_reach"]
@@ -41,10 +41,9 @@ class Arrivals:
     time: Vector
     speed: Vector
 
-    def where(self, keep: Sequence[bool]) -> Arrivals:
+    def where(self, keep: Mask) -> Arrivals:
         """Return some of them."""
-        mask = np.asarray(keep, dtype=bool)
-        return Arrivals(self.time[mask], self.speed[mask])
+        return Arrivals(self.time[keep], self.speed[keep])
 
 
 def arrivals_at(place: float, cars: Sequence[Actor], limit: float, *, fastest: float = math.inf, delay: float = 0.0) -> Arrivals:
@@ -81,7 +80,7 @@ def driver_value(actor: Actor, name: str, otherwise: float) -> float:
 
 
 def time_to_reach(distance: Vector | float, start: Vector | float, wanted: Vector | float, accel: Vector | float) -> Vector:
-    """Return the time for a distance (m) from a speed with an acceleration up to a wanted speed, which is taken at once if lower.
+    """Return the time for a distance (m) from a speed with an acceleration up to a wanted speed, a lower one at once.
 
     Distances that are behind give negative times at the present speed. Speeds in m/s, accelerations in m/s^2.
     """
@@ -93,7 +92,9 @@ def time_to_reach(distance: Vector | float, start: Vector | float, wanted: Vecto
     return np.asarray(np.where(d < 0.0, d / np.maximum(v, _SLOWEST), after))
 
 
-def gaps(arrivals: Arrivals, ready: float, longer_than: Sequence[float] = (4.0, 5.0, 6.0, 7.0), following: int = 3) -> dict[str, float]:
+def gaps(
+    arrivals: Arrivals, ready: float, longer_than: Sequence[float] = (4.0, 5.0, 6.0, 7.0), following: int = 3
+) -> dict[str, float]:
     """Return the gaps among arrivals from when the ego is ready to take one on (s).
 
     Returns:
@@ -110,7 +111,7 @@ def gaps(arrivals: Arrivals, ready: float, longer_than: Sequence[float] = (4.0, 
 
 
 def first_gap(arrivals: Arrivals, ready: float, length: float) -> dict[str, float]:
-    """Return of the first gap longer than this (s) when it begins (`wait`, s), its length (`gap`, s) and who ends it (`closing`, m/s)."""
+    """Return when the first gap longer than this begins (`wait`), how long it is (`gap`) and who ends it (`closing`); s, m/s."""
     relative = arrivals.time - ready
     coming, speed = relative[relative > 0.0], arrivals.speed[relative > 0.0]
     begin = np.concatenate([[0.0], coming])
@@ -126,8 +127,8 @@ def beside(arrivals: Arrivals, time: float, speed: float, neighbours: int = 1) -
     """Return who is ahead of and behind the ego, that gets to the same place at a time (s) with a speed (m/s).
 
     Returns:
-        For each neighbour ahead and behind, the time between them (s), the difference of speeds (m/s, theirs less the ego's) and the
-        time to a collision if both went on (s); and the `room` between the nearest ones (s).
+        For each neighbour ahead and behind, the time between them (s), the difference of speeds (m/s, theirs less the ego's) and
+        the time to a collision if both went on (s); and the `room` between the nearest ones (s).
     """
     relative = arrivals.time - time
     ahead, behind = np.flatnonzero(relative <= 0.0)[::-1], np.flatnonzero(relative > 0.0)

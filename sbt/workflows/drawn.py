@@ -37,14 +37,14 @@ def covariates_first(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int
             return [Finding(_RULE, ok=False, detail=f"after the runs: {failed or 'there are none'}")]
         differ = [name for k, name in enumerate(names) if (before[:, k] != after[:, k]).any()]
         if differ:
-            return [Finding(_RULE, ok=False, detail=f"after the runs were executed, {', '.join(differ)} of the same pairs differ")]
-        return [Finding(_RULE, ok=True, detail=f"{len(names)} covariates of {len(jobs)} pairs, the same before and after the runs")]
+            return [Finding(_RULE, ok=False, detail=f"after the runs, {', '.join(differ)} of the same pairs differ")]
+        return [Finding(_RULE, ok=True, detail=f"{len(names)} covariates of {len(jobs)} pairs, the same before and after them")]
 
     return afterwards
 
 
 def _computed(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> tuple[Points | None, tuple[str, ...], str]:
-    """Return the covariates (n, c) of these pairs and their names, or why they cannot be computed; None: the scenario has none."""
+    """Return the covariates (n, c) of these pairs and their names, or why there are none; None: the scenario tells none."""
     try:
         found = Covariates.of(scenario)
         if found is None:

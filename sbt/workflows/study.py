@@ -311,13 +311,15 @@ class Study:
             "described": described, **where_it_is(self.loaded.folder, Path(config.store)),
             "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
-            **({COVARIATES: list(self.covariates.names)} if self.live and self.covariates is not None else self._kept(COVARIATES)),
+            **self._told_names(),
             **({"isolation": self.isolation.described()} if self.isolation is not None and self.isolation.warm else {}),
         }  # fmt: skip
 
-    def _kept(self, key: str) -> Json:
-        """Return what the store remembers under a key, where it does."""
-        return {key: self.kept[key]} if key in self.kept else {}
+    def _told_names(self) -> Json:
+        """Return the names of the covariates as the store remembers them; empty where seeds are not looked at."""
+        if not self.live:
+            return {COVARIATES: self.kept[COVARIATES]} if COVARIATES in self.kept else {}
+        return {} if self.covariates is None else {COVARIATES: list(self.covariates.names)}
 
     def conclusion(self, data: JsonMapping) -> Conclusion:
         """Return a conclusion from the JSON in the store; values by name where the campaign's own type is not at hand."""
