@@ -100,7 +100,7 @@ RUN = {
     "docs/falsification.md": {"yaml"}, "docs/metamodels.md": {"bash", "python", "yaml"}, "docs/metrics.md": {"bash", "python"},
     "docs/python.md": {"python"}, "docs/reference_drivers.md": {"python"}, "docs/requirements.md": {"python", "yaml"},
     "docs/reliability.md": {"bash"}, "docs/scenarios.md": {"python"},
-    "docs/testbeds.md": {"console", "python", "yaml"}, "docs/traffic.md": {"yaml"},
+    "docs/testbeds.md": {"console", "python", "yaml"}, "docs/traffic.md": {"python", "yaml"},
     "docs/tutorials/actors.md": {"bash", "python", "yaml"}, "docs/tutorials/own_files.md": {"bash", "xml", "yaml"},
     "docs/tutorials/opendrive.md": {"bash", "xml", "yaml"},
     "docs/tutorials/recorded_traffic.md": {"bash", "python", "xml", "yaml"},
