@@ -33,7 +33,7 @@ FLOORS = (
     ("config",),
     ("report",),
     ("workflows",),
-    ("benchmark", "testing"),
+    ("benchmark", "serve", "testing"),
     ("cli",),
     ("__main__",),
 )

@@ -7,13 +7,13 @@ import gzip
 import json
 import math
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from browser import PROGRAM
 from test_report import CRITICAL, fill, metric, predict, scenario_of
 
 from sbt.problem.outcome import Outcome, Status
@@ -27,7 +27,6 @@ from sbt.report.slices import slices_through
 from sbt.store.database import PlannedRun, Store
 from sbt.sumo.nets import Lane
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 EVIL = "</script><script>alert(1)</script><b>\N{COLLISION SYMBOL}" + "x" * 180
 
 
@@ -131,7 +130,7 @@ def test_data_cannot_leave_its_element():
 SCRIPT = (Path(__file__).parent / "data" / "tries_explorer.js").read_text(encoding="utf-8")
 
 
-@pytest.mark.skipif(BROWSER is None, reason="needs chromium, which is not installed")
+@pytest.mark.skipif(PROGRAM is None, reason="needs chromium, which is not installed")
 def test_a_browser_goes_from_a_point_to_its_film(tmp_path):
     scenario = scenario_of(3, description=EVIL)
     with fill(tmp_path, scenario, configuration={"scenario": EVIL}) as store:
@@ -142,7 +141,7 @@ def test_a_browser_goes_from_a_point_to_its_film(tmp_path):
     drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
     own = [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=390,900", "--hide-scrollbars"]
     asked = ["--virtual-time-budget=30000", "--dump-dom", f"file://{tmp_path}/tried.html"]
-    command = [BROWSER, "--headless=new", "--no-sandbox", *drawing, *own, *asked]
+    command = [PROGRAM, "--headless=new", "--no-sandbox", *drawing, *own, *asked]
     done = subprocess.run(command, capture_output=True, text=True, timeout=180)
     answer = re.search(r'<pre id="answer">([^<]*)<', done.stdout)
     assert answer, done.stderr[-2000:]

@@ -18,6 +18,7 @@ from sbt.cli.new import new
 from sbt.cli.pin import pin
 from sbt.cli.predict import predict
 from sbt.cli.replay import replay
+from sbt.cli.serve import serve
 
 __all__ = ["app", "main"]
 
@@ -48,6 +49,7 @@ app.command(cls=PlainFlags)(verb(new))
 app.command(cls=PlainFlags)(verb(benchmark))
 app.command(cls=PlainFlags)(verb(compare))
 app.command(cls=PlainFlags)(verb(compare_ego))
+app.command(cls=PlainFlags)(verb(serve))
 app.command("list", cls=PlainFlags)(verb(inform.list_))
 app.command(cls=PlainFlags)(verb(inform.schema))
 app.command(cls=PlainFlags)(verb(inform.doctor))

@@ -198,17 +198,20 @@ class Explorer {
   }
 }
 
-const begin = async () => {
+const explore = async data => {
   const place = document.getElementById("explore");
-  if (!place || !window.DecompressionStream) return;
-  const data = opened(JSON.parse(await unpacked("explorer-data")));
-  place.hidden = false;
-  if (!data.index.length) { place.hidden = true; return; }
+  place.hidden = !data.index.length;
+  if (place.hidden) return;
   const explorer = new Explorer(place, data);
   window.explorer = explorer;
   const scheme = matchMedia("(prefers-color-scheme: dark)");
   scheme.addEventListener("change", () => { painted.clear(); explorer.parallel = false; explorer.draw(); if (explorer.player) explorer.player.show(explorer.player.now); });
   new ResizeObserver(() => { if (explorer.player) explorer.player.show(explorer.player.now); }).observe(place);
-  if (document.getElementById("library").textContent.trim()) setTimeout(() => withLibrary(() => explorer.draw()), 30);
+  if (window.Plotly) explorer.draw();
+  else if (document.getElementById("library").textContent.trim()) setTimeout(() => withLibrary(() => explorer.draw()), 30);
+};
+const begin = async () => {
+  if (!document.getElementById("explorer-data") || !window.DecompressionStream) return;
+  await explore(opened(JSON.parse(await unpacked("explorer-data"))));
 };
 begin();

@@ -12,7 +12,7 @@ from sbt.store.records import FitRecord
 from sbt.store.rescue import Diagnosis, examine, save
 from sbt.store.writer import Writer, writer_of
 
-__all__ = ["Diagnosis", "examine", "read_status", "save"]
+__all__ = ["Diagnosis", "Writer", "examine", "read_status", "save", "writer_of"]
 
 
 def read_status(folder: Path) -> Json:
@@ -28,9 +28,12 @@ def read_status(folder: Path) -> Json:
     with Store.read(folder) as store:
         iterations, fits, counts = store.iterations(), store.fits(), store.counts
         writer, conclusion = writer_of(folder), store.conclusion
-        done, budget = sum(counts.values()) - counts.get(PLANNED, 0), _budget(store.configuration)
+        kept = store.configuration
+        done, budget = sum(counts.values()) - counts.get(PLANNED, 0), _budget(kept)
         return {
             "store": str(folder),
+            "campaign": kept.get("campaign"),
+            "scenario": kept.get("scenario"),
             **_progress(writer, done, budget, finished=conclusion is not None),
             "runs": counts,
             "iterations": len(iterations),
