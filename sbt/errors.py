@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["InputError", "PluginError", "RunError", "SbtError", "StoreError", "described", "did_you_mean", "place_of"]
+__all__ = [
+    "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean", "place_of",
+]  # fmt: skip
 
 
 class SbtError(Exception):
@@ -26,6 +28,14 @@ class PluginError(InputError):
 
 class StoreError(SbtError):
     """The store cannot be read or written, or belongs to another configuration."""
+
+
+class UnwritableError(SbtError, OSError):
+    """A file cannot be written: its folder is read-only, the disk is full."""
+
+    def __str__(self) -> str:
+        """Return the file and why."""
+        return f"a result must be written, but {self.filename} cannot be: {self.strerror}"
 
 
 class RunError(SbtError):

@@ -6,8 +6,11 @@ import os
 import secrets
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-__all__ = ["move_atomically", "write_atomically"]
+from sbt.errors import UnwritableError
+
+__all__ = ["as_cell", "move_atomically", "write_atomically"]
 
 _MODE = 0o644
 
@@ -24,7 +27,17 @@ def write_atomically(path: Path, content: str | bytes | Callable[[Path], object]
 
     Returns:
         The path.
+
+    Raises:
+        UnwritableError: the system does not let it be written.
     """
+    try:
+        return _written(path, content)
+    except OSError as error:
+        raise UnwritableError(error.errno, error.strerror or str(error), str(path)) from error
+
+
+def _written(path: Path, content: str | bytes | Callable[[Path], object]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, _MODE))  # the process's umask applies
@@ -45,3 +58,18 @@ def move_atomically(path: Path, target: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())
     path.replace(target)
+
+
+def as_cell(value: Any) -> Any:
+    """Return what a cell of a table for people holds: a text that a spreadsheet would take for a formula begins with a quote.
+
+    >>> as_cell("=1+1"), as_cell("-3.5"), as_cell("car"), as_cell(-3.5)
+    ("'=1+1", '-3.5', 'car', -3.5)
+    """
+    if not isinstance(value, str) or not value.startswith(("=", "+", "-", "@", "\t", "\r", "\n")):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value

@@ -5,20 +5,26 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import shutil
+import sqlite3
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from sbt.config.load import parse
-from sbt.errors import InputError
+from sbt.errors import InputError, UnwritableError
 from sbt.execution.worker import run_job
+from sbt.files import as_cell, write_atomically
 from sbt.problem.distribution import Distribution
 from sbt.problem.outcome import Job
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
+from sbt.store.connection import _copied
 from sbt.sumo.files import SumoFiles
+from sbt.workflows.exporting import _cells
 from sbt.workflows.study import Study
 
 
@@ -71,3 +77,36 @@ def test_ends_far_apart_are_a_range():
     assert Parameter("a", 0.0, 1e-90).high == 1e-90
     assert CriticalInterval(high=1e99).high == 1e99
     assert Distribution.of("normal", mean=0, std=1e-9).truncated(-1, 1).mass == pytest.approx(1)
+
+
+def test_what_cannot_be_written_is_said(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UnwritableError, match=r"a result must be written, but .*runs\.csv cannot be: ") as error:
+        write_atomically(tmp_path / "file" / "runs.csv", "x")
+    assert error.value.strerror
+
+
+def test_a_store_where_nothing_may_be_written_is_read_with_its_log(tmp_path: Path):
+    """As of a campaign that was killed, on a read-only medium: what was committed last stands in the log alone."""
+    db = sqlite3.connect(tmp_path / "c.sqlite", isolation_level=None)
+    db.execute("PRAGMA journal_mode = WAL")
+    db.execute("CREATE TABLE t (a)")
+    db.execute("INSERT INTO t VALUES (7)")
+    (tmp_path / "ro").mkdir()
+    for name in ("c.sqlite", "c.sqlite-wal"):
+        shutil.copyfile(tmp_path / name, tmp_path / "ro" / name)
+    copy = _copied(tmp_path / "ro" / "c.sqlite", tmp_path / "ro" / "c.sqlite-wal")
+    assert copy.execute("SELECT a FROM t").fetchall() == [(7,)]
+    copy.close()
+    db.close()
+    assert sorted(path.name for path in (tmp_path / "ro").iterdir()) == ["c.sqlite", "c.sqlite-wal"]
+
+
+def test_no_cell_of_a_table_is_a_formula():
+    frame = pd.DataFrame({"x": [-1.5, 2.0], "reason": ["=cmd|'/C calc'!A0", "-2"], "@m": ["+a", "\tb"], "n": [1, -1]})
+    cells = _cells(frame)
+    assert list(cells.columns) == ["x", "reason", "'@m", "n"]
+    assert cells["reason"].tolist() == ["'=cmd|'/C calc'!A0", "-2"]
+    assert cells["'@m"].tolist() == ["'+a", "'\tb"]
+    assert cells["x"].tolist() == [-1.5, 2.0]
+    assert [as_cell(value) for value in (None, 3, "a=b", "-")] == [None, 3, "a=b", "'-"]

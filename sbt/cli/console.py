@@ -77,6 +77,8 @@ def _verdict(error: BaseException) -> tuple[str, Exit]:
         return str(error), Exit.INPUT
     if isinstance(error, SbtError):
         return str(error), Exit.INTERNAL
+    if isinstance(error, OSError) and error.filename is not None:  # the disk, not the code
+        return f"a file must be readable and writable, but {error.filename} is not: {error.strerror}", Exit.INTERNAL
     what = f"{type(error).__name__}: {error}".removesuffix(": ")
     return f"internal error: {what} (SBT_DEBUG=1 shows where)", Exit.INTERNAL
 

@@ -11,6 +11,7 @@ import typer
 
 from sbt.cli.console import clean_stdout, print_json
 from sbt.errors import InputError, RunError
+from sbt.files import as_cell
 
 __all__ = ["metrics"]
 
@@ -80,4 +81,4 @@ def _value(metric: Any, trace: Any) -> float | None:
 def _write(target: Any, columns: list[str], rows: list[dict[str, Any]]) -> None:
     writer = csv.DictWriter(target, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({key: as_cell(value) for key, value in row.items()} for row in rows)

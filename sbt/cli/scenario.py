@@ -85,6 +85,8 @@ def _print_run(run: Run) -> None:
 def _write_trace(path: Path, run: Run) -> None:
     import csv
 
+    from sbt.files import as_cell
+
     if run.states is None:
         return
     rows = run.states.rows()
@@ -92,7 +94,7 @@ def _write_trace(path: Path, run: Run) -> None:
         with path.open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]) if rows else ["time", "actor"])
             writer.writeheader()
-            writer.writerows(rows)
+            writer.writerows({key: as_cell(value) for key, value in row.items()} for row in rows)
     except OSError as error:
         raise InputError(f"--trace must be a file that can be written, but got '{path}': {error.strerror}") from None
 

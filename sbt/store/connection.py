@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import tempfile
 from contextlib import closing
 from pathlib import Path
 
@@ -15,9 +17,24 @@ def connected(path: Path) -> sqlite3.Connection:
     db = sqlite3.connect(f"{address}?mode=ro", uri=True, isolation_level=None)
     try:
         db.execute("PRAGMA schema_version").fetchone()
-    except sqlite3.OperationalError:  # a WAL file that may not be written beside: read what is committed
+    except sqlite3.OperationalError:  # beside the file nothing may be written, which WAL needs
         db.close()
+        log = path.with_name(f"{path.name}-wal")
+        if log.is_file() and log.stat().st_size > 0:  # of a campaign that was killed: what it committed last is only there
+            return _copied(path, log)
         db = sqlite3.connect(f"{address}?immutable=1", uri=True, isolation_level=None)
+    return db
+
+
+def _copied(path: Path, log: Path) -> sqlite3.Connection:
+    """Open a copy of a file with its log; the copy lives as long as the connection."""
+    with tempfile.TemporaryDirectory(prefix="sbt-read-") as folder:
+        for file in (path, log):
+            shutil.copyfile(file, Path(folder, file.name))
+        with closing(sqlite3.connect(Path(folder, path.name), isolation_level=None)) as copy:
+            copy.execute("PRAGMA journal_mode = DELETE")  # takes the log into the file
+        db = sqlite3.connect(Path(folder, path.name).as_uri() + "?mode=ro&immutable=1", uri=True, isolation_level=None)
+        db.execute("PRAGMA schema_version").fetchone()  # open from now on, also without its name
     return db
 
 

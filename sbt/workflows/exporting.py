@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from sbt.campaigns.preventable import with_judgements
 from sbt.errors import InputError, did_you_mean
-from sbt.files import write_atomically
+from sbt.files import as_cell, write_atomically
 from sbt.plugins import Objects
 from sbt.store.database import Store
 from sbt.store.history import named_columns
@@ -49,8 +49,14 @@ def _frame(store: Store, study: Study) -> pd.DataFrame:
 
 def _as_csv(store: Store, study: Study) -> Path:
     """Write one row a run."""
-    frame = _frame(store, study)
+    frame = _cells(_frame(store, study))
     return write_atomically(store.folder / "exports" / "runs.csv", lambda part: frame.to_csv(part, index=False))
+
+
+def _cells(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table for spreadsheets: no text and no name of a column is a formula."""
+    texts = {name: frame[name].map(as_cell) for name in frame.columns if frame[name].dtype.kind not in "biufcM"}
+    return frame.assign(**texts).rename(columns=as_cell)
 
 
 def _as_parquet(store: Store, study: Study) -> Path:
@@ -66,7 +72,7 @@ def _as_boundary(store: Store, study: Study) -> Path:
     from sbt.campaigns.boundary import boundary_points
 
     space = study.scenario.space
-    points = pd.DataFrame(named_columns(boundary_points(study.settings, store.history()), space.names, space.choices))
+    points = _cells(pd.DataFrame(named_columns(boundary_points(study.settings, store.history()), space.names, space.choices)))
     return write_atomically(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
 
 
