@@ -309,6 +309,38 @@ def test_a_worker_that_lets_no_other_code_run_ends_with_its_driver(analytic: Pat
     assert until(lambda: not tagged(str(temporary)))
 
 
+STRAYING = """
+
+def stray(values, seed):
+    import os, tempfile
+    folder = tempfile.mkdtemp()
+    os.chdir(folder)
+    os.rmdir(folder)
+    if os.fork() == 0 and values["a"] > 0.5:
+        raise SystemExit(3)
+    return {"y": values["a"], "noise": 0.0}
+
+STRAY = scenario(stray)
+"""
+
+
+@pytest.mark.parametrize("kind", ["serial", "local"])
+def test_a_run_that_forks_and_leaves_its_folder_changes_nothing(
+    kind: str, analytic: Path, configured: Callable[..., Path], started: Any, temporary: Path
+):
+    """The child that it forked would otherwise go on as a second driver of the same store."""
+    (analytic.parent / "straying.py").write_text(analytic.read_text() + STRAYING)
+    executor = {"kind": kind} | ({"workers": 1} if kind == "local" else {})
+    config = configured("c", campaign="coverage", budget=6, initial=3, batch=3, executor=executor)
+    changes = ("--set", "scenario=straying.py:STRAY", "--set", "store=c", "--set", "metamodel=null")
+    driver = started(*SBT, "run", config.name, "--json", *changes, cwd=config.parent)
+    out, err = driver.communicate(timeout=120)
+    assert out, err
+    assert (driver.returncode, json.loads(out)["ok"], err) == (0, 6, ""), err
+    assert (config.parent / "c" / "report.html").is_file()
+    assert until(lambda: not tagged(str(temporary)))
+
+
 def test_tasks_end_with_their_driver(analytic: Path, started: Any, temporary: Path):
     script = "import time\nfrom sbt.execution.tasks import each\nfor _ in each(time.sleep, [60.0, 60.0], 2): pass\n"
     driver = started(sys.executable, "-c", script)

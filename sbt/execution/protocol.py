@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
 
@@ -101,9 +103,11 @@ class SerialExecutor:
         """
         simulate = self._scenario.simulate
         together = isinstance(simulate, Batched) and simulate.batched
+        place = Path.cwd()
         while queue:
             with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
                 outcomes = self._together(queue) if together else self._alone(queue)
+            _restore(place)
             yield outcomes
 
     def _together(self, queue: deque[Job]) -> list[Outcome]:
@@ -116,6 +120,17 @@ class SerialExecutor:
         while queue and time.perf_counter() - start < _QUICK:
             outcomes.append(run_job(self._scenario, queue.popleft()))
         return outcomes
+
+
+def _restore(place: Path) -> None:
+    """Undo what a run may do to its process, so that the next one and the campaign find the working directory and the streams."""
+    open_missing()
+    try:
+        moved = Path.cwd() != place
+    except FileNotFoundError:  # a folder that the run has removed since
+        moved = True
+    if moved:
+        os.chdir(place)
 
 
 def chunk_of(queue: deque[Job], size: float, workers: int) -> list[Job]:

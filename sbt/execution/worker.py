@@ -104,9 +104,13 @@ def _together(
 
 def _outcome(job: Job, measured: Callable[[], _Measured], seconds: float = 0.0) -> Outcome:
     """Return the outcome of a job: its metrics, or the status and reason of what was raised."""
-    start = time.perf_counter() - seconds
+    start, process = time.perf_counter() - seconds, os.getpid()
     try:
-        metrics, reported, unconfirmed = measured()
+        try:
+            metrics, reported, unconfirmed = measured()
+        finally:
+            if os.getpid() != process:  # a child that the run forked: going on, it would be a second driver or worker
+                os._exit(0)
         interruption.check()  # the code of the run may have caught the KeyboardInterrupt of a signal
         return Outcome(job.index, Status.OK, metrics, "", time.perf_counter() - start, reported, unconfirmed)
     except BaseException as error:  # a user's scenario may raise anything, SystemExit too; the campaign goes on
