@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import importlib.util
 import json
 import os
 import shutil
@@ -180,6 +181,8 @@ def main() -> None:
     parser.add_argument("--corruptions", type=int, metavar="N")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
+    if args.executor == "dask" and importlib.util.find_spec("distributed") is None:
+        parser.error("--executor dask needs distributed: pip install 'sumo-sbt[dask]'")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if args.resumed is not None:

@@ -259,16 +259,18 @@ def test_two_workers_and_a_broken_off_campaign_give_the_same_rows(falsified: Run
     whole = falsified("TWO", "whole", budget=40)
     local = falsified("TWO", "local", budget=40, executor={"kind": "local", "workers": 2})
     assert rows(local) == rows(whole)
-    append, done = Store.append, 0
+    append, done = Store.append_all, 0
 
-    def dies(self: Store, *args: Any) -> None:
+    def dies(self: Store, outcomes: Any, *args: Any) -> None:
         nonlocal done
-        done += 1
-        if done in (7, 25, 43):
-            raise KeyboardInterrupt
-        append(self, *args)
+        before, done = done, done + len(outcomes)
+        for k in (7, 25, 43):
+            if before < k <= done:
+                append(self, outcomes[: k - before - 1], *args)
+                raise KeyboardInterrupt
+        append(self, outcomes, *args)
 
-    monkeypatch.setattr(Store, "append", dies)
+    monkeypatch.setattr(Store, "append_all", dies)
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             falsified("TWO", "broken", budget=40)

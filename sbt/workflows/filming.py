@@ -10,7 +10,7 @@ from typing import Any
 
 from sbt.errors import SbtError
 from sbt.execution.worker import run_traced
-from sbt.plugins.approval import is_trusted
+from sbt.plugins.approval import UntrustedError
 from sbt.problem.outcome import Job
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
@@ -23,25 +23,27 @@ from sbt.workflows.study import Study
 __all__ = ["film_runs", "net_of", "shown_requirement"]
 
 
+_DIRECT = "The scenario gives its metrics directly: there is no trace to show."
+
+
 @cache
 def _lanes(net: Path, content: bytes) -> tuple[Lane, ...]:
     """Return the lanes of a network, which is read once as long as its file stays the same."""
     return lanes(str(net))
 
 
-def film_runs(study: Study, history: History, chosen: Mapping[int, str], *, folder: Path) -> tuple[list[Film], str]:
+def film_runs(study: Study, history: History, chosen: Mapping[int, str]) -> tuple[list[Film], str]:
     """Execute runs again; return those that are as they were, to the last bit, and in words why others are missing.
 
     Args:
         study: as it was configured.
         history: its runs.
         chosen: indices of runs, each with the reason why it is shown.
-        folder: of the store; the code that it names runs only where the user has approved that.
     """
     if not chosen:
         return [], ""
-    if study.own_code and not study.live and not is_trusted(folder):
-        return [], "Films need the scenario's own code, which runs only where the store is trusted."
+    if not (study.kept.get("described") or {"traced": True})["traced"]:
+        return [], _DIRECT
     rows = {int(index): row for row, index in enumerate(history.index)}
     films: list[Film] = []
     missing: dict[int, str] = {}
@@ -49,7 +51,7 @@ def film_runs(study: Study, history: History, chosen: Mapping[int, str], *, fold
         with study.loaded.scope.naming():
             runnable, scenario = study.runnable, study.spec.resolve()
             if runnable.simulate is None:
-                return [], "The scenario gives its metrics directly: there is no trace to show."
+                return [], _DIRECT
             for run, role in chosen.items():
                 record = history.record(rows[run])
                 film = _film(scenario, runnable, record, role)
@@ -57,6 +59,8 @@ def film_runs(study: Study, history: History, chosen: Mapping[int, str], *, fold
                     films.append(film)
                 else:
                     missing[run] = film
+    except UntrustedError:
+        return films, "Films need the scenario's own code, which runs only where it was approved: report --trust."
     except (SbtError, OSError) as error:
         return films, f"Films are missing: {error}"
     note = "; ".join(f"no film of run {run}: {reason}" for run, reason in list(missing.items())[:3])

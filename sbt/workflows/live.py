@@ -63,7 +63,7 @@ def film_of(folder: Path, run: int) -> Json:
         history = store.history()
         if run not in set(history.index.tolist()):
             return {"film": None, "lanes": [], "note": f"There is no run {run} that has ended."}
-        films, note = film_runs(Study.from_store(store), history, {run: f"run {run}"}, folder=folder)
+        films, note = film_runs(Study.from_store(store), history, {run: f"run {run}"})
     reels = Reels()
     data = reels.add(films[0]) if films else None
     return {"film": data, "lanes": reels.lanes, "note": note}

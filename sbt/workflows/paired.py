@@ -124,9 +124,9 @@ def _page(store: Path, studies: Sequence[Study], histories: Sequence[History], r
     within = np.cumsum([took[run] for run in kinds]) <= _SECONDS
     chosen = [run for run, short in zip(kinds, within, strict=True) if short]
     films, notes = [], []
-    for study, history, name in zip(studies, histories, ("a", "b"), strict=True):
+    for study, history in zip(studies, histories, strict=True):
         said = {run: _said(study, history, rows[run]) for run in chosen}
-        found, note = film_runs(study, history, said, folder=store / name)
+        found, note = film_runs(study, history, said)
         films.append({film.run: film for film in found})
         notes.append(note)
     both = [(kinds[run], films[0][run], films[1][run]) for run in chosen if run in films[0] and run in films[1]]

@@ -205,7 +205,7 @@ def _report(
     log = Log(store.history(), tuple(store.iterations()), ())
     told = sensitivities_in(study, log) if getattr(conclusion, "probability", None) else ()
     predict = None if fitted is None else fitted.predict
-    film = partial(film_runs, study, store.history(), folder=store.folder)
+    film = partial(film_runs, study, store.history())
     return write_report(store, study.scenario, predict, conclusion, folder=target, sensitivity=told, film=film)
 
 
