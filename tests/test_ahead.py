@@ -12,6 +12,7 @@ import sbt
 from sbt.campaigns.parts import BatchStage
 from sbt.errors import InputError
 from sbt.loop.stages import Batch, Log
+from sbt.samplers.greedy import select_representative
 from sbt.seeds import run_seed, run_seeds
 
 AHEAD = {"size": 8, "ahead": 1}
@@ -69,3 +70,14 @@ def test_what_needs_all_results_refuses_to_look_ahead(tmp_path: Path):
 def test_seeds_drawn_at_once_are_those_drawn_alone(seed: int):
     indices = [*range(40), 999_999, 2**31]
     assert run_seeds(seed, indices) == [run_seed(seed, k) for k in indices]
+
+
+def test_lazy_selection_takes_what_a_full_one_takes():
+    rng = np.random.Generator(np.random.PCG64(5))
+    u, existing, weight = rng.random((300, 3)), rng.random((40, 3)), rng.random(300) ** 4
+    nearest = ((u[:, None] - existing) ** 2).sum(axis=2).min(axis=1)
+    between, full = ((u[:, None] - u) ** 2).sum(axis=2), list[int]()
+    for _ in range(90):
+        full.append(int(np.argmax(weight @ np.maximum(nearest[:, None] - between, 0.0))))
+        nearest = np.minimum(nearest, between[full[-1]])
+    assert select_representative(u, weight, existing, 90, np.ones(3)).tolist() == full

@@ -34,12 +34,17 @@ SMALLEST = {
     "failing_runs.py": "--seeds 1 --only falsification",
     "failing_estimates.py": "--counts 1 --seeds 1 --problems overlap_d2_half --table {folder}/failing.jsonl",
     "asked_again.py": "--seeds 1 --table {folder}/again.jsonl",
+    "ahead.py": "--seeds 1 --budget 40",
+    "fuzz.py": "--configurations 2 --scenarios 1",
+    "large.py": "--runs 200 --batch 100",
+    "pairs.py": "crossing_pedestrian --seeds 1 --runs 30",
+    "run_price.py": "--runs 2 --repeats 1 --only crossing_pedestrian",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
-SUMO |= {"noise.py", "physics.py", "throughput.py", "transfer.py", "watcher.py"}
+SUMO |= {"fuzz.py", "noise.py", "pairs.py", "physics.py", "run_price.py", "throughput.py", "transfer.py", "watcher.py"}
 LONG = {"batch_size.py", "benchmark_page.py", "snapshots.py"}  # hours; draws what test_benchmark.py runs; minutes on a town
-SHARED = {"street_traffic.py"}  # networks and traffic of the scripts
+SHARED = {"fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
 
 
 def test_every_script_is_known():

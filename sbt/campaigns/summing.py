@@ -143,7 +143,7 @@ def sums(settings: Settings) -> bool:
 
 def took_sum(log: Log) -> bool:
     """Return whether combinations are summed: not where a smaller budget had begun with draws."""
-    return bool(log.iterations) and log.iterations[0].read(EstimationProposal).method == "combinations"
+    return bool(log.iterations) and log.iterations[0].proposal.get("method") == "combinations"
 
 
 def summed(log: Log, settings: Settings, requirement: Requirement | None = None) -> Summed:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -24,6 +25,7 @@ _KEEP, _CHILDREN, _ROUNDS = 60, 16, 3  # best candidates of a round, steps from 
 _STEP, _NARROWER = 0.1, 2.5  # first step in the unit cube, by how much it shrinks from round to round
 _FLIPPED = 0.2  # chance that a step takes another choice: each of three is tried at every good candidate
 _PROBES = 128  # pairs of points that an influence is estimated from: its relative error is about 1 / sqrt(2 x 128)
+_AT_ONCE, _LOOKED_AT = 256, 16  # points whose gain is computed at once: at first, and again
 _LEAST = 0.05  # of the largest influence: an input the metamodel calls irrelevant may not be
 
 
@@ -146,7 +148,8 @@ def select_representative(u: Points, weight: Vector, existing: Points, n: int, s
     """Return the indices (<= n) of points selected one by one so that little weight stays far from a run.
 
     Each selection reduces the weighted sum of squared distances to the nearest run the most: the greedy
-    solution of a weighted k-medoids problem in which the existing runs are centres already.
+    solution of a weighted k-medoids problem in which the existing runs are centres already. What a point reduces only
+    shrinks as others are selected, so that few have to be looked at again each time; the selection is the same.
 
     Args:
         u: (m, d) points that are to be represented, and to select from.
@@ -160,19 +163,29 @@ def select_representative(u: Points, weight: Vector, existing: Points, n: int, s
 
     Source:
         Nemhauser, Wolsey and Fisher (1978), doi 10.1007/BF01588971: the greedy selection reaches at least
-        1 - 1/e of the largest possible reduction.
+        1 - 1/e of the largest possible reduction. Lazy evaluation: Minoux (1978), doi 10.1007/BFb0006528.
     """
     if n == 0:
         return np.empty(0, dtype=np.int64)
     at = u * scale
     between = cdist(at, at, "sqeuclidean")
     nearest = cKDTree(existing * scale).query(at)[0] ** 2
-    selected: list[int] = []
+
+    def gain_of(rows: NDArray[np.intp]) -> Vector:
+        return np.asarray((np.maximum(nearest - between[rows], 0.0) * weight).sum(axis=1))
+
+    most = np.concatenate([gain_of(part) for part in np.array_split(np.arange(len(u)), len(u) // _AT_ONCE + 1)])
+    known, selected = np.zeros(len(u), dtype=np.int64), list[int]()  # so many were selected when `most` was computed
     while len(selected) < n:
-        gain = weight @ np.maximum(nearest[:, None] - between, 0.0)
-        best = int(np.argmax(gain))
-        if gain[best] <= 0.0:
+        best = int(np.argmax(most))
+        if most[best] <= 0.0:
             break
-        selected.append(best)
-        nearest = np.minimum(nearest, between[best])
+        if known[best] == len(selected):
+            selected.append(best)
+            nearest = np.minimum(nearest, between[best])
+            continue
+        stale = np.argpartition(-most, _LOOKED_AT)[:_LOOKED_AT] if len(most) > _LOOKED_AT else np.arange(len(most))
+        stale = stale[known[stale] < len(selected)]
+        stale = np.union1d(stale, best)
+        most[stale], known[stale] = gain_of(stale), len(selected)
     return np.array(selected, dtype=np.int64)

@@ -31,6 +31,7 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History
+from sbt.workflows.earlier import usable_runs
 from sbt.workflows.portable import place_of, where_it_is
 
 if TYPE_CHECKING:
@@ -343,22 +344,7 @@ class Study:
             names = f"{before.config.scenario} there, {self.config.scenario} here"
             rule = f"warm_start.store must have the same scenario, ego and step, but {folder} has another ({names})"
             raise InputError(f"{rule}; transfer: true takes it as a trend")
-        here, there = self.scenario.space.names, tuple(before.kept["names"])
-        if there != here:
-            raise InputError(
-                f"warm_start.store must have the same inputs, but {folder} has others ({', '.join(there)} there, "
-                f"{', '.join(here)} here)"
-            )
-        choices = self.scenario.space.choices
-        if set(choices) != set(history.choices):
-            named = (", ".join(found) or "none" for found in (history.choices, choices))
-            raise InputError("warm_start.store must have choices of the same inputs, but {} there, {} here".format(*named))
-        history = history.recoded(choices)
-        runs = history.where(self.scenario.space.feasible(history.x)) if len(history) else history
-        for metric in (part.metric for part in self.scenario.requirement.parts):
-            if len(runs) and metric not in runs.metrics and runs.ok.any():
-                raise InputError(f"warm_start.store must have measured {metric}, but {folder} did not")
-        return runs
+        return usable_runs(self.scenario, folder, tuple(before.kept["names"]), history)
 
     def _earlier(self, choice: WarmStart) -> tuple[Path, Study, History]:
         """Return folder, study and runs of the campaign that `warm_start` names.
