@@ -46,7 +46,7 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
     """
     if len(u) < 2 or ok.all() or not ok.any():
         return None
-    predictor, least = _fitted(u, ok, rng), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
+    predictor, least = _fitted(u, ok, rng, input_noise=True), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
 
     def score(points: Points) -> Vector:
         p = np.clip(predictor(points).mu, 0.0, 1.0)
@@ -59,7 +59,8 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
 def failure_probability(u: Points, ok: Mask, rng: np.random.Generator) -> Callable[[Points], Vector]:
     """Return P(a run gives no metric) as a function of the metamodel's inputs, never closer to 0 or 1 than n runs can tell.
 
-    The ends are 1 / (n + 2) away: that of an event which n runs have not met, by the rule of succession.
+    The ends are 1 / (n + 2) away: that of an event which n runs have not met, by the rule of succession. Noise of labels that
+    depends on the inputs would cost five times as much, and predicted new labels no better (docs/estimation.md).
 
     Args:
         u: (n, d) metamodel inputs of all runs, n >= 2.
@@ -67,19 +68,15 @@ def failure_probability(u: Points, ok: Mask, rng: np.random.Generator) -> Callab
         rng: of the fit.
     """
     least = 1.0 / (len(u) + 2.0)
-    predictor = _fitted(u, ok, rng)
+    predictor = _fitted(u, ok, rng, input_noise=False)
     return lambda points: np.clip(1.0 - predictor.mu(points), least, 1.0 - least)
 
 
-def _fitted(u: Points, ok: Mask, rng: np.random.Generator) -> GaussianProcessPredictor | ForestPredictor:
-    """Return a predictor of the labels 0 and 1: a Gaussian process, or a forest where there are many.
-
-    One noise for all labels: one that depends on the inputs costs two to five times as much, and predicts new labels no better
-    (docs/estimation.md).
-    """
+def _fitted(u: Points, ok: Mask, rng: np.random.Generator, *, input_noise: bool) -> GaussianProcessPredictor | ForestPredictor:
+    """Return a predictor of the labels 0 and 1: a Gaussian process, or a forest where there are many."""
     from sbt.metamodels.extra_trees import ExtraTrees
     from sbt.metamodels.gaussian_process import GaussianProcess
 
     if len(u) <= _MOST_EXACT:
-        return GaussianProcess(certainly_noisy=True, input_noise=False).fit(u, ok.astype(np.float64), rng)
+        return GaussianProcess(certainly_noisy=True, input_noise=input_noise).fit(u, ok.astype(np.float64), rng)
     return ExtraTrees().fit(u, ok.astype(np.float64), rng)
