@@ -250,7 +250,7 @@ def _statement(runs: History, hits: int, modes: list[FailureMode], bound: Search
     if hits == n - failed:
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
     unsure = [m for m in modes if m.confirmed is not None and m.confirmed < 1.0]
-    unconfirmed = f" {len(unsure)} of them did not fail again with every fresh seed." if unsure else ""
+    unconfirmed = f" Repeats with fresh seeds did not all fail in {plural(len(unsure), 'mode')}." if unsure else ""
     return f"{_counted(hits, n, len(modes))}{unconfirmed}{hidden}"
 
 

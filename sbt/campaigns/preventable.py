@@ -53,6 +53,8 @@ def count_avoided(modes: Sequence[Sequence[Judgement]]) -> list[str]:
     counts = (f"{name} {sum(each.avoided is True for mode in modes for each in mode if each.driver == name)}" for name in drivers)
     unjudged = sum(all(each.avoided is None for each in mode) for mode in modes)
     rest = f"; to {unjudged} the models are not applicable" if unjudged else ""
+    if unjudged == len(modes):
+        return [f"The reference drivers' models are not applicable to {plural(unjudged, 'failure mode')}: nothing was judged."]
     judged = plural(len(modes), "judged failure mode")
     return [f"Of {judged}, reference drivers in the place of ego avoid: {', '.join(counts)}{rest}."]
 

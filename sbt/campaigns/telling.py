@@ -9,6 +9,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
 from sbt.estimators.binomial import interval
 from sbt.loop.stages import Facts
@@ -189,8 +191,14 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
 
 def _worst(mode: FailureMode, facts: Facts) -> str:
     """Return the deepest failure and how often it came back, in words."""
-    metric = facts.requirement.told_as
+    metric, history = facts.requirement.told_as, facts.history
     said = f"the worst, run {mode.representative} ({measured(metric, mode.metric, facts.unit)})"
+    margins = facts.requirement.margins(history)
+    if np.isfinite(margins).any():
+        deepest = int(history.index[int(np.nanargmin(margins))])
+        own = history.index == mode.representative
+        if own.any() and np.nanmin(margins) < margins[own][0]:  # of a noisy simulator: the likeliest is not the deepest
+            said = said.replace("the worst", "the likeliest to fail again", 1) + f"; the deepest is run {deepest}; the former"
     n = mode.confirmation_runs
     if mode.confirmed is None or n == 0:
         return f"{said}, was not repeated"
@@ -241,6 +249,8 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         silent = "The critical runs so far were chosen by results, so their share is no estimate"
     else:
         ends = f"{confidence} interval {number(found.low, 3)} to {number(found.high, 3)}"
+        if every and found.low == found.high:
+            ends = "exact if the simulator is deterministic"
         said = f"The probability of {subject} is {number(found.probability, 3)} ({ends})"
         missed = min(found.undetected_mass_bound, 1.0 - found.probability)
         silent = (
@@ -260,6 +270,8 @@ def _after_estimation(found: EstimationConclusion, n: int) -> str:
         return "campaign: falsification searches for the first critical run; ten times as many runs lower the bound tenfold"
     if found.probability is None:
         return f"a larger budget than {n:,} runs, so that after searching and learning some draws count"
+    if found.combinations is not None and found.low == found.high:
+        return "if equal inputs may end differently, acquisition: {kind: monte_carlo} gives an interval that holds then too"
     if found.gate is not None and found.gate.verdict == "undecided":
         return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
     if found.cov is not None and found.cov > _PRECISE and found.counted:
@@ -276,7 +288,7 @@ def _after_estimation(found: EstimationConclusion, n: int) -> str:
             f"it is as narrow as asked; to bound the unseen by the estimate itself, draw {_round(unseen):,} runs from the inputs'"
             " distribution (acquisition: {kind: monte_carlo})"
         )
-    return "it is as narrow as asked; look at the critical runs in the report"
+    return f"it is as narrow as asked{'; look at the critical runs in the report' if found.hits else ''}"
 
 
 def _condition(facts: Facts) -> str:

@@ -159,7 +159,7 @@ def _status_lines(found: Mapping[str, Any]) -> list[str]:
         lines.append("  validation: " + ", ".join(scores))
     if found["conclusion"] is None:
         return [*lines, f"  not finished{_STATES.get(found['state'], '')}"]
-    return [*lines, *conclusion_lines(found["conclusion"])]
+    return [*lines, *conclusion_lines({**found["conclusion"], "store": found["store"]})]
 
 
 def _progress_line(found: Mapping[str, Any]) -> str:

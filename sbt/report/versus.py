@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sbt.campaigns.wording import number, percent
+from sbt.campaigns.wording import number, percent, plural
 from sbt.files import write_atomically
 from sbt.problem.plain import Json
 from sbt.report.explorer import library, packed, render, scripts, styles
@@ -69,10 +69,10 @@ def _interval(result: Mapping[str, Any], confidence: float) -> str:
 
 
 def _sentences(result: Mapping[str, Any]) -> list[str]:
-    failed = result["before"]["failed"] + result["after"]["failed"]
+    failed, fixed = result["before"]["failed"] + result["after"]["failed"], plural(len(result["fixed"]), "failure")
     return [
-        f"{len(result['fixed']):,} failures were fixed, {len(result['new']):,} are new, {result['still']:,} runs are critical"
-        f" with both, of {result['pairs']:,} pairs of runs with common draws and seeds.",
+        f"{fixed} {'was' if len(result['fixed']) == 1 else 'were'} fixed, {len(result['new']):,} are new,"
+        f" {result['still']:,} runs are critical with both, of {result['pairs']:,} pairs of runs with common draws and seeds.",
         "The interval of the change is exact and paired: only runs with different verdicts tell the egos apart."
         + (f" {failed:,} failed runs count as whatever is worse for the end in question." if failed else ""),
     ]
@@ -90,7 +90,7 @@ def _bars(result: Mapping[str, Any]) -> Json:
 
     bars = [
         {"name": name, "y": 22 + 38 * k, "low": place(each["low"]), "high": place(each["high"]), "at": place(each["probability"]),
-         "text": f"{100 * each['probability']:{'+' if name == 'change' else ''}.3g} %"}
+         "text": f"{100 * each['probability']:+.3g} points" if name == "change" else f"{100 * each['probability']:.3g} %"}
         for k, (name, each) in enumerate(given)
     ]  # fmt: skip
     return {"bars": bars, "zero": place(0.0)}

@@ -210,7 +210,7 @@ class Campaigns:
                 env=self._environment(), stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
         self._resumed = [each for each in self._resumed if each.poll() is None] + [process]
-        return f"resumed; what it says is in {folder.name}/serve.log"
+        return f"resumed; what it says is in {folder / 'serve.log'}"
 
     def _environment(self) -> dict[str, str]:
         own = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}

@@ -146,7 +146,15 @@ def pin_runs(folder: Path, runs: Sequence[str], into: Path) -> Path:
     }  # fmt: skip
     for key, value in values.items():
         page = page.replace(key, value)
-    return write_atomically(into / f"test_pinned_{title}.py", page)
+    path = into / f"test_pinned_{title}_{_runs([again.record.index for again in replays])}.py"
+    if path.is_file() and path.read_text(encoding="utf-8") != page:
+        raise InputError(f"a pin replaces no other one, but {path} is there and differs; remove it, or choose another folder")
+    return write_atomically(path, page)
+
+
+def _runs(runs: Sequence[int]) -> str:
+    """Return runs as a part of a file's name, many of them by their ends and number."""
+    return "_".join(map(str, runs)) if len(runs) <= 5 else f"{runs[0]}_to_{runs[-1]}_{len(runs)}_runs"
 
 
 def _index(run: str, conclusion: JsonMapping) -> int:
