@@ -198,7 +198,7 @@ def _worst(mode: FailureMode, facts: Facts) -> str:
         deepest = int(history.index[int(np.nanargmin(margins))])
         own = history.index == mode.representative
         if own.any() and np.nanmin(margins) < margins[own][0]:  # of a noisy simulator: the likeliest is not the deepest
-            said = said.replace("the worst", "the likeliest to fail again", 1) + f"; the deepest is run {deepest}; the former"
+            said = said.replace("the worst, ", "", 1) + f", the likeliest to fail again (run {deepest} is the deepest)"
     n = mode.confirmation_runs
     if mode.confirmed is None or n == 0:
         return f"{said}, was not repeated"
