@@ -102,7 +102,12 @@ if (typeof Explorer !== "undefined") {
     } }, "Show the film of this run");
     this.part("film").replaceChildren(button);
   };
-  const act = verb => async () => { at("said").textContent = (await asked(`/api/${KEY}/${verb}`, { method: "POST" }).catch(error => ({ said: error.message }))).said; };
+  // A process takes some seconds to begin or to end: until then the button stays as it was pressed.
+  const act = verb => async () => {
+    at(verb).disabled = true;
+    setTimeout(() => { at(verb).disabled = false; }, 15000);
+    at("said").textContent = (await asked(`/api/${KEY}/${verb}`, { method: "POST" }).catch(error => ({ said: error.message }))).said;
+  };
   at("stop").addEventListener("click", act("stop"));
   at("resume").addEventListener("click", act("resume"));
   at("newer").addEventListener("click", async () => { const status = await asked(`/api/${KEY}/status`); await load(status.done); at("newer").hidden = true; });
