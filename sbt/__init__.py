@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         Distribution,
         Empirical,
         Exponential,
+        FieldOfView,
         Film,
         Gumbel,
         InputError,
@@ -82,7 +83,7 @@ _FROM = {
     "sbt.problem.requirement": ("CriticalInterval", "Requirement"),
     "sbt.problem.scenario": ("LogicalScenario Scenario", "Metric", "Roles"),
     "sbt.problem.space": ("ParameterSpace",),
-    "sbt.problem.trace": ("Trace",),
+    "sbt.problem.trace": ("FieldOfView", "Trace"),
     "sbt.store.database": ("PlannedRun",),
     "sbt.workflows.front": (
         "Run", "check_target check", "installed list", "open_result open", "run_campaign run", "simulate_scenario simulate",
@@ -96,8 +97,8 @@ _NAMES = {name.split()[-1]: (module, name.split()[0]) for module, names in _FROM
 
 __all__ = [  # noqa: RUF022  (by use)
     "run", "open", "simulate", "list", "check", "Scenario", "Parameter", "ParameterSpace", "Requirement", "CriticalInterval",
-    "any_of", "all_of", "CombinedRequirement", "Metric", "Roles", "Trace", "Distribution", "Uniform", "Normal", "LogNormal",
-    "Exponential", "Gumbel", "Weibull", "Beta", "Triangular", "SciPy",
+    "any_of", "all_of", "CombinedRequirement", "Metric", "Roles", "Trace", "FieldOfView", "Distribution", "Uniform", "Normal",
+    "LogNormal", "Exponential", "Gumbel", "Weibull", "Beta", "Triangular", "SciPy",
     "Empirical", "KnotProfile", "RecordedProfile", "Prediction", "Result", "Run", "Film", "Progress",
     "CampaignKind", "Campaign", "Batch", "Log", "PlannedRun", "SbtError", "InputError", "PluginError", "RunError", "StoreError",
     "acquisitions", "campaigns", "metamodels", "metrics", "testing", "__version__",

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-import secrets
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sbt.errors import UnwritableError
+from sbt.processes import own_name, remove_abandoned, scratch
 
-__all__ = ["as_cell", "move_atomically", "write_atomically"]
+__all__ = ["as_cell", "move_atomically", "scratch_in", "write_atomically"]
 
 _MODE = 0o644
 
@@ -19,7 +20,7 @@ def write_atomically(path: Path, content: str | bytes | Callable[[Path], object]
     """Write a file beside its place and move it there, so that every reader sees the old one or the new one.
 
     Two processes that write the same file do not disturb each other: the last one wins. Folders that are
-    missing are made.
+    missing are made, and what processes left that were killed while they wrote is removed.
 
     Args:
         path: the file, replaced where it exists.
@@ -39,7 +40,8 @@ def write_atomically(path: Path, content: str | bytes | Callable[[Path], object]
 
 def _written(path: Path, content: str | bytes | Callable[[Path], object]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    remove_abandoned(path.parent)
+    part = path.with_name(f"{own_name(f'.{path.name}')}.part")
     os.close(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, _MODE))  # the process's umask applies
     try:
         if callable(content):
@@ -51,6 +53,14 @@ def _written(path: Path, content: str | bytes | Callable[[Path], object]) -> Pat
         part.unlink(missing_ok=True)
         raise
     return path
+
+
+def scratch_in(folder: Path | None, kind: str) -> tempfile.TemporaryDirectory[str]:
+    """Make a hidden temporary folder in a folder, after what processes left there that were killed is removed.
+
+    None: in that of the system for temporary files.
+    """
+    return scratch(kind, folder)
 
 
 def move_atomically(path: Path, target: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import secrets
 import shutil
 import socket
 import tempfile
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-__all__ = ["SCRATCH", "ProcessId", "machine", "remove_abandoned", "scratch"]
+__all__ = ["SCRATCH", "ProcessId", "machine", "own_name", "remove_abandoned", "scratch"]
 
 SCRATCH = "SBT_SCRATCH"
 """Variable of the environment: the folder in which a worker makes its temporary folders; its driver removes it."""
@@ -75,17 +76,31 @@ def machine() -> str:
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=4).hexdigest()
 
 
-def scratch(kind: str) -> tempfile.TemporaryDirectory[str]:
+def own_name(beginning: str) -> str:
+    """Return a name for a temporary file or folder that says whose it is: `BEGINNING-MACHINE-PID-START-...`."""
+    own = ProcessId.current()
+    return f"{beginning}-{machine()}-{own.pid}-{own.start}-{secrets.token_hex(4)}"
+
+
+def scratch(kind: str, folder: Path | None = None) -> tempfile.TemporaryDirectory[str]:
     """Make a temporary folder of this process: `sbt-KIND-MACHINE-PID-START-...`, or inside that of a worker's driver.
 
     The first call in a process removes the folders of processes that have ended.
+
+    Args:
+        kind: what it is for, small letters.
+        folder: where it shall be, then hidden, after what ended processes left there is removed; None: that of the system
+            for temporary files.
     """
+    if folder is not None:
+        remove_abandoned(folder)
+        prefix = f"{own_name(f'.{kind}')}-"
+        return tempfile.TemporaryDirectory(prefix=prefix, dir=folder, ignore_cleanup_errors=True)
     outer = os.environ.get(SCRATCH)
     if outer is not None and Path(outer).is_dir():
         return tempfile.TemporaryDirectory(prefix=f"{kind}-", dir=outer, ignore_cleanup_errors=True)
     _remove_once(os.getpid(), tempfile.gettempdir())
-    own = ProcessId.current()
-    return tempfile.TemporaryDirectory(prefix=f"sbt-{kind}-{machine()}-{own.pid}-{own.start}-", ignore_cleanup_errors=True)
+    return tempfile.TemporaryDirectory(prefix=f"{own_name(f'sbt-{kind}')}-", ignore_cleanup_errors=True)
 
 
 @cache
@@ -94,13 +109,17 @@ def _remove_once(pid: int, folder: str) -> None:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove the temporary folders of this user's processes on this machine that have ended."""
-    pattern = re.compile(rf"sbt-[a-z]+-{machine()}-(\d+)-(\d+)-\w+")
+    """Remove the temporary files and folders of this user's processes on this machine that have ended."""
+    pattern = re.compile(rf"(?:sbt-[a-z]+|\..+)-{machine()}-(\d+)-(\d+)-[-\w]+(?:\.part)?")
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             match = pattern.fullmatch(entry.name)
             with suppress(OSError):
                 if match is None or entry.stat(follow_symlinks=False).st_uid != os.getuid():
                     continue
-                if not ProcessId(int(match[1]), int(match[2])).alive:
+                if ProcessId(int(match[1]), int(match[2])).alive:
+                    continue
+                if entry.is_dir(follow_symlinks=False):
                     shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    Path(entry.path).unlink()

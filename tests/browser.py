@@ -121,6 +121,11 @@ class Browser:
         for kind in ("keyDown", "keyUp"):
             self._do(self._call("Input.dispatchKeyEvent", type=kind, windowsVirtualKeyCode=code, **named))
 
+    def click(self, x: float, y: float) -> None:
+        """Click at a place of the window (px), as a mouse does."""
+        for kind in ("mousePressed", "mouseReleased"):
+            self._do(self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1))
+
     def picture(self, file: Path) -> Path:
         """Write the whole page as PNG."""
         found = self._do(self._call("Page.captureScreenshot", format="png", captureBeyondViewport=True))

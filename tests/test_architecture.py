@@ -38,7 +38,7 @@ FLOORS = (
     ("__main__",),
 )
 """Rooms from the ground up; those on one floor do not know each other unless stated in NEIGHBOURS."""
-NEIGHBOURS = {"samplers": {"acquisitions"}, "plugins": {"errors", "interruption"}, "files": {"errors"}}
+NEIGHBOURS = {"samplers": {"acquisitions"}, "plugins": {"errors", "interruption"}, "files": {"errors", "processes"}}
 LATE = {
     "metrics": {"sumo"},  # reading recorded FCD needs the networks' geometry
 }

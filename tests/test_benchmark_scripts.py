@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from browser import PROGRAM
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 SMALLEST = {
@@ -29,7 +30,7 @@ SMALLEST = {
     "several.py": "--seeds 1 --what falsification --needs any",
     "boundary_table.py": "--problems testbed:borehole_1e-3:box --methods even --seeds 1 --reference 500 --store {folder}/table",
     "estimation.py": "--problems gayton_hat@200 --seeds 1 --table {folder}/table.jsonl",
-    "faults.py": "--kills 2",
+    "faults.py": "--kills 1 --only export storm",
     "choices.py": "--task falsification --seeds 1 --store {folder}/choices",
     "failing_runs.py": "--seeds 1 --only falsification",
     "failing_estimates.py": "--counts 1 --seeds 1 --problems overlap_d2_half --table {folder}/failing.jsonl",
@@ -38,13 +39,16 @@ SMALLEST = {
     "fuzz.py": "--configurations 2 --scenarios 1",
     "large.py": "--runs 200 --batch 100",
     "pairs.py": "crossing_pedestrian --seeds 1 --runs 30",
+    "report_speed.py": "--runs 20 --scenario cut_in --clicks 2 --opened 1",
     "run_price.py": "--runs 2 --repeats 1 --only crossing_pedestrian",
+    "fidelity.py": "testbed:two_hollows_noisy --cost 0.2 --budget 60 --seeds 1",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
-SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "faults.py", "overhead.py", "slice_teeth.py", "step_length.py"}
+SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py"}
 SUMO |= {"fuzz.py", "noise.py", "pairs.py", "physics.py", "run_price.py", "throughput.py", "transfer.py", "watcher.py"}
-LONG = {"batch_size.py", "benchmark_page.py", "snapshots.py"}  # hours; draws what test_benchmark.py runs; minutes on a town
-SHARED = {"fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
+SUMO |= {"report_speed.py"}  # and Chromium
+LONG = {"batch_size.py", "benchmark_page.py", "known_before.py", "snapshots.py"}  # hours, or minutes
+SHARED = {"disturbing.py", "fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
 
 
 def test_every_script_is_known():
@@ -54,6 +58,8 @@ def test_every_script_is_known():
 @pytest.mark.slow
 @pytest.mark.parametrize("script", [pytest.param(s, marks=[pytest.mark.sumo] if s in SUMO else []) for s in SMALLEST])
 def test_it_runs(script, tmp_path, campaign):
+    if script == "report_speed.py" and PROGRAM is None:
+        pytest.skip("Chromium is not installed")
     if script == "warm_start.py":
         campaign(campaign="coverage", budget=100, store=str(tmp_path / "store"))
     arguments = SMALLEST[script].format(folder=tmp_path).split()

@@ -13,6 +13,7 @@ from scipy.spatial.distance import cdist
 from studies import run_loaded, settings_of
 from typer.testing import CliRunner
 
+import sbt
 from sbt import testbeds
 from sbt.acquisitions import expected_feasibility, straddle
 from sbt.campaigns.exploration import fruitless_runs, should_explore
@@ -329,6 +330,17 @@ def test_boundary_points_are_exported(tmp_path: Path):
     assert len(rows) > 100
     assert 0.25 < critical[0].mean() < 0.75  # half on either side, where 14 % are critical
     assert critical[1].mean() < 0.2
+
+
+def test_where_there_is_no_boundary_that_is_said(tmp_path: Path):
+    keys = {"budget": 12, "metamodel": "gp", "requirement": {"critical": [-100.0, -99.0]}, "executor": "serial"}
+    sbt.run(campaign="coverage", scenario="testbed:four_branch_7", store=tmp_path / "s", report=False, **keys)
+    done = CliRunner().invoke(app, ["export", str(tmp_path / "s"), "--format", "boundary"])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == (
+        "a boundary needs places where the metamodel's P(critical) is 0.5, but it finds none (of 12 runs 0 are critical); "
+        "no file is written\n"
+    )
 
 
 @pytest.mark.parametrize("recalibrate", [False, True])

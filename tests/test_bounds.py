@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
 import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 
+from sbt.config.asked import Asked
+from sbt.config.benchmark import Benchmark
 from sbt.config.load import parse
+from sbt.config.model import Configuration
+from sbt.config.scenario_model import ScenarioModel
 from sbt.errors import InputError, UnwritableError
 from sbt.execution.worker import run_job
 from sbt.files import as_cell, write_atomically
+from sbt.metamodels.base import build
+from sbt.plugins import load, names
 from sbt.problem.distribution import Distribution
 from sbt.problem.outcome import Job
 from sbt.problem.parameter import Parameter
@@ -52,6 +62,69 @@ def test_values_beyond_what_they_can_mean_are_refused(keys: dict[str, object], r
     with pytest.raises(InputError, match=rule) as error:
         _ = Study(parse(json.dumps({"campaign": "coverage", "scenario": "cut_in", **keys}))).settings
     assert len(str(error.value)) < 1000
+
+
+def unbounded(schema: Any, path: str = "") -> list[str]:
+    """Return where a JSON schema takes any whole number, or any number of conditions, metrics, judges, ..."""
+    if isinstance(schema, list):
+        return [each for k, item in enumerate(schema) for each in unbounded(item, f"{path}/{k}")]
+    if not isinstance(schema, dict):
+        return []
+    whole = schema.get("type") == "integer" and not {"maximum", "exclusiveMaximum"} & set(schema)
+    return [path] * whole + [each for key, value in schema.items() for each in unbounded(value, f"{path}/{key}")]
+
+
+def test_every_whole_number_of_a_file_has_an_upper_bound():
+    models = (Configuration, ScenarioModel, Benchmark, Asked)
+    assert [each for model in models for each in unbounded(model.model_json_schema(), model.__name__)] == []
+
+
+@pytest.mark.parametrize("name", names("metamodels"))
+def test_every_setting_of_a_metamodel_has_a_type_and_a_bound(name: str):
+    kind = load("metamodels", name)
+    for preset in (None, *getattr(kind, "PRESETS", {})):
+        assert build(kind, preset)
+    for field in dataclasses.fields(kind):
+        wrong = {"int": (10**12, 1e12, True, "1"), "float": (float("nan"), "1", True), "bool": (1, "yes")}
+        for value in wrong.get(str(field.type).removesuffix(" | None"), ()):
+            with pytest.raises(InputError, match=f"{field.name} must be"):
+                build(kind, settings={field.name: value})
+    with pytest.raises(InputError, match=r"widths must be a list of at most 100, each a whole number of at most [0-9]+"):
+        build(load("metamodels", "bnn"), settings={"widths": [10**9]})
+
+
+@pytest.mark.parametrize(
+    ("keys", "rule"),
+    [
+        ({"judges": ["fsm"] * 1000}, "judges: must have at most 20 entries, but got 1000"),
+        ({"judges": ["fsm", "fsm"]}, "judges: each must be named once, but got 'fsm' again"),
+        ({"metrics": ["pet"] * 1000}, "metrics: must have at most 100 entries"),
+        ({"constraints": ["d_t < 2"] * 1000}, "constraints: must have at most 100 entries"),
+        ({"metamodel": {"kind": "gp", "max_epochs": 1e12}}, "metamodel: max_epochs must be within 10000000"),
+        ({"batch": 10**12}, "batch: must be less than or equal to 10000000"),
+    ],
+)
+def test_long_lists_and_large_numbers_are_refused(keys: dict[str, object], rule: str):
+    with pytest.raises(InputError, match=rule):
+        parse(json.dumps({"campaign": "falsification", "scenario": "cut_in", **keys}))
+
+
+def test_a_wrong_configuration_waits_for_no_library_of_metamodels(tmp_path: Path):
+    """Nor for a scenario's simulator: torch alone takes a second and 200 MB."""
+    (tmp_path / "c.yaml").write_text("campaign: falsification\nscenario: cut_in\nbugdet: 3\ninputs: {d_t: {min: 9, max: 1}}\n")
+    script = (
+        "import sys\nfrom sbt.errors import InputError\nfrom sbt.workflows.study import Study\n"
+        f"try: Study.from_file({str(tmp_path / 'c.yaml')!r})\nexcept InputError as error: print(len(error.errors))\n"
+        "print({'torch', 'sklearn', 'pandas', 'libsumo', 'scipy.stats', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "2\nset()\n"
+
+
+@pytest.mark.parametrize("value", ["!!bool maybe", "!!int x", "!!float abc", "!!timestamp 1", "!!binary x", "!own x", "&a [*a]"])
+def test_odd_tags_of_yaml_are_errors_in_words(value: str):
+    with pytest.raises(InputError, match=r"<text>.*must (be YAML|be a whole number|have at most)"):
+        parse(f"campaign: coverage\nscenario: cut_in\nbudget: {value}\n")
 
 
 def test_a_packed_file_does_not_unpack_to_all_memory(tmp_path: Path):

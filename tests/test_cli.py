@@ -266,6 +266,46 @@ def test_sigterm_is_an_interruption(folder: Path):
     assert (running.returncode, told) == (130, "interrupted\n")
 
 
+SIGNALLED = """
+import os, signal, sys
+
+module = sys.argv.pop()
+
+class Signals:
+    def find_spec(self, name, path=None, target=None):
+        global module
+        if name == module:
+            module = None
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Signals())
+from sbt.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["typer", "sbt.cli.console", "sbt.cli.verbs", "sbt.cli.serve", "numpy", "scipy.special", "sbt.scenarios.cut_in"],
+)
+def test_ctrl_c_while_anything_is_imported_is_one_sentence(folder: Path, module: str):
+    done = subprocess.run(
+        [sys.executable, "-c", SIGNALLED, "simulate", "cut_in", module], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr in ("interrupted, nothing was run yet\n", "interrupted\n")
+
+
+@pytest.mark.parametrize("seconds", [0.25, 0.5, 1.0])
+def test_ctrl_c_at_any_moment_is_told_without_a_traceback(folder: Path, seconds: float):
+    running = subprocess.Popen([*SBT, "run", "c.yaml"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(seconds)
+    running.send_signal(signal.SIGINT)
+    _, told = running.communicate(timeout=30)
+    assert running.returncode in (130, 0)  # it may have been done
+    assert "Traceback" not in told
+
+
 def test_simulate_prints_one_json_object_and_nothing_else(folder: Path):
     done = process("simulate", "plane.py:SCENARIO", "speed=8", "--seed", "3", "--json")
     assert done.returncode == 0
@@ -506,7 +546,18 @@ def test_a_shell_completes_scenarios_and_stores(folder: Path):
     assert complete_stores("other") == []
 
 
-def test_status_says_how_far_a_campaign_is_and_watching_one_that_nobody_runs_ends(folder: Path):
+def test_watching_waits_for_a_campaign_that_may_just_be_starting(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    states = iter(["dead", "dead", "running", "finished"])
+    about = {"store": "s", "runs": {}, "done": 1, "budget": 3, "rate": None, "remaining": None, "iterations": 1}
+    told = {**about, "validation": None, "conclusion": None}
+    monkeypatch.setattr("sbt.cli.campaign._status", lambda folder: {**told, "state": next(states)})
+    monkeypatch.setattr("sbt.cli.campaign._EVERY", 0.0)
+    lines = call("status", str(folder), "--watch").stdout.splitlines()
+    assert [line.split(",")[0] for line in lines[:3]] == ["s: dead", "s: running", "s: finished"]
+
+
+def test_status_says_how_far_a_campaign_is_and_watching_one_that_nobody_runs_ends(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sbt.cli.campaign._STARTING", 0.0)
     said = call("status", str(store(folder / "s")), "--watch").stdout
     assert re.search(r"/s: interrupted, 3 of \d+ runs$", said.splitlines()[0]), said
     assert "not finished: it was interrupted; run it again to go on" in said

@@ -71,3 +71,27 @@ def test_an_estimate_on_warm_ups_has_their_spread(tmp_path, method):
     assert found.high > plain.high
     assert "conditional on the traffic of 20 warm-ups; the interval has the spread" in traffic.sentence()
     assert dataclasses.replace(found, warmed_traffic=None).probability == plain.probability
+
+
+def test_requirements_and_the_rule_of_precision_know_of_the_spread_between_warm_ups(tmp_path):
+    def evaluate(values, seed):
+        warm = 1.5 if seed % 20 < 5 else 0.0
+        return {"y": values["x"] + warm, "z": values["x"] - warm}
+
+    inputs = [sbt.Parameter("x", -4, 4, "", sbt.Normal(0, 1))]
+    requirement = sbt.any_of(sbt.Requirement("y", low=1.0), sbt.Requirement("z", high=-1.0))
+    scenario = sbt.Scenario("warm", inputs=inputs, evaluate=evaluate, requirement=requirement)
+    store = tmp_path / "store"
+    common = {"campaign": "estimation", "acquisition": "monte_carlo", "executor": {"kind": "serial"}, "seed": 1, "initial": 100}
+    plain = sbt.run(scenario=scenario, budget=2000, batch=100, stop={"cov": 0.1}, store=store, **common)
+    with Store.read(store) as opened:
+        history, iterations = opened.history(), tuple(opened.iterations())
+        study = Study.from_store(opened, objects={("scenarios", "object:warm"): scenario}, live=True)
+        (stage,) = study.campaign.stages
+        assert stage.stop(Log(history, iterations, ())) == "cov"
+        history.columns["warm_up"][:] = history.columns["seed"] % 20
+        assert stage.stop(Log(history, iterations, ())) is None
+        found, _ = study.campaign.conclude(Log(history, iterations, ()))
+    for before, after in zip(plain.conclusion.requirements, found.requirements, strict=True):
+        assert after.probability == before.probability
+        assert after.high - after.low > 1.2 * (before.high - before.low)

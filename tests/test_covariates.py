@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import sbt
+from sbt.config.scenario_file import from_file
 from sbt.errors import InputError
 from sbt.plugins import Scope, load
 from sbt.problem.covariates import Covariates, telling_all
@@ -76,8 +77,7 @@ def test_covariates_are_finite_numbers_of_the_pair_alone(name: str) -> None:
     scenario = load("scenarios", name)
     x = scenario.space.from_unit(stream(1, name).random((12, scenario.space.dimension)))
     general = telling_all(replace(scenario, simulate=replace(scenario.simulate, covariates=None)))
-    persons = name == "crossing_pedestrian"  # of whom the general set does not tell
-    for told in (scenario,) if persons else (scenario, general):
+    for told in (scenario, general):
         found, again = Covariates.of(told), Covariates.of(told)
         assert found is not None
         assert again is not None
@@ -142,6 +142,11 @@ def test_what_cannot_be_told_is_said(tmp_path: Path) -> None:
     endless.known_before = lambda values, seed: {"late": float("inf")}  # type: ignore[method-assign]
     with pytest.raises(InputError, match="covariate late must be finite, but is inf at a="):
         run(tmp_path / "endless", scenario=scenario_of(endless))
+    text, rows = {"late": "a"}, [1.0]
+    for told, said in ((text, "covariate late must be a number, but is 'a' at a="), (rows, "must return numbers by name")):
+        endless.known_before = lambda values, seed, told=told: told  # type: ignore
+        with pytest.raises(InputError, match=said):
+            Covariates.of(scenario_of(endless))
 
 
 def test_check_finds_covariates_that_depend_on_what_was_run() -> None:
@@ -163,3 +168,60 @@ def test_a_coverage_states_what_inputs_and_traffic_explain(tmp_path: Path) -> No
     assert found.inputs + found.traffic + found.rest == pytest.approx(1.0)
     assert 0.2 < found.traffic < 0.7
     assert found.rest < 0.1
+
+
+LOOP = """
+def traffic(rng):
+    return rng.exponential(6.0, 3).cumsum()
+
+def simulate(sumo, values, rng):
+    arrivals = traffic(rng)
+    sumo.start(["sumo", "-n", "my.net.xml"])
+
+def covariates(values, rng):
+    return {"first": traffic(rng)[0] - values["gap"]}
+
+LENGTH = 3.0
+"""
+SCENARIO = """
+simulate: loop.py:simulate
+covariates: {covariates}
+ego: ego
+inputs: {{gap: {{min: 1, max: 3}}}}
+duration: 10
+metrics: [ttc_path_min]
+requirement: {{metric: ttc_path_min, critical: [-.inf, 1.0]}}
+"""
+
+
+def test_a_scenario_file_names_the_covariates_of_its_loop(tmp_path: Path) -> None:
+    (tmp_path / "loop.py").write_text(LOOP)
+    path = tmp_path / "scenario.yaml"
+    path.write_text(SCENARIO.format(covariates="loop.py:covariates"))
+    found = Covariates.of(from_file(str(path), tmp_path))
+    assert found is not None
+    assert found.names == ("first",)
+    drawn = stream(7, "loop").exponential(6.0, 3).cumsum()[0]
+    assert found.at(np.array([[2.0]]), [7])[0, 0] == drawn - 2.0, "what the loop's generator draws first"
+    for wrong, said in (
+        ("auto", "covariates must be file.py:NAME"),
+        ("loop.py:LENGTH", "must be a function covariates"),
+        ("loop.py:covariate", "covariates"),
+    ):
+        path.write_text(SCENARIO.format(covariates=wrong))
+        with pytest.raises(InputError, match=f"scenario.yaml:3:.*{said}"):
+            from_file(str(path), tmp_path)
+
+
+def test_the_general_set_knows_when_a_person_crosses_the_way_of_ego() -> None:
+    scenario = load("scenarios", "crossing_pedestrian")
+    general = Covariates.of(telling_all(replace(scenario, simulate=replace(scenario.simulate, covariates=None))))
+    own = Covariates.of(scenario)
+    assert general is not None
+    assert own is not None
+    x = scenario.space.from_unit(stream(2, "persons").random((60, scenario.space.dimension)))
+    here, lane = general.at(x, range(60)), own.at(x, range(60))[:, own.names.index("lane")]
+    past, coming = (here[:, general.names.index(name)] for name in ("person_since", "person_next_1"))
+    told = np.where(lane <= 0.0, -past, coming)
+    assert np.median(np.abs(told - lane)) < 1.5, "the time between ego and the pedestrian at the lane"
+    assert np.corrcoef(told, lane)[0, 1] > 0.8

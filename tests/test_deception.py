@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from sbt.campaigns.modes import FailureRate, connected
+from sbt.campaigns.modes import FailureRate, connected, representative_of
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers import portfolio
@@ -97,6 +97,13 @@ def test_modes_of_a_noisy_simulator_are_joined_relative_to_their_ends():
     assert len(set(connected(fitted, u, np.zeros(3)).tolist())) == 3
     first, second, third = connected(fitted, u, np.zeros(3), noisy=True).tolist()
     assert first == second != third
+
+
+def test_a_mode_is_represented_by_the_run_likeliest_to_fail_again_however_small_the_rates():
+    log_rate, depth, same = np.log([0.04, 0.14, 0.139, 0.06]), np.array([-0.5, -0.1, -0.2, -0.4]), np.zeros(4)
+    assert representative_of(log_rate, depth, same) == 2  # of two that are alike the deeper one
+    assert representative_of(same, depth, same) == 0
+    assert representative_of(same, same, np.array([0.0, 3.0, 1.0, 2.0])) == 1
 
 
 def test_the_interval_of_a_failure_rate_is_exact_and_counts_failed_runs_both_ways():

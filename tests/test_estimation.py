@@ -85,6 +85,8 @@ def test_nothing_critical(campaign: Run):
     assert found["high"] > found["exact_bound"] > 0.0  # 97.5 % and 95 %
     assert found["exact_bound"] < 0.25  # 3 over half of about 30 draws
     assert any("nothing critical was met" in w for w in found["warnings"])
+    assert found["failed_as_critical"] == 0.0
+    assert not found.get("convergence")
 
 
 def test_everything_critical(campaign: Run):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 from scipy.special import gammaincinv, log_ndtr, ndtr
 from scipy.stats import binomtest
 
 from sbt.campaigns.pools import Frame, draw_pool, fit_proposal
+from sbt.campaigns.teaching import select_teaching
 from sbt.estimators.binomial import interval, lower, upper
 from sbt.estimators.choices import log_normal
 from sbt.estimators.events import FailingLogProbability, events
@@ -241,6 +244,19 @@ def test_with_few_hits_the_interval_is_also_that_of_their_number(hits):
     assert mirrored == pytest.approx([low, high], abs=1e-9)
 
 
+@pytest.mark.parametrize("excess", [0.0, 0.004, 0.009])
+def test_an_estimate_that_corrections_take_to_nothing_keeps_the_width_of_its_hits(excess):
+    """One hit of 166 draws: whatever a metamodel claimed and draws took back, the limit is that of the hit alone."""
+    x = np.array([1.0] + [0.0] * 165)
+    claimed = CountedBatch(0.0, 0.0, 0.0, np.ones(166), np.full(166, 1 / 166 + excess), x)
+    found = combine_estimates([claimed])
+    assert found.value <= 0.0 + 1e-12
+    assert found.limit(0.975, side=1, few=True) >= gammaincinv(2.0, 0.975) / 166 - 1e-12
+    assert found.limit(0.975, side=-1, few=True) == 0.0
+    mirrored = combine_estimates([CountedBatch(1.0, 0.0, 0.0, np.ones(166), np.full(166, 165 / 166 - excess), 1.0 - x)])
+    assert mirrored.limit(0.975, side=-1, few=True) <= 1.0 - gammaincinv(2.0, 0.975) / 166 + 1e-12
+
+
 @pytest.mark.parametrize("stop", [False, True])
 def test_intervals_cover_with_a_wrong_metamodel_and_optional_stopping(stop):
     """The metamodel denies most of the failures: corrections are rare and large. 95 % is meant, 0.91 is 2.6 errors below."""
@@ -271,6 +287,27 @@ def test_the_nominal_draws_are_the_first_and_their_share_is_exact():
     first = np.concatenate([d.rows[: d.nominal] for d in drawn])
     expected = float(plan.nominal_probability @ (z[:, 0] > 1.0))
     assert (z[first, 0] > 1.0).mean() == pytest.approx(expected, abs=0.02)  # as in the inputs' distribution
+
+
+def test_runs_that_teach_leave_less_doubt_far_from_a_run_than_draws_and_keep_the_nominal_share():
+    rng = stream(12, "teaching")
+    z, stratum = H.sample(3000, rng)
+    log_h = H.log_density(z)
+    plan = plan_batch(*wrong(z), log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum)
+    runs = z[draw_systematic(plan, 30, z[:, 0], rng).rows]
+
+    def doubt_left(rows):
+        return plan.guided @ cdist(z, np.vstack([runs, z[rows]]), "sqeuclidean").min(axis=1)
+
+    chosen = [select_teaching(plan, 13, z, runs, rng) for _ in range(200)]
+    drawn = [draw_systematic(plan, 13, z[:, 0], rng).rows for _ in range(200)]
+    assert {len(rows) for rows, _ in chosen} == {13}
+    assert max(doubt_left(rows) for rows, _ in chosen) < np.mean([doubt_left(rows) for rows in drawn])
+    assert np.mean([first for _, first in chosen]) == pytest.approx(13 * SHARES[1], abs=0.15)
+    first = np.concatenate([rows[:first] for rows, first in chosen])
+    assert (z[first, 0] > 0.0).mean() == pytest.approx(float(plan.nominal_probability @ (z[:, 0] > 0.0)), abs=0.08)
+    sharp = replace(plan, guided=np.eye(len(z))[0])  # one point holds all the doubt: the others are draws
+    assert len(select_teaching(sharp, 13, z, runs, rng)[0]) == 13
 
 
 def test_meta_is_says_what_the_metamodel_predicts():

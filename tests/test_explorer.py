@@ -19,7 +19,7 @@ from test_report import CRITICAL, fill, metric, predict, scenario_of
 from sbt.problem.outcome import Outcome, Status
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import Metric
-from sbt.problem.trace import Trace
+from sbt.problem.trace import FieldOfView, Trace
 from sbt.report.explorer import packed
 from sbt.report.html import write_report
 from sbt.report.reel import Film, Reels
@@ -38,7 +38,8 @@ def trace_of(k=0):
     speed = np.where(np.isnan(x), np.nan, np.array([[10.0, 2.0, 5.0]]))
     heading = np.where(np.isnan(x), np.nan, np.array([[0.0, math.pi, 0.0]]))
     size = np.array([4.5, 4.5, 4.5]), np.array([1.8, 1.8, 1.8])
-    return Trace(time, ("ego", f"co{EVIL}", "bike"), x, y, heading, speed, 0.0 * speed, *size, ended="collision")
+    names, view = ("ego", f"co{EVIL}", "bike"), FieldOfView(50.0, 2.0)
+    return Trace(time, names, x, y, heading, speed, 0.0 * speed, *size, ended="collision", view=view)
 
 
 NEAREST = Metric("gap", lambda t: float(np.nanmin(np.hypot(t.x[:, 1] - t.x[:, 0], t.y[:, 1] - t.y[:, 0]))), "m")

@@ -96,6 +96,10 @@ def test_runs_are_named_by_index_or_mode_and_must_be_there(tmp_path: Path):
     done = CliRunner().invoke(app, ["pin", str(tmp_path / "s"), "mode:1", str(representative), "--into", str(tmp_path / "t")])
     assert done.exit_code == 0, done.output
     text = Path(done.stdout.strip()).read_text(encoding="utf-8")
+    assert done.stderr == ""
+    harmless = int(result.frame.index[~result.frame["critical"].astype(bool)][0])
+    told = CliRunner().invoke(app, ["pin", str(tmp_path / "s"), str(harmless), "--into", str(tmp_path / "h")])
+    assert told.stderr == f"no failures: runs {harmless} violate nothing; the test guards that they do not begin to\n"
     assert text.count("'seed'") == 1, "one run, named twice, is pinned once"
     assert f"'run': {representative}," in text
     assert json.loads(json.dumps(text.split("FOLDER = ")[1].splitlines()[0])).endswith("/ '.'")

@@ -48,6 +48,16 @@ def test_picks_lie_beneath_the_middle_of_a_plateau_until_a_failure_explains_it()
     assert len(beneath_plateaus(search, seen, found, floor(found), 3, rng)) == 0
 
 
+def test_some_picks_look_at_the_slopes_around_a_floor_that_no_failure_explains():
+    u = SobolSequence(2, 1).points(0, 60)
+    u = u[np.sqrt(((u - CENTRE) ** 2).sum(axis=1)) > 0.09]
+    search, rng = Search(LOW, PROCESS), stream(1, "beside")
+    picks = beneath_plateaus(search, search_data(search, u, floor(u), None, rng), u, floor(u), 8, rng, beside=True)
+    distance = np.sqrt(((picks - CENTRE) ** 2).sum(axis=1))
+    assert (distance[:-2] < 0.3).all()
+    assert ((distance[-2:] > 0.28) & (distance[-2:] < 0.6)).all()
+
+
 @pytest.mark.parametrize("critical", [LOW, CriticalInterval(low=0.0)])
 def test_a_widened_jump_keeps_the_sides_and_comes_back(critical: CriticalInterval, tmp_path: Path):
     rng = stream(3, "step")

@@ -12,6 +12,7 @@ import torch
 from pretended_cuda import pretended_cuda
 from typer.testing import CliRunner
 
+import sbt
 from sbt.cli import app
 from sbt.errors import InputError
 from sbt.problem.parameter import Parameter
@@ -117,3 +118,16 @@ def test_a_campaign_without_metamodel_says_so(campaign, tmp_path):
     done = invoke("predict", tmp_path / "s", "--inputs", tmp_path / "rows.csv")
     assert done.exit_code == 2
     assert "predict needs a campaign with a metamodel" in done.stderr
+
+
+def test_no_cell_of_the_written_table_is_a_formula(tmp_path):
+    inputs = [sbt.Parameter("kind", choices=["=1+1", "car"]), sbt.Parameter("a", 0, 1)]
+    need, names = sbt.Requirement("y", high=0.2), ("y",)
+    scenario = sbt.Scenario("said", inputs, need, evaluate=lambda v, seed: {"y": v["a"]}, metric_names=names)
+    keys = {"budget": 20, "metamodel": {"kind": "et", "trees": 5}, "executor": {"kind": "serial"}}
+    sbt.run(campaign="coverage", scenario=scenario, store=tmp_path / "s", report=False, **keys)
+    (tmp_path / "rows.csv").write_text("kind,a\n=1+1,0.5\n")
+    done = invoke("predict", tmp_path / "s", "--inputs", tmp_path / "rows.csv", "--output", tmp_path / "out.csv")
+    assert done.exit_code == 0, done.output
+    (row,) = csv.DictReader((tmp_path / "out.csv").read_text().splitlines())
+    assert (row["kind"], float(row["a"])) == ("'=1+1", 0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import re
 import shlex
@@ -25,6 +26,7 @@ from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
+from sbt.report.explorer import explorer_data
 from sbt.report.gallery import _lines_of
 from sbt.report.html import write_report
 from sbt.report.influence import influence_of
@@ -269,7 +271,7 @@ def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
     [
         (
             CoverageConclusion(0.163, 0.12, 0.21),
-            "16.3 % of the parameter space of wedge is critical (ttc_min in [-5, 0.5]; 95 % interval 12 % to 21 %)",
+            "16.3 % of what gives a metric in the parameter space of wedge is critical (ttc_min in [-5, 0.5]; 95 % interval",
         ),
         (BoundaryConclusion(0.163, 0.01, 0.1, None), "takes 16.3 % of the parameter space"),
         (
@@ -296,11 +298,12 @@ def test_conclusion_in_words(tmp_path, result, expected):
 
 def test_ego_of_the_campaign_is_not_forgotten(tmp_path):
     scenario = scenario_of(2)
-    with fill(tmp_path, scenario, configuration={"ego": {"kind": "acc"}}) as store:
-        store.conclude({"store": "runs/a b"})
+    (tmp_path / "a b").mkdir()
+    with fill(tmp_path / "a b", scenario, configuration={"ego": {"kind": "acc"}}) as store:
+        store.conclude({"store": "runs/before it was moved"})
         text = page_of(store, scenario, None).text
     assert "which <code>simulate</code> does not know" in text
-    assert "replay &#39;runs/a b&#39; RUN" in text
+    assert f"replay &#39;{store.folder}&#39; RUN" in text
 
 
 def test_requirement_in_words():
@@ -400,7 +403,9 @@ def test_of_runs_with_the_same_margin_the_hardest_impact_comes_first(tmp_path):
         for k, speed in enumerate((3.0, 9.0, 6.0, 0.0)):
             store.append(Outcome(k, Status.OK, {"ttc_min": 0.0 if speed else 2.0, "impact_speed": speed}))
         table = critical_table(store.history(), scenario.requirement, "s")
+        data = explorer_data(Findings.of(store, scenario, None), scenario, None, np.ones(1))
     assert [row[0].text for row in table.rows] == ["1", "2", "0"]
+    assert np.frombuffer(base64.b64decode(data["rank"]), "<i4").tolist() == [2, 0, 1, 3]
 
 
 def test_a_caption_speaks_of_the_lines_there_are():
@@ -409,3 +414,25 @@ def test_a_caption_speaks_of_the_lines_there_are():
     assert "Solid: P = 0.5" in both
     assert "dashed: 0.1 and 0.9" in both
     assert _lines_of(np.array([[0.0, 0.3]]), whole=False) == " Dashed: 0.1."
+
+
+def test_a_first_look_reads_runs_that_are_evenly_spaced(tmp_path):
+    """The same rows as of all runs, at most so many, from the first to the last; those without an outcome are none."""
+    scenario = scenario_of(2)
+    with fill(tmp_path, scenario, runs=60, held_out=40, fits=False) as store:
+        store.plan(9, "boundary", [PlannedRun("boundary", {"d_t": 1.0, "d_v": 2.0})], [7], {})
+        whole, some, all_ = store.history(), store.sample(20), store.sample(500)
+        assert all_.index.tolist() == whole.index.tolist()
+        assert len(some) <= 20
+        assert np.diff(some.index).max() <= 6
+        np.testing.assert_array_equal(some.x, whole.x[some.index])
+        np.testing.assert_array_equal(some.y("ttc_min"), whole.y("ttc_min")[some.index])
+
+
+def test_where_every_run_failed_the_first_sentence_says_so(tmp_path):
+    """With what to do next, and no figure that shows nothing."""
+    scenario = scenario_of(2)
+    with fill(tmp_path, scenario, runs=10, held_out=0, fail=True, fits=False) as store:
+        text = page_of(store, scenario, None, CoverageConclusion(None, 0.0, 1.0)).text
+    assert "Nothing is known of wedge: none of 10 runs gave a metric." in text
+    assert 'id="figure-progress"' not in text

@@ -8,13 +8,18 @@ import pytest
 from typer.testing import CliRunner
 
 import sbt
-from sbt.campaigns.place import boundary_place
+from sbt.campaigns.boundary import BoundaryConclusion
+from sbt.campaigns.parts import CriticalShare
+from sbt.campaigns.place import BoundaryPlace, Cut, Stretch, boundary_place
+from sbt.campaigns.telling import tell_boundary
 from sbt.campaigns.wording import measured, requirement_words, written_unit
 from sbt.cli import app
+from sbt.loop.stages import Facts
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
+from sbt.store.history import History
 
 WEDGE = sbt.Scenario(
     "wedge",
@@ -76,3 +81,23 @@ def test_units_are_printed_as_people_write_them():
     assert written_unit("kg*m^2/s^-3") == "kg*m²/s⁻³"
     assert measured("a", -9.0, "m/s^2") == "a -9 m/s²"
     assert requirement_words(Requirement("braking", low=6.0), "m/s^2") == "braking ≥ 6 m/s²"
+
+
+def test_a_boundary_that_is_less_certain_than_it_is_wide_is_no_answer():
+    """The first sentence says so, and that held-out runs deny the share; a sharp one is told as before."""
+    history = History.of(("a",))
+    facts = Facts(history, Requirement("y", high=0.0), "m", "s")
+    share = CriticalShare(0.5, 0.4, 0.6, counted=100)
+    vague = "Where runs of s are critical (y \N{LESS-THAN OR EQUAL TO} 0 m) is not known sharply yet"
+    for unsure, begins in ((0.01, "In s, a run is critical"), (0.5, vague)):
+        place = BoundaryPlace(("a",), 0.0, 1.0, (Cut(None, (Stretch(0.0, 0.3),), unsure),), {}, {"a": 1.0})
+        first = tell_boundary(BoundaryConclusion(0.3, 0.0, 0.0, None, place=place), share, facts)[0]
+        assert first.startswith(begins)
+        assert first.endswith("The held-out runs deny its figures (below): do not rely on it yet.")
+
+
+def test_few_combinations_are_advised_to_be_run():
+    """Where the budget was smaller than their number."""
+    facts = Facts(History.of(("a",)), Requirement("y", high=0.0), "m", "s", {}, 40)
+    told = tell_boundary(BoundaryConclusion(0.3, 0.0, 0.0, None), CriticalShare(None, 0.0, 1.0), facts)
+    assert told[2].startswith("Next: budget: 40 runs all 40 combinations of the inputs")

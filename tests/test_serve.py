@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import sbt
 uvicorn = pytest.importorskip("uvicorn", reason="the extra serve is not installed")
 
 from browser import PROGRAM, Browser  # noqa: E402
+from test_accessibility import faults  # noqa: E402
 
 from sbt.serve.app import application  # noqa: E402
 from sbt.serve.campaigns import Campaigns  # noqa: E402
@@ -111,6 +113,8 @@ def test_stores_are_shown_in_every_state(served: Served) -> None:
     assert "damaged" in rows["runs/broken"]["error"]
     data = served.json(f"/api/{ended['key']}/explorer")
     assert (data["total"], data["critical_total"]) == (8, ended["critical"])
+    first = served.json(f"/api/{ended['key']}/explorer?first=1")
+    assert {k: first[k] for k in ("total", "index", "sentences")} == {k: data[k] for k in ("total", "index", "sentences")}
     assert data["sentences"]
     assert b"<html" in served.ask(f"/c/{ended['key']}/report")[1]
     assert served.ask(f"/api/{rows['runs/broken']['key']}/explorer")[0] == 500
@@ -202,5 +206,10 @@ def test_the_pages_work_in_a_browser(served: Served, width: int) -> None:
         browser.ask("document.querySelector('[data-part=film] button').click()")
         browser.wait("document.querySelector('[data-part=film] canvas')")
         assert browser.ask("document.documentElement.scrollWidth") <= width
+        if width < 600 and importlib.util.find_spec("axe_core_python") is not None:
+            assert faults(browser) == []
+            browser.open(served.address)
+            browser.wait("document.querySelectorAll('#campaigns tr').length === 2")
+            assert faults(browser) == []
         assert browser.errors == []
         assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {served.address.split("/")[2]}

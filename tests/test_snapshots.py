@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +16,12 @@ from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.sumo import snapshot
-from sbt.sumo.demand import seconds_of
+from sbt.sumo.demand import excerpts, pieces_of, seconds_of
 from sbt.sumo.departures import requested_departures
+from sbt.sumo.template import template
 from sbt.sumo.user_simulation import UserSimulation
+from sbt.sumo.warming import _read
+from tests.own_networks import run_program
 from tests.warm_networks import T0, town
 
 CENTRE = {"accel": 2.0, "tau": 1.25}
@@ -208,6 +212,109 @@ def test_vehicles_are_inserted_beside_warmed_traffic(tmp_path):
 def test_an_insertion_that_cannot_be_is_said(tmp_path, change, reason):
     with pytest.raises(InputError, match=reason):
         simulation(inserting(tmp_path, **change)).isolation.warm  # noqa: B018
+
+
+LOOP = """
+def simulate(sumo, values, rng):
+    assert sumo.simulation.getTime() == 42.0
+    sumo.vehicle.add("ego", "way", "car", departSpeed="5", departLane="1")
+    while True:
+        sumo.simulationStep()
+        if "ego" in sumo.vehicle.getIDList():
+            sumo.vehicle.setSpeed("ego", values["v"] * rng.uniform(0.9, 1.1))
+"""
+
+
+def looping(folder: Path, *, warm: str = "warm_up: {until: 42, seeds: 1}") -> Path:
+    """Write a scenario whose loop adds the ego to warmed traffic and drives it."""
+    town(folder)
+    (folder / "loop.py").write_text(LOOP)
+    (folder / "way.rou.xml").write_text('<routes><route id="way" edges="A0B0 B0C0"/></routes>')
+    sumo = "sumo: {net: town.net.xml, routes: [cars.rou.xml, buses.rou.xml, way.rou.xml], additional: [stops.add.xml]}"
+    (folder / "scenario.yaml").write_text(f"""{sumo}
+simulate: loop.py:simulate
+inputs: {{v: {{min: 5, max: 12}}}}
+{warm}
+ego: ego
+duration: 1
+metrics: [distance_min]
+requirement: {{metric: distance_min, critical: [-.inf, 1.0]}}
+""")
+    return folder / "scenario.yaml"
+
+
+@pytest.mark.sumo
+def test_a_damaged_state_is_made_again(tmp_path):
+    found = simulation(town(tmp_path, warm_up="warm_up: {seeds: 1}"))
+    kept = found.isolated(replace(found.isolation, states=str(tmp_path / "states"), forking=False))
+    whole = kept(CENTRE, 4)
+    (state,) = (tmp_path / "states").glob("*.gz")
+    data = bytearray(state.read_bytes())
+    data[len(data) // 2] ^= 8
+    state.write_bytes(data)
+    _read.cache_clear()
+    assert kept(CENTRE, 4).identical(whole)
+
+
+@pytest.mark.sumo
+def test_a_loop_begins_where_warm_up_says(tmp_path):
+    found = simulation(looping(tmp_path))
+    assert (found.isolation.level, found.isolation.until) == ("snapshot", T0)
+    forked = found({"v": 8.0}, 5)
+    assert forked.identical(found.isolated(replace(found.isolation, forking=False))({"v": 8.0}, 5))
+    assert not forked.identical(found({"v": 8.0}, 6))
+    assert "unless warm_up.until says when" in simulation(looping(tmp_path / "without", warm="")).isolation.why
+
+
+@pytest.mark.slow
+@pytest.mark.sumo
+def test_a_run_that_leaks_costs_itself(tmp_path):
+    path = looping(tmp_path / "town")
+    loop = tmp_path / "town" / "loop.py"
+    leak = "    held = []\n    while values['v'] > 10:\n        held.append(b'x' * 200_000_000)\n        sumo.simulationStep()\n"
+    loop.write_text(loop.read_text().replace("    while True", f"{leak}    while True"))
+    executor = {"kind": "local", "workers": 1, "memory": "1.5 GiB"}
+    rows = sbt.run(campaign="coverage", scenario=str(path), budget=8, seed=1, store=tmp_path / "store", executor=executor).frame
+    leaking = rows["x.v"] > 10
+    assert 0 < leaking.sum() < 8
+    assert (rows["status"][leaking] == "crashed").all()
+    assert (rows["status"][~leaking] == "ok").all()
+
+
+@pytest.mark.sumo
+def test_plain_sumo_drives_an_export_as_the_run(tmp_path):
+    found = simulation(town(tmp_path / "town", warm_up="warm_up: {seeds: 1}"))
+    trace = found(CENTRE, 4).actor("ego")
+    found.write_files(CENTRE, 4, tmp_path / "export")
+    end = str(T0 + 10)
+    run_program(tmp_path / "export", "sumo", "-c", "run.sumocfg", "--fcd-output", "fcd.xml", "--precision", "9", "--end", end)
+    seen = [v for v in ET.parse(tmp_path / "export" / "fcd.xml").getroot().iter("vehicle") if v.get("id") == "ego"]
+    speeds = [float(v.get("speed", "nan")) for v in seen[: len(trace.speed)]]
+    assert speeds == pytest.approx(list(trace.speed), abs=1e-9)
+
+
+def guiding(folder: Path, departs: float) -> Path:
+    """Write a scenario that guides another vehicle, which departs at some time (s)."""
+    inputs = ", a: {profile: {knots: [0, 2]}, min: -2, max: 2}"
+    path = town(folder, warm_up="warm_up: {until: 42, seeds: 1}\nactors: {lead: {acceleration: a}}", inputs=inputs)
+    routes, lead = folder / "ego.rou.xml", f'<trip id="lead" type="car" depart="{departs}" from="A0B0" to="C0D0"/></routes>'
+    routes.write_text(routes.read_text().replace("</routes>", lead))
+    return path
+
+
+@pytest.mark.sumo
+def test_a_guided_vehicle_departs_after_the_warm_up(tmp_path):
+    found, values = simulation(guiding(tmp_path / "after", 43)), {**CENTRE, "a_0": 1.0, "a_1": 2.0}
+    forked = found(values, 3)
+    assert forked.identical(found.isolated(replace(found.isolation, forking=False))(values, 3))
+    with pytest.raises(InputError, match="'lead' departs at 20 s, before the warm-up ends"):
+        simulation(guiding(tmp_path / "before", 20)).isolation.warm  # noqa: B018
+
+
+def test_an_element_ends_before_the_end_of_a_file_of_almost_its_name(tmp_path):
+    (tmp_path / "one.rou.xml").write_text('<routes><vType id="a" ></vType ><route id="r" edges="x"/></routes>')
+    pieces, _ = pieces_of(template(tmp_path / "one.rou.xml"))
+    assert [*excerpts(pieces, {}, tmp_path)] == [b'<vType id="a" ></vType >', b'<route id="r" edges="x"/>']
 
 
 def test_times_are_read_as_sumo_reads_them():

@@ -93,6 +93,16 @@ def test_a_kept_simulation_is_a_fresh_one_whatever_ran_before():
     assert len({(t.ended, len(t.time)) for t in kept}) > 8
 
 
+@pytest.mark.parametrize(("isolation", "kept"), [("auto", True), ("reuse", True), ("fresh", False)])
+def test_a_reference_that_is_asked_for_keeps_nothing_between_loads(isolation: str, kept: bool, monkeypatch: pytest.MonkeyPatch):
+    calls: list[bool] = []
+    monkeypatch.setattr("sbt.sumo.session._keep_xml", lambda: calls.append(True))
+    scenario = CUT_IN.configured(isolation=isolation)
+    assert scenario.simulate is not None
+    scenario.simulate({"d_v": 20.0, "d_t": 1.0}, 0)
+    assert bool(calls) is kept
+
+
 def test_positions_are_centres_and_start_as_specified():
     trace = driving(car(position=100.0, speed=20.0, lane=0), car("co", 180.0, 10.0, 2))({}, 0)
     assert trace.actors == ("ego", "co")

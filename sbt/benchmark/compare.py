@@ -17,10 +17,10 @@ from sbt.config.assemble import assemble, scenario_of
 from sbt.config.load import Loaded
 from sbt.errors import InputError
 from sbt.execution.protocol import SerialExecutor
+from sbt.files import scratch_in
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Status
 from sbt.problem.plain import Json, JsonMapping
-from sbt.processes import scratch
 from sbt.samplers.search import DEFLATION
 from sbt.seeds import run_seed
 from sbt.store.database import Store
@@ -130,7 +130,7 @@ def _run(loaded: Loaded, name: str, seed: int) -> Cell:
 
 def _own(loaded: Loaded, name: str, seed: int) -> tuple[Points, Vector]:
     """Return points and margins of a campaign with one of its own methods, as `sumo-sbt run` runs it."""
-    with scratch("compare") as folder:
+    with scratch_in(None, "compare") as folder:
         store = str(Path(folder) / "store")
         acquisition = loaded.config.acquisition.model_copy(update={"kind": name})
         config = loaded.config.model_copy(update={"seed": seed, "store": store, "acquisition": acquisition, "judges": ()})

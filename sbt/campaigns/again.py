@@ -18,7 +18,7 @@ from sbt.campaigns.crude import NOMINAL
 from sbt.campaigns.known import Known
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
-from sbt.campaigns.summing import counted_with, took_sum
+from sbt.campaigns.summing import counted_with, summed, took_sum
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores, log_normal
 from sbt.estimators.events import events
@@ -65,6 +65,7 @@ class Reused:
         crude: the draws come from the campaign's distribution itself.
         critical, safe: runs of the whole campaign where the new distribution has mass.
         least: effective sample size below which the draws say nothing.
+        exact: all combinations of inputs were run, and no noise was met: sums have no error.
     """
 
     space: ParameterSpace
@@ -77,6 +78,7 @@ class Reused:
     critical: int
     safe: int
     least: float
+    exact: bool = False
 
 
 def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
@@ -116,8 +118,14 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         space, batches, worst, int((~history.ok[every]).sum()), nominal,
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
-        least,
+        least, took_sum(log) and _exact(log, settings),
     )  # fmt: skip
+
+
+def _exact(log: Log, settings: Settings) -> bool:
+    """Return whether every combination was run, by a simulator without noise."""
+    found = summed(log, settings)
+    return found.missing == 0.0 and not found.noisy
 
 
 def _least(drawn: History, old: ParameterSpace, space: ParameterSpace) -> float:

@@ -10,15 +10,18 @@ import numpy as np
 
 from sbt.acquisitions import even, is_greedy
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
+from sbt.campaigns.combinations import EveryCombination, every_combination
+from sbt.campaigns.doubt import TrafficDoubt, traffic_doubt
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
+from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_boundary
 from sbt.campaigns.warmed import conditional_on
-from sbt.campaigns.wording import percent
+from sbt.campaigns.wording import percent, requirement_words
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
@@ -53,6 +56,9 @@ class BoundaryConclusion:
         held_out_fractions: of a combination, the share of the held-out runs that violates each requirement.
         independence: of the metrics of a combination, given the inputs.
         place: where the boundary lies; None: the metamodel sees none.
+        explained: what inputs and drawn traffic explain of the metric; None: it is not known.
+        doubt: what inputs and drawn traffic decide of whether a run is critical; None: it is not known.
+        every_combination: what is known because every combination of the inputs was run; None: some were not.
     """
 
     critical_fraction: float | None
@@ -69,6 +75,8 @@ class BoundaryConclusion:
     independence: Independence | None = optional()
     place: BoundaryPlace | None = optional()
     explained: ExplainedVariance | None = optional()
+    doubt: TrafficDoubt | None = optional()
+    every_combination: EveryCombination | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -77,8 +85,13 @@ class BoundaryConclusion:
 
     def sentences(self, facts: Facts) -> list[str]:
         """Return where the boundary lies, what that does not tell, what to do next, and then the details."""
+        if none_gave_a_metric(facts):
+            return nothing_known(facts)
         measured = self.held_out_fraction if self.held_out_fraction is not None else share_among_held_out(facts)
-        found = [*tell_boundary(self, measured, facts), *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
+        every = self.every_combination
+        condition = requirement_words(facts.requirement, facts.unit, facts.units)
+        told = tell_boundary(self, measured, facts) if every is None else every.sentences(facts.scenario, condition)
+        found = [*told, *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
         if self.failing_fraction is not None:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
@@ -88,6 +101,8 @@ class BoundaryConclusion:
             found += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         if self.explained is not None:
             found.append(self.explained.sentence(facts.requirement.told_as))
+        if self.doubt is not None:
+            found.append(self.doubt.sentence())
         return found
 
 
@@ -117,11 +132,14 @@ def recipe(settings: Settings) -> Campaign:
         shares = r.critical_fraction, r.expected_misclassified, r.ambiguous_volume
         if r.critical_fraction < _SMALL and not settings.scenario.requirement.combined:
             shares = learner.fine_shares(fitted)
+        every = every_combination(settings.scenario, log.history)
+        shares = shares if every is None else (every.share, 0.0, 0.0)
         place = boundary_place(partial(_log_odds, fitted, settings), settings.scenario, settings.seed)
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
-            place, explained_variance(settings, log.history),
+            place, explained_variance(settings, log.history), traffic_doubt(settings, log.history),
+            every,
         ), fitted  # fmt: skip
 
     stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even)

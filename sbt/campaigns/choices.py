@@ -19,6 +19,7 @@ from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
+from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.greedy import influence_on_mean, propose_greedily, select_diverse, select_representative
 from sbt.samplers.pool import PoolSequence
@@ -111,15 +112,14 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     return Chosen(so_far, proposal)
 
 
-def _typical(
-    settings: Settings, fitted: FittedMetamodel, log: Log, n: int, taken: Points, start: int
-) -> tuple[RoiDraw, Points]:
+def _typical(settings: Settings, fitted: FittedMetamodel, log: Log, n: int, taken: Points, start: int) -> tuple[RoiDraw, Points]:
     """Return a draw from a_BI, and the n of its points that represent it best beside the runs there are."""
     space = settings.scenario.space
     drawn = max(n, min(_DRAWN + 2 * n, _MOST_DRAWN)) if n else 0
     draw, x = _draw(settings, fitted, boundary, log, drawn, taken=taken, start=start, most=_MAX_REJECTION_CANDIDATES)
     u, there = (np.clip(space.to_unit(p), 0.0, 1.0) for p in (x, np.concatenate([log.planned.x, taken])))
-    scale = influence_on_mean(fitted.predict, space.dimension, stream(settings.seed, "representative", log.iteration))
+    rng = stream(settings.seed, "representative", log.iteration)
+    scale = influence_on_mean(fitted.sketch or fitted.predict, space.dimension, rng)
     weight = np.exp(_score(settings, fitted, boundary)(u))  # a_BI once more: sharper than it was drawn
     at = space.cube.embedded
     return draw, x[select_representative(at(u), weight, at(there), n, space.cube.spread(scale))]
@@ -141,12 +141,23 @@ def _position(log: Log) -> int:
 
 
 def _score(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acquisition) -> Callable[[Points], Vector]:
+    if fitted is None or acquisition is even:
+        return lambda u: np.zeros(len(u))
+    return _score_by(settings, fitted, acquisition, fitted.predict)
+
+
+def _rough_score(settings: Settings, fitted: FittedMetamodel, acquisition: Acquisition) -> Callable[[Points], Vector] | None:
+    """Return about the score, many times quicker; None where there is no such thing."""
+    return None if fitted.sketch is None else _score_by(settings, fitted, acquisition, fitted.sketch)
+
+
+def _score_by(
+    settings: Settings, fitted: FittedMetamodel, acquisition: Acquisition, predict: Callable[[Points], Prediction]
+) -> Callable[[Points], Vector]:
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
 
     def score(u: Points) -> Vector:
-        if fitted is None or acquisition is even:
-            return np.zeros(len(u))
-        found = log_scores(acquisition, fitted.predict(u), critical, space.log_density(space.from_unit(u)))
+        found = log_scores(acquisition, predict(u), critical, space.log_density(space.from_unit(u)))
         return found if fitted.log_success is None else found + fitted.log_success(u)  # a run that fails shows nothing
 
     return score
@@ -185,7 +196,8 @@ def _draw(
         accept_filter=_admissible(settings), bound=bound, fill=False,
     )  # fmt: skip
     if draw.method == "short" and acquisition is not even:
-        draw = _particles(settings, score, bound, draw, label, n)
+        rough = None if fitted is None else _rough_score(settings, fitted, acquisition)
+        draw = _particles(settings, score, rough, bound, draw, label, n)
         if draw.method == "short":  # the score is -inf wherever one looks
             return _draw(settings, fitted, even, log, n, taken=taken, start=begin)
     if len(draw.u) < n and fitted is not None and fitted.log_success is not None:  # too little of the space is worth a run
@@ -196,19 +208,18 @@ def _draw(
 
 
 def _particles(
-    settings: Settings, score: Callable[[Points], Vector], bound: Callable[[Points], Vector] | None, draw: RoiDraw, label: str,
-    n: int,
+    settings: Settings, score: Callable[[Points], Vector], rough: Callable[[Points], Vector] | None,
+    bound: Callable[[Points], Vector] | None, draw: RoiDraw, label: str, n: int,
 ) -> RoiDraw:  # fmt: skip
     """Return the draw with points of a sequential Monte Carlo sampler instead of picks among the rejected."""
     rng, admissible = stream(settings.seed, "smc", label), _admissible(settings)
 
-    def inside(u: Points) -> Vector:
-        value = score(u)
-        return value if admissible is None else np.where(admissible(u), value, -np.inf)
+    def inside(value_of: Callable[[Points], Vector]) -> Callable[[Points], Vector]:
+        return value_of if admissible is None else lambda u: np.where(admissible(u), value_of(u), -np.inf)
 
     found = smc(
-        inside, settings.scenario.space.dimension, rng, particles=max(1024, 2 * n), start=max(4096, 2 * n), bound=bound,
-        cube=settings.scenario.space.cube, uniform=_feasible(settings),
+        inside(score), settings.scenario.space.dimension, rng, particles=max(1024, 2 * n), start=max(4096, 2 * n), bound=bound,
+        cube=settings.scenario.space.cube, uniform=_feasible(settings), rough=None if rough is None else inside(rough),
     )  # fmt: skip
     if found is None:
         return draw
@@ -243,7 +254,7 @@ def _greedy(
     scenario, space = settings.scenario, settings.scenario.space
     rng = stream(settings.seed, "greedy", log.iteration)
     score, admissible = _score(settings, fitted, acquisition), _admissible(settings)
-    scale = influence_on_mean(fitted.predict, space.dimension, rng)
+    scale = influence_on_mean(fitted.sketch or fitted.predict, space.dimension, rng)
     there = np.clip(space.to_unit(np.concatenate([log.planned.x, taken])), 0.0, 1.0)
     if scenario.pool is not None:
         rows = _rows(settings, log, taken)
@@ -256,6 +267,7 @@ def _greedy(
         return np.clip(space.to_unit(space.from_unit(v)), 0.0, 1.0)
 
     u, looked = propose_greedily(
-        score, there, n, scale, rng, snap=snap, admissible=admissible, cube=space.cube, uniform=_feasible(settings)
-    )
+        score, there, n, scale, rng, snap=snap, admissible=admissible, cube=space.cube, uniform=_feasible(settings),
+        rough=_rough_score(settings, fitted, acquisition),
+    )  # fmt: skip
     return space.from_unit(u), looked

@@ -43,7 +43,7 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
         prior = pool.probability if batch.read(EstimationProposal).method == "difference" else 0.0
         of_batch = CountedBatch(
             prior, pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
-            critical[rows].astype(np.float64),
+            critical[rows].astype(np.float64), draws.weight,
         )  # fmt: skip
         stated = draws.failed_critical if failed_critical else None
         found.append(of_batch if stated is None else with_event(of_batch, stated))
@@ -69,6 +69,11 @@ def _counted(log: Log) -> Iterator[tuple[Iteration, PoolSummary, CountedDraws]]:
 def counted_iterations(log: Log) -> list[int]:
     """Return the numbers of the batches that count."""
     return [batch.number for batch, _, _ in _counted(log)]
+
+
+def _denied(proposal: EstimationProposal) -> float:
+    """Return the P(critical) below which a critical draw is a surprise; beside other drivers much less than the mean is none."""
+    return _DENIED * (proposal.pool.probability if proposal.pairs is not None and proposal.pool is not None else 1.0)
 
 
 @dataclass(frozen=True)
@@ -97,14 +102,15 @@ class Seen:
         history = log.history
         critical = settings.scenario.requirement.critical_runs(history)
         drawn = np.isin(history.stage, (DRAWN, LEARNED))
-        rows, pi = [np.empty(0, dtype=np.intp)], [np.empty(0)]
+        rows, surprising = [np.empty(0, dtype=np.intp)], [np.empty(0, dtype=np.bool_)]
         for batch in log.iterations:
-            nominal = batch.read(EstimationProposal).nominal
+            proposal = batch.read(EstimationProposal)
+            nominal = proposal.nominal
             if nominal is not None:
                 first = np.flatnonzero(drawn & (history.iteration == batch.number))[: len(nominal.pi)]
                 rows.append(first)
-                pi.append(np.array(nominal.pi)[: len(first)])
-        mine, denied = np.concatenate(rows), np.concatenate(pi) < _DENIED
+                surprising.append(np.array(nominal.pi)[: len(first)] < _denied(proposal))
+        mine, denied = np.concatenate(rows), np.concatenate(surprising)
         return cls(
             int(critical.sum()), int((history.ok & ~critical).sum()), len(mine), int(critical[mine].sum()),
             int((~history.ok[mine]).sum()), int((critical[mine] & denied).sum()),

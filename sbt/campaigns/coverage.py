@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from sbt.campaigns.choices import evenly
 from sbt.campaigns.each import each_share, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
+from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_share
@@ -51,8 +52,11 @@ class CoverageConclusion:
 
     def sentences(self, facts: Facts) -> list[str]:
         """Return what was found in words."""
+        if none_gave_a_metric(facts):
+            return nothing_known(facts)
         told = [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
-        whole = CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted)
+        lost = int((~facts.history.ok).sum())
+        whole = CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted, lost)
         return [*tell_share(whole, facts), *shares_words(self.requirements), *conditional_on(facts.history), *told]
 
 

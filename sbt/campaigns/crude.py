@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sbt.campaigns.clustering import spread_of_share
 from sbt.campaigns.records import COUNT, EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.estimators.monte_carlo import Proportion
@@ -47,8 +48,11 @@ class MonteCarloStage:
             return "budget"
         target = self.settings.stop.get("cov")
         if target is not None and log.iteration >= _FEWEST_BATCHES:
-            share = nominal_proportion(log, self.settings)
-            if share.hits >= _FEWEST_HITS and share.cov is not None and share.cov <= target:
+            share, history = nominal_proportion(log, self.settings), log.history
+            critical = self.settings.scenario.requirement.critical_runs(history)
+            between = spread_of_share(history, history.stage == NOMINAL, critical)
+            differing = between is not None and between.exceeds(target, share.value)
+            if share.hits >= _FEWEST_HITS and share.cov is not None and share.cov <= target and not differing:
                 return "cov"
         return None
 

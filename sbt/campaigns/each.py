@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sbt.campaigns.clustering import spread_of_draws, spread_of_share
 from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations, with_event
 from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion
+from sbt.campaigns.gate import Limits
 from sbt.campaigns.parts import CriticalShare, share_of
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.summing import summed, took_sum
 from sbt.campaigns.wording import number, percent
-from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
+from sbt.estimators.intervals import FEW_HITS, CombinedEstimate, CountedBatch, combine_estimates
 from sbt.loop.stages import Log
 from sbt.problem.requirement import Requirement
 from sbt.store.history import History
@@ -77,7 +79,10 @@ def _from_nominal(log: Log, settings: Settings, stage: str, confidence: float) -
     tail, found = 0.5 * (1.0 + confidence), []
     for part in settings.scenario.requirement.parts:
         share = nominal_proportion(log, settings, stage, part)
-        found.append(RequirementEstimate(part.label, share.value, share.lower(tail), share.upper(tail), share.hits))
+        between = spread_of_share(log.history, log.history.stage == stage, part.critical_runs(log.history))
+        limits = Limits(share.lower, share.upper)
+        limits = limits if between is None else between.widened(limits, share.value)
+        found.append(RequirementEstimate(part.label, share.value, limits.lower(tail), limits.upper(tail), share.hits))
     return tuple(found)
 
 
@@ -94,9 +99,20 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
         if min(hits, misses) == 0:  # no variance is known: the draws from the inputs' distribution bound it
             ends = _bounds(part, log, settings, tail)
         else:
-            ends = low.limit(tail, side=-1, few=few), high.limit(tail, side=1, few=few)
+            ends = _ends(log, safe, value, low, high, few=few, confidence=tail)
         found.append(RequirementEstimate(part.label, value, min(ends[0], value), max(ends[1], value), hits))
     return tuple(found)
+
+
+def _ends(
+    log: Log, batches: list[CountedBatch], value: float, low: CombinedEstimate, high: CombinedEstimate, *, few: bool,
+    confidence: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Return the ends of an interval, at least as wide as the spread between warm-ups says."""
+    between = spread_of_draws(log, batches)
+    limits = Limits(lambda c: low.limit(c, side=-1, few=few), lambda c: high.limit(c, side=1, few=few))
+    limits = limits if between is None else between.widened(limits, value)
+    return limits.lower(confidence), limits.upper(confidence)
 
 
 def _bounds(part: Requirement, log: Log, settings: Settings, confidence: float) -> tuple[float, float]:

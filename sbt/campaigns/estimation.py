@@ -9,15 +9,19 @@ from typing import Any
 from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
+from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
+from sbt.campaigns.levels import LevelsTold, is_two_level, levels_told
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
+from sbt.campaigns.pairing import PairStage, pairs_of, pairs_words
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.stopping import FEWEST_BATCHES
 from sbt.campaigns.summing import SummingStage, summed, sums, took_sum
 from sbt.campaigns.telling import tell_estimation
-from sbt.campaigns.warmed import WarmTraffic, warmed_limits, warmed_traffic
+from sbt.campaigns.two_level import TwoLevelStage
+from sbt.campaigns.warmed import WarmTraffic, warmed_traffic
 from sbt.campaigns.wording import number, plural
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
@@ -68,6 +72,9 @@ class EstimationConclusion:
         requirements: of a combination, the probability of each requirement, from the same draws.
         warmed_traffic: what the result is conditional on, where runs began with warmed traffic.
         combinations: of whole numbers and choices, where all of them were to be run and their probabilities summed.
+        fidelity: what coarse runs did for it, where there are some.
+        pairs: of inputs and seed, from which counted runs were drawn by what the seed draws; None: seeds were not looked at.
+        explained: what inputs and drawn traffic explain of the metric; None: it is not known.
     """
 
     probability: float | None
@@ -90,6 +97,9 @@ class EstimationConclusion:
     requirements: tuple[RequirementEstimate, ...] | None = optional()
     warmed_traffic: WarmTraffic | None = optional()
     combinations: int | None = optional()
+    fidelity: LevelsTold | None = optional()
+    pairs: int | None = optional()
+    explained: ExplainedVariance | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -101,12 +111,15 @@ class EstimationConclusion:
         noise = [] if self.simulator_noise is None else self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         noise = [*estimates_words(self.requirements, self.confidence), *noise]
         noise += [] if self.warmed_traffic is None else [self.warmed_traffic.sentence()]
+        noise += [] if self.fidelity is None else [self.fidelity.sentence()]
         details = {"coefficient of variation": self.cov, "effective sample size": self.effective_sample_size}
         behind = [f"Behind it: {', '.join(f'{k} {number(v, 3)}' for k, v in details.items() if v is not None)}."]
         behind = behind if self.probability is not None and self.exact_bound is None else []
         if self.failed_as_critical is not None and self.failed_as_critical != self.probability:
             behind.append(f"If every failed run were critical, it would be {number(self.failed_as_critical, 3)}.")
-        return [*tell_estimation(self, facts), *behind, *noise]
+        traffic = [] if self.pairs is None or self.counted is None else [pairs_words(self.pairs, self.counted)]
+        traffic += [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
+        return [*tell_estimation(self, facts), *behind, *traffic, *noise]
 
 
 Concluded = tuple[EstimationConclusion, Limits]
@@ -124,6 +137,12 @@ def recipe(settings: Settings) -> Campaign:
     if settings.scenario.pool is not None:
         raise InputError("estimation needs a scenario that can be run anywhere, but recorded rows have no proposal density")
     method = settings.method
+    if settings.coarse_cost is not None:
+        if method not in ("auto", "difference") or settings.transfer is not None or settings.prior_runs is not None:
+            got = f"acquisition.kind {method}" if method not in ("auto", "difference") else "warm_start"
+            raise InputError(f"fidelity goes with acquisition.kind auto, and without warm_start, but got {got}")
+        rule = "coarse runs choose what is run next (fidelity)"
+        return replace(_campaign(settings, TwoLevelStage(settings), _from_draws), depends=rule)
     if method == "auto" and settings.scenario.space.dimension >= _HIGH_DIMENSION:
         if settings.transfer is not None:
             rule = f"warm_start.transfer needs fewer than {_HIGH_DIMENSION} inputs, or acquisition.kind difference"
@@ -139,7 +158,8 @@ def recipe(settings: Settings) -> Campaign:
     if method == "subset":
         return _campaign(settings, SubsetStage(settings), _from_repeats)
     if method == "difference":
-        return _campaign(settings, SequentialStage(settings), _from_draws)
+        pairs = settings.covariates is not None and settings.transfer is None and settings.prior_runs is None
+        return _campaign(settings, PairStage(settings) if pairs else SequentialStage(settings), _from_draws)
     raise InputError(f"estimation draws by auto, difference, monte_carlo or subset, but got '{method}'")
 
 
@@ -156,7 +176,10 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
         gate = None if settings.gate is None else gate_verdict(limits, settings.gate, found.undetected_mass_bound)
         each = each_estimate(log, settings)
-        return replace(found, gate=gate, simulator_noise=noise, requirements=each, warmed_traffic=traffic), None
+        return replace(
+            found, gate=gate, simulator_noise=noise, requirements=each, warmed_traffic=traffic,
+            fidelity=levels_told(log, settings), pairs=pairs_of(log), explained=explained_variance(settings, log.history),
+        ), None  # fmt: skip
 
     return Campaign((stage,), conclude)
 
@@ -164,7 +187,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
 def _on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: WarmTraffic) -> Concluded:
     """Return the conclusion with an interval that has the spread between warm-ups."""
     value, error = found.probability, traffic.std_error
-    limits, tail = warmed_limits(limits, value, traffic), 0.5 * (1.0 + _CONFIDENCE)
+    limits, tail = traffic.widened(limits, value), 0.5 * (1.0 + _CONFIDENCE)
     cov = found.cov if not value or error is None else max(found.cov or 0.0, error / value)
     warnings = found.warnings
     if value and error is not None and error / value > (found.cov or 0.0):
@@ -194,6 +217,10 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
     few_low, few_high = min(hits, counted - hits) < FEW_HITS, min(worst, misses) < FEW_HITS  # the same where no run failed
     value, exact_bound = _clipped(low.value), None
     limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
+    failing = not log.history.ok.all()
+    if hits and misses:
+        unstated = failing and any(map(is_two_level, log.iterations))
+        limits = _held(limits, seen, low.value, high.value, unstated=unstated)
     warnings = []
     if not seen.critical:
         limits, value = _nothing_critical(seen), 0.0
@@ -227,10 +254,11 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         )
     return _conclusion(
         value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,
-        effective_sample_size=low.effective_sample_size, failed_as_critical=max(_clipped(high.value), value),
+        effective_sample_size=low.effective_sample_size,
+        failed_as_critical=max(_clipped(high.value), value) if failing else value,
         undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
         largest_weight_share=low.largest_share,
-        convergence=_convergence(log, safe, critical),
+        convergence=_convergence(log, safe, critical) if seen.critical else None,
         counted=counted, exact_bound=exact_bound,
     ), limits  # fmt: skip
 
@@ -255,6 +283,23 @@ def _uncounted(log: Log, settings: Settings) -> Concluded:
         return _conclusion(None, limits, warnings=(few,)), limits
     limits = _nothing_critical(seen)
     return _conclusion(None, limits, warnings=(few, _NOTHING), exact_bound=limits.upper(_CONFIDENCE)), limits
+
+
+def _held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool) -> Limits:
+    """Return limits that reach the exact bounds by draws from the inputs' distribution, where an estimate left [0, 1].
+
+    Args:
+        limits: by the estimates.
+        seen: what these draws met.
+        low: the estimate with failed runs as safe.
+        high: as critical.
+        unstated: runs failed, and no belief states where: the upper limit reaches the exact bound too.
+    """
+    unmet = high <= 0.0 or unstated
+    return Limits(
+        (lambda c: min(limits.lower(c), 1.0 - seen.most(seen.draws - seen.hits, c))) if low >= 1.0 else limits.lower,
+        (lambda c: max(limits.upper(c), seen.most(seen.hits + seen.failed, c))) if unmet else limits.upper,
+    )
 
 
 def _nothing_critical(seen: Seen) -> Limits:
@@ -345,5 +390,5 @@ ESTIMATION = CampaignKind(
     "probability of a critical scenario under the inputs' distribution", recipe, EstimationConclusion, acquisition="auto",
     most_initial=15, batch=15,
     methods=("auto", "difference", "monte_carlo", "subset"), stop={"cov": 0.1}, metamodel_free=("monte_carlo", "subset"),
-    takes_gate=True,
+    takes_gate=True, takes_fidelity=True,
 )  # fmt: skip

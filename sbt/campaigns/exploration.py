@@ -27,6 +27,7 @@ __all__ = ["exploration_share", "explore", "fruitless_runs", "should_explore", "
 _SHARE, _SHARE_HIDDEN, _SHARE_UNKNOWN = 0.5, 0.75, 0.9
 """Shares of a batch that explore; where plateaus may hide regions; and there before the first critical run."""
 _RARE = 0.01  # critical share of the space below which a region is easily missed
+_MOST_ROWS = 1000  # that the search learns from: it looks for regions, not for their edges, and costs the square of them
 _PATIENCE = 0.2  # of the budget: exploratory runs without a new region that end the exploration
 
 
@@ -104,7 +105,7 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
     seen = log.history.where(log.history.stage != VALIDATION)
     search = Search(
         scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
-        lambda u: space.feasible(space.from_unit(u)), cube=space.cube,
+        lambda u: space.feasible(space.from_unit(u)), cube=space.cube, most_rows=_MOST_ROWS,
     )  # fmt: skip
     y = scenario.requirement.values(seen)
     u = np.clip(space.to_unit(seen.x), 0.0, 1.0)

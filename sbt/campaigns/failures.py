@@ -10,6 +10,7 @@ import numpy as np
 
 from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
+from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
@@ -121,6 +122,8 @@ class FalsificationConclusion:
 
     def sentences(self, facts: Facts) -> list[str]:
         """Return whether the requirement is falsified, and what follows from the runs."""
+        if none_gave_a_metric(facts):
+            return nothing_known(facts)
         said = tell_failures(self, share_among_held_out(facts), facts)
         said += [self.statement] if self.statement and self.statement != _plain(facts.history, self) else []
         if self.simulator_noise is not None:
@@ -249,9 +252,14 @@ def _statement(runs: History, hits: int, modes: list[FailureMode], bound: Search
         )
     if hits == n - failed:
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
-    unsure = [m for m in modes if m.confirmed is not None and m.confirmed < 1.0]
+    unsure = [m for m in modes if m.confirmed is not None and _uncritical(m.confirmed, m)]
     unconfirmed = f" Repeats with fresh seeds did not all fail in {plural(len(unsure), 'mode')}." if unsure else ""
     return f"{_counted(hits, n, len(modes))}{unconfirmed}{hidden}"
+
+
+def _uncritical(confirmed: float, mode: FailureMode) -> bool:
+    """Return whether some repetition gave a metric and was not critical."""
+    return round(confirmed * mode.confirmation_runs) + (mode.confirmations_lost or 0) < mode.confirmation_runs
 
 
 def _counted(hits: int, n: int, modes: int) -> str:

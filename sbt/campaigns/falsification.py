@@ -174,7 +174,9 @@ class SearchStage:
             filling = np.isin(runs.stage, FILLING)
             pending = None if log.pending is None else np.clip(space.to_unit(log.pending.x), 0.0, 1.0)
             repeats = s.scenario.pool is None
-            return portfolio.propose(search, u, y, n, rng, runs.iteration, filling, repeats=repeats, pending=pending)
+            return portfolio.propose(
+                search, u, y, n, rng, runs.iteration, filling, repeats=repeats, pending=pending, around_floors=True
+            )
         return propose_by(s.method, search, u, y, n, rng, runs.iteration)
 
     def _pairs(self, covariates: Covariates, runs: History, u: Points, y: Vector, n: int, rng: np.random.Generator) -> Picks:
@@ -241,7 +243,7 @@ class SearchStage:
         """Return the runs of points, each by its stage; of few combinations, each but once."""
         scenario = self.failure_search.settings.scenario
         x = scenario.space.from_unit(np.array([u for _, u in rows]).reshape(-1, scenario.space.dimension))
-        x = without_repetition(scenario, runs, x)
+        x = without_repetition(scenario, runs, x, continuous=self._learns)
         return [PlannedRun(stage, named_inputs(scenario, row)) for (stage, _), row in zip(rows, x, strict=False)]
 
     def _snapped(self, parts: list[tuple[str, Points]], runs: History) -> list[PlannedRun]:

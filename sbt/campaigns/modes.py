@@ -20,7 +20,10 @@ from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
 from sbt.store.records import Judgement, optional
 
-__all__ = ["FailureMode", "FailureRate", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of", "violations"]
+__all__ = [
+    "FailureMode", "FailureRate", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of",
+    "representative_of", "violations",
+]  # fmt: skip
 
 _PROBES = 9  # on the segment between two runs
 _MOST = 200  # critical runs that are compared with each other; further ones join the nearest
@@ -28,7 +31,7 @@ _CHUNK = 100  # segments asked for at once
 _UNMEASURED = -2.0
 _FAR = 1e6  # beyond any distance in the unit cube
 _NOT_WITHIN = 1e-9
-_RATE_STEPS = 20  # rates within a twentieth are alike: depth decides
+_RATE_STEPS = 20  # P(critical) within a twentieth of itself is alike: depth decides
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,7 @@ class FailureMode:
         runs: their indices.
         confirmed: share of the repetitions of the representative with fresh seeds that were critical; None: not repeated.
         confirmation_runs: repetitions.
+        confirmations_lost: repetitions that gave no metric; None: all gave one.
         failure_rate: of the representative's inputs, where the simulator is noisy; None: it is not, or nothing was repeated.
         most_likely: its run of largest density.
         nearest_safe: the uncritical run nearest to the representative; None: there is none.
@@ -127,6 +131,7 @@ class FailureMode:
     unconfirmed: int = 0
     violates: Mapping[str, int] | None = optional()
     failure_rate: FailureRate | None = optional()
+    confirmations_lost: int | None = optional()
 
 
 def severity(history: History) -> Vector:
@@ -137,6 +142,11 @@ def severity(history: History) -> Vector:
     if "impact_speed" not in history.metrics:
         return np.zeros(len(history))
     return np.nan_to_num(history.y("impact_speed"))
+
+
+def worst_first(history: History, margins: Vector) -> NDArray[np.int64]:
+    """Return (n,) the rows by margin, the smallest first, those with the same margin by severity, what has no margin last."""
+    return np.lexsort((-severity(history), margins))
 
 
 def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False) -> NDArray[np.int64]:
@@ -196,9 +206,9 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
     kind = _kind(history, cube.choices(u))
     group = connected(fitted, u[chosen], kind[chosen], noisy=noisy)
-    unlikely = np.zeros(len(history))
+    log_rate = np.zeros(len(history))
     if noisy:
-        unlikely[hits] = -np.round(_RATE_STEPS * fitted.probability(u[hits]))
+        log_rate[hits] = fitted.log_probability(u[hits])
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]
     log_p = scenario.space.log_density(history.x[hits])
@@ -206,11 +216,24 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
     found = []
     for name in np.unique(label):
         rows = hits[label == name]
-        representative = int(rows[np.lexsort((-worse[rows], depth[rows], unlikely[rows]))[0]])
+        representative = int(rows[representative_of(log_rate[rows], depth[rows], worse[rows])])
         likely = int(rows[np.argmax(log_p[label == name])])
         safe = int(uncritical[cdist(at[[representative]], at[uncritical])[0].argmin()]) if len(uncritical) else None
         found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
     return sorted(found, key=lambda mode: (depth[mode.representative], -worse[mode.representative], mode.representative))
+
+
+def representative_of(log_rate: Vector, depth: Vector, worse: Vector) -> int:
+    """Return which of n critical runs stands for its mode: the likeliest to fail again, of those alike the deepest.
+
+    Alike is relative: where noise decides, the best place may fail with one seed in ten, and others with one in twenty.
+
+    Args:
+        log_rate: (n,) log P(critical) of the metamodel; all alike where the simulator is deterministic.
+        depth: (n,) margin, smaller is deeper.
+        worse: (n,) severity.
+    """
+    return int(np.lexsort((-worse, depth, -np.round(_RATE_STEPS * log_rate)))[0])
 
 
 def _kind(history: History, choices: Points) -> Vector:
@@ -244,6 +267,7 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, again: His
         unconfirmed=int(history.unconfirmed[list(mode.rows)].sum()),
         violates=violations(requirement, history.where(np.isin(np.arange(len(history)), mode.rows))),
         failure_rate=FailureRate.of(requirement.critical_runs(again), ~again.ok) if noisy and len(again) else None,
+        confirmations_lost=int((~again.ok).sum()) or None,
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.database import PlannedPoints, PlannedRun
 from sbt.store.history import VALIDATION, History
-from sbt.store.records import FitRecord
+from sbt.store.records import FitRecord, optional
 
 __all__ = ["BatchStage", "CriticalShare", "critical_share", "held_out_runs", "named_inputs", "share_among_held_out", "share_of"]
 
@@ -40,6 +40,7 @@ class CriticalShare:
             high end.
         confidence: of the interval.
         counted: runs.
+        lost: those among them that gave no metric; None: all gave one, or it is not known.
     """
 
     critical_fraction: float | None
@@ -47,6 +48,7 @@ class CriticalShare:
     high: float
     confidence: float = 0.95
     counted: int = 0
+    lost: int | None = optional()
 
     def sentence(self) -> list[str]:
         """Return the share in words; nothing where it is not known."""
@@ -177,7 +179,7 @@ def share_of(history: History, requirement: Requirement) -> CriticalShare:
         independent = effective_runs(critical.astype(np.float64), history.columns["warm_up"]) / n
     least, most, runs = hits * independent, (hits + failed) * independent, n * independent
     low, high = float(interval(least, runs)[0]), float(interval(most, runs)[1])
-    return CriticalShare(hits / ok if ok else None, low, high, 0.95, n)
+    return CriticalShare(hits / ok if ok else None, low, high, 0.95, n, failed or None)
 
 
 def share_among_held_out(facts: Facts) -> CriticalShare:
@@ -185,4 +187,4 @@ def share_among_held_out(facts: Facts) -> CriticalShare:
     held_out = facts.history.where(facts.history.stage == VALIDATION)
     hits, n, ok = int(facts.requirement.critical_runs(held_out).sum()), len(held_out), int(held_out.ok.sum())
     low, high = float(interval(hits, n)[0]), float(interval(hits + n - ok, n)[1])
-    return CriticalShare(hits / ok if ok else None, low, high, 0.95, n)
+    return CriticalShare(hits / ok if ok else None, low, high, 0.95, n, n - ok or None)

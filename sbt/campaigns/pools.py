@@ -14,25 +14,29 @@ import numpy as np
 
 from sbt.campaigns.counting import DRAWN, LEARNED
 from sbt.campaigns.records import COUNT, LEARN, CountedDraws, EstimationProposal, EventDraws, NominalDraws, PoolSummary
+from sbt.campaigns.teaching import select_teaching
 from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
 from sbt.estimators.events import Event, events
 from sbt.estimators.importance import Draws, Plan, draw_systematic, plan_batch, stated
 from sbt.estimators.mixture import Mixture, Near, effective_size, fit_mixture, particles, reweighted
-from sbt.estimators.surrogate import LogProbability
+from sbt.estimators.surrogate import LogProbability, sketch_of
 from sbt.metamodels.joint import LogPair
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import PlannedRun
 
-__all__ = ["Frame", "Pool", "Proposal", "draw_batch", "draw_pool", "fit_proposal", "planned"]
+__all__ = ["SKETCH", "Frame", "Pool", "Proposal", "draw_batch", "draw_pool", "fit_proposal", "planned"]
 
 # Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/estimation.md).
-_POOL = 10_000
-"""Points of a pool: its own variance is a hundredth of what 100 draws leave."""
+_POOL, _POOL_COST, _POOL_EACH = 10_000, 2e10, 300
+"""Points of a pool: its own variance is a hundredth of what 100 draws leave. Fewer with many runs (points times squared runs),
+but so many for each draw."""
 _PILOT = 2_500
 """Points of a pilot pool."""
 _PARTICLES = 800
 """Particles that the mixture is fitted to, per cloud."""
+SKETCH = 600
+"""Runs that the metamodel learned from which guides the particles, from twice as many on."""
 _REFITS, _REFIT_POINTS, _ENOUGH = 4, 3000, 0.15
 """How often the mixture is fitted again to its own points at most, how many they are, and the effective share of them that is
 enough: of a perfect fit four tenths would be."""
@@ -115,10 +119,12 @@ def fit_proposal(
 
 
 def draw_pool(
-    space: ParameterSpace, frame: Frame, proposal: Proposal, shares: tuple[float, ...], rng: np.random.Generator
-) -> Pool:
-    """Return a fresh pool and how a batch would be drawn from it."""
-    return _pooled(space, frame, proposal.mixture, proposal.log_probability, shares, _POOL, rng, proposal.pilot.form)
+    space: ParameterSpace, frame: Frame, proposal: Proposal, shares: tuple[float, ...], rng: np.random.Generator,
+    learned: int = 0, draws: int = 1,
+) -> Pool:  # fmt: skip
+    """Return a fresh pool and how a batch would be drawn from it, so many draws; the metamodel `learned` from so many runs."""
+    n = int(np.clip(_POOL_COST / max(learned, 1) ** 2, min(_POOL_EACH * draws, _POOL), _POOL))
+    return _pooled(space, frame, proposal.mixture, proposal.log_probability, shares, n, rng, proposal.pilot.form)
 
 
 def _pooled(
@@ -143,10 +149,15 @@ def _pooled(
 
 
 def _fitted(log_probability: LogProbability, start: Mixture, hits: Points, rng: np.random.Generator) -> Mixture:
-    """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi)), and of what else is estimated."""
+    """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi)), and of what else is estimated.
+
+    With many runs a sketch of the metamodel guides the particles; the mixture is then fitted again to points of its own, which
+    the metamodel itself weights.
+    """
+    rough = sketch_of(log_probability, SKETCH)
 
     def target(v: Points, k: int) -> Vector:
-        return _targets(log_probability, v)[k]
+        return _targets(rough, v)[k]
 
     near = Near(start, hits)
     count = len(_targets(log_probability, hits[:1]))
@@ -176,13 +187,19 @@ def _targets(log_probability: LogProbability, v: Points) -> list[Vector]:
 
 def draw_batch(
     space: ParameterSpace, pool: Pool, n: int, rng: np.random.Generator, *, counts: bool, once: bool = True,
-    fallback: bool = False,
+    fallback: bool = False, existing: Points | None = None,
 ) -> tuple[tuple[PlannedRun, ...], EstimationProposal]:  # fmt: skip
     """Return n runs drawn from a pool with known density, that count or only teach, and what the log keeps of them.
 
-    `once`: the metamodel has no point drawn twice, as where the simulator is deterministic.
+    `once`: the metamodel has no point drawn twice, as where the simulator is deterministic. `existing`: (k, d) normal scores of
+    earlier runs; where they are given, runs that only teach are chosen apart from them and from each other.
     """
     log_pi, log_not = pool.whole.safe
+    if not counts and existing is not None and len(existing):
+        rows, first = select_teaching(pool.plan, n, pool.z, existing, rng)
+        summary = PoolSummary(len(pool.z), pool.plan.predicted, pool.plan.anticipated, len(pool.mixture.shares), fallback)
+        nominal = NominalDraws(tuple(np.exp(log_pi[rows[:first]]).tolist()))
+        return planned(space, pool.z[rows], LEARNED), EstimationProposal(LEARN, "uncertainty", pool=summary, nominal=nominal)
     draws = draw_systematic(pool.plan, n, log_pi - log_not, rng, once=once)
     plan = draws.plan
     summary = PoolSummary(len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from sbt.store.records import optional
 
 __all__ = [
-    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CountedDraws", "EstimationProposal", "EventDraws", "NominalDraws",
-    "PoolSummary", "SearchProposal",
+    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CoarseDraws", "CountedDraws", "EstimationProposal", "EventDraws",
+    "LevelsRecord", "NominalDraws", "PoolSummary", "SearchProposal",
 ]  # fmt: skip
 
 EXPLORE, LEARN, COUNT = "explore", "learn", "count"
@@ -117,6 +117,7 @@ class CountedDraws:
         pi: of each draw, the metamodel's P(critical).
         parts: of a combination, what is stated of each requirement.
         failed_critical: what is stated of critical or failed runs; left out where no run had failed.
+        weight: of the batch among others, in draws; None: their number.
     """
 
     pool_variance: float
@@ -125,6 +126,7 @@ class CountedDraws:
     pi: tuple[float, ...]
     parts: tuple[EventDraws, ...] | None = optional()
     failed_critical: EventDraws | None = optional()
+    weight: float | None = optional()
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,42 @@ class NominalDraws:
 
 
 @dataclass(frozen=True)
+class CoarseDraws:
+    """A pool of pairs of inputs and seed, and those of them that were run at the coarse level of fidelity.
+
+    Attributes:
+        pool: number of pairs.
+        total, squares: sums over the pool of P(critical) as believed before any run, and of its square.
+        before: of each coarse run, that belief.
+        probability: of each, with which it was drawn.
+        both: the first so many are run at both levels, whatever the coarse run gives.
+        fine: number of further runs of the scenario to be drawn.
+    """
+
+    pool: int
+    total: float
+    squares: float
+    before: tuple[float, ...]
+    probability: tuple[float, ...]
+    both: int
+    fine: int
+
+
+@dataclass(frozen=True)
+class LevelsRecord:
+    """What two levels of fidelity were worth when a batch was chosen, in variance times cost: smaller is better.
+
+    Attributes:
+        coarse: whether coarse runs were made for it.
+        two_levels, one_level: with coarse runs, and without; None: too little was known.
+    """
+
+    coarse: bool
+    two_levels: float | None = None
+    one_level: float | None = None
+
+
+@dataclass(frozen=True)
 class EstimationProposal:
     """How a batch of an estimation was chosen.
 
@@ -150,6 +188,9 @@ class EstimationProposal:
         counted: the draws that count.
         nominal: the draws in proportion to the inputs' distribution.
         axes: of many inputs, those that the subspace of the draws holds beside its direction.
+        drawn_coarse: with two levels of fidelity, the coarse runs of the batch.
+        levels: and what they were worth.
+        pairs: the batch has pairs of inputs and seed; so many came from the pool, the others were searched for.
     """
 
     phase: str
@@ -159,3 +200,6 @@ class EstimationProposal:
     counted: CountedDraws | None = optional()
     nominal: NominalDraws | None = optional()
     axes: tuple[int, ...] | None = optional()
+    drawn_coarse: CoarseDraws | None = optional()
+    levels: LevelsRecord | None = optional()
+    pairs: int | None = optional()

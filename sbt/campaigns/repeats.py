@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import PlannedRun
 from sbt.store.history import PLANNED, History
-from sbt.store.records import to_json
+from sbt.store.records import optional, to_json
 
 __all__ = ["REPEAT", "WANTED", "SimulatorNoise", "equal_inputs", "repeats_wanted", "simulator_noise", "stated_noise"]
 
@@ -39,11 +39,13 @@ class SimulatorNoise:
         repeats: runs beyond the first one at the same inputs; only those that gave metrics count.
         noisy: some metric differed; False: none did; None: nothing was repeated.
         std: pooled standard deviation of the requirement's metric at equal inputs; None: nothing was repeated.
+        lost: inputs at which a run gave a metric and another one, with another seed, gave none; None: there are none.
     """
 
     repeats: int
     noisy: bool | None
     std: float | None
+    lost: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -52,6 +54,13 @@ class SimulatorNoise:
 
     def sentences(self, metric: str, unit: str = "") -> list[str]:
         """Return in words what is known; nothing where nothing was repeated."""
+        if self.lost is None:
+            return self._of_metrics(metric, unit)
+        places = "the same inputs" if self.lost == 1 else f"{self.lost} inputs"
+        said = f"With equal inputs and other seeds a run may give a metric or none, as at {places}: what fails is noisy."
+        return [said, *(self._of_metrics(metric, unit) if self.noisy else ())]
+
+    def _of_metrics(self, metric: str, unit: str) -> list[str]:
         if self.noisy is None or self.std is None:
             return []
         again = f"{plural(self.repeats, 'run')} repeated inputs with other seeds"
@@ -95,7 +104,17 @@ def simulator_noise(history: History, requirement: Requirement) -> SimulatorNois
 
 def stated_noise(history: History, scenario: LogicalScenario) -> SimulatorNoise | None:
     """Return what a conclusion says of the simulator's noise; None for recorded rows, which nothing simulates."""
-    return simulator_noise(history, scenario.requirement) if scenario.pool is None else None
+    return replace(simulator_noise(history, scenario.requirement), lost=_lost(history)) if scenario.pool is None else None
+
+
+def _lost(history: History) -> int | None:
+    """Return at how many inputs some runs gave a metric and others gave none; None: at none."""
+    runs = history.where((history.status != PLANNED) & history.drawn & (history.columns["level"] == 0))
+    if not len(runs):
+        return None
+    group = equal_inputs(runs.x)
+    gave, all_ = np.bincount(group, runs.ok), np.bincount(group)
+    return int(((gave > 0) & (gave < all_)).sum()) or None
 
 
 def _differs(y: NDArray[np.float64], group: NDArray[np.intp]) -> bool:

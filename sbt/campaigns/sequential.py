@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from sbt.campaigns.counting import DRAWN
 from sbt.campaigns.crude import MonteCarloStage, took_monte_carlo
 from sbt.campaigns.known import Known, metamodel_of
-from sbt.campaigns.pools import Frame, Proposal, draw_batch, draw_pool, fit_proposal, planned
+from sbt.campaigns.pools import SKETCH, Frame, Proposal, draw_batch, draw_pool, fit_proposal, planned
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, EstimationProposal
 from sbt.campaigns.repeats import repeats_wanted, simulator_noise
 from sbt.campaigns.settings import Settings
@@ -24,7 +24,7 @@ from sbt.campaigns.stopping import count_begins, is_precise, relative_error, ste
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, to_cube
 from sbt.estimators.importance import BLIND, SHARES
 from sbt.estimators.mixture import wide_scales
-from sbt.estimators.surrogate import Coordinates, LogProbability
+from sbt.estimators.surrogate import MOST_LEARNED, Coordinates, LogProbability, sketch_of
 from sbt.loop.stages import Batch, Log
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import Cube
@@ -34,14 +34,15 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 
-__all__ = ["SequentialStage"]
+__all__ = ["SEARCHED", "SequentialStage"]
 
-_SEARCH_STAGE = "hunt"
+SEARCHED = "hunt"
 """Stage of runs that search for modes."""
 
 # When the search for modes ends.
-_SEARCH_BUDGET = 0.4
-"""Largest share of the budget that it takes."""
+_SEARCH_BUDGET = 0.25
+"""Largest share of the budget that it takes. It leaves known regions alone, so that each of its hits seems to be a new mode while
+the metamodel is coarse; later batches go on searching, and learn those regions too."""
 _QUIET = 3
 """Batches without a new mode after which it ends."""
 _COMMON = 0.02
@@ -55,6 +56,8 @@ _SEARCH_SHARE = (0.2, 0.1)
 
 _GAIN = 4.0
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""
+_SEARCHED = 1000
+"""Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
 _SURPRISE = 0.01
 """P of an earlier metamodel below which a critical run since then refutes it."""
 
@@ -120,7 +123,7 @@ class SequentialStage:
         modes = self._modes_while_searching(log, known, log_probability)
         if modes is not None:
             rows = self._search_modes(known, log, size)
-            return Batch(self._runs(rows, _SEARCH_STAGE), EstimationProposal(EXPLORE, "explore", modes=modes))
+            return Batch(self._runs(rows, SEARCHED), EstimationProposal(EXPLORE, "explore", modes=modes))
         return self._drawn(log, known, log_probability, size)
 
     def _noise_decides(self, log: Log, log_probability: LogProbability) -> bool:
@@ -159,7 +162,7 @@ class SequentialStage:
     def _modes_while_searching(self, log: Log, known: Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
-        It ends with 40 % of the budget, after three batches without a new mode, and where failures are common:
+        It ends with a quarter of the budget, after three batches without a new mode, and where failures are common:
         draws from the inputs' distribution meet every region that counts. An earlier campaign tells where to draw at once.
         """
         if self.settings.transfer is not None and not known.one_sided:
@@ -175,7 +178,7 @@ class SequentialStage:
     def _common(self, log_probability: LogProbability | None, iteration: int) -> bool:
         """Return whether the metamodel takes more than 1 in 50 draws from the inputs' distribution to be critical."""
         z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
-        return log_probability is not None and float(np.exp(log_probability(z)[0]).mean()) > _COMMON
+        return log_probability is not None and float(np.exp(sketch_of(log_probability, SKETCH)(z)[0]).mean()) > _COMMON
 
     def _search_modes(self, known: Known, log: Log, n: int) -> Points:
         """Return n search picks (n, d): the falsification portfolio in the cube of the wide distribution, some spread evenly."""
@@ -191,7 +194,7 @@ class SequentialStage:
         if n > even:
             search = Search(
                 s.scenario.requirement.critical, metamodel_of(s), lambda v: self._coordinates(self._scores(v)),
-                within, cube=Cube(nominal=space.cube.nominal),
+                within, cube=Cube(nominal=space.cube.nominal), most_rows=_SEARCHED,
             )  # fmt: skip
             z, y, batch = known.attempts()
             pending = None if log.pending is None else to_cube(space.to_normal(log.pending.x), self._wide, self._choices)
@@ -212,15 +215,16 @@ class SequentialStage:
         fallback = self._fallback(log, known, relative_error(proposal.pilot.anticipated, proposal.pilot.predicted))
         if fallback is not None:
             proposal = self._proposal(fallback, known, shares, rng)
-        pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng)
+        pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng, min(len(known.y), MOST_LEARNED), size)
         counts = known.one_sided or count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
         blind = not len(known.y) or self._common(log_probability, log.iteration)
         searched = 0 if blind else min(round(_SEARCH_SHARE[counts] * size), size - 1)
         noisy = simulator_noise(log.history, s.scenario.requirement).noisy is True
         runs, kept = draw_batch(
-            s.scenario.space, pool, size - searched, rng, counts=counts, once=not noisy, fallback=fallback is not None
+            s.scenario.space, pool, size - searched, rng, counts=counts, once=not noisy, fallback=fallback is not None,
+            existing=np.vstack([known.z, s.scenario.space.to_normal(log.planned.x)]),
         )  # fmt: skip
-        return Batch((*runs, *self._runs(self._search_modes(known, log, searched), _SEARCH_STAGE)), kept)
+        return Batch((*runs, *self._runs(self._search_modes(known, log, searched), SEARCHED)), kept)
 
     def _proposal(
         self, log_probability: LogProbability | None, known: Known, shares: tuple[float, ...], rng: np.random.Generator

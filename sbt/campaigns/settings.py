@@ -52,6 +52,7 @@ class Settings:
         prior_runs: runs of another campaign to learn from, never to count.
         transfer: what a campaign of another setup tells, as a trend.
         covariates: what the seed draws, known before the run; None: seeds are not looked at.
+        coarse_cost: of a run at the coarse level of fidelity, in runs; None: there is no such level.
     """
 
     scenario: LogicalScenario
@@ -70,6 +71,7 @@ class Settings:
     transfer: Transfer | None = None
     ahead: int = 0
     covariates: Covariates | None = None
+    coarse_cost: float | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ class CampaignKind:
         batch: default runs per iteration; None: as many as initial.
         takes_gate: it takes the keys `gate` and `warm_start`.
         takes_transfer: it takes the key `warm_start` with `transfer: true`.
+        takes_fidelity: it takes the key `fidelity`.
     """
 
     description: str
@@ -129,6 +132,7 @@ class CampaignKind:
     batch: int | None = None
     takes_gate: bool = False
     takes_transfer: bool = False
+    takes_fidelity: bool = False
 
     @classmethod
     def of(cls, found: Any, name: str) -> CampaignKind:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from sbt.campaigns.clustering import spread_of_draws
 from sbt.campaigns.counting import counted_batches
 from sbt.campaigns.records import EstimationProposal, PoolSummary
+from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
-from sbt.estimators.intervals import FEWEST_HITS, combine_estimates
+from sbt.estimators.intervals import FEWEST_HITS, WIDEST, combine_estimates
 from sbt.loop.stages import Log
 from sbt.store.records import Iteration
 
@@ -21,10 +23,11 @@ _FEWEST_LEARNED = 3
 _VALUES, _STALLED, _USABLE = 4, 1.5, 0.5
 """Learning has stalled where the anticipated coefficient of variation of so many batches varies by less than the factor; it is
 usable below the value."""
+_VALUES_IN_NOISE = 2
+"""The same of a noisy simulator, and the batches that only teach, at least: most of what it anticipates is noise, which learning
+does not take away, and a run that does not count is missing later."""
 _TARGET = 0.02
 """Anticipated coefficient of variation that is good enough where `stop.cov` sets none."""
-_WIDEST = 3.0
-"""Half width of the 95 % interval over the coefficient of variation that ends a campaign, at most: 1.96 with normal errors."""
 FEWEST_BATCHES = 4
 """Batches that must count before their spread is taken for a measure of the error."""
 _LOST, _MEMORY, _EXACT = 10.0, 4, 0.01
@@ -50,11 +53,13 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
     spent = len(log.planned)
     if spent + size > _LATEST * settings.budget:
         return True
-    if len(drawn) < (_FEWEST_LEARNED if settings.transfer is None else 1):
+    noisy = simulator_noise(log.history, settings.scenario.requirement).noisy is True
+    values, fewest = (_VALUES_IN_NOISE, _VALUES_IN_NOISE) if noisy else (_VALUES, _FEWEST_LEARNED)
+    if len(drawn) < (fewest if settings.transfer is None else 1):
         return False
     left = math.sqrt(drawn_share * (settings.budget - spent))
-    errors = [relative_error_of(pool) / left for _, pool in drawn[-_VALUES:]]
-    if len(errors) == _VALUES and max(errors) < _STALLED * min(errors) and errors[-1] < _USABLE:
+    errors = [relative_error_of(pool) / left for _, pool in drawn[-values:]]
+    if len(errors) == values and max(errors) < _STALLED * min(errors) and errors[-1] < _USABLE:
         return True  # learning no longer pays
     target = settings.stop.get("cov")
     return errors[-1] <= (_TARGET if target is None else target)
@@ -72,7 +77,10 @@ def is_precise(log: Log, settings: Settings) -> bool:
     found = combine_estimates(counted)
     hits = sum(float(b.critical.sum()) for b in counted)
     half = 0.5 * (found.limit(0.975, side=1) - found.limit(0.975, side=-1))
-    return hits >= FEWEST_HITS and found.std_error <= target * found.value and half <= _WIDEST * target * found.value
+    between = spread_of_draws(log, counted)
+    if between is not None and between.exceeds(target, found.value):  # more warm-ups would narrow it, more runs do not
+        return False
+    return hits >= FEWEST_HITS and found.std_error <= target * found.value and half <= WIDEST * target * found.value
 
 
 def steadier(log: Log, error: float) -> int | None:

@@ -11,8 +11,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sbt.campaigns.lost import (
+    decides_bound,
+    decides_share,
+    lost_runs,
+    none_gave_a_metric,
+    nothing_known,
+    repetitions,
+    why_they_fail,
+)  # fmt: skip
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
 from sbt.estimators.binomial import interval
+from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 from sbt.loop.stages import Facts
 
 if TYPE_CHECKING:
@@ -30,28 +40,32 @@ _CONFIRM = "confirm"  # stage of the runs that repeat a failure
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
+_WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is no boundary to learn"
 _SMALL_SHARE = 0.01  # bound of the critical share that a coverage of 300 runs without a critical one gives
 
 
 def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
-    """Return the three sentences of a coverage; nothing where no run gave a metric."""
+    """Return the three sentences of a coverage, or of the held-out runs where there is no metamodel."""
     if share.critical_fraction is None:
-        return []
-    where, runs = _of(facts), plural(share.counted, "run")
-    said = f"{percent(share.critical_fraction)} of the parameter space{where} is critical ({_condition(facts)}; {_ends(share)})"
+        return nothing_known(facts)
+    where, runs, lost = _of(facts), plural(share.counted, "run"), share.lost or 0
+    space = f"what gives a metric in the parameter space{where}" if lost else f"the parameter space{where}"
+    said = f"{percent(share.critical_fraction)} of {space} is critical ({_condition(facts)}; {_ends(share)})"
     if share.critical_fraction == 0.0:
         most = f"at most {percent(share.high)} of the parameter space is"
         said = f"No run{where} was critical ({_condition(facts)}): {most} ({_ends(share)})"
         further = "campaign: falsification searches for the rare critical run; as many even runs again only halve the bound"
     elif share.critical_fraction == 1.0:
-        further = "widen the ranges of the inputs, or the requirement: where all is critical there is no boundary to learn"
+        further = _WIDEN
+    elif decides_share(lost, share.counted, share.low, share.high):
+        further = f"failed runs decide the width of this interval, and more runs never halve it: {why_they_fail()}"
     else:
         further = (
             f"campaign: boundary says where critical runs lie, campaign: estimation how probable they are; about"
             f" {_round(3 * share.counted):,} more runs would halve this interval"
         )
     return [
-        f"{said}, by {runs} spread evenly over it.",
+        f"{said}, by {runs} spread evenly over it{f'; {lost_runs(lost, share.counted)}' if lost else ''}.",
         "This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same, nor where"
         " they lie.",
         f"Next: {further}.",
@@ -76,16 +90,34 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     if found.place is not None:
         where = _where(found.place, facts.units)
         lead = f"{_of(facts, 'In').strip() or 'Here'}, a run is critical ({_condition(facts)}) where {where}"
+        if _vague(found.place):
+            lead = (
+                f"Where runs{_of(facts)} are critical ({_condition(facts)}) is not known sharply yet: edges are less certain than"
+                f" the critical part is wide. The metamodel's best guess is that a run is critical where {where}"
+            )
     else:
         lead = f"{percent(found.critical_fraction)} of the parameter space{_of(facts)} is critical ({_condition(facts)})"
     rests = f"the metamodel learned that from {plural(learned, 'run')}"
+    missing = "an uncritical" if _all_critical(facts) else "a critical"
+    denied = " The held-out runs deny its figures (below): do not rely on it yet." if _denied(found, measured_share) else ""
     said = [
-        f"{lead}; {rests}, and {sure}.",
-        "This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same; a critical"
+        f"{lead}; {rests}, and {sure}.{denied}",
+        f"This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same; {missing}"
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
-        f"Next: {_after_boundary(found, tested=tested)}.",
+        f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
     ]
     return [*said, *_reconciled(found, measured_share), *_too_sure(found)]
+
+
+def _vague(place: BoundaryPlace) -> bool:
+    """Return whether an edge is less certain than the critical stretch beside it is wide."""
+    return any(cut.unsure >= min(s.high - s.low for s in cut.critical) for cut in place.cuts)
+
+
+def _denied(found: BoundaryConclusion, runs: CriticalShare) -> bool:
+    """Return whether held-out runs deny the share of the metamodel, or its certainty."""
+    share = found.critical_fraction or 0.0
+    return bool(_too_sure(found)) or (runs.critical_fraction is not None and not runs.low <= share <= runs.high)
 
 
 def _where(place: BoundaryPlace, units: Mapping[str, str]) -> str:
@@ -120,7 +152,15 @@ def _stretches(cut: Cut, place: BoundaryPlace, unit: str) -> list[str]:
     return said
 
 
-def _after_boundary(found: BoundaryConclusion, *, tested: bool) -> str:
+def _all_critical(facts: Facts) -> bool:
+    """Return whether every run that gave a metric was critical."""
+    ok = facts.history.ok
+    return bool(ok.any() and facts.requirement.critical_runs(facts.history)[ok].all())
+
+
+def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:
+    if _all_critical(facts):
+        return _WIDEN
     if not tested:
         return "test it: validation.reference: 300 scores the metamodel on 300 more runs drawn at random"
     scores, unsure = found.validation, found.ambiguous_volume or 0.0
@@ -203,14 +243,15 @@ def _worst(mode: FailureMode, facts: Facts) -> str:
     if mode.confirmed is None or n == 0:
         return f"{said}, was not repeated"
     again = round(mode.confirmed * n)
-    low, high = (percent(float(end)) for end in interval(again, n))
-    return f"{said}, was critical again in {again} of {n} repetitions with fresh seeds (95 % interval {low} to {high})"
+    lost = mode.confirmations_lost or 0
+    low, high = percent(float(interval(again, n)[0])), percent(float(interval(again + lost, n)[1]))
+    return f"{said}, was critical again in {repetitions(again, n, lost, ' with fresh seeds')} (95 % interval {low} to {high})"
 
 
 def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
     bound = found.bound
     searched = plural(len(facts.history), "run")
-    said = f"The requirement{_of(facts)} was not falsified: no run of {searched} was critical ({_condition(facts)})"
+    said = f"The requirement{_of(facts)} was not falsified: none of {searched} was critical ({_condition(facts)})"
     silent = "This does not tell that there is no failure: guided runs bound nothing"
     further = "a larger budget"
     if bound is not None and bound.space_filling_runs:
@@ -225,13 +266,17 @@ def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
     if closest is not None:
         near = measured(facts.requirement.told_as, closest.metric, facts.unit)
         further += f"; look at run {closest.run}, which came closest ({near})"
-    return [f"{said}.", f"{silent}, and a failure in a small part of the space may be there.", f"Next: {further}."]
+    silent += ", and a failure in a small part of the space may be there"
+    return [f"{said}.", f"{silent}.", f"Next: {_every_combination(facts)}{further}."]
 
 
 def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     """Return the three sentences of an estimation."""
     confidence, n = percent(found.confidence), len(facts.history)
     verdict = "" if found.gate is None else f"Gate: {found.gate.verdict}; {found.gate.statement}. "
+    if none_gave_a_metric(facts):
+        first, *rest = nothing_known(facts)
+        return [f"{verdict}{first}", *rest]
     rests = "" if n == 0 else f", from {plural(n, 'run')}"
     every = found.combinations is not None and found.undetected_mass_bound == 0.0
     critical = f"{found.hits:,} of them {'was' if found.hits == 1 else 'were'} critical"
@@ -259,29 +304,51 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         )
         if every:
             silent = "This is a sum over all combinations: none is unseen. It does not tell of noise that repeats do not show"
+        elif found.low == 0.0 and found.hits:
+            silent += (
+                f". It does not tell that the probability may be 0 either, though the interval begins there: {found.hits:,}"
+                f" critical draw{'s' if found.hits > 1 else ''} of unequal weight cannot exclude that it is far smaller"
+            )
         elif missed > found.high:
             silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
-    return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_after_estimation(found, n)}."]
+    return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
 
 
-def _after_estimation(found: EstimationConclusion, n: int) -> str:
+def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     """Return how many more runs, and which, would tell more."""
+    n = len(facts.history)
+    worst = found.failed_as_critical
     if found.exact_bound is not None:
+        lost = 0.0 if n == 0 else 1.0 - float(facts.history.ok.mean())
+        kept = decides_bound(lost if worst is None else worst, found.exact_bound)
+        if kept is not None:
+            return kept
         return "campaign: falsification searches for the first critical run; ten times as many runs lower the bound tenfold"
     if found.probability is None:
         return f"a larger budget than {n:,} runs, so that after searching and learning some draws count"
+    if worst is not None and worst - found.probability > 2.0 * _PRECISE * found.probability:
+        return (
+            f"failed runs decide the width of the interval: its upper end, {number(found.high, 3)}, counts them as critical, and"
+            f" more runs never bring it much below {number(worst, 3)}; {why_they_fail()}"
+        )
     if found.combinations is not None and found.low == found.high:
         return "if equal inputs may end differently, acquisition: {kind: monte_carlo} gives an interval that holds then too"
     if found.gate is not None and found.gate.verdict == "undecided":
         return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
-    if found.cov is not None and found.cov > _PRECISE and found.counted:
-        more = found.counted * ((found.cov / _PRECISE) ** 2 - 1.0)
+    wide, counted = _too_wide(found), found.counted or n
+    if wide > 1.0 and counted:
+        more, made = counted * (wide**2 - 1.0), n or counted
         if more < _TOO_FAR:
             return (
-                f"about {_round(more):,} more runs (budget: {_round(n + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
+                f"about {_round(more):,} more runs (budget: {_round(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
                 " fewer where the metamodel goes on to learn"
             )
         return "more runs than can be asked for here narrow it; change the metamodel, or the requirement to a milder one"
+    if found.failed_as_critical is not None and found.failed_as_critical > (1.0 + 2.0 * _PRECISE) * found.probability:
+        return (
+            "mend what makes runs fail and run again: the figure is as narrow as asked but for them, which count as safe for the"
+            " lower end and as critical for the upper one"
+        )
     unseen = 3.0 / max(found.probability, 1e-300)
     if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
         return (
@@ -289,6 +356,24 @@ def _after_estimation(found: EstimationConclusion, n: int) -> str:
             " distribution (acquisition: {kind: monte_carlo})"
         )
     return f"it is as narrow as asked{'; look at the critical runs in the report' if found.hits else ''}"
+
+
+def _too_wide(found: EstimationConclusion) -> float:
+    """Return how many times too large the error is, by the rule that ends a campaign; up to 1: narrow as asked."""
+    value = found.probability or 0.0
+    few = 0.0 if found.combinations is not None else math.sqrt(FEWEST_HITS / max(found.hits, 1))
+    if value <= 0.0:
+        return few
+    error, half = (found.cov or 0.0) / _PRECISE, 0.5 * (found.high - found.low) / (_PRECISE * value)
+    return max(error, few, half / 2.0 if half > WIDEST else 0.0)
+
+
+def _every_combination(facts: Facts) -> str:
+    """Return the advice to run every combination of whole numbers and choices, where they are few and were not all run."""
+    n = facts.combinations
+    if n is None or len(facts.history) >= n:
+        return ""
+    return f"budget: {n:,} runs all {n:,} combinations of the inputs, after which none is unseen; or "
 
 
 def _condition(facts: Facts) -> str:

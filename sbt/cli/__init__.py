@@ -1,75 +1,49 @@
-"""The command line `sumo-sbt`; nothing heavy is imported before a verb needs it."""
+"""The command line `sumo-sbt`: what answers Ctrl-C before anything else is imported."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import os
+import signal
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from sbt import __version__
-from sbt.cli import campaign, inform, metrics, scenario
-from sbt.cli.benchmark import benchmark
-from sbt.cli.compare import compare
-from sbt.cli.compare_ego import compare_ego
-from sbt.cli.console import process, verb
-from sbt.cli.estimate_again import estimate_again
-from sbt.cli.flags import PlainFlags, PlainGroup
-from sbt.cli.new import new
-from sbt.cli.pin import pin
-from sbt.cli.predict import predict
-from sbt.cli.replay import replay
-from sbt.cli.serve import serve
+if TYPE_CHECKING:
+    from sbt.cli.verbs import app
 
 __all__ = ["app", "main"]
 
-app = typer.Typer(
-    name="sumo-sbt",
-    cls=PlainGroup,
-    help="Scenario-based testing of automated vehicles on SUMO.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
-for _verb in (
-    campaign.run,
-    campaign.merge,
-    scenario.simulate,
-    scenario.check,
-    campaign.status,
-    campaign.report,
-    campaign.export,
-    campaign.bundle,
-    predict,
-    estimate_again,
-    replay,
-    pin,
-):
-    app.command(cls=PlainFlags)(verb(_verb))
-app.command(cls=PlainFlags)(verb(metrics.metrics))
-app.command(cls=PlainFlags)(verb(new))
-app.command(cls=PlainFlags)(verb(benchmark))
-app.command(cls=PlainFlags)(verb(compare))
-app.command(cls=PlainFlags)(verb(compare_ego))
-app.command(cls=PlainFlags)(verb(serve))
-app.command("list", cls=PlainFlags)(verb(inform.list_))
-app.command(cls=PlainFlags)(verb(inform.schema))
-app.command(cls=PlainFlags)(verb(inform.doctor))
+_INTERRUPTED = 130
 
 
-def _version(value: bool) -> None:
-    if value:
-        print(f"sumo-sbt {__version__}")
-        raise typer.Exit
+class _Starting:
+    """Answers Ctrl-C while the verbs are imported: nothing was begun that would have to be put away."""
 
+    def __init__(self) -> None:
+        self.active = True
 
-@app.callback()
-def _options(
-    *,
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
-) -> None:
-    """Scenario-based testing of automated vehicles on SUMO."""
+    def __call__(self, number: int, frame: Any) -> None:
+        if self.active:
+            os.write(2, b"interrupted, nothing was run yet\n")
+            os._exit(_INTERRUPTED)  # an exception would end in whatever is being imported, which may keep it
+        raise KeyboardInterrupt
 
 
 def main() -> None:
     """Run the command line; ends the process."""
+    starting = _Starting()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored: a shell's background
+        signal.signal(signal.SIGINT, starting)
+    from sbt.cli.console import process
+    from sbt.cli.verbs import app
+
     with process():
+        starting.active = False
         app(prog_name="sumo-sbt")
+
+
+def __getattr__(name: str) -> Any:
+    """Import the verbs when they are asked for."""
+    if name != "app":
+        raise AttributeError(f"module 'sbt.cli' has no attribute '{name}'")
+    from sbt.cli.verbs import app
+
+    return app

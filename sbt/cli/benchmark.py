@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, next_command, print_json, resumable
 
 __all__ = ["benchmark"]
 
@@ -49,5 +49,7 @@ def benchmark(
     else:
         print(f"{result['done']} of {result['cells']} cells done, {len(result['failed'])} failed")
         print(f"table: {result['table']}, {len(result['figures'])} figures" if result["table"] else f"store: {result['store']}")
+        if result["done"] < result["cells"] and not figures_only:
+            next_command("sumo-sbt", "benchmark", str(config))
     if result["failed"]:
         raise fail("\n".join(f"{name}: {reason}" for name, reason in result["failed"].items()), Exit.INTERNAL)

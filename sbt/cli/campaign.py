@@ -22,6 +22,8 @@ __all__ = ["bundle", "export", "merge", "report", "run", "status"]
 
 _EVERY = 2.0
 """Seconds between two looks of `status --watch`."""
+_STARTING = 10.0
+"""Seconds that `status --watch` waits for the process of a campaign that nobody runs: it may just be starting."""
 _STATES = {
     "interrupted": ": it was interrupted; run it again to go on",
     "dead": ": its process was killed; run it again to go on, nothing is lost but the runs in flight",
@@ -120,13 +122,16 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
 def status(
     folder: Folder,
     *,
-    watch: Annotated[bool, typer.Option("--watch", help="Repeat until nobody runs the campaign any more.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Repeat until nobody runs the campaign any more, for 10 s.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the progress of a campaign, also while it runs."""
-    found, told = _status(folder), ""
+    found, told, seen = _status(folder), "", time.monotonic()
     try:
-        while watch and found["state"] == "running" and not getattr(sys.stdout, "gone", False):
+        while watch and not getattr(sys.stdout, "gone", False):
+            seen = time.monotonic() if found["state"] == "running" else seen
+            if found["state"] == "finished" or time.monotonic() - seen > _STARTING:
+                break
             line = _progress_line(found)
             if not as_json and line != told:
                 print(line, flush=True)
@@ -153,7 +158,8 @@ def _status(folder: Path) -> dict[str, Any]:
 
 def _status_lines(found: Mapping[str, Any]) -> list[str]:
     counts = ", ".join(f"{n} {name}" for name, n in sorted(found["runs"].items())) or "none planned"
-    lines = [_progress_line(found), f"  runs: {counts}; {found['iterations']} iterations"]
+    coarse = f", {found['coarse_runs']} coarse ones beside them" if "coarse_runs" in found else ""
+    lines = [_progress_line(found), f"  runs: {counts}{coarse}; {found['iterations']} iterations"]
     if found["validation"] is not None:
         scores = (f"{key.replace('_', ' ')} {shown(found['validation'].get(key))}" for key in _SCORES)
         lines.append("  validation: " + ", ".join(scores))
@@ -199,6 +205,7 @@ def export(
 
         path = export_store(with_store(folder, trust=trust), form)
     print(path)
+    next_command("sumo-sbt", "report", str(folder))
 
 
 def bundle(

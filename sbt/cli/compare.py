@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sbt.cli.console import clean_stdout, print_json, resumable
+from sbt.cli.console import clean_stdout, next_command, print_json, resumable
 
 __all__ = ["compare"]
 
@@ -42,3 +42,4 @@ def compare(
         print_json({"cells": [vars(cell) for cell in cells]})
     else:
         print(room.table(cells))
+        next_command("sumo-sbt", "run", str(config))

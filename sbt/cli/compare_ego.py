@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, print_json, resumable
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, next_command, print_json, resumable
 
 __all__ = ["compare_ego"]
 
@@ -38,6 +38,9 @@ def compare_ego(
         print_json(result)
     else:
         print("\n".join(_rare_lines(result) if rare else _lines(result)))
+        if not rare and (result["new"] or result["fixed"]):
+            side, found = ("b", result["new"]) if result["new"] else ("a", result["fixed"])
+            next_command("sumo-sbt", "replay", str(folder / side), str(found[0]["run"]), "--film", "run.gif")
     if fail_if_rose and result["verdict"] == "rose":
         raise fail("the probability of a critical run rose", Exit.CRITICAL)
 

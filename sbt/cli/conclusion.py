@@ -89,7 +89,10 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
     said.append(f"{mode['size']} critical run{'' if mode['size'] == 1 else 's'}")
     if mode.get("confirmed") is not None:
         n = mode["confirmation_runs"]
-        said.append(f"critical again in {round(mode['confirmed'] * n)} of {n} repetitions")
+        from sbt.campaigns.lost import repetitions
+
+        again, lost = round(mode["confirmed"] * n), mode.get("confirmations_lost") or 0
+        said.append(f"critical again in {repetitions(again, n, lost)}")
     if mode.get("unconfirmed"):
         said.append(f"{mode['unconfirmed']} with a contact that SUMO does not list")
     if mode.get("preventable"):

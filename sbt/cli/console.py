@@ -10,6 +10,7 @@ import os
 import shlex
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -30,6 +31,8 @@ __all__ = [
 
 P = ParamSpec("P")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_begun = threading.Event()
+"""Set when a verb begins: before, there is nothing that an interruption would have to put away."""
 _ONCE = 0.5
 """Signals within so many seconds are one: a terminal that closes, or `timeout`, sends it twice."""
 
@@ -56,6 +59,7 @@ def verb(function: Callable[P, None]) -> Callable[P, None]:
 
     @functools.wraps(function)
     def reported(*args: P.args, **kwargs: P.kwargs) -> None:
+        _begun.set()
         with _handled():
             try:
                 function(*args, **kwargs)
@@ -95,6 +99,9 @@ def _handled() -> Iterator[None]:
         now = time.monotonic()
         if first == math.inf:
             first = now
+            if not _begun.is_set():  # an exception would end in what is being imported or parsed, which may keep it
+                _write(stderr, "interrupted, nothing was run yet")
+                os._exit(int(Exit.INTERRUPTED))
             if _resumable:
                 name = signal.Signals(number).name
                 _write(stderr, f"stopping ({name}): {_resumable[-1].consequence()}; a second signal stops at once")

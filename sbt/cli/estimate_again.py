@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sbt.cli.campaign import Folder, Trust, with_store
-from sbt.cli.console import clean_stdout, print_json
+from sbt.cli.console import clean_stdout, next_command, print_json
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def estimate_again(
         print_json(found.to_dict())
     else:
         print("\n".join(_lines(found)))
+        next_command("sumo-sbt", "report", str(folder))
 
 
 def _interval(text: str) -> tuple[float, float]:

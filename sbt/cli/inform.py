@@ -119,7 +119,13 @@ def _told(folder: Path, found: Diagnosis) -> Iterator[str]:
         if which:
             more = f" and {len(which) - 8} more" if len(which) > 8 else ""
             yield f"  {what}: {', '.join(map(str, which[:8]))}{more}"
-    if found.configuration:
-        yield f"  save what is whole: sumo-sbt doctor {folder} --save NEW"
+    beside = folder / "config.resolved.yaml"
+    if not found.runs and beside.is_file():
+        yield f"  nothing can be saved; the same campaign anew: sumo-sbt run {beside} --store NEW"
+    elif not found.runs:
+        yield "  nothing can be saved: begin a new campaign"
+    elif found.configuration or beside.is_file():
+        where = "" if found.configuration else f", with the configuration of {beside}"
+        yield f"  save what is whole{where}: sumo-sbt doctor {folder} --save NEW"
     else:
         yield "  nothing can go on without the configuration: begin a new campaign"

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sbt.cli.console import clean_stdout
+from sbt.cli.console import clean_stdout, next_command
 
 __all__ = ["new"]
 
@@ -27,3 +27,4 @@ def new(
         written = write_scenario(folder, config, ego)
     for line in (*written.paths, *written.notes):
         print(line)
+    next_command("sumo-sbt", "check", str(written.paths[0]))

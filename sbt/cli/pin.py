@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -22,8 +23,12 @@ def pin(
 ) -> None:
     """Write a pytest file that guards found failures: same start, same metrics, and the requirement for a new ego."""
     with clean_stdout():
-        from sbt.workflows.pinning import pin_runs
+        from sbt.workflows.pinning import pin_runs, uncritical
 
         path = pin_runs(with_store(folder, trust=trust), runs, into)
+        harmless = uncritical(folder, runs)
+    if harmless:
+        told = ", ".join(map(str, harmless[:8])) + (f" and {len(harmless) - 8} more" if len(harmless) > 8 else "")
+        print(f"no failures: runs {told} violate nothing; the test guards that they do not begin to", file=sys.stderr)
     print(path)
     next_command("pytest", "-q", str(path))

@@ -6,13 +6,14 @@ import csv
 import io
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from sbt.cli.campaign import Folder, Trust, with_store
 from sbt.cli.console import clean_stdout, print_json
 from sbt.errors import InputError
+from sbt.files import as_cell
 
 __all__ = ["predict"]
 
@@ -37,9 +38,10 @@ def predict(
         print(f"not inputs, ignored: {', '.join(table.ignored)}", file=sys.stderr)
     if output is not None or not as_json:
         text = io.StringIO()
-        writer = csv.DictWriter(text, [*table.inputs, *table.columns], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+        names = [*table.inputs, *table.columns]
+        writer = csv.writer(text, lineterminator="\n")
+        lines: list[list[Any]] = [names, *([row[name] for name in names] for row in rows)]
+        writer.writerows([as_cell(value) for value in line] for line in lines)
         _write(text.getvalue(), output)
     if as_json:
         print_json({

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sbt.cli.campaign import Folder, Trust, with_store
-from sbt.cli.console import Exit, clean_stdout, fail, print_json
+from sbt.cli.console import Exit, clean_stdout, fail, next_command, print_json
 
 if TYPE_CHECKING:
     from sbt.workflows.running import Replay
@@ -73,6 +73,9 @@ def replay(
             print(f"film: {gif.resolve()}")
         if judgements:
             print("\n".join(["with a reference driver in the place of ego:", *map(judgement_line, judgements)]))
+        if same and outcome.status == "ok":
+            film = ["sumo-sbt", "replay", str(folder), str(run), "--film", f"{run}.gif"]
+            next_command(*(film if gif is None else ["sumo-sbt", "pin", str(folder), str(run), "--into", "tests"]))
     if not same:
         now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
         raise fail(f"a replay must equal the stored run, but got {now}, not {stored}{changed_since(folder)}", Exit.INTERNAL)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sbt.cli.completion import complete_scenarios
-from sbt.cli.console import Exit, clean_stdout, fail, print_json
+from sbt.cli.console import Exit, clean_stdout, fail, next_command, print_json
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def simulate(
         print_json(run.to_dict())
     else:
         _print_run(run)
+        next_command("sumo-sbt", "check", scenario)
     if run.status != "ok":
         raise typer.Exit(int(Exit.FAILED_RUNS))
 
@@ -131,6 +132,9 @@ def check(
     if not checked.ok:
         broken = sum(not finding.ok for finding in checked.findings)
         raise fail(f"{target}: {broken} of {len(checked.findings)} rules are broken", Exit.INPUT)
+    if not as_json:
+        campaign = target.endswith((".yaml", ".yml")) and Path(target).name != "scenario.yaml"
+        next_command("sumo-sbt", "run" if campaign else "simulate", target)
 
 
 def _pairs(what: str, texts: list[str]) -> dict[str, Any]:

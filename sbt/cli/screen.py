@@ -84,7 +84,7 @@ def _modes(result: Mapping[str, Any], width: int) -> Any:
         again, n = mode.get("confirmed"), mode.get("confirmation_runs", 0)
         table.add_row(
             str(k), str(mode["representative"]), number(mode["metric"], 3), *(number(mode["inputs"][name], 3) for name in names),
-            str(mode["size"]), "" if again is None else f"{round(again * n)} of {n}",
+            str(mode["size"]), "" if again is None else f"{round(again * n)} of {n - (mode.get('confirmations_lost') or 0)}",
         )  # fmt: skip
     return table
 

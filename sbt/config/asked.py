@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sbt.config.load import ConfigError, located, read_text
 from sbt.config.model import Condition, CorrelationEntry, InputChange
+from sbt.config.requirement_model import MOST
 from sbt.config.source import Problems, SourceMap, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space
 from sbt.problem.plain import JsonMapping
@@ -25,8 +26,8 @@ class Asked(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     inputs: dict[str, InputChange] = Field(default={}, description="Changes to the campaign's inputs, by name.")
-    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False)] = ()
-    constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = ()
+    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False, max_length=1000)] = ()
+    constraints: Annotated[tuple[Condition, ...], Field(strict=False, max_length=MOST)] = ()
 
 
 def asked_space(inputs: Path | JsonMapping, space: ParameterSpace) -> ParameterSpace:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from sbt.acquisitions import Acquisition, even
+from sbt.config.fidelity import check_levels, coarse_level
 from sbt.config.load import Loaded
 from sbt.config.model import Choice
 from sbt.config.several import combined_requirement
@@ -28,7 +29,7 @@ from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, metric_from
 
-__all__ = ["Assembly", "acquisition_of", "assemble", "metamodel_of", "scenario_of", "spec_of"]
+__all__ = ["Assembly", "acquisition_of", "assemble", "check", "metamodel_of", "scenario_of", "spec_of"]
 
 T = TypeVar("T")
 
@@ -56,15 +57,33 @@ def assemble(loaded: Loaded) -> Assembly:
     Raises:
         ConfigError: all problems of the scenario, metamodel and acquisition at once.
     """
+    metamodel, acquisition, scenario = check(loaded)
+    if not _states_metamodel(loaded):
+        metamodel = metamodel_of(loaded)
+    return Assembly(scenario, spec_of(loaded), metamodel, acquisition)
+
+
+def check(loaded: Loaded) -> tuple[Metamodel | None, Acquisition | None, LogicalScenario]:
+    """Return metamodel, acquisition and scenario; a metamodel that the user does not state is right, and is not loaded for it.
+
+    Libraries of metamodels take a second to load, which a message about a slip of the pen shall not wait for.
+
+    Raises:
+        ConfigError: all problems of the scenario, metamodel and acquisition at once.
+    """
     problems = Problems(loaded.source)
     with loaded.scope.naming():
-        metamodel = _metamodel(loaded, problems)
+        metamodel = _metamodel(loaded, problems) if _states_metamodel(loaded) else None
         acquisition = _acquisition(loaded, problems)
         scenario = _scenario(loaded, problems)
         for k, driver in enumerate(loaded.config.judges or ()):
             problems.attempt(("judges", k), partial(loaded.scope.load, "controllers", driver))
     problems.check()
-    return Assembly(scenario, spec_of(loaded), metamodel, acquisition)
+    return metamodel, acquisition, scenario
+
+
+def _states_metamodel(loaded: Loaded) -> bool:
+    return "metamodel" in loaded.config.model_fields_set
 
 
 def scenario_of(loaded: Loaded) -> LogicalScenario:
@@ -121,7 +140,7 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
         config.scenario, str(loaded.folder.resolve()), ego, config.executor.isolation, config.simulation.step_length,
         config.requirement.stl, types, named, carried,
         friction=None if config.simulation.friction is None else (config.simulation.friction.min, config.simulation.friction.max),
-        formulas=config.requirement.formulas,
+        formulas=config.requirement.formulas, coarse=coarse_level(config, loaded.folder),
     )  # fmt: skip
 
 
@@ -140,6 +159,8 @@ def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
         raise problems.error()
     space = configured_space(config, scenario.space, problems, loaded.folder)
     requirement = _requirement(loaded, scenario, problems)
+    if (choice := config.fidelity) is not None:
+        problems.attempt(("fidelity",), partial(check_levels, choice, spec, replace(scenario, requirement=requirement)))
     return replace(scenario, space=space, requirement=requirement)
 
 

@@ -23,6 +23,7 @@ from sbt.config.model import (
     RequirementChange,
     SimulationChoice,
 )
+from sbt.config.requirement_model import MOST_RUNS
 from sbt.config.source import ConfigError, Key, Place, SourceMap
 from sbt.plugins import Scope
 
@@ -41,9 +42,9 @@ class ScenarioEntry(_Strict):
 
     scenario: Name = Field(description="An installed scenario, table:FOLDER, or file.py:NAME.")
     name: str | None = Field(default=None, pattern=_LABEL, description="Name in tables and folders; default: the scenario's.")
-    batch: int = Field(default=1000, ge=2, description="Runs per iteration.")
-    iterations: int | None = Field(default=None, ge=1, description="Iterations; null: those of the benchmark.")
-    reference: int | None = Field(default=None, ge=2, description="Reference runs; null: those of the benchmark.")
+    batch: int = Field(default=1000, ge=2, le=MOST_RUNS, description="Runs per iteration.")
+    iterations: int | None = Field(default=None, ge=1, le=MOST_RUNS, description="Iterations; null: those of the benchmark.")
+    reference: int | None = Field(default=None, ge=2, le=MOST_RUNS, description="Reference runs; null: those of the benchmark.")
     requirement: RequirementChange = Field(default=RequirementChange(), description="What is critical; default: the own.")
     inputs: dict[str, InputChange] = Field(default={}, description="Changes to the scenario's inputs, by name.")
     ego: Choice | None = Field(default=None, description="The AV under test; null: the scenario's own.")
@@ -71,13 +72,15 @@ class MetamodelEntry(MetamodelChoice):
 def _several(value: Any) -> Any:
     """Let a number of seeds n stand for the seeds 1 to n."""
     if isinstance(value, int) and not isinstance(value, bool):
-        if value < 1:
-            raise ValueError(f"must be a number of seeds >= 1 or a list of seeds, but got {value}")
+        if not 1 <= value <= _SEEDS:
+            raise ValueError(f"must be a number of seeds of 1 to {_SEEDS} or a list of seeds, but got {value}")
         return list(range(1, value + 1))
     return value
 
 
-Seed = Annotated[int, Field(ge=0)]
+_SEEDS = 10_000
+"""Most seeds of a benchmark."""
+Seed = Annotated[int, Field(ge=0, le=2**64 - 1)]
 
 
 class Benchmark(_Strict):
@@ -93,16 +96,16 @@ class Benchmark(_Strict):
     seeds: Annotated[tuple[Seed, ...], BeforeValidator(_several), Field(strict=False, min_length=1)] = Field(
         default=(1, 2), description="Seeds of the cells: a list, or a number n for 1 to n."
     )
-    iterations: int = Field(default=10, ge=1, description="Batches of a cell, the even first one included.")
-    reference: int = Field(default=100_000, ge=2, description="Random runs a scenario that score all its cells.")
-    reference_seed: int = Field(default=1_000_000, ge=0, description="Seed of the reference runs; none of `seeds`.")
+    iterations: int = Field(default=10, ge=1, le=MOST_RUNS, description="Batches of a cell, the even first one included.")
+    reference: int = Field(default=100_000, ge=2, le=MOST_RUNS, description="Random runs a scenario that score all its cells.")
+    reference_seed: int = Field(default=1_000_000, ge=0, le=2**64 - 1, description="Seed of the reference runs; none of `seeds`.")
     references: Name | None = Field(
         default=None, description="Folder of the reference runs, shared by benchmarks; default: <store>/reference."
     )
     max_candidates: int = Field(
-        default=2**19, ge=1024, description="Most candidates a batch; beyond, the best of them are taken (method pool)."
+        default=2**19, ge=1024, le=2**24, description="Most candidates a batch; beyond, the best of them are taken (method pool)."
     )
-    workers: int = Field(default=1, ge=1, description="Cells that run at the same time.")
+    workers: int = Field(default=1, ge=1, le=4096, description="Cells that run at the same time.")
     timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped.")
     store: Name = Field(default="runs/benchmark", description="Folder of the results.")
 

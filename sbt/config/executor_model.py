@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator
 
-from sbt.config.requirement_model import Name
+from sbt.config.requirement_model import MOST_RUNS, Name
 from sbt.errors import did_you_mean
 
 __all__ = ["EXECUTORS", "ExecutorChoice"]
@@ -71,13 +71,13 @@ class ExecutorChoice(_Strict):
         default=None, description="Of dask's scheduler, such as tcp://host:8786; null: dask workers on this machine."
     )
     timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped; .inf: never.")
-    memory: Annotated[int, BeforeValidator(_bytes_of)] | None = Field(
-        default=None, ge=2**28,
+    memory: Annotated[int, Field(ge=2**28, le=2**60), BeforeValidator(_bytes_of)] | None = Field(
+        default=None,
         description="Memory (such as 2 GiB) that a worker may use, at least 256 MiB; a run that needs more is crashed. "
         "null: no limit.",
     )  # fmt: skip
     recycle: int | None = Field(
-        default=None, ge=1, description="Runs after which a worker is replaced by a fresh one; null: never."
+        default=None, ge=1, le=MOST_RUNS, description="Runs after which a worker is replaced by a fresh one; null: never."
     )
     isolation: Literal["auto", "fresh", "reuse", "replicas", "snapshot"] = Field(
         default="auto",

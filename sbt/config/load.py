@@ -298,6 +298,8 @@ def _problem(error: Any, model: type[BaseModel]) -> tuple[Key, str, bool]:
         return path, _RULES[kind], True
     if kind == "value_error":  # a rule of ours: the message has the value already, or names it
         return path, str(error["ctx"]["error"]), False
+    if kind == "too_long":
+        return path, f"must have at most {error['ctx']['max_length']} entries, but got {len(error['input'])}", False
     rule = _RULES.get(kind, error["msg"].replace("Input should be", "must be"))
     return path, f"{rule}, but got {_shown(error['input'])}", kind == "invalid_key"
 

@@ -24,11 +24,13 @@ from pydantic import (
     ValidationInfo,
     WithJsonSchema,
     field_validator,
+    model_validator,
 )
 
 from sbt.config.executor_model import ExecutorChoice
+from sbt.config.fidelity_model import FidelityChoice
 from sbt.config.kinds import kind_of
-from sbt.config.requirement_model import Interval, Name, RequirementChange, two_values
+from sbt.config.requirement_model import MOST, MOST_RUNS, Interval, Name, RequirementChange, check_numbers, each_once, two_values
 from sbt.config.simulation_model import SimulationChoice
 from sbt.plugins import OBJECT
 from sbt.problem.expression import Expression
@@ -105,6 +107,13 @@ class MetamodelChoice(Choice):
     )
 
 
+    @model_validator(mode="after")
+    def _within_reason(self) -> MetamodelChoice:
+        if not (".py:" in self.kind or self.kind.startswith(OBJECT)):
+            check_numbers(self.settings)
+        return self
+
+
 class AcquisitionChoice(_Strict):
     """How runs are chosen: an acquisition function, or a method of the campaign."""
 
@@ -146,15 +155,16 @@ class CorrelationEntry(_Strict):
 class BatchChoice(_Strict):
     """Runs per iteration, and whether the next ones are chosen while they run."""
 
-    size: int | None = Field(default=None, ge=1, description="Runs per iteration; default: that of the campaign.")
+    size: int | None = Field(default=None, ge=1, le=MOST_RUNS, description="Runs per iteration; default: that of the campaign.")
     ahead: int = Field(
         default=0, ge=0, le=4,
-        description="Batches in flight that the choice of the next one does not wait for: 1 keeps the workers busy.",
+        description="Batches in flight that the choice of the next one does not wait for: 1 keeps the workers busy; more "
+        "bridge batches whose times vary.",
     )  # fmt: skip
 
 
 Batch = Annotated[
-    Annotated[BatchChoice, Tag("[keys]")] | Annotated[Annotated[int, Field(ge=1)], Tag("[number]")],
+    Annotated[BatchChoice, Tag("[keys]")] | Annotated[Annotated[int, Field(ge=1, le=MOST_RUNS)], Tag("[number]")],
     Discriminator(lambda given: "[keys]" if isinstance(given, BatchChoice | Mapping) else "[number]"),
 ]
 
@@ -163,14 +173,14 @@ class ValidationChoice(_Strict):
     """Runs that score the metamodel and never train it."""
 
     share: float = Field(default=0.1, ge=0, lt=1, description="Share of every batch that is drawn at random and held out.")
-    reference: int = Field(default=0, ge=0, le=10**7, description="Extra random runs beyond the budget, only for scoring.")
+    reference: int = Field(default=0, ge=0, le=MOST_RUNS, description="Extra random runs beyond the budget, only for scoring.")
 
 
 class StopRules(_Strict):
     """When to stop before the budget is used up; null switches a rule off."""
 
-    failures: int | None = Field(default=None, ge=1, description="Falsification: number of critical runs.")
-    modes: int | None = Field(default=None, ge=1, description="Falsification: number of distinct failure modes.")
+    failures: int | None = Field(default=None, ge=1, le=MOST_RUNS, description="Falsification: number of critical runs.")
+    modes: int | None = Field(default=None, ge=1, le=MOST_RUNS, description="Falsification: number of distinct failure modes.")
     stable: float | None = Field(default=None, gt=0, lt=1, description="Boundary: share of the space that still changes sides.")
     misclassified: float | None = Field(
         default=None, gt=0, lt=1,
@@ -259,15 +269,17 @@ class Configuration(_Strict):
         default=RequirementChange(), description="What is critical; default: the scenario's own."
     )
     inputs: dict[str, InputChange] = Field(default={}, description="Changes to the scenario's inputs, by name.")
-    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False)] = Field(
+    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False, max_length=1000)] = Field(
         default=(), description="Correlated pairs of inputs; the others stay as the scenario has them."
     )
-    constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = Field(
+    constraints: Annotated[tuple[Condition, ...], Field(strict=False, max_length=MOST)] = Field(
         default=(),
         description="Conditions on inputs that every concrete scenario meets, such as 'v_ego - v_co < 30'.",
     )
-    features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel, name: formula.")
-    metrics: Annotated[tuple[Name, ...], Field(strict=False)] = Field(
+    features: dict[str, Formula] = Field(
+        default={}, max_length=MOST, description="Derived inputs for the metamodel, name: formula."
+    )
+    metrics: Annotated[tuple[Name, ...], Field(strict=False, max_length=MOST)] = Field(
         default=(), description="Further safety metrics: installed names, or file.py:NAME (a Metric or a function of a trace)."
     )
     ego: Choice | None = Field(
@@ -276,7 +288,7 @@ class Configuration(_Strict):
     )
     simulation: SimulationChoice = Field(default=SimulationChoice(), description="How SUMO simulates; default: the scenario's.")
     seed: int = Field(default=0, ge=0, le=2**64 - 1, description="Seed of everything random in the campaign.")
-    budget: int = Field(default=500, ge=1, le=10**7, description="Runs, the initial ones included.")
+    budget: int = Field(default=500, ge=1, le=MOST_RUNS, description="Runs, the initial ones included.")
     acquisition: AcquisitionChoice = Field(
         default_factory=_acquisition,
         description="How runs are chosen; default: that of the campaign.",
@@ -285,7 +297,7 @@ class Configuration(_Strict):
         default=None, description="An earlier campaign to learn from; null: none."
     )
     initial: int = Field(
-        default_factory=_tenth, ge=1,
+        default_factory=_tenth, ge=1, le=MOST_RUNS,
         description="Evenly distributed runs before the first fit; default: budget / 10, at least 10; at most 10 in a "
         "falsification and 15 in an estimation with a metamodel.",
     )  # fmt: skip
@@ -309,7 +321,10 @@ class Configuration(_Strict):
         default=None, description="Look at what the seed draws, before the run: auto (null), where the scenario tells it; "
         "true: also by a general set, an error where nothing can be told; false: never.",
     )  # fmt: skip
-    judges: Annotated[tuple[Name, ...] | None, Field(strict=False)] = Field(
+    fidelity: FidelityChoice | None = Field(
+        default=None, description="Estimation: cheaper runs of the same inputs and seeds that teach; null: none."
+    )
+    judges: Annotated[tuple[Name, ...], Field(strict=False, max_length=20), AfterValidator(each_once)] | None = Field(
         default=None, description="Egos to run failures again with; default: falsification, the four reference drivers.",
     )  # fmt: skip
     executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")
@@ -357,6 +372,17 @@ class Configuration(_Strict):
             return value
         if value is not None and name is not None and not kind_of(name).takes_gate:
             raise ValueError(f"only an estimation campaign takes it, but the campaign is {name}")
+        return value
+
+    @field_validator("fidelity")
+    @classmethod
+    def _learns_from_coarse(cls, value: FidelityChoice | None, info: ValidationInfo) -> FidelityChoice | None:
+        name = info.data.get("campaign")
+        if value is not None and name is not None and not kind_of(name).takes_fidelity:
+            raise ValueError(f"only an estimation learns from coarse runs, but the campaign is {name}")
+        batch = info.data.get("batch")
+        if value is not None and isinstance(batch, BatchChoice) and batch.ahead:
+            raise ValueError("coarse runs choose those that follow them: batch.ahead must be 0")
         return value
 
     @field_validator("stop")

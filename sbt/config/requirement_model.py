@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
@@ -10,7 +11,29 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from sbt.problem.combination import KINDS
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Interval", "Name", "RequirementChange", "RequirementItem", "two_values"]
+__all__ = [
+    "MOST", "MOST_RUNS", "Interval", "Name", "RequirementChange", "RequirementItem", "check_numbers", "each_once", "two_values",
+]  # fmt: skip
+
+MOST_RUNS = 10**7
+"""Most runs that any key may ask for: what is larger is a slip of the pen, and would take all memory or time."""
+MOST = 100
+"""Most entries of a list whose every entry costs something before the first run."""
+
+
+def each_once(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return names; refuse one that is given twice."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"each must be named once, but got '{twice}' again")
+    return names
+
+
+def check_numbers(settings: Mapping[str, Any]) -> None:
+    """Refuse at once what no setting of a metamodel can be; itself it knows more, but its library takes seconds to load."""
+    for key, value in settings.items():
+        if isinstance(value, int | float) and abs(value) > MOST_RUNS:
+            raise ValueError(f"{key} must be within {MOST_RUNS}, but got {value}")
 
 
 def two_values(value: Any) -> Any:
@@ -63,10 +86,10 @@ class RequirementChange(BaseModel):
         default=None, description="A formula such as G[0,20](gap > 2 and ttc > 1.5) instead of a metric; its robustness is "
         "the metric stl, critical in [-.inf, 0].",
     )  # fmt: skip
-    any: Annotated[tuple[RequirementItem, ...], Field(strict=False)] | None = Field(
+    any: Annotated[tuple[RequirementItem, ...], Field(strict=False, max_length=MOST)] | None = Field(
         default=None, description="Requirements, of which any one being violated is critical."
     )
-    all: Annotated[tuple[RequirementItem, ...], Field(strict=False)] | None = Field(
+    all: Annotated[tuple[RequirementItem, ...], Field(strict=False, max_length=MOST)] | None = Field(
         default=None, description="Requirements that are critical only where all are violated in the same run."
     )
 

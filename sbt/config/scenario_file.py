@@ -36,7 +36,7 @@ from sbt.sumo.recorded import RecordedTraffic
 from sbt.sumo.recorder import RecordingSettings
 from sbt.sumo.snapshot import WarmUp
 from sbt.sumo.template import placeholders
-from sbt.sumo.user_simulation import Loop, UserSimulation, step_until_over
+from sbt.sumo.user_simulation import Covariates, Loop, UserSimulation, step_until_over
 
 __all__ = ["from_file", "is_scenario"]
 
@@ -145,7 +145,7 @@ class _Builder:
                 tuple(one.further() for one in further if one is not None),
             ),
             files, loop, self._folder, model.step_length, profiles=tuple(self._profiles.values()), participants=moved,
-            warm=self._warm_up(), space=space or ParameterSpace(()),
+            warm=self._warm_up(), space=space or ParameterSpace(()), covariates=self._covariates(),
         ))  # fmt: skip
         problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
@@ -277,6 +277,16 @@ class _Builder:
             self._problems.add(("simulate",), f"a loop must be a function simulate(sumo, values, rng), but '{name}' is not")
         loop: Loop = found if found is not None else step_until_over
         return loop
+
+    def _covariates(self) -> Covariates | None:
+        """Return the function of what a seed draws, if there is one."""
+        name = self._model.covariates
+        if name is None:
+            return None
+        found: Covariates | None = self._problems.attempt(("covariates",), lambda: load("scenarios", name, self._folder))
+        if found is not None and not callable(found):
+            self._problems.add(("covariates",), f"covariates must be a function covariates(values, rng), but '{name}' is not")
+        return found
 
     def _ego(self, entry: EgoEntry, files: SumoFiles | None, path: Key) -> EgoVehicle | None:
         there = files is None or self._model.simulate is not None or files.vehicle(entry.id) is not None

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, ValidationInfo, field_validator
 
 from sbt.config.model import Choice, ChoicesGiven, Condition, CorrelationEntry, Formula, Interval, Name, RequirementChange
+from sbt.config.requirement_model import MOST
 from sbt.problem.plain import Json
 
 __all__ = [
@@ -38,6 +39,7 @@ class _Open(_Strict):
         return dict(self.__pydantic_extra__)
 
 
+_Whole = Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
 Names = Annotated[
     tuple[Name, ...], BeforeValidator(lambda value: [value] if isinstance(value, str) else value), Field(strict=False)
 ]
@@ -50,7 +52,7 @@ class SumoEntry(_Strict):
     net: Name | None = Field(default=None, description="The network (.net.xml, .net.xml.gz); default: the configuration's.")
     routes: Names = Field(default=(), description="Route files; default: the configuration's.")
     additional: Names = Field(default=(), description="Additional files; default: the configuration's.")
-    options: dict[str, str | float | int | bool] = Field(default={}, description="Further SUMO options, name: value.")
+    options: dict[str, str | float | _Whole | bool] = Field(default={}, description="Further SUMO options, name: value.")
 
 
 class DeformationEntry(_Strict):
@@ -99,7 +101,7 @@ class RecordedEntry(_Strict):
 class ProfileEntry(_Strict):
     """A curve over time that several inputs shape: by its values at knots, or a recorded one that is deformed."""
 
-    knots: Annotated[tuple[float, ...], Field(strict=False)] | None = Field(
+    knots: Annotated[tuple[float, ...], Field(strict=False, max_length=1000)] | None = Field(
         default=None, description="Times (s); the values there are the inputs NAME_0, NAME_1, ... (range beside the profile)."
     )
     interpolate: Literal["linear", "pchip"] = Field(default="linear", description="Between knots; pchip: smooth, no overshoot.")
@@ -181,7 +183,7 @@ class WarmUpEntry(_Strict):
         default="auto", description="Time (s) at which runs begin; auto: shortly before the ego and all that inputs change."
     )
     seeds: int | None = Field(
-        default=None, ge=1, description="Number of warm-ups; null: one for 50 runs, at most 8; of an estimation 20."
+        default=None, ge=1, le=10_000, description="Number of warm-ups; null: one for 50 runs, at most 8; of an estimation 20."
     )
 
     @property
@@ -194,7 +196,7 @@ class InsertEntry(_Strict):
     """A vehicle that the scenario inserts beside the traffic of the files; numbers may be placeholders."""
 
     edge: Name = Field(description="Where it starts.")
-    lane: int | Name = Field(default=0, description="Index of its lane, from the right.")
+    lane: Annotated[int, Field(ge=0, le=1000)] | Name = Field(default=0, description="Index of its lane, from the right.")
     position: float | Name = Field(description="Of its front bumper on the lane (m).")
     speed: float | Name = Field(description="At its start (m/s).")
     at: float | Name | None = Field(default=None, description="When it starts (s); null: at warm_up.until.")
@@ -212,12 +214,19 @@ class ScenarioModel(_Strict):
     description: str = Field(default="", description="The first line is a title.")
     sumo: Annotated[SumoEntry, _under("config")] | None = Field(default=None, description="The files, or just a .sumocfg.")
     simulate: Name | None = Field(default=None, description="file.py:NAME of a loop simulate(sumo, values, rng).")
+    covariates: Name | None = Field(
+        default=None, description="file.py:NAME of covariates(values, rng): what the run's seed draws, by name, before the run."
+    )
     inputs: dict[str, InputEntry] = Field(min_length=1, description="By name; ${name} in the files.")
-    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False)] = Field(default=(), description="Correlated pairs.")
-    constraints: Annotated[tuple[Condition, ...], Field(strict=False)] = Field(default=(), description="Conditions on inputs.")
-    features: dict[str, Formula] = Field(default={}, description="Derived inputs for the metamodel.")
+    correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False, max_length=1000)] = Field(
+        default=(), description="Correlated pairs."
+    )
+    constraints: Annotated[tuple[Condition, ...], Field(strict=False, max_length=MOST)] = Field(
+        default=(), description="Conditions on inputs."
+    )
+    features: dict[str, Formula] = Field(default={}, max_length=MOST, description="Derived inputs for the metamodel.")
     ego: Annotated[EgoEntry, _under("id")] = Field(description="The vehicle under test, or just its id.")
-    egos: Annotated[tuple[Annotated[EgoEntry, _under("id")], ...], Field(strict=False)] = Field(
+    egos: Annotated[tuple[Annotated[EgoEntry, _under("id")], ...], Field(strict=False, max_length=MOST)] = Field(
         default=(), description="Further vehicles under test: the worst counts. ego: [a, b] is short for ego: a, egos: [b]."
     )
     actors: dict[str, ActorEntry] = Field(default={}, description="By id: who follows a profile.")
@@ -241,7 +250,7 @@ class ScenarioModel(_Strict):
     warm_up: WarmUpEntry | None = Field(
         default=None, description="Traffic is warmed up once; null: where that spares much and changes no input's effect."
     )
-    metrics: Annotated[tuple[Annotated[MetricEntry, _under("kind")], ...], Field(strict=False)] = Field(
+    metrics: Annotated[tuple[Annotated[MetricEntry, _under("kind")], ...], Field(strict=False, max_length=MOST)] = Field(
         default=(), description="What is measured."
     )
     requirement: RequirementChange = Field(description="{metric, critical}, {stl}, or {any: [...]} or {all: [...]} of such.")
@@ -251,6 +260,14 @@ class ScenarioModel(_Strict):
     def _something_to_run(cls, value: str | None, info: ValidationInfo) -> str | None:
         if value is not None and ".py:" not in value:
             raise ValueError(f"a loop must be file.py:NAME, but got '{value}'")
+        return value
+
+    @field_validator("covariates")
+    @classmethod
+    def _known_before(cls, value: str | None) -> str | None:
+        if value is not None and ".py:" not in value:
+            rule = "covariates must be file.py:NAME (what SUMO itself draws from files is not known before the run)"
+            raise ValueError(f"{rule}, but got '{value}'")
         return value
 
 

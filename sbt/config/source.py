@@ -176,9 +176,11 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
         what = " ".join(filter(None, (error.context, error.problem))).replace("\n", " ")
         hint = " (indent with blanks, not with tabs)" if "'\\t'" in what else ""
         raise ConfigError([f"{name}:{line}:{column}: the file must be YAML, but {what}{hint}"]) from None
-    except (YAMLError, ValueError, RecursionError) as error:
+    except (YAMLError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         where = str(text[: getattr(error, "position", 0)]).count("\n") + 1
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if not isinstance(error, YAMLError | ValueError | RecursionError):  # as !!bool x does
+            reason = f"a value is not what its tag (!!) says: {reason}"
         raise ConfigError([f"{name}:{where}:1: the file must be YAML, but {reason}"]) from None
     if odd := _half_character(value):
         raise ConfigError([f"{name}: a file must be Unicode text, but has half of a character in {odd!r}"])

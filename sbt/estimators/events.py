@@ -7,11 +7,11 @@ readings are made: failed runs are safe, (1 - P(fail)) pi, or critical, P(fail) 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.estimators.surrogate import JointLogProbability, LogProbability
+from sbt.estimators.surrogate import JointLogProbability, LogProbability, sketch_of
 from sbt.metamodels.joint import LogPair, joined_log_probability
 from sbt.metamodels.success import failure_probability
 from sbt.problem.arrays import Mask, Points, Vector
@@ -34,6 +34,10 @@ class FailingLogProbability:
     def __call__(self, points: Points) -> LogPair:
         """Return (n,) log P(critical) and (n,) log P(uncritical)."""
         return _failing(self.given(points), self.fails(points)).safe
+
+    def sketch(self, rows: int) -> FailingLogProbability:
+        """Return about the same, learned from fewer runs."""
+        return replace(self, given=sketch_of(self.given, rows))
 
 
 @dataclass(frozen=True, eq=False)

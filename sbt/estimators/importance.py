@@ -20,7 +20,10 @@ import numpy as np
 
 from sbt.problem.arrays import Vector
 
-__all__ = ["BLIND", "SHARES", "Draws", "Plan", "Stated", "draw_systematic", "plan_batch", "stated", "stratified_variance"]
+__all__ = [
+    "BLIND", "SHARES", "Draws", "Plan", "Stated", "at_most_one", "draw_systematic", "plan_batch", "rows_at", "stated",
+    "stratified_variance",
+]  # fmt: skip
 
 SHARES = (0.63, 0.20, 0.05, 0.12)
 """Shares of the draws in proportion to the metamodel's uncertainty, to the nominal distribution, to the pool and to the
@@ -74,6 +77,8 @@ class Plan:
         nominal: share of the draws in proportion to the nominal distribution.
         nominal_probability: (N,) of each pool point in such a draw, sum 1.
         moment: (N,) mean square of what a run would correct at each pool point, by the metamodel.
+        guided: (N,) probability of each pool point in a draw that the metamodel guides, sum 1.
+        guided_share: of the draws.
     """
 
     form: str
@@ -87,6 +92,8 @@ class Plan:
     nominal: float
     nominal_probability: Vector
     moment: Vector
+    guided: Vector
+    guided_share: float
 
     def drawn_with(self, probability: Vector) -> Plan:
         """Return the same plan with other probabilities r (N,) of the pool points."""
@@ -152,13 +159,14 @@ def plan_batch(
             continue
         r = shares[1] * nominal + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
         mean = float((w * pi).sum())
-        r += shares[0] * _guided(log_spread, mean, others, w, log_w)
+        guided = _guided(log_spread, mean, others, w, log_w)
+        r += shares[0] * guided
         r /= r.sum()
         variance = stratified_variance(n * w * pi, stratum)
         if name == "difference":
-            plan = Plan(name, r, pi, w, mean, mean, 0.0, variance, shares[1], nominal, pi * np.exp(log_not))
+            plan = Plan(name, r, pi, w, mean, mean, 0.0, variance, shares[1], nominal, pi * np.exp(log_not), guided, shares[0])
         else:
-            plan = Plan(name, r, np.zeros(n), w, 0.0, mean, 0.0, variance, shares[1], nominal, pi)
+            plan = Plan(name, r, np.zeros(n), w, 0.0, mean, 0.0, variance, shares[1], nominal, pi, guided, shares[0])
         plans.append(plan.drawn_with(r))
     return min(plans, key=lambda plan: plan.anticipated)
 
@@ -227,17 +235,17 @@ def draw_systematic(plan: Plan, n: int, order: Vector, rng: np.random.Generator,
             others. A deterministic simulator tells nothing new the second time.
     """
     nominal = int(plan.nominal * n + rng.random())  # rounded at random: its expectation is exact
-    known = _inverted(plan.nominal_probability, rng.random(nominal))
+    known = rows_at(plan.nominal_probability, rng.random(nominal))
     rest, others = np.maximum(plan.probability - plan.nominal * plan.nominal_probability, 0.0), n - nominal
     if once and others:
-        expected = _at_most_one(rest, others)
+        expected = at_most_one(rest, others)
         plan, rest = plan.drawn_with((expected + nominal * plan.nominal_probability) / n), expected
     rows = np.argsort(order, kind="stable")
-    drawn = rows[_inverted(rest[rows], (np.arange(others) + rng.random()) / max(others, 1))]
+    drawn = rows[rows_at(rest[rows], (np.arange(others) + rng.random()) / max(others, 1))]
     return Draws(np.concatenate([known, drawn]), plan, nominal)
 
 
-def _at_most_one(probability: Vector, n: int) -> Vector:
+def at_most_one(probability: Vector, n: int) -> Vector:
     """Return (N,) how often n draws are expected to meet each point: in proportion to a probability, never above 1.
 
     Where there are no more than n points, they are met in proportion alone.
@@ -254,7 +262,7 @@ def _at_most_one(probability: Vector, n: int) -> Vector:
         certain |= beyond
 
 
-def _inverted(probability: Vector, at: Vector) -> Vector:
+def rows_at(probability: Vector, at: Vector) -> Vector:
     """Return the rows at which the cumulative probability, not normalised, reaches `at` in [0, 1)."""
     edges = np.cumsum(probability)
     return np.minimum(np.searchsorted(edges, at * edges[-1], side="right"), len(edges) - 1)

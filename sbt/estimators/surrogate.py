@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sbt.estimators.transfer import Trend, trended
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sketched, with_target
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
@@ -25,11 +26,13 @@ from sbt.problem.cube import Cube
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability"]
+__all__ = ["MOST_LEARNED", "Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability", "sketch_of"]
 
 LogProbability = Callable[[Points], tuple[Vector, Vector]]
 """(n, d) normal scores to (n,) log P(critical) and (n,) log P(uncritical)."""
 
+MOST_LEARNED = 2000
+"""Runs, drawn at random, that a Gaussian process of an estimation learns from at most: a proposal costs their square."""
 _REACH = 5.0  # normal scores from -5 to 5 are the unit interval: 6e-7 of the distribution lies beyond
 _QUANTILE = 0.5  # of the distances to the edge: the scale of the warp; a smaller one becomes a step as runs gather there
 _LEAST_R2 = 0.5  # leave-one-out R2 from which on a trend is taken: it explains more than it leaves
@@ -89,6 +92,16 @@ class JointLogProbability:
         """Return (n,) log P(critical) and (n,) log P(uncritical)."""
         return joined_log_probability(self.critical, [part(points) for part in self.parts])
 
+    def sketch(self, rows: int) -> JointLogProbability:
+        """Return about the same, learned from fewer runs."""
+        return replace(self, parts=tuple(sketch_of(part, rows) for part in self.parts))
+
+
+def sketch_of(log_probability: LogProbability, rows: int) -> LogProbability:
+    """Return about the same, learned from so many runs and many times quicker; itself where that would gain nothing."""
+    sketch: Any = getattr(log_probability, "sketch", None)
+    return log_probability if sketch is None else sketch(rows)
+
 
 @dataclass(frozen=True, eq=False)
 class _Form:
@@ -108,22 +121,65 @@ class _Form:
     trend: Callable[[Points], Vector] | None = None
     noise: float = 0.0
 
-    def fit(self, metamodel: Metamodel, u: Points, rows: NDArray[np.intp], rng: np.random.Generator) -> Predictor:
+    def fit(self, metamodel: Metamodel, u: Points, rows: NDArray[np.intp], rng: np.random.Generator) -> _Learned:
         """Return the predictor of the values, learned from some rows of u (n, d)."""
         values = self.values if self.trend is None else self.values - self.trend(u)
         target = with_target(metamodel, self.interval) if self.trend is None else metamodel
         with named_errors(metamodel, len(u)):
-            predictor = target.fit(u[rows], values[rows], rng)
+            return _Learned(self, target.fit(u[rows], values[rows], rng), metamodel, len(u))
 
-        def predict(inputs: Points) -> Prediction:
-            with named_errors(metamodel, len(u)):
-                p = check_prediction(predictor(inputs), len(inputs))
-            if self.noise > 0.0:
-                lacking = np.maximum(self.noise - p.noise**2, 0.0)
-                p = Prediction(p.mean, np.sqrt(p.std**2 + lacking), p.weight, np.sqrt(p.noise**2 + lacking))
-            return p if self.trend is None else Prediction(p.mean + self.trend(inputs), p.std, p.weight, p.noise)
 
-        return predict
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """The predictor of a form's values.
+
+    Args:
+        form: what is learned.
+        predictor: of what the trend leaves.
+        metamodel, n: what was fitted, and to how many runs; errors name them.
+    """
+
+    form: _Form
+    predictor: Predictor
+    metamodel: Metamodel
+    n: int
+
+    def __call__(self, inputs: Points) -> Prediction:
+        """Return the prediction of the values at the metamodel's inputs (n, d)."""
+        with named_errors(self.metamodel, self.n):
+            p = check_prediction(self.predictor(inputs), len(inputs))
+        form = self.form
+        if form.noise > 0.0:
+            lacking = np.maximum(form.noise - p.noise**2, 0.0)
+            p = Prediction(p.mean, np.sqrt(p.std**2 + lacking), p.weight, np.sqrt(p.noise**2 + lacking))
+        return p if form.trend is None else Prediction(p.mean + form.trend(inputs), p.std, p.weight, p.noise)
+
+
+@dataclass(frozen=True, eq=False)
+class _Largest:
+    """The largest P(critical) of a few fits.
+
+    Args:
+        coordinates: normal scores to the metamodel's inputs.
+        learned: the fits.
+    """
+
+    coordinates: Callable[[Points], Points]
+    learned: tuple[_Learned, ...]
+
+    def __call__(self, points: Points) -> tuple[Vector, Vector]:
+        """Return (n,) log P(critical) and (n,) log P(uncritical)."""
+        inputs = self.coordinates(points)
+        each = [predict(inputs).log_probability(predict.form.interval) for predict in self.learned]
+        log_pi, log_not = each[0]
+        for other_pi, other_not in each[1:]:
+            larger = other_pi > log_pi
+            log_pi, log_not = np.where(larger, other_pi, log_pi), np.where(larger, other_not, log_not)
+        return log_pi, log_not
+
+    def sketch(self, rows: int) -> _Largest:
+        """Return about the same, learned from fewer runs."""
+        return replace(self, learned=tuple(replace(each, predictor=sketched(each.predictor, rows)) for each in self.learned))
 
 
 def fit_log_probability(
@@ -171,6 +227,8 @@ def fit_log_probability(
     trends = [replace(form, trend=_trend(u, form.values)) for form in (whole, plain)]
     forms = [whole, plain, *(form for form in trends if form.trend is not None)]
     every = np.arange(len(y))
+    if len(y) > MOST_LEARNED and getattr(metamodel, "CUBIC", False):
+        every = np.sort(rng.permutation(len(y))[:MOST_LEARNED])
     if len(y) < _FEWEST_SCORED:
         chosen = [whole, *forms[2:3]]
     else:
@@ -178,18 +236,7 @@ def fit_log_probability(
         best = int(np.argmax(gain))
         sure = forms[best].trend is None or gain[best] > _SURE
         chosen = [forms[best]] if sure else [whole, forms[best]]
-    found = [(form.interval, form.fit(metamodel, u, every, rng)) for form in chosen]
-
-    def largest(points: Points) -> tuple[Vector, Vector]:
-        inputs = coordinates(points)
-        each = [predict(inputs).log_probability(interval) for interval, predict in found]
-        log_pi, log_not = each[0]
-        for other_pi, other_not in each[1:]:
-            larger = other_pi > log_pi
-            log_pi, log_not = np.where(larger, other_pi, log_pi), np.where(larger, other_not, log_not)
-        return log_pi, log_not
-
-    return largest
+    return _Largest(coordinates, tuple(form.fit(metamodel, u, every, rng) for form in chosen))
 
 
 def _gains(metamodel: Metamodel, forms: list[_Form], u: Points, weight: Vector, rng: np.random.Generator) -> Vector:

@@ -162,7 +162,7 @@ class DaskExecutor:
             for job in suspects:
                 if (yield from self._drain(deque([job]))):
                     reason = "the dask worker died, also when this run was tried again alone"
-                    yield [Outcome(job.index, Status.CRASHED, {}, reason)]
+                    yield [Outcome(job.index, Status.CRASHED, {}, reason, level=job.level)]
 
     def _drain(self, queue: deque[Job]) -> Any:
         """Run the queued jobs; return those whose workers died."""

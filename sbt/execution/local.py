@@ -32,7 +32,7 @@ from sbt.execution.pool import broken, close_pool, open_pool
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.streams import open_missing
-from sbt.execution.worker import run_jobs
+from sbt.execution.worker import run_at_levels
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.processes import scratch
@@ -151,11 +151,11 @@ class LocalExecutor:
     def _lost(self, job: Job, cause: _Cause) -> Outcome:
         if cause is _Cause.LATE:
             reason = f"a run must take at most {self._timeout:g} s: its process was stopped"
-            return Outcome(job.index, Status.TIMEOUT, {}, reason)
+            return Outcome(job.index, Status.TIMEOUT, {}, reason, level=job.level)
         what = "the worker process died"
         if cause is _Cause.LARGE:
             what = f"a worker may use {(self._memory or 0) / 2**20:.0f} MiB of memory: its process was stopped"
-        return Outcome(job.index, Status.CRASHED, {}, f"{what}, also when this run was tried again alone")
+        return Outcome(job.index, Status.CRASHED, {}, f"{what}, also when this run was tried again alone", level=job.level)
 
     def _drain(self, queue: deque[Job]) -> Any:
         """Run the queued jobs; return those without an outcome after a worker died, and the runs that were in progress."""
@@ -268,10 +268,10 @@ def settle() -> None:
 
 
 @cache
-def _scenario(folder: str) -> LogicalScenario:
-    """Return the scenario that the driver wrote for its workers."""
+def _scenario(folder: str, level: int = 0) -> LogicalScenario:
+    """Return the scenario that the driver wrote for its workers, at a level of fidelity."""
     spec, timeout = pickle.loads(Path(folder, _SCENARIO).read_bytes())
-    scenario: LogicalScenario = spec.resolve()
+    scenario: LogicalScenario = spec.at_level(level).resolve()
     try:
         scenario.prepare()
         return scenario.limited(timeout)
@@ -294,7 +294,7 @@ def _prepare(folder: str, workers: int) -> None:
 
 def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:
     """Run jobs in a worker and record which are in progress."""
-    outcomes = run_jobs(_scenario(folder), jobs, partial(_mark, folder))
+    outcomes = run_at_levels(partial(_scenario, folder), jobs, partial(_mark, folder))
     for outcome in outcomes if _limit(folder) else ():
         if outcome.reason.startswith(_TOO_LARGE):  # what earlier runs left may be to blame: tried again alone, as after a death
             _mark(folder, (outcome.index,))

@@ -13,7 +13,7 @@ from typing import Protocol, Self, runtime_checkable
 from sbt import interruption
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.streams import open_missing
-from sbt.execution.worker import run_job, run_jobs
+from sbt.execution.worker import run_at_levels, run_job
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.scenario import Batched
 
@@ -80,7 +80,7 @@ class SerialExecutor:
     apart = False
 
     def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
-        self._scenario = spec.resolve().limited(timeout)
+        self._scenarios = tuple(level.resolve().limited(timeout) for level in spec.levels)
 
     def __enter__(self) -> Self:
         """Return the executor."""
@@ -101,10 +101,10 @@ class SerialExecutor:
         Raises:
             KeyboardInterrupt: Ctrl-C, after the run that was at work at the latest.
         """
-        simulate = self._scenario.simulate
-        together = isinstance(simulate, Batched) and simulate.batched
         place = Path.cwd()
         while queue:
+            simulate = self._scenarios[queue[0].level].simulate
+            together = isinstance(simulate, Batched) and simulate.batched
             with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
                 outcomes = self._together(queue) if together else self._alone(queue)
             _restore(place)
@@ -112,13 +112,16 @@ class SerialExecutor:
 
     def _together(self, queue: deque[Job]) -> list[Outcome]:
         """Run the next jobs at once."""
-        return run_jobs(self._scenario, [queue.popleft() for _ in range(min(CHUNK, len(queue)))], lambda _: None)
+        jobs = [queue.popleft() for _ in range(min(CHUNK, len(queue)))]
+        return run_at_levels(self._scenarios.__getitem__, jobs, lambda _: None)
 
     def _alone(self, queue: deque[Job]) -> list[Outcome]:
         """Run the next job, and more where that takes no time."""
-        start, outcomes = time.perf_counter(), [run_job(self._scenario, queue.popleft())]
-        while queue and time.perf_counter() - start < _QUICK:
-            outcomes.append(run_job(self._scenario, queue.popleft()))
+        start = time.perf_counter()
+        outcomes: list[Outcome] = []
+        while queue and (not outcomes or time.perf_counter() - start < _QUICK):
+            job = queue.popleft()
+            outcomes.append(run_job(self._scenarios[job.level], job))
         return outcomes
 
 

@@ -23,7 +23,22 @@ from sbt.problem.isolation import Isolation, Warmable
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 
-__all__ = ["ScenarioSpec"]
+__all__ = ["CoarseLevel", "ScenarioSpec"]
+
+@dataclass(frozen=True)
+class CoarseLevel:
+    """A second, cheaper level of fidelity: other settings of the same scenario, which the same inputs and seeds are run at.
+
+    Args:
+        step_length: its step (s); None: that of its scenario.
+        name: of its scenario, as of `ScenarioSpec`; None: the same.
+        metrics: that it measures, beside those of its own requirement; None: all.
+    """
+
+    step_length: float | None = None
+    name: str | None = None
+    metrics: tuple[str, ...] | None = None
+
 
 Attempt = Callable[[tuple[str | int, ...], Callable[[], LogicalScenario]], LogicalScenario | None]
 
@@ -48,6 +63,8 @@ class ScenarioSpec:
         drivers: egos (kind and settings) that are exchanged for the scenario's own from run to run, as `sbt.execution.exchange`
             says; none: the ego is not exchanged.
         carried: the scenario itself, as `sbt.execution.carrying.carry` gives it; empty where the name says which it is.
+        only: measure nothing but these metrics and those of the requirement; None: all.
+        coarse: a cheaper level of fidelity (`at_level`); None: there is none. It does not change the scenario itself.
     """
 
     name: str
@@ -63,6 +80,28 @@ class ScenarioSpec:
     friction: tuple[float, float] | None = None
     formulas: tuple[tuple[str, str], ...] = ()
     isolated: Isolation | None = None
+    only: tuple[str, ...] | None = None
+    coarse: CoarseLevel | None = None
+
+    def at_level(self, level: int) -> ScenarioSpec:
+        """Return the scenario at a level of fidelity: 0 is itself, 1 the coarse one.
+
+        Raises:
+            InputError: it has no such level.
+        """
+        if level == 0:
+            return self if self.coarse is None else replace(self, coarse=None)
+        if self.coarse is None or level != 1:
+            raise InputError(f"a run must be at a level of fidelity of its campaign, but {self.name} has no level {level}")
+        coarse = self.coarse
+        if coarse.name is None:
+            return replace(self, step_length=coarse.step_length, only=coarse.metrics, coarse=None)
+        return replace(self, name=coarse.name, step_length=coarse.step_length, carried=b"", only=coarse.metrics, coarse=None)
+
+    @property
+    def levels(self) -> tuple[ScenarioSpec, ...]:
+        """The scenario at each of its levels of fidelity, its own first."""
+        return tuple(self.at_level(k) for k in range(1 if self.coarse is None else 2))
 
     def resolve(self) -> LogicalScenario:
         """Return the scenario; loaded once per process and specification.
@@ -72,7 +111,7 @@ class ScenarioSpec:
             InputError: the scenario does not offer one of the choices, or was carried and cannot be loaded here.
         """
         ego = None if self.ego is None else json.dumps(dict(self.ego), sort_keys=True)
-        plain = replace(self, ego=None, drivers=(), folder=str(Path(self.folder).resolve()))
+        plain = replace(self, ego=None, drivers=(), coarse=None, folder=str(Path(self.folder).resolve()))
         scenario = _resolved(plain, ego)
         return with_drivers(scenario, self.drivers) if self.drivers else scenario
 
@@ -113,6 +152,8 @@ class ScenarioSpec:
         yield ("executor", "isolation"), partial(LogicalScenario.configured, isolation=self.isolation)  # may depend on the ego
         if self.isolated is not None:
             yield ("executor", "isolation"), partial(_isolated, isolation=self.isolated)
+        if self.only is not None:
+            yield ("fidelity",), partial(_measuring_only, self.only)
 
 
 def _loaded(name: str, folder: Path, carried: bytes) -> LogicalScenario:
@@ -179,6 +220,13 @@ def _with_formula(name: str, formula: str, scenario: LogicalScenario) -> Logical
         raise InputError(f"a formula needs the trace of a run, but scenario {scenario.name} gives its metrics directly")
     roles = scenario.roles
     return _measuring(scenario, stl(formula, name, roles.ego, roles.other, roles.margin))
+
+
+def _measuring_only(names: tuple[str, ...], scenario: LogicalScenario) -> LogicalScenario:
+    """Return the scenario with these metrics and those of its requirement, where they are measured on traces."""
+    kept = {*names, *(part.metric for part in scenario.requirement.parts)}
+    found = tuple(metric for metric in scenario.metrics if metric.name in kept)
+    return scenario if scenario.simulate is None else replace(scenario, metrics=found)
 
 
 def _measuring(scenario: LogicalScenario, metric: Metric) -> LogicalScenario:

@@ -29,10 +29,11 @@ def warm_up(spec: ScenarioSpec, workers: int, tell: Callable[[str], None] = lamb
     isolation = spec.isolated
     if isolation is None or not isolation.warm:
         return
-    simulate = spec.resolve().simulate
-    if not isinstance(simulate, Warmable):
-        return
-    missing = [(spec, k) for k in range(isolation.seeds) if not simulate.warmed_up(k)]
+    missing: list[tuple[ScenarioSpec, int]] = []
+    for level in spec.levels:  # a state is of its step: a coarse run begins with a coarse warm-up
+        simulate = level.resolve().simulate
+        if isinstance(simulate, Warmable):
+            missing += [(level, k) for k in range(isolation.seeds) if not simulate.warmed_up(k)]
     if missing:
         tell(f"warming up the traffic, {isolation.seeds} times until t = {isolation.until:g} s")
     for (_, k), problem in each(_warm_up, missing, min(workers, max(len(missing), 1))):

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
+from itertools import groupby
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["run_job", "run_jobs", "run_traced", "versions"]
+__all__ = ["run_at_levels", "run_job", "run_jobs", "run_traced", "versions"]
 
 _Measured = tuple[dict[str, float], str, str]
 """Metrics, SUMO's own collision list, and what differs between it and the contacts."""
@@ -84,6 +85,13 @@ def run_jobs(scenario: LogicalScenario, jobs: Sequence[Job], at_work: Callable[[
     return outcomes
 
 
+def run_at_levels(
+    scenario: Callable[[int], LogicalScenario], jobs: Sequence[Job], at_work: Callable[[Sequence[int]], None]
+) -> list[Outcome]:
+    """Run several concrete scenarios as `run_jobs` does, each at its level of fidelity: `scenario` gives that of a level."""
+    return [o for level, some in groupby(jobs, lambda job: job.level) for o in run_jobs(scenario(level), list(some), at_work)]
+
+
 def _together(
     scenario: LogicalScenario, jobs: Sequence[Job], at_work: Callable[[Sequence[int]], None]
 ) -> list[Trace | BaseException] | None:
@@ -112,12 +120,12 @@ def _outcome(job: Job, measured: Callable[[], _Measured], seconds: float = 0.0) 
             if os.getpid() != process:  # a child that the run forked: going on, it would be a second driver or worker
                 os._exit(0)
         interruption.check()  # the code of the run may have caught the KeyboardInterrupt of a signal
-        return Outcome(job.index, Status.OK, metrics, "", time.perf_counter() - start, reported, unconfirmed)
+        return Outcome(job.index, Status.OK, metrics, "", time.perf_counter() - start, reported, unconfirmed, job.level)
     except BaseException as error:  # a user's scenario may raise anything, SystemExit too; the campaign goes on
         if interruption.is_interruption(error):
             raise KeyboardInterrupt from None
         status, reason = _verdict(error)
-    return Outcome(job.index, status, {}, reason, time.perf_counter() - start)
+    return Outcome(job.index, status, {}, reason, time.perf_counter() - start, level=job.level)
 
 
 def _verdict(error: BaseException) -> tuple[Status, str]:

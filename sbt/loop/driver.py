@@ -102,7 +102,8 @@ class Driver:
         self._last = time.perf_counter()
         self._busy += sum(outcome.seconds for outcome in outcomes)
         for outcome in outcomes:
-            self.counter.count(outcome.status, outcome.metrics)
+            if outcome.level == 0:
+                self.counter.count(outcome.status, outcome.metrics)
             self.counter.tell("simulating")
 
     def simulate(self, executor: Executor, queue: deque[Job]) -> None:

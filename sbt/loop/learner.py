@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sbt.loop.several import each_requirement, independence
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors, sketched
 from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
@@ -32,6 +32,8 @@ _LEAST_PROBE = 1024
 """Of them, feasible ones: a standard error below 1.6 %."""
 _FINE, _FINE_COST = 2**16, 6e9
 """Points at which a small share is measured for a conclusion, at most; and points times squared number of runs: some seconds."""
+_SKETCH = 600
+"""Runs that a sketch of the metamodel is made of."""
 _CHUNK = 4096
 """Points that are predicted at once: bounds the memory of mixtures."""
 
@@ -46,6 +48,7 @@ class FittedMetamodel:
         seconds: the fit took.
         log_ambiguity_bound: (n, d) points -> (n,) quick upper bounds of log a_BI; None: the metamodel has none.
         log_success: (n, d) points -> (n,) log P(a run gives a metric); None: all runs so far did.
+        sketch: predicts about the same and many times quicker, to guide what `predict` judges; None: there is no such thing.
     """
 
     predict: Callable[[Points], Prediction]
@@ -53,6 +56,7 @@ class FittedMetamodel:
     seconds: float
     log_ambiguity_bound: Callable[[Points], Vector] | None = None
     log_success: Callable[[Points], Vector] | None = None
+    sketch: Callable[[Points], Prediction] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,9 @@ class Learner:
 
         success = self.success(history)
         record = self._record(predict, predictor, history, len(training), success)
-        return FittedMetamodel(predict, record, seconds, bound, success)
+        rough = sketched(predictor, _SKETCH)
+        sketch = None if rough is predictor else self.on_inputs(rough, len(training))
+        return FittedMetamodel(predict, record, seconds, bound, success, sketch)
 
     def success(self, history: History) -> Callable[[Points], Vector] | None:
         """Return log P(a run gives a metric) at the inputs' (n, d) unit-cube points; None where all runs did, or none."""

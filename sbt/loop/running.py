@@ -100,7 +100,8 @@ def _log(store: Store, ahead: int) -> Log:
     """Return the log as a stage sees it that chooses the next batch; all of it where it does not look ahead."""
     iterations, fits = tuple(store.iterations()), tuple(store.fits())
     if ahead == 0 or not iterations:
-        return Log(store.history(), iterations, fits)
+        coarse = store.history(level=1)
+        return Log(store.history(), iterations, fits, coarse=coarse if len(coarse) else None)
     history = store.history(until=_last_visible(len(iterations), ahead))
     pending = store.pending(since=len(history))
     return Log(history, iterations, fits, pending if len(pending) else None)

@@ -16,7 +16,12 @@ from sbt.store.database import PlannedRun
 from sbt.store.history import History
 from sbt.store.records import FitRecord, Iteration
 
-__all__ = ["Batch", "Campaign", "Conclusion", "Facts", "Log", "LooksAhead", "Progress", "Shard", "Stage", "proposed"]
+__all__ = [
+    "Batch", "Campaign", "Conclusion", "Facts", "Log", "LooksAhead", "Progress", "Shard", "Stage", "few_combinations", "proposed",
+]  # fmt: skip
+
+_FEW = 4096
+"""Combinations of whole numbers and choices that are kept account of."""
 
 T = TypeVar("T")
 
@@ -45,12 +50,14 @@ class Log:
         iterations: how earlier batches were chosen.
         fits: scores of earlier metamodels.
         pending: runs of later batches, of which nothing is known but that they are being run; None: there are none.
+        coarse: finished runs of a coarser level of fidelity, which only teach; None: there are none.
     """
 
     history: History
     iterations: tuple[Iteration, ...]
     fits: tuple[FitRecord, ...]
     pending: History | None = None
+    coarse: History | None = None
 
     @cached_property
     def planned(self) -> History:
@@ -89,6 +96,7 @@ class Facts:
         unit: of the metric.
         scenario: its name.
         units: of inputs and metrics, by name.
+        combinations: of the inputs, where all are whole numbers or choices and there are at most 4,096; None: otherwise.
     """
 
     history: History
@@ -96,11 +104,21 @@ class Facts:
     unit: str = ""
     scenario: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
+    combinations: int | None = None
 
     @classmethod
     def of(cls, history: History, scenario: LogicalScenario) -> Facts:
         """Return the facts of a campaign with this scenario."""
-        return cls(history, scenario.requirement, scenario.unit, scenario.name, scenario.units)
+        return cls(
+            history, scenario.requirement, scenario.unit, scenario.name, scenario.units, few_combinations(scenario)
+        )
+
+
+def few_combinations(scenario: LogicalScenario) -> int | None:
+    """Return the number of combinations of whole numbers and choices that can be run; None where they are not few."""
+    space = scenario.space
+    points = None if scenario.pool is not None else space.cube.combinations(space.dimension, _FEW)
+    return None if points is None else int(space.feasible(space.from_unit(points)).sum())
 
 
 class Stage(Protocol):

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, sample_paths, without_repetitions
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, sample_paths, sketched, without_repetitions
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -40,12 +40,13 @@ class Auto:
     fitted to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
     every batch, takes about a quarter of the time: a smaller ensemble, two folds of at most 400 rows, and none below 300.
 
-    For a known critical interval (`with_target`) the score is not the density of y but the probability of the range that
-    it fell into (see `Bins`). The process leaves out one row at a time, in closed form; the others learn from 80 % of the
-    rows, 90 % from 1,000 rows on. The first model, `gp` with nu 2.5 and one noise, is taken alone unless the mixture is
-    better by three standard errors, and better over the space, too (rows crowd at the edge, where a mixture that hedges
-    looks better than it is). Where the metric jumps at the edge, `gp` learns a widened jump if that predicts the sides better
-    (see `stepped`). Where it leaves next to nothing to gain, the others are not even tried.
+    For a known critical interval (`with_target`) the score is not the density of y but the probability of the range that it
+    fell into (see `Bins`). The process leaves out one row at a time, in closed form; the others learn from 80 % of the rows,
+    90 % from 1,000 rows on where all rows are compared (or ten folds are needed to hold as many as are). The first model, `gp`
+    with nu 2.5 and one noise, is taken alone unless the mixture is better by three standard errors, and better over the space,
+    too (rows crowd at the edge, where a mixture that hedges looks better than it is). Where the metric jumps at the edge, `gp`
+    learns a widened jump if that predicts the sides better (see `stepped`). Where it leaves next to nothing to gain, the
+    others are not even tried.
 
     Args:
         folds: of the cross-validation, >= 2.
@@ -130,7 +131,7 @@ class Auto:
             reason = f"100 % gp: it misses a mean log likelihood {left}"
             comparison = ModelComparison({name: float(name == "gp") for name in models}, {"gp": float(own.mean())}, reason)
             return self._mixed(models, {"gp": process}, comparison, u, y, rng)
-        folds = max(self.folds, 5 if n < 1000 else 10)
+        folds = max(self.folds, 5 if n < 1000 else 10 if self.compare_rows >= n else min(max(n // self.compare_rows, 5), 10))
         rivals = self._models(n, n - n // folds, target_aware=True)
         others, rows = held_out_scores([rivals[k] for k in rivals if k != "gp"], u, y, folds, rng, bins, self.compare_rows)
         scores = np.vstack([own[rows], others])
@@ -227,6 +228,10 @@ class MixturePredictor:
                 ends = p * (1.0 - 1e-9), p * (1.0 + 1e-9)
             low, high = low + weight * ends[0], high + weight * ends[1]
         return low, np.minimum(high, 1.0)
+
+    def sketch(self, rows: int) -> MixturePredictor:
+        """Return the mixture of the predictors' sketches, or of themselves where they have none."""
+        return MixturePredictor(tuple(sketched(p, rows) for p in self.predictors), self.weight, self.comparison)
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of y as a function at u (m, d), each by one of the predictors."""

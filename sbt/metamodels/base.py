@@ -22,7 +22,9 @@ A metamodel of one's own is any class with `fit(u, y, rng)`; its settings are th
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
@@ -36,7 +38,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
     "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "log_ambiguity_bound",
-    "named_errors", "sample_paths", "simplest", "split_validation", "standardise", "with_target",
+    "named_errors", "sample_paths", "simplest", "sketched", "split_validation", "standardise", "with_target",
     "without_repetitions",
 ]  # fmt: skip
 
@@ -46,6 +48,7 @@ Predictor = Callable[[Points], Prediction]
 _SMALLEST = 1e-304  # of an upper bound of a_BI, before the logarithm: about the smallest normal number
 _MIXED = 5  # components from which on one of them stands for a function (an ensemble, a forest)
 _CONSTANT = 1e-12  # standard deviation relative to |y|: below it, y is constant but for rounding
+_LARGER = 100  # times its default that a whole number may be: what is larger never ends, or takes all memory
 _CONSTANT_SCALE = 1e-3  # scale of a constant y, relative to max(1, |y|)
 
 
@@ -105,6 +108,12 @@ def log_ambiguity_bound(predictor: Screened, u: Points, critical: CriticalInterv
     return np.log(np.maximum(2.0 * np.minimum(np.minimum(high, 1.0 - low), 0.5), _SMALLEST))
 
 
+def sketched(predictor: Predictor, rows: int) -> Predictor:
+    """Return what predicts about the same from so many rows (the predictor's `sketch`); itself where that would gain nothing."""
+    sketch: Any = getattr(predictor, "sketch", None)
+    return predictor if sketch is None else sketch(rows)
+
+
 def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generator) -> Points:
     """Return (n, m) draws of y as a function, at u (m, d).
 
@@ -149,6 +158,7 @@ def build(kind: Any, preset: str | None = None, settings: Mapping[str, Any] | No
     values = {**presets.get(preset or "", {}), **(settings or {})}
     if isinstance(kind, type):
         _check_settings(name, kind, values)
+        _check_values(kind, values)
         try:
             made = kind(**values)
         except SbtError:
@@ -184,6 +194,39 @@ def _check_settings(name: str, kind: type, values: Mapping[str, Any]) -> None:
     missing = [p.name for p in required if p.name not in values]
     if missing:
         raise InputError(f"{name} needs the setting{'s' * (len(missing) > 1)} {', '.join(missing)}, but got {_listed(values)}")
+
+
+def _check_values(kind: type, values: Mapping[str, Any]) -> None:
+    """Raise InputError where values are not what a metamodel of this package declares; others check their own.
+
+    Whole numbers are at most a hundred times the default, or what a preset has; other numbers are finite.
+    """
+    if not (kind.__module__.startswith("sbt.") and dataclasses.is_dataclass(kind)):
+        return
+    presets: Iterable[Mapping[str, Any]] = getattr(kind, "PRESETS", {}).values()
+    for field in dataclasses.fields(kind):
+        if field.name not in values:
+            continue
+        value, declared = values[field.name], str(field.type)
+        stated = [each for each in (field.default, *(p.get(field.name) for p in presets)) if each is not None]
+        rule = _rule(declared.removesuffix(" | None"), value, stated)
+        if rule and not (value is None and declared.endswith(" | None")):
+            raise InputError(f"{field.name} must be {rule}, but got {value!r}")
+
+
+def _rule(declared: str, value: Any, stated: Iterable[Any]) -> str:
+    """Return what a value of a declared type must be and is not; "" where it is."""
+    if declared == "tuple[int, ...]":
+        flat = list(value) if isinstance(value, list | tuple) else [None]
+        rule = next((r for each in flat if (r := _rule("int", each, [n for numbers in stated for n in numbers]))), "")
+        return f"a list of at most {_LARGER}, each {rule or 'a whole number'}" if rule or len(flat) > _LARGER else ""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if declared == "int":
+        most = max(_LARGER * next(iter(stated)), *stated)
+        return "" if number and isinstance(value, int) and abs(value) <= most else f"a whole number of at most {most}"
+    if declared == "float":
+        return "" if number and math.isfinite(value) else "a finite number"
+    return "true or false" if declared == "bool" and not isinstance(value, bool) else ""
 
 
 @contextmanager

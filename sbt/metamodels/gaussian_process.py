@@ -22,7 +22,19 @@ from scipy.optimize import minimize
 from sbt.errors import InputError
 from sbt.metamodels.base import check_rows, split_validation, standardise, without_repetitions
 from sbt.metamodels.extra_trees import ExtraTrees
-from sbt.metamodels.gp_algebra import Hyperparameters, Matrix, cholesky, diagonal, host, like, native, placed, solve, solve_right
+from sbt.metamodels.gp_algebra import (
+    NOISE_FLOOR,
+    Hyperparameters,
+    Matrix,
+    cholesky,
+    diagonal,
+    host,
+    like,
+    native,
+    placed,
+    solve,
+    solve_right,
+)
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative_variance
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import check_device, device_of, single_threaded
@@ -31,8 +43,7 @@ from sbt.problem.arrays import Points, Vector
 __all__ = ["GaussianProcess", "GaussianProcessPredictor"]
 
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
-_NOISE_FLOOR = 1e-8  # variance relative to that of y: condition numbers stay below 1e-6 / machine epsilon at 2,000 rows
-_LIKELY_NOISE, _NO_NOISE = -5.0, math.log(_NOISE_FLOOR)  # log variances: the mode of a noisy metric, and a deterministic one
+_LIKELY_NOISE, _NO_NOISE = -5.0, math.log(NOISE_FLOOR)  # log variances: the mode of a noisy metric, and a deterministic one
 _HEAVY_NOISE = -0.7  # log variance: half of y's, the mode where a simulator is known to be noisy
 _LEAST_NOISE = 1e-4  # GPyTorch's own floor, where there are no priors or certainly noise
 _FOLDS = 5  # of the noise regression
@@ -59,6 +70,8 @@ class GaussianProcess:
         nu: smoothness of the kernel: 0.5, 1.5 or 2.5.
         input_noise: let the noise depend on the input (from 10 rows on).
         fit_rows: most rows that hyperparameters are fitted on, >= 2; chosen by the rng.
+        most_rows: most rows that the process is conditioned on, >= 2; chosen by the rng, which beats a choice by y
+            (docs/metamodels.md). Its memory grows with their square.
         student_t: predict a Student-t, from the leave-one-out residuals, instead of a Gaussian.
         priors: fit under priors by L-BFGS; otherwise by Adam with early stopping.
         learning_rate: step of Adam, > 0.
@@ -79,6 +92,7 @@ class GaussianProcess:
     nu: float = 1.5
     input_noise: bool = True
     fit_rows: int = 500
+    most_rows: int = 10_000
     student_t: bool = False
     priors: bool = True
     learning_rate: float = 0.1
@@ -88,6 +102,7 @@ class GaussianProcess:
     certainly_noisy: bool = False
     heavy_noise: bool = False
 
+    CUBIC: ClassVar[bool] = True  # a fit costs the cube of its rows, a prediction their square: estimations give it few
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"nu": 0.5, "input_noise": False, "priors": False, "learning_rate": 0.1, "patience": 200}
     }
@@ -95,10 +110,10 @@ class GaussianProcess:
     def __post_init__(self) -> None:
         if self.nu not in (0.5, 1.5, 2.5):
             raise InputError(f"nu must be 0.5, 1.5 or 2.5, but got {self.nu}")
-        if not (self.fit_rows >= 2 and self.patience >= 1 and self.max_epochs >= 1):
+        if not (self.fit_rows >= 2 and self.most_rows >= 2 and self.patience >= 1 and self.max_epochs >= 1):
             raise InputError(
-                "GaussianProcess needs fit_rows >= 2, patience >= 1 and max_epochs >= 1, "
-                f"but got {self.fit_rows}, {self.patience} and {self.max_epochs}"
+                "GaussianProcess needs fit_rows >= 2, most_rows >= 2, patience >= 1 and max_epochs >= 1, "
+                f"but got {self.fit_rows}, {self.most_rows}, {self.patience} and {self.max_epochs}"
             )
         if not self.learning_rate > 0.0:
             raise InputError(f"learning_rate must be > 0, but got {self.learning_rate}")
@@ -117,6 +132,9 @@ class GaussianProcess:
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> GaussianProcessPredictor:
         """Return the process conditioned on u (n, d) and y (n,); see `Metamodel.fit`."""
         u, y = without_repetitions(*check_rows(u, y))
+        if len(y) > self.most_rows:
+            rows = np.sort(rng.permutation(len(y))[: self.most_rows])
+            u, y = u[rows], y[rows]
         with single_threaded():
             return self._fit(u, y, rng)
 
@@ -160,7 +178,7 @@ def _fit_noise_spread(
 def _factor(hyper: Hyperparameters, u: Points, noise: Vector, device: torch.device) -> Matrix:
     """Return the (n, n) lower Cholesky factor of the covariance of rows with that noise variance."""
     rows = placed(u, device)
-    return cholesky(hyper.covariance(rows, rows), np.maximum(noise, _NOISE_FLOOR))
+    return cholesky(hyper.covariance(rows, rows), np.maximum(noise, NOISE_FLOOR))
 
 
 def _leave_one_out(factor: Matrix, z: Vector) -> tuple[Vector, Vector]:
@@ -215,7 +233,7 @@ class _Model:
         )
         kernel = gpytorch.kernels.ScaleKernel(base, outputscale_constraint=Positive(**log))
         kernel.raw_outputscale.requires_grad_(not priors)
-        floor = _NOISE_FLOOR if priors and noise_mode is None else _LEAST_NOISE
+        floor = NOISE_FLOOR if priors and noise_mode is None else _LEAST_NOISE
         likelihood = gpytorch.likelihoods.GaussianLikelihood(noise_constraint=GreaterThan(floor, **log))
         return cls(kernel.double().to(device), likelihood.double().to(device), floor, priors, noise_mode)
 

@@ -18,12 +18,15 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector
 
 __all__ = [
-    "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "inverse_diagonal", "like", "matern", "native",
-    "placed", "solve", "solve_right", "squared_columns", "triangular",
+    "NOISE_FLOOR", "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "inverse_diagonal", "inverse_lower",
+    "like", "native", "placed", "solve", "solve_right", "squared_columns", "triangular",
 ]  # fmt: skip
 
 Matrix = Any
 """float64: a NumPy array on the CPU, a tensor on another device."""
+NOISE_FLOOR = 1e-8
+"""Least noise variance relative to that of y: condition numbers stay below 1e-6 / machine epsilon at 2,000 rows."""
+_CACHED = 2**15  # entries of a matrix that are computed at once: three arrays of them stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,30 +40,35 @@ class Hyperparameters:
 
     def covariance(self, a: Matrix, b: Matrix) -> Matrix:
         """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
-        lengthscale = like(self.lengthscale, a)
+        scale = like(math.sqrt(2.0 * self.nu) / self.lengthscale, a)
         if isinstance(a, torch.Tensor):
-            distance: Matrix = torch.cdist(a / lengthscale, b / lengthscale, compute_mode="donot_use_mm_for_euclid_dist")
-        else:
-            distance = cdist(a / lengthscale, b / lengthscale)
-        return self.outputscale * matern(distance, self.nu)
+            r: Matrix = torch.cdist(a * scale, b * scale, compute_mode="donot_use_mm_for_euclid_dist")
+            return self.outputscale * _matern(r, self.nu)
+        found, rows = cdist(a * scale, b * scale), max(_CACHED // max(len(b), 1), 1)
+        for start in range(0, len(found), rows):
+            part = found[start : start + rows]
+            part[:] = _matern(part, self.nu)
+            if self.outputscale != 1.0:
+                part *= self.outputscale
+        return found
 
 
-def matern(distance: Matrix, nu: float) -> Matrix:
-    """Return the Matern correlation at scaled distances >= 0, for nu 0.5, 1.5 or 2.5.
+def _matern(r: Matrix, nu: float) -> Matrix:
+    """Return the Matern correlation at r = sqrt(2 nu) times the scaled distance; writes on `r`.
 
     Source:
         Rasmussen & Williams (2006), eq. (4.17).
     """
-    r = math.sqrt(2.0 * nu) * distance
     correlation = -r
     if isinstance(r, torch.Tensor):
         correlation.exp_()
     else:
         np.exp(correlation, out=correlation)
-    if nu > 0.5:  # in place: these matrices are large
-        square = r * r / 3.0 if nu == 2.5 else None
+    if nu > 0.5:
+        square = r * r if nu == 2.5 else None
         r += 1.0
         if square is not None:
+            square *= 1.0 / 3.0
             r += square
         correlation *= r
     return correlation
@@ -113,7 +121,12 @@ def inverse_diagonal(factor: Matrix) -> Vector:
     """Return the (n,) diagonal of the inverse of the covariance whose factor this is."""
     if isinstance(factor, torch.Tensor):
         return host(torch.cholesky_inverse(factor).diagonal())
-    return np.asarray(np.diag(lapack.dpotri(factor, lower=1)[0]))
+    return np.asarray(np.diag(inverse_lower(factor)))
+
+
+def inverse_lower(factor: Points) -> Points:
+    """Return the (n, n) inverse of the covariance whose factor this is; only its lower triangle is written."""
+    return np.asarray(lapack.dpotri(factor, lower=1)[0])
 
 
 def solve_right(factor: Matrix, right: Points) -> Points:

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.special import ndtr
 
 from sbt.metamodels.extra_trees import ForestPredictor
 from sbt.metamodels.gp_algebra import (
+    NOISE_FLOOR,
     Hyperparameters,
     Matrix,
     cholesky,
     host,
     inverse_diagonal,
+    inverse_lower,
     like,
     placed,
+    solve_right,
     squared_columns,
     triangular,
 )
@@ -32,6 +34,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative_variance"]
 
+_GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, are spread evenly: rows that are chosen by them hit no period
 _CHUNK = 512  # points predicted at once: 2 MB a 500 rows
 _QUICK = 128  # points bounded at once: intermediate arrays stay in the cache
 _ROUNDED = {np.float32: 1e-6, np.float64: 2e-15}  # of a correlation: at most a dozen roundings
@@ -91,6 +94,24 @@ class GaussianProcessPredictor:
             at = [like(u[i : i + _CHUNK], rows) for i in range(0, len(u), _CHUNK)]
             chunks = [host(alpha @ self.hyper.covariance(part, rows).T) for part in at]
         return np.asarray(self.shift + self.scale * (self.centre + np.concatenate([np.empty(0), *chunks])))
+
+    def sketch(self, rows: int) -> GaussianProcessPredictor:
+        """Return the process conditioned on so many of its rows, evenly spread over their order; itself up to twice as many.
+
+        It guides searches, whose points the process itself then judges: a prediction costs the square of the rows.
+        """
+        n = len(self.u)
+        if n <= 2 * rows:
+            return self
+        z = self.centre + self.factor @ (self.factor.T @ self.alpha)
+        kept = np.flatnonzero(np.arange(n) * _GOLDEN % 1.0 < rows / n)
+        u = self.u[kept]
+        noise = self.hyper.noise * (np.ones(len(u)) if self.spread is None else self.spread(u))
+        with single_threaded():
+            at = placed(u, device_of(self.device))
+            factor = cholesky(self.hyper.covariance(at, at), np.maximum(noise, NOISE_FLOOR))
+            alpha = solve_right(factor, (z[kept] - self.centre)[:, None])[:, 0]
+        return replace(self, u=u, factor=host(factor), alpha=alpha)
 
     def leave_one_out(self, u: Points, y: Vector) -> Prediction:
         """Return the prediction of each row y (n,) at u (n, d) from all other rows, the hyperparameters kept; cubic in n.
@@ -241,12 +262,11 @@ class GaussianProcessPredictor:
             Rasmussen & Williams (2006), eqs. (5.10) to (5.12), for blocks of rows.
         """
         with single_threaded():
-            root = solve_triangular(self.factor, np.eye(len(self.u)), lower=True)
-            inverse = root.T @ root
+            inverse = inverse_lower(self.factor)
             found = []
             for rows in groups:
                 at = np.asarray(rows, dtype=np.intp)
-                block = np.linalg.inv(inverse[np.ix_(at, at)])
+                block = np.linalg.inv(inverse[np.maximum.outer(at, at), np.minimum.outer(at, at)])
                 found.append((self.scale * (block @ self.alpha[at]), self.scale * np.sqrt(np.diag(block))))
         return found
 

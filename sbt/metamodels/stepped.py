@@ -88,6 +88,10 @@ class SteppedPredictor:
         """Return the (n,) mean of y at u (n, d)."""
         return self.step.back(self.process.mu(u))
 
+    def sketch(self, rows: int) -> SteppedPredictor:
+        """Return the same with the sketch of its process."""
+        return SteppedPredictor(self.process.sketch(rows), self.step)
+
     def leave_one_out(self, u: Points, y: Vector) -> Prediction:
         """Return the prediction of each row from all others, see `GaussianProcessPredictor`."""
         return self.step.prediction(self.process.leave_one_out(u, self.step.moved(y)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -70,8 +71,13 @@ class Covariates:
         found = _told(source, centre, 0)
         return None if not found else cls(scenario, source, tuple(found))
 
-    def at(self, x: Points, seeds: Sequence[int]) -> Points:
+    def at(self, x: Points, seeds: Sequence[int], *, keep: bool = True) -> Points:
         """Return the (n, c) covariates of inputs (n, d), in their units, with a seed each.
+
+        Args:
+            x: the inputs.
+            seeds: of each.
+            keep: remember what was computed; not worth the memory for pools, of which few pairs are met again.
 
         Raises:
             InputError: they are not finite, or have other names than elsewhere in the space.
@@ -79,9 +85,10 @@ class Covariates:
         rows = np.empty((len(x), len(self.names)))
         for k, (row, seed) in enumerate(zip(x, seeds, strict=True)):
             key = row.tobytes(), int(seed)
-            if key not in self._known:
-                self._known[key] = self._drawn(row, int(seed))
-            rows[k] = self._known[key]
+            known = self._known.get(key)
+            rows[k] = self._drawn(row, int(seed)) if known is None else known
+            if keep and known is None:
+                self._known[key] = rows[k].copy()
         return rows
 
     def _drawn(self, row: Vector, seed: int) -> Vector:
@@ -101,7 +108,7 @@ class Covariates:
 def _told(source: DrawsAhead, values: Values, seed: int) -> Mapping[str, float] | None:
     """Return the covariates of a pair; an error of the scenario's own code says where."""
     try:
-        return source.known_before(values, seed)
+        found = source.known_before(values, seed)
     except SbtError:
         raise
     except Exception as error:
@@ -109,3 +116,10 @@ def _told(source: DrawsAhead, values: Values, seed: int) -> Mapping[str, float] 
             f"covariates must be known before the run, but at {written(values)}, seed {seed} computing them raised"
             f" {described(error)}"
         ) from error
+    where = f"at {written(values)}, seed {seed}"
+    if found is not None and not isinstance(found, Mapping):
+        raise InputError(f"known_before must return numbers by name, or None, but is {found!r} {where}")
+    for name, value in (found or {}).items():
+        if not isinstance(value, Real):
+            raise InputError(f"covariate {name} must be a number, but is {value!r} {where}")
+    return found

@@ -31,7 +31,9 @@ def describe_scenario(scenario: LogicalScenario) -> Json:
         "constraints": [[text, isinstance(rule, Expression)] for text, rule in space.constraints],
         "features": [[name, rule.text if isinstance(rule, Expression) else None] for name, rule in space.features],
         "requirement": to_plain(need),
-        "metrics": [{"name": m.name, "unit": m.unit, "direction": m.direction} for m in scenario.metrics]
+        "metrics": [
+            {"name": m.name, "unit": m.unit, "direction": m.direction, "description": m.description} for m in scenario.metrics
+        ]
         or [{"name": name, "unit": "", "direction": "low"} for name in scenario.metric_names],
         "recorded": scenario.pool is not None, "traced": scenario.simulate is not None,
     }  # fmt: skip
@@ -86,7 +88,10 @@ def rebuild_scenario(data: JsonMapping) -> LogicalScenario:
         tuple((name, Expression(text)) for name, text in data["features"]),
     )  # fmt: skip
     need, absent = data["requirement"], _Absent(data["name"])
-    metrics = tuple(Metric(m["name"], absent.measure, m["unit"], m["direction"]) for m in data["metrics"])
+    metrics = tuple(
+        Metric(m["name"], absent.measure, m["unit"], m["direction"], description=m.get("description", ""))
+        for m in data["metrics"]
+    )
     return LogicalScenario(data["name"], space, from_plain(need), absent, metrics, data["description"])
 
 

@@ -62,6 +62,8 @@ class Job:
     index: int
     inputs: Values
     seed: int
+    level: int = 0
+    """of fidelity, 0 the scenario's own"""
 
 
 @dataclass(frozen=True)
@@ -78,3 +80,5 @@ class Outcome:
     """SUMO's own collision list, as a cross-check of the geometric verdict"""
     unconfirmed: str = ""
     """contacts that SUMO's own list does not confirm and what differs, and other doubts about contacts (`doubts`)"""
+    level: int = 0
+    """of fidelity, as of the job"""

@@ -91,7 +91,7 @@ class ParameterSpace:
             if name in known:
                 known[name].number(choice)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the inputs, in the order of the columns."""
         return tuple(p.name for p in self.parameters)
@@ -107,14 +107,15 @@ class ParameterSpace:
         counts = [(k, len(p.choices), round(p.high - p.low) + 1) for k, p in enumerate(self.parameters) if p.discrete]
         return Cube(tuple((k, n) for k, m, n in counts if not m), tuple((k, m) for k, m, _ in counts if m))
 
-    @property
+    @cached_property
     def choices(self) -> dict[str, tuple[str, ...]]:
         """The choices of the inputs that have some, by name."""
         return {p.name: p.choices for p in self.parameters if p.choices}
 
     def named(self, x: Vector) -> dict[str, Value]:
         """Return the (d,) numbers of a point as values by name, choices as text."""
-        return {p.name: p.value(v) for p, v in zip(self.parameters, x, strict=True)}
+        values = dict(zip(self.names, np.asarray(x, dtype=np.float64).tolist(), strict=True))
+        return values | {name: choices[int(values[name])] for name, choices in self.choices.items()}
 
     def numbers(self, values: Values) -> Vector:
         """Return the (d,) numbers of values by name, a choice as its position.

@@ -7,6 +7,7 @@ where the trace is recorded.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -18,7 +19,7 @@ from sbt.errors import RunError
 from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 
-__all__ = ["ActorTrace", "States", "Trace", "select_parts"]
+__all__ = ["ActorTrace", "FieldOfView", "States", "Trace", "select_parts"]
 
 States = NDArray[np.float64]
 
@@ -53,6 +54,33 @@ def select_parts(parts: tuple[ActorTrace, ...], i: slice | NDArray[Any]) -> tupl
     )
 
 
+@dataclass(frozen=True)
+class FieldOfView:
+    """Where the sensor of the first actor sees something; films draw it.
+
+    Attributes:
+        reach: how far it sees (m); inf: as far as the picture shows.
+        ahead: of the sensor ahead of the middle of the actor (m).
+        half_angle: to each side of the heading (rad).
+        half_width: it sees only so far to each side of the actor's own axis, its path (m); inf: no such limit.
+        hidden_by: names of the actors that hide what is behind them; None: all others.
+
+    Raises:
+        ValueError: a length or angle is not positive.
+    """
+
+    reach: float = math.inf
+    ahead: float = 0.0
+    half_angle: float = 0.5 * math.pi
+    half_width: float = math.inf
+    hidden_by: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "half_angle", "half_width"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"a field of view needs {name} > 0, but got {getattr(self, name)}")
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """States of m actors at t instants.
@@ -72,6 +100,7 @@ class Trace:
         parts: name to the parts of a long vehicle (`ActorTrace.parts`), NaN where it is not there.
         unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`); other doubts.
         unreacting: actors that are moved as they were recorded, whatever happens.
+        view: where the sensor of the first actor sees something, for films (not compared); None: unknown.
 
     In traffic road users come and go: where one is not there, all its states are NaN (`present`).
 
@@ -97,6 +126,7 @@ class Trace:
     parts: Mapping[str, tuple[ActorTrace, ...]] = field(default_factory=dict)
     unconfirmed: tuple[str, ...] = ()
     unreacting: tuple[str, ...] = ()
+    view: FieldOfView | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.actors))
@@ -147,7 +177,10 @@ class Trace:
         if actors is not None:
             return some
         signals = {name: v[i] for name, v in self.signals.items()}
-        return replace(some, reported=self.reported, signals=signals, unconfirmed=self.unconfirmed, unreacting=self.unreacting)
+        return replace(
+            some, reported=self.reported, signals=signals, unconfirmed=self.unconfirmed, unreacting=self.unreacting,
+            view=self.view,
+        )  # fmt: skip
 
     def signal(self, name: str) -> Vector:
         """Return the (t,) values of one signal.

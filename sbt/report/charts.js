@@ -50,12 +50,14 @@ const drawScatter = (place, data, view) => {
 
 // Parallel coordinates of runs that gave metrics; the metric first, then the inputs by influence. Of very many runs some,
 // evenly: first of the critical ones, which lie on top.
-const LINES = 3000;
+const LINES = 3000, CROSSINGS = 24000;  // a browser without a graphics processor draws about 5,000 crossings of lines and axes a second
 const thinned = (rows, most) => rows.length <= most ? rows : Array.from({ length: most }, (_, k) => rows[Math.floor(k * rows.length / most)]);
 const drawParallel = (place, data, view) => {
   const all = [...data.index.keys()].filter(row => data.verdict[row] !== 2 && Number.isFinite(data.told.values[row]));
-  const critical = thinned(all.filter(row => data.verdict[row] === 1), LINES / 2);
-  const rows = [...thinned(all.filter(row => data.verdict[row] === 0), LINES - critical.length), ...critical];
+  const most = Math.min(LINES, Math.floor(CROSSINGS / (data.inputs.length + 1)));
+  const critical = thinned(all.filter(row => data.verdict[row] === 1), Math.floor(most / 2));
+  const rows = [...thinned(all.filter(row => data.verdict[row] === 0), most - critical.length), ...critical];
+  place.classList.toggle("empty", !rows.length);
   if (!rows.length) { place.textContent = "No run gave a number to draw."; return undefined; }
   place.dataset.lines = rows.length < all.length ? `Shown are ${rows.length} of ${all.length} runs; ranges filter all.` : "";
   const columns = [data.told, ...data.ranked];
@@ -85,6 +87,7 @@ const drawParallel = (place, data, view) => {
 };
 
 const drawInfluence = (place, data, chosen) => {
+  if (!data.inputs.some(input => input.influence) && !data.weights.some(weight => weight > 0)) { place.textContent = "The runs tell of none yet."; return undefined; }
   const known = data.inputs.some(input => input.influence);
   const ranked = [...data.ranked].reverse();
   const value = input => known ? input.influence[0] : data.weights[data.inputs.indexOf(input)];

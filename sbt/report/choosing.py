@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sbt.campaigns.failures import FalsificationConclusion
+from sbt.campaigns.modes import worst_first
 from sbt.problem.space import ParameterSpace
 from sbt.report.words import Findings
 
@@ -25,18 +26,18 @@ def runs_to_film(found: Findings, space: ParameterSpace, *, most: int = _MOST, s
     Every failure mode with its nearest safe neighbour, the uncritical run closest to the limit, then critical runs, worst first;
     of repetitions with the same inputs the first.
     """
-    took = dict(zip(found.history.index.tolist(), found.history.seconds.tolist(), strict=True))
-    ok = set(found.history.index[found.history.ok].tolist())
-    inputs = {int(index): x.tobytes() for index, x in zip(found.history.index, found.history.x, strict=True)}
+    history, ok = found.history, found.history.ok
     chosen: dict[int, str] = {}
     shown: set[bytes] = set()
     for run, role in _ranked(found, space):
         if len(chosen) >= most:
             break
-        if run in ok and inputs[run] not in shown and took[run] <= seconds:
-            seconds -= took[run]
+        row = int(np.searchsorted(history.index, run))
+        inputs, took = history.x[row].tobytes(), float(history.seconds[row])
+        if ok[row] and inputs not in shown and took <= seconds:
+            seconds -= took
             chosen[run] = role
-            shown.add(inputs[run])
+            shown.add(inputs)
     return chosen
 
 
@@ -50,7 +51,8 @@ def _ranked(found: Findings, space: ParameterSpace) -> Iterator[tuple[int, str]]
     if not history.ok.any():
         return
     critical, margin = found.critical, np.where(history.ok, requirement.margins(history), np.inf)
-    worst = np.flatnonzero(critical)[np.argsort(margin[critical], kind="stable")]
+    order = worst_first(history, margin)
+    worst = order[critical[order]]
     safe = np.flatnonzero(history.ok & ~critical)
     if not modes and len(worst):
         yield int(history.index[worst[0]]), "most critical run"

@@ -39,7 +39,7 @@ const digits = (value, n = 4) => {
   const text = size !== 0 && (size < 1e-4 || size >= 1e7) ? value.toExponential(n - 1) : String(Number(value.toPrecision(n)));
   return text.replace("-", "\u2212");
 };
-const withUnit = (text, unit) => unit ? `${text} ${unit.replace("^2", "\u00b2")}` : text;
+const withUnit = (text, unit) => unit ? `${text} ${unit.replace("^2", "\u00b2").replace("^3", "\u00b3")}` : text;
 const titled = column => withUnit(column.name, column.unit ? `(${column.unit})` : "");
 const percent = p => p < 1e-6 ? "below 0.0001 %" : p > 1 - 1e-6 ? "above 99.9999 %" : `${digits(100 * p, 3)} %`;
 const VERDICTS = ["not critical", "critical", "failed"];
@@ -53,7 +53,7 @@ const opened = raw => {
   index.forEach((run, row) => rowOf.set(run, row));
   const columns = [...inputs, ...metrics];
   const told = metrics.find(m => m.name === raw.told) || { name: "margin", unit: "", choices: [], values: floats(raw.margin) };
-  return { ...raw, inputs, metrics, columns, told, index, rowOf, margin: floats(raw.margin), iteration: wholes(raw.iteration),
+  return { ...raw, inputs, metrics, columns, told, index, rowOf, margin: floats(raw.margin), rank: wholes(raw.rank), iteration: wholes(raw.iteration),
     filmOf: new Map(raw.films.map(film => [film.run, film])), ranked: raw.order.map(k => inputs[k]) };
 };
 const valueText = (column, row) => {

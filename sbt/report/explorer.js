@@ -2,12 +2,13 @@
 const within = (ranges, value) => ranges.some(([low, high]) => value >= low && value <= high);
 
 class Explorer {
-  constructor(place, data) {
+  constructor(place, data, kept) {
     this.place = place;
     this.data = data;
     this.part = name => place.querySelector(`[data-part=${name}]`);
     const [first, second] = data.ranked.map(input => data.columns.indexOf(input));
     this.view = { x: first, y: second ?? Math.max(data.columns.indexOf(data.told), 0), run: null, brushes: new Map(), picked: null, rows: [...data.index.keys()] };
+    if (kept) Object.assign(this.view, { x: kept.x, y: kept.y });
     this.view.brushed = brushes => { this.view.brushes = brushes; this.filter(); };
     this.table = new RunTable(data, row => this.choose(row, true), () => this.filter());
     this.part("table").append(this.table.node);
@@ -15,7 +16,7 @@ class Explorer {
     this.axes();
     this.filmList();
     this.part("clear").addEventListener("click", () => this.clear());
-    this.choose(this.best(), false);
+    this.choose(kept && data.rowOf.has(kept.run) ? data.rowOf.get(kept.run) : this.best(), false);
   }
   best() {
     const film = this.data.films[0];
@@ -32,6 +33,7 @@ class Explorer {
   }
   filmList() {
     const { films, film_note: note, films_left_out: rest } = this.data;
+    this.part("films").previousElementSibling.hidden = !films.length && !note;
     this.part("films").append(...films.map(film => make("button", { type: "button", class: "chip", onclick: () => this.choose(this.data.rowOf.get(film.run), true) },
       `${film.role}: run ${film.run}`)));
     this.part("film-note").textContent = [note, rest ? `${rest} more would not fit in.` : ""].join(" ").trim();
@@ -80,10 +82,9 @@ class Explorer {
     tip.replaceChildren(make("b", {}, `run ${data.index[row]}, ${VERDICTS[data.verdict[row]]}`),
       ...columns.map(column => make("div", {}, `${shortened(column.name, 28)}: ${withUnit(valueText(column, row), column.unit)}`)));
     tip.hidden = false;
-    const box = this.place.getBoundingClientRect();
-    const left = event.clientX - box.left + 14;
-    tip.style.left = `${left + 240 > box.width ? Math.max(0, left - 270) : left}px`;
-    tip.style.top = `${event.clientY - box.top + 10}px`;
+    const left = event.clientX + 14;  // in the window: where the page lies is not asked, which would lay it out
+    tip.style.left = `${left + 260 > window.innerWidth ? Math.max(0, left - 290) : left}px`;
+    tip.style.top = `${event.clientY + 10}px`;
   }
   filter(redraw = true) {
     const { data, view, table } = this;
@@ -102,24 +103,29 @@ class Explorer {
     this.filter();
     this.draw();
   }
+  // The film is seen first; whatever takes longer follows when it is painted.
   choose(row, reveal) {
     if (row === null || row === undefined) return;
     this.view.run = row;
-    this.facts(row);
+    this.title(row);
     this.film(row);
     this.table.mark(row);
-    setTimeout(() => {  // the film is there first
-      if (!window.Plotly || this.view.run !== row) return;
+    requestAnimationFrame(() => setTimeout(() => {
+      if (this.view.run !== row) return;
+      this.facts(row);
+      if (reveal) this.part("run").scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
+      if (!window.Plotly) return;
       if (this.listening) Plotly.relayout(this.part("scatter"), { shapes: ring(this.data, this.view) });
       this.slice();
       this.curves();
-    });
-    if (reveal) this.part("run").scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
+    }, 100));
+  }
+  title(row) {
+    this.part("run-title").textContent = `Run ${this.data.index[row]}: ${VERDICTS[this.data.verdict[row]]}`;
+    this.part("run-title").dataset.verdict = this.data.verdict[row];
   }
   facts(row) {
-    const { data } = this, run = data.index[row], verdict = VERDICTS[data.verdict[row]];
-    this.part("run-title").textContent = `Run ${run}: ${verdict}`;
-    this.part("run-title").dataset.verdict = data.verdict[row];
+    const { data } = this, run = data.index[row];
     const line = column => make("tr", {}, make("th", { scope: "row" }, column.name), make("td", {}, withUnit(valueText(column, row), column.unit)));
     const group = (name, columns) => columns.length ? [make("tr", {}, make("th", { colspan: "2", class: "group" }, name)), ...columns.map(line)] : [];
     const reason = data.reason[row] ? [make("p", { class: "note" }, `Failed: ${data.reason[row]}`)] : [];
@@ -136,7 +142,7 @@ class Explorer {
   film(row) {
     const { data } = this, place = this.part("film"), run = data.index[row], raw = data.filmOf.get(run);
     if (this.player) this.player.pause();
-    this.player = this.shown = this.moved = null;
+    this.shown = this.moved = null;
     if (!raw) {
       this.part("curves").replaceChildren();
       place.replaceChildren(make("p", { class: "note" }, data.verdict[row] === 2 ? "A failed run has no film."
@@ -146,10 +152,16 @@ class Explorer {
     this.shown = developed(raw);
     this.laid = this.laid || data.lanes.map(outlined);
     const label = `run ${run} from above: ${raw.role}; ${raw.contacts.length ? `contact with ${raw.contacts[0].with}` : "no contact"}`;
-    this.player = new Player([this.shown], this.laid, [label], t => { if (this.moved) this.moved(t); });
-    const rest = raw.left_out ? ` ${raw.left_out} road users far away are left out.` : "";
-    place.replaceChildren(make("p", { class: "role" }, `${raw.role}; ${raw.ended ? `ended: ${raw.ended}` : ""}`), this.player.scenes[0].canvas, this.player.bar,
-      make("p", { class: "note" }, `Dashed: the way driven in the next ${AHEAD} s. Space plays, arrow keys step.${rest}`));
+    const rest = raw.left_out ? ` ${raw.left_out} road users far away are left out.` : "", role = `${raw.role}; ${raw.ended ? `ended: ${raw.ended}` : ""}`;
+    this.player = this.player || new Player(1, t => { if (this.moved) this.moved(t); });
+    this.player.load([this.shown], this.laid, [label]);
+    if (this.screen && this.screen.isConnected) {
+      this.screen.firstChild.textContent = role;
+      this.screen.lastChild.textContent = legend([raw]) + rest;
+    } else {
+      this.screen = make("div", {}, make("p", { class: "role" }, role), this.player.scenes[0].canvas, this.player.bar, make("p", { class: "note" }, legend([raw]) + rest));
+      place.replaceChildren(this.screen);
+    }
     this.player.begin();
   }
   async curves() {
@@ -198,15 +210,20 @@ class Explorer {
   }
 }
 
-const explore = async data => {
+// Shows the explorer; `kept`: axes and run of one that it takes the place of.
+const explore = async (data, kept = null) => {
   const place = document.getElementById("explore");
   place.hidden = !data.index.length;
   if (place.hidden) return;
-  const explorer = new Explorer(place, data);
+  const explorer = new Explorer(place, data, kept);
   window.explorer = explorer;
   const scheme = matchMedia("(prefers-color-scheme: dark)");
-  scheme.addEventListener("change", () => { painted.clear(); explorer.parallel = false; explorer.draw(); if (explorer.player) explorer.player.show(explorer.player.now); });
-  new ResizeObserver(() => { if (explorer.player) explorer.player.show(explorer.player.now); }).observe(place);
+  scheme.addEventListener("change", () => { painted.clear(); explorer.parallel = false; explorer.draw(); if (explorer.shown) explorer.player.show(explorer.player.now); });
+  let width = 0;
+  new ResizeObserver(() => {
+    if (place.clientWidth !== width && explorer.shown) explorer.player.show(explorer.player.now);
+    width = place.clientWidth;
+  }).observe(place);
   if (window.Plotly) explorer.draw();
   else if (document.getElementById("library").textContent.trim()) setTimeout(() => withLibrary(() => explorer.draw()), 30);
 };

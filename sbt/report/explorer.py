@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sbt.campaigns.failures import FalsificationConclusion
+from sbt.campaigns.modes import worst_first
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
@@ -22,19 +23,18 @@ from sbt.report.influence import Influence
 from sbt.report.projection import Predict
 from sbt.report.reel import Film, Reels
 from sbt.report.slices import slices_through
+from sbt.report.thinning import shown_runs
 from sbt.report.words import Findings
 
 __all__ = ["explorer_data", "library", "packed", "render", "scripts", "styles"]
 
-_MOST = 20_000
-"""Largest number of runs in the page."""
 _FILMS = 3_000_000
 """Largest size of all films together as text (bytes), before it is packed."""
 _SLICES = 40
 """Slices go through at most so many runs."""
 _WORST = 8
 """... so many of the most critical ones among them."""
-_SCRIPTS = ("data.js", "charts.js", "table.js", "film.js", "explorer.js")
+_SCRIPTS = ("data.js", "charts.js", "table.js", "sight.js", "film.js", "explorer.js")
 _STYLES = ("explorer.css",)
 
 
@@ -56,7 +56,7 @@ def explorer_data(
     """
     history, requirement = found.history, found.requirement
     critical = found.critical
-    keep = _kept(history.ok, critical, [film.run for film in films], history.index)
+    keep = shown_runs(history.ok, critical, history.index, [film.run for film in films])
     shown = history.where(keep)
     verdict = np.where(~history.ok, 2, np.where(critical, 1, 0))[keep]
     margin = requirement.margins(shown)
@@ -70,6 +70,7 @@ def explorer_data(
         "weights": [float(f"{w:.4g}") for w in np.asarray(weights).tolist()],
         "order": np.argsort(-np.asarray(weights), kind="stable").tolist(),
         "index": _whole(shown.index), "verdict": verdict.tolist(), "margin": _floats(margin),
+        "rank": _whole(np.argsort(worst_first(shown, margin), kind="stable")),
         "x": [_floats(shown.x[:, k]) for k in range(shown.x.shape[1])],
         "y": [_floats(shown.y(m)) for m in history.metrics],
         "stages": stages, "stage": [stages.index(s) for s in shown.stage.tolist()],
@@ -79,19 +80,6 @@ def explorer_data(
         "films_left_out": len(films) - len(reeled), "commands": dict(commands or {}),
         "slices": _slices(found, scenario, predict, [film.run for film in films]),
     }  # fmt: skip
-
-
-def _kept(ok: Any, critical: Any, wanted: Sequence[int], index: Any) -> Any:
-    """Return (n,) which runs are in the page: all, or critical, failed and filmed ones first and the rest evenly thinned."""
-    n = len(ok)
-    if n <= _MOST:
-        return np.ones(n, dtype=bool)
-    keep = np.isin(index, wanted)
-    for mask, share in ((critical, 0.6), (~ok, 0.8), (ok & ~critical, 1.0)):
-        rows, room = np.flatnonzero(mask & ~keep), int(share * _MOST) - int(keep.sum())
-        if len(rows) and room > 0:
-            keep[rows[np.unique(np.linspace(0, len(rows) - 1, min(room, len(rows))).astype(int))]] = True
-    return keep
 
 
 def _within(films: Sequence[Film]) -> tuple[Reels, list[Json]]:
@@ -131,7 +119,7 @@ def _slices(found: Findings, scenario: LogicalScenario, predict: Predict | None,
     spread = history.index[history.ok]
     spread = spread[np.unique(np.linspace(0, len(spread) - 1, _SLICES).astype(int))].tolist()
     margin = np.where(history.ok, found.requirement.margins(history), np.inf)
-    worst = history.index[np.argsort(margin, kind="stable")[: min(_WORST, len(spread))]].tolist()
+    worst = history.index[worst_first(history, margin)[: min(_WORST, len(spread))]].tolist()
     runs = list(dict.fromkeys([*filmed, *worst, *spread]))[:_SLICES]
     rows = {int(index): row for row, index in enumerate(history.index)}
     x = history.x[[rows[run] for run in runs]]

@@ -1,7 +1,10 @@
 // Films: one or several runs of the same draw from above, in step, with their curves over time.
 const ACTORS = { ego: "#1f6fb4", other: "#d9822b", standing: "#8a8f94", person: "#8e63c0", bicycle: "#2f8d57" };
+const FEW = 6;  // so many road users are named; of more only ego and its opponent
 const AHEAD = 3;  // seconds of the way that is drawn before the ego and its opponent
 
+const legend = films => ["Dashed: the way driven in the next 3 s; dotted: where they would be after 1, 2 and 3 s with the same speed and heading.",
+  ...(films.some(film => film.view) ? ["Yellow: what ego's sensor can see."] : []), "Space plays, arrow keys step."].join(" ");
 const developed = film => {
   const states = s => ({ length: s.length, width: s.width, x: summed(s.x).map(v => v / 100), y: summed(s.y).map(v => v / 100),
     h: summed(s.h).map(v => v / 1000) });
@@ -22,11 +25,13 @@ const between = (values, [k, share]) => {
   return share === 0 || next === undefined || Number.isNaN(next) ? values[k] : values[k] + share * (next - values[k]);
 };
 
+// One film on a canvas, which goes from film to film: a new one would cost the browser more than all that is drawn.
 class Scene {
-  constructor(film, lanes, label) {
+  constructor() { this.canvas = make("canvas", { role: "img", tabindex: "0" }); }
+  load(film, lanes, label) {
     this.film = film;
     this.lanes = lanes;
-    this.canvas = make("canvas", { role: "img", tabindex: "0", "aria-label": label });
+    this.canvas.setAttribute("aria-label", label);
     this.canvas.style.aspectRatio = String(film.ratio);
   }
   draw(t) {
@@ -42,12 +47,15 @@ class Scene {
     c.setTransform(scale, 0, 0, -scale, w / 2 - scale * mx, h / 2 + scale * my);
     this.roads(c, scale);
     const order = film.actors.map((_, j) => j).sort((a, b) => this.rank(a) - this.rank(b));
+    drawArea(c, film, at, scale);
     for (const j of [0, film.opponent]) if (j !== null && film.actors[j]) this.way(c, film.actors[j], at, t, scale);
+    film.actors.forEach((actor, j) => { if (this.named(j) && actor.kind !== "standing") drawExpected(c, actor, at, scale); });
     for (const j of order) this.actor(c, film.actors[j], at, scale, j === film.opponent);
     this.contact(c, t, scale);
     c.setTransform(1, 0, 0, 1, 0, 0);
     this.words(c, at, t, { scale, mx, my, w, h, sharp });
   }
+  named(j) { return this.film.actors.length <= FEW || j === 0 || j === this.film.opponent; }
   rank(j) { return j === this.film.opponent ? 2 : j === 0 ? 1 : 0; }
   roads(c, scale) {
     const [ox, oy] = this.film.origin;
@@ -117,9 +125,8 @@ class Scene {
     c.lineWidth = 3 * sharp; c.lineJoin = "round";
     c.strokeStyle = colour("--ground"); c.fillStyle = colour("--ink");
     const write = (text, x, y, align) => { c.textAlign = align; c.strokeText(text, x, y); c.fillText(text, x, y); };
-    const few = this.film.actors.length <= 6;
     this.film.actors.forEach((actor, j) => {
-      if (!few && j !== 0 && j !== this.film.opponent) return;
+      if (!this.named(j)) return;
       const x = w / 2 + scale * (between(actor.x, at) - mx), y = h / 2 - scale * (between(actor.y, at) - my);
       if (!(x > 0 && x < w && y > 0 && y < h)) return;
       write(shortened(actor.name, 24), x, y - (scale * actor.width / 2 + 7 * sharp), "center");
@@ -140,13 +147,10 @@ class Scene {
 
 // A player of one or several scenes with one slider; `seen` is told every instant that is shown.
 class Player {
-  constructor(films, lanes, labels, seen = () => {}) {
-    this.films = films;
+  constructor(count, seen = () => {}) {
     this.seen = seen;
-    this.end = Math.max(...films.map(film => film.time[film.time.length - 1]));
-    this.scenes = films.map((film, k) => new Scene(film, lanes, labels[k]));
-    this.step = Math.max(...films.map(film => film.time.length > 1 ? film.time[1] - film.time[0] : 0.1));
-    this.slider = make("input", { type: "range", min: 0, max: this.end, step: "any", "aria-label": "time (s)",
+    this.scenes = Array.from({ length: count }, () => new Scene());
+    this.slider = make("input", { type: "range", min: 0, step: "any", "aria-label": "time (s)",
       oninput: () => { this.pause(); this.show(Number(this.slider.value)); } });
     this.button = make("button", { type: "button", class: "play", onclick: () => this.toggle() }, "Play");
     this.speed = make("select", { "aria-label": "speed of the film" },
@@ -156,6 +160,15 @@ class Player {
     this.bar = make("div", { class: "film-bar" }, this.button, stepper(-1, "one step back", "\u2212"),
       stepper(1, "one step on", "+"), this.slider, this.speed);
     for (const scene of this.scenes) scene.canvas.addEventListener("keydown", event => this.key(event));
+  }
+  // Takes films from now on, and stands at the worst moment of the first.
+  load(films, lanes, labels) {
+    this.pause();
+    this.films = films;
+    this.end = Math.max(...films.map(film => film.time[film.time.length - 1]));
+    this.slider.max = this.end;
+    this.scenes.forEach((scene, k) => scene.load(films[k], lanes, labels[k]));
+    this.step = Math.max(...films.map(film => film.time.length > 1 ? film.time[1] - film.time[0] : 0.1));
     this.now = films[0].time[films[0].moment] ?? 0;
     this.fresh = true;
   }

@@ -81,7 +81,7 @@ def _frames(trace: Trace, metric: Metric, requirement: Requirement, lanes: Seque
     view = view_of(trace, opponent, moment, box.width * size[0] / (box.height * size[1]))
     above.set_title(title, loc="left", fontsize=9)
     draw_lanes(above, _near(lanes, view))
-    scenery = Scenery(above, trace, opponent)
+    scenery = Scenery(above, trace, opponent, reach=2.0 * (view.half_x + view.half_y))
     contacts = Contacts(above, trace)
     halo = [withStroke(linewidth=2.0, foreground="white")]
     clock = above.text(0.99, 0.97, "", transform=above.transAxes, ha="right", va="top", fontsize=9, zorder=9, path_effects=halo)

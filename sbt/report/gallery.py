@@ -14,16 +14,18 @@ from sbt.report.convergence import drawing_of_convergence
 from sbt.report.modes import drawing_of_modes
 from sbt.report.projection import Predict, log_probability, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
+from sbt.report.thinning import shown_runs
 from sbt.report.words import Findings, requirement_words
-from sbt.store.history import VALIDATION
+from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord
 
 __all__ = ["Drawing", "draw"]
 
-_MARKERS = "Light circles are uncritical, dark triangles critical, crosses failed; hollow markers are held out."
 
 _MOST_RUNS_ON_MAP = 800
 _MOST_PANELS = 9
+_FEW_HELD_OUT = 20
+_NO_CHANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,11 @@ def _runs(found: Findings, space: ParameterSpace, predict: Predict | None, weigh
     lines = -(-len(pairs) // columns)
     figure = new_figure(5.4 if columns == 1 else 11.0, 4.4 if columns == 1 else 0.35 + 3.3 * lines)
     grid = np.atleast_1d(figure.subplots(lines, columns)).ravel()
+    history, caption = _thinned(found)
     for ax, pair in zip(grid, pairs, strict=True):
-        figures.plot_runs(found.history, found.requirement, space, ax, pair=pair)
+        figures.plot_runs(history, found.requirement, space, ax, pair=pair)
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper center", ncols=3 if columns == 1 else 5)
-    caption = f"Every run. {_MARKERS}"
+    caption += f" {_markers(found)}"
     if any(parameter.discrete for parameter in space.parameters):
         caption += " Runs of whole-number inputs and of choices are spread around their value."
     if columns > 1:
@@ -90,10 +93,29 @@ def _runs(found: Findings, space: ParameterSpace, predict: Predict | None, weigh
     yield Drawing("runs", "Runs in input space", caption, to_svg(figure, "runs"), wide=columns > 1)
 
 
+def _thinned(found: Findings) -> tuple[History, str]:
+    """Return the runs that a figure shows, and in words which they are."""
+    history = found.history
+    keep = shown_runs(history.ok, found.critical, history.index)
+    if keep.all():
+        return history, "Every run."
+    words = f"{int(keep.sum()):,} of {len(history):,} runs, evenly thinned within critical, failed and other ones"
+    return history.where(keep), f"{words}: critical and failed ones are shown more often than they are."
+
+
+def _markers(found: Findings) -> str:
+    """Return what the markers mean, of those that are there."""
+    crosses = "" if found.history.ok.all() else ", crosses failed"
+    hollow = "; hollow markers are held out" if found.held_out.any() else ""
+    return f"Light circles are uncritical, dark triangles critical{crosses}{hollow}."
+
+
 def _runs_over_one(found: Findings, space: ParameterSpace, predict: Predict | None) -> Drawing:
     figure = new_figure(5.4, 4.4)
-    ax = figures.plot_metric(found.history, found.requirement, space, figure.subplots(), unit=found.unit)
-    caption = f"The safety metric of every run; shaded where critical. {_MARKERS} Failed runs lie on the floor."
+    history, caption = _thinned(found)
+    ax = figures.plot_metric(history, found.requirement, space, figure.subplots(), unit=found.unit)
+    caption = f"The safety metric of runs; shaded where critical. {caption} {_markers(found)}"
+    caption += "" if found.history.ok.all() else " Failed runs lie on the floor."
     if predict is not None:
         choices = space.parameters[0].choices
         u = (np.arange(len(choices))[:, None] + 0.5) / len(choices) if choices else np.linspace(0.0, 1.0, 401)[:, None]
@@ -142,6 +164,8 @@ def _lines_of(probability: Vector, *, whole: bool) -> str:
     if dashed:
         said += f"{';' if solid else ' Dashed:'}{' dashed:' if solid else ''} {' and '.join(f'{level:g}' for level in dashed)}"
     if not said:
+        if high < _NO_CHANCE:
+            return f" P is below {_NO_CHANCE:g} all over: no line is drawn."
         return f" P is {low:.2g} to {high:.2g} all over: no line is drawn."
     return f"{said}." + (" The gap between the dashed lines is its uncertainty." if whole and len(dashed) == 2 else "")
 
@@ -194,6 +218,8 @@ def _held_out(found: Findings, space: ParameterSpace, predict: Predict) -> Itera
             " dashed: flagging everything."
         )
         yield Drawing("precision_recall", "Finding critical runs", caption, to_svg(figure, "precision_recall"))
+    if int(mask.sum()) < _FEW_HELD_OUT and not truth.any():
+        return  # a single bin, of which nothing can be read
     figure = new_figure(5.4, 4.0)
     curves.plot_reliability(np.exp(log_p), truth, figure.subplots())
     caption = (
@@ -231,15 +257,20 @@ def _counts(found: Findings) -> Iterator[Drawing]:
         figure = new_figure(5.4, 3.7)
         curves.plot_metric_histogram(found.history, part, figure.subplots(), unit=unit)
         caption = (
-            f"The safety metric; shaded where critical ({requirement_words(part, unit)}). Held-out runs are"
-            " random, the others were chosen. The outermost bins hold what lies beyond."
+            f"The safety metric; shaded where critical ({requirement_words(part, unit)})."
+            f"{' Held-out runs are random, the others were chosen.' if found.held_out.any() else ''}"
+            " The outermost bins hold what lies beyond."
         )
         name = f"metric_{k + 1}" if k else "metric"
         yield Drawing(name, f"Distribution of {part.metric}", caption, to_svg(figure, name))
+    if not found.critical.any():
+        return
     figure = new_figure(5.4, 3.7)
     curves.plot_progress(found.history, found.requirement, figure.subplots())
-    caption = (
-        "Critical runs found so far, by the stage that requested them. Dashed: the number expected of as many random runs,"
-        " from the share among the held-out ones. A steeper curve is the gain of choosing runs."
-    )
+    caption = "Critical runs found so far, by the stage that requested them."
+    if len(found.history.held_out):
+        caption += (
+            " Dashed: the number expected of as many random runs, from the share among the held-out ones. A steeper curve is"
+            " the gain of choosing runs."
+        )
     yield Drawing("progress", "Critical runs over the campaign", caption, to_svg(figure, "progress"))

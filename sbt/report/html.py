@@ -170,13 +170,19 @@ def _duration(seconds: float) -> str:
 def _scores(found: Findings) -> list[tuple[str, str]]:
     """Return the scores of the last metamodel on held-out runs."""
     scores = {} if found.validation is None else found.validation.to_dict()
-    given = [(SCORES[key], number(scores[key], 3)) for key in SCORES if scores.get(key) is not None]
+    given = [(SCORES[key], _score(key, scores[key])) for key in SCORES if scores.get(key) is not None]
     counts = (("held-out runs", "n"), ("critical among them", "n_critical"))
     return given and given + [(name, number(scores[key])) for name, key in counts if scores.get(key) is not None]
 
 
+def _score(key: str, value: float) -> str:
+    """Return a score for people; errors of a probability have a thousandth as their least."""
+    return "below 0.001" if key == "calibration_error" and value < 0.001 else number(value, 3)
+
+
 def _commands(found: Findings, store: Store) -> dict[str, str]:
-    folder = str(found.ended.get("store") or store.folder)
+    written = found.ended.get("store")  # as the user wrote it, where the store is still there
+    folder = str(written if written and Path(written).resolve() == store.folder.resolve() else store.folder)
     if given := _objects(found.configuration):
         return {
             "run": f"sbt.run({f'{folder}/config.resolved.yaml'!r}, {given}, store={f'{folder}-again'!r})",

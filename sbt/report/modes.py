@@ -38,6 +38,7 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     doubtful = any(mode.unconfirmed for mode in modes)
     for number_of, mode in enumerate(modes, 1):
         confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.confirmation_runs}"
+        confirmed += f", {mode.confirmations_lost} gave no metric" if mode.confirmations_lost else ""
         rows.append((
             Cell.of(number_of), Cell.of(mode.representative), Cell.of(mode.metric),
             *((Cell(violated_words(mode)),) if several else ()), Cell.of(mode.size), Cell(confirmed),

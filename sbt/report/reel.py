@@ -15,6 +15,7 @@ from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.report.contacts import contacts_of
 from sbt.report.scene import actor_kind, is_wide, view_of
+from sbt.report.sight import hiding
 from sbt.report.worst import metric_so_far, worst_moment
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class Reels:
             ],
             "lanes": self._around(film.lanes, view.middle, (view.half_x, view.half_y), origin),
             "origin": origin.tolist(),
-            "curves": _curves(film, at, opponent),
+            "curves": _curves(film, at, opponent), "view": _view(trace, shown),
         }  # fmt: skip
 
     def _around(
@@ -156,6 +157,18 @@ def _states(actor: ActorTrace, at: np.ndarray, origin: np.ndarray) -> Json:
         "length": round(float(actor.length), 2), "width": round(float(actor.width), 2),
         "x": _series((actor.x[at] - origin[0]) * 100.0), "y": _series((actor.y[at] - origin[1]) * 100.0),
         "h": _series(heading * 1000.0),
+    }  # fmt: skip
+
+
+def _view(trace: Trace, shown: list[int]) -> Json | None:
+    """Return where ego's sensor sees something; None as a length is no limit."""
+    view = trace.view
+    if view is None:
+        return None
+    reach, half_width = (round(v, 3) if np.isfinite(v) else None for v in (view.reach, view.half_width))
+    return {
+        "reach": reach, "ahead": round(view.ahead, 3), "half_angle": round(view.half_angle, 4), "half_width": half_width,
+        "hidden_by": [shown.index(j) for j in hiding(trace, view) if j in shown],
     }  # fmt: skip
 
 

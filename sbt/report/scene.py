@@ -10,6 +10,7 @@ import numpy as np
 
 from sbt.metrics.geometry import rectangles
 from sbt.problem.trace import ActorTrace, Trace
+from sbt.report.sight import Sight
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -221,9 +222,10 @@ class Scenery:
         axes: to draw on.
         trace: the run.
         opponent: actor that is marked and named, None: nobody.
+        reach: what ego's sensor sees is drawn so far at most (m).
     """
 
-    def __init__(self, axes: Axes, trace: Trace, opponent: int | None = None):
+    def __init__(self, axes: Axes, trace: Trace, opponent: int | None = None, *, reach: float = 2.0 * _NEAR):
         from matplotlib.collections import PolyCollection
         from matplotlib.patheffects import withStroke
 
@@ -234,6 +236,8 @@ class Scenery:
         self._colors = [_COLOURS[actor_kind(trace, j)] for j in range(len(trace.actors))]
         self._shapes: Any = axes.add_collection(PolyCollection([], zorder=5), autolim=False)
         few = len(trace.actors) <= FEW
+        named = [j for j in range(len(trace.actors)) if (few or j in (0, opponent)) and not self._stands[j]]
+        self._sight = Sight(axes, trace, named, self._colors, reach)
         self._name = axes.annotate(
             "", (0.0, 0.0), (0, 9), textcoords="offset points", ha="center", fontsize=7.5, color="#222222", zorder=8,
             annotation_clip=True, visible=not few, path_effects=[withStroke(linewidth=2.0, foreground="white")],
@@ -241,6 +245,7 @@ class Scenery:
 
     def show(self, k: int) -> None:
         """Draw everybody who is there at instant k; ego, and above it its opponent, on top."""
+        self._sight.show(k)
         others = [j for j in range(1, len(self._people)) if self._there[k, j] and j != self._opponent]
         shown = [j for j in (*others, 0, self._opponent) if j is not None and self._there[k, j]]
         outlines = {j: self._outlines(k, j) for j in shown}

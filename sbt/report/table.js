@@ -70,7 +70,7 @@ class RunTable {
   }
   show(rows) {
     const { column, down } = this.order;
-    const values = column === null ? this.data.margin : this.columns[column].values;
+    const values = column === null ? this.data.rank : this.columns[column].values;
     const sign = down ? -1 : 1, key = row => Number.isNaN(values[row]) ? Infinity : values[row];
     this.rows = rows;
     this.sorted = [...rows].sort((a, b) => {  // what has no value comes last, in either direction
@@ -96,5 +96,9 @@ class RunTable {
     return make("button", { type: "button", class: "open", "aria-label": `open run ${run}${film ? ", with a film" : ""}`, onclick: () => this.chosen(row) },
       String(run), film ? " \u25b6" : "");
   }
-  mark(row) { this.current = row; this.page(); }
+  mark(row) {
+    this.current = row;
+    const at = this.sorted.slice(this.first, this.first + PAGE).indexOf(row);
+    [...this.body.rows].forEach((line, k) => { line.classList.toggle("chosen", k === at); });
+  }
 }

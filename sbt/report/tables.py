@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sbt.campaigns.asking import Sensitivity
-from sbt.campaigns.modes import severity
+from sbt.campaigns.modes import worst_first
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent, written_unit
 from sbt.plugins import OBJECT
@@ -178,7 +178,7 @@ def critical_table(
     for each in judgements:
         judged.setdefault(each.run, []).append(each)
     margin = requirement.margins(history)
-    found = [int(k) for k in np.lexsort((-severity(history), margin)) if margin[k] <= 0]
+    found = [int(k) for k in worst_first(history, margin) if margin[k] <= 0]
     metrics = sorted(history.metrics, key=lambda name: name not in [part.metric for part in requirement.parts])
     rows = []
     for k in found[:_MOST]:
@@ -230,7 +230,7 @@ def failed_table(history: History, reference: str) -> Table:
     rest = len(failed) - len(rows)
     note = f"{rest:,} more failed runs are in the store." if rest else ""
     kinds = "" if not failed else " " + ", ".join(
-        f"{status}: {count:,} ({percent(count / len(failed))})" for status, count in _counted(failed)
+        f"{status}: {count:,} of {len(history):,} runs ({percent(count / len(history))})" for status, count in _counted(failed)
     ) + "."  # fmt: skip
     return Table(("run", "stage", "status", "reason", "seconds", "again"), rows, (note + kinds).strip())
 

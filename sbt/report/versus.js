@@ -6,22 +6,23 @@ class Versus {
     this.lanes = data.lanes.map(outlined);
     this.part = name => place.querySelector(`[data-part=${name}]`);
     data.pairs.forEach((pair, k) => this.part("list").append(make("button", { type: "button", class: "chip", onclick: () => this.open(k) }, pair.title)));
+    this.player = new Player(2, t => this.moved.forEach(move => move(t)));
+    this.part("bar").append(this.player.bar);
     this.open(0);
   }
   open(k) {
     const pair = this.data.pairs[k];
     this.k = k;
-    if (this.player) this.player.pause();
     this.films = pair.films.map(developed);
     this.moved = [];
     const labels = ["before", "after"].map((name, j) => `${pair.title}, ${name}: ${pair.films[j].contacts.length ? "contact" : "no contact"}`);
-    this.player = new Player(this.films, this.lanes, labels, t => this.moved.forEach(move => move(t)));
+    this.player.load(this.films, this.lanes, labels);
     this.part("title").textContent = pair.title;
     this.part("inputs").textContent = pair.inputs;
     this.curves = this.films.map(() => make("div"));
     this.part("films").replaceChildren(...this.player.scenes.map((scene, j) =>
       make("div", {}, make("p", { class: "role" }, `${["Before", "After"][j]}: ${pair.said[j]}`), scene.canvas, this.curves[j])));
-    this.part("bar").replaceChildren(this.player.bar);
+    this.part("legend").textContent = legend(this.films);
     this.player.begin();
     this.draw();
   }

@@ -52,7 +52,7 @@ def write_versus(
         "explorer": {
             "data": packed({"pairs": pairs, "lanes": reels.lanes}), "library": library() if pairs else "",
             "styles": markupsafe.Markup(styles()),
-            "scripts": markupsafe.Markup(scripts("data.js", "charts.js", "film.js", "versus.js")),
+            "scripts": markupsafe.Markup(scripts("data.js", "charts.js", "sight.js", "film.js", "versus.js")),
         },
     })  # fmt: skip
     return write_atomically(folder / PAGE, page)

@@ -53,6 +53,7 @@ def write_video(file: Path, images: Sequence[Any], milliseconds: Sequence[int]) 
 
 def _by_ffmpeg(file: Path, images: Sequence[Any], milliseconds: Sequence[int]) -> None:
     """Write a film whose pictures follow each other evenly; the last is repeated as long as it is shown."""
+    file.open("wb").close()  # what the system says of it is clearer than what ffmpeg says
     width, height = images[0].size
     each = milliseconds[0]
     held = max(round(milliseconds[-1] / each), 1)
@@ -62,7 +63,9 @@ def _by_ffmpeg(file: Path, images: Sequence[Any], milliseconds: Sequence[int]) -
     data = b"".join(image.convert("RGB").tobytes() for image in [*images, *[images[-1]] * (held - 1)])
     done = subprocess.run(command, input=data, capture_output=True, check=False)
     if done.returncode:
-        raise InputError(f"ffmpeg must write {file}, but it says: {done.stderr.decode(errors='replace').strip()[-300:]}")
+        file.unlink(missing_ok=True)
+        said = " ".join(done.stderr.decode(errors="replace").split())[-200:] or f"it ended with {done.returncode}"
+        raise InputError(f"ffmpeg must be able to write {file.suffix} (or choose .gif), but: {said}")
 
 
 def _ffmpeg() -> str:

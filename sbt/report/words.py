@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from sbt.campaigns.failures import FalsificationConclusion
+from sbt.campaigns.lost import nothing_known
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.wording import number, percent, requirement_words, written_unit
 from sbt.estimators.binomial import upper
-from sbt.loop.stages import Conclusion, Facts
+from sbt.loop.stages import Conclusion, Facts, few_combinations
 from sbt.problem.outcome import Doubt
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
@@ -62,6 +64,7 @@ class Findings:
         direction: "low" where small values of the metric are bad, "high" where large ones are.
         units: of inputs and metrics, by name.
         scenario: its name.
+        combinations: of the inputs, where they are few.
     """
 
     history: History
@@ -75,16 +78,20 @@ class Findings:
     direction: str = "low"
     units: Mapping[str, str] = field(default_factory=dict)
     scenario: str = ""
+    combinations: int | None = None
 
     @classmethod
-    def of(cls, store: Store, scenario: LogicalScenario, conclusion: Conclusion | None) -> Findings:
-        """Return the findings of a store, at whatever point of the campaign."""
+    def of(
+        cls, store: Store, scenario: LogicalScenario, conclusion: Conclusion | None, *, history: History | None = None
+    ) -> Findings:
+        """Return the findings of a store, at whatever point of the campaign; of some of its runs, where they are given."""
         fits = store.fits()
         validation = getattr(conclusion, "validation", None) or (fits[-1].validation if fits else None)
         return cls(
-            store.history(), scenario.requirement, scenario.unit, store.configuration, conclusion, store.conclusion or {},
+            store.history() if history is None else history, scenario.requirement, scenario.unit, store.configuration,
+            conclusion, store.conclusion or {},
             validation, store.counts.get(PLANNED, 0), scenario.direction,
-            scenario.units, scenario.name,
+            scenario.units, scenario.name, few_combinations(scenario),
         )  # fmt: skip
 
     @property
@@ -100,7 +107,7 @@ class Findings:
     @property
     def facts(self) -> Facts:
         """What the conclusion's own sentences may refer to."""
-        return Facts(self.history, self.requirement, self.unit, self.scenario, self.units)
+        return Facts(self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations)
 
 
 def distribution_words(parameter: Parameter) -> str:
@@ -120,7 +127,7 @@ def distribution_words(parameter: Parameter) -> str:
 def conclusion_sentences(found: Findings) -> list[str]:
     """Return what the campaign found, the most important first: the sentences of `run --json`, or what is known before them."""
     if found.conclusion is not None:
-        return found.conclusion.sentences(found.facts)
+        return found.conclusion.sentences(found.facts) or nothing_known(found.facts)
     ok, critical = int(found.history.ok.sum()), int(found.critical.sum())
     if not ok:
         return ["No run has given a metric yet."]
@@ -185,7 +192,8 @@ def _about_runs(found: Findings) -> list[str]:
     if history.ok.any() and not found.critical.any():
         n = int(found.held_out.sum())
         most = percent(float(upper(0, n, 0.95)))
-        bound = f" From the {n:,} random held-out runs alone, up to {most} may be critical (95 %)." if n else ""
+        own = isinstance(found.conclusion, FalsificationConclusion)  # which states a bound by more runs
+        bound = f" From the {n:,} random held-out runs alone, up to {most} may be critical (95 %)." if n and not own else ""
         sentences.append(f"No critical run was found. That is no proof that there is none.{bound}")
     if len(set(history.versions)) > 1:
         sentences.append("Runs were made with different versions of the software; see the header.")
@@ -216,9 +224,9 @@ def _about_scores(found: Findings) -> list[str]:
     if not n:
         sentences.append("The metamodel was never tested: there are no held-out runs.")
     elif critical < _FEW_CRITICAL:
-        plural = "s" if critical != 1 else ""
+        few = "No critical run" if critical == 0 else f"Only {critical} critical run{'s' if critical > 1 else ''}"
         sentences.append(
-            f"Only {critical} critical run{plural} among the {number(n)} held-out ones: precision and likelihood of critical"
+            f"{few} among the {number(n)} held-out ones: precision and likelihood of critical"
             " runs are noisy, and whole critical regions may be missing from the test."
         )
     if error is not None and error > _POOR_CALIBRATION:

@@ -22,6 +22,7 @@ __all__ = ["influence_on_mean", "propose_greedily", "refine_diverse", "select_di
 
 _CANDIDATES = 4096  # uniform ones; the refinement adds up to 2,880
 _KEEP, _CHILDREN, _ROUNDS = 60, 16, 3  # best candidates of a round, steps from each, rounds
+_SCORED = 1024  # candidates of largest rough score that are scored, where there is a rough score
 _STEP, _NARROWER = 0.1, 2.5  # first step in the unit cube, by how much it shrinks from round to round
 _FLIPPED = 0.2  # chance that a step takes another choice: each of three is tried at every good candidate
 _PROBES = 128  # pairs of points that an influence is estimated from: its relative error is about 1 / sqrt(2 x 128)
@@ -40,6 +41,7 @@ def propose_greedily(
     admissible: Callable[[Points], Mask] | None = None,
     cube: Cube = CONTINUOUS,
     uniform: Points | None = None,
+    rough: Callable[[Points], Vector] | None = None,
 ) -> tuple[Points, int]:
     """Return (<= n, d) points of the highest scores that lie apart, and the number of candidates scored.
 
@@ -53,9 +55,16 @@ def propose_greedily(
         admissible: (m, d) points -> (m,) booleans; None: all are.
         cube: which coordinates take single values.
         uniform: (k, d) uniform admissible candidates; None: drawn by the rng.
+        rough: about the score and many times quicker: it says which candidates the score looks at. None: at all.
     """
     first = rng.random((_CANDIDATES, existing.shape[1])) if uniform is None else uniform
-    u, value = refine_diverse(score if admissible is None else _within(score, admissible, snap), first, scale, rng, cube)
+    within = score if admissible is None else _within(score, admissible, snap)
+    if rough is None:
+        u, value = refine_diverse(within, first, scale, rng, cube)
+    else:
+        u, value = refine_diverse(rough if admissible is None else _within(rough, admissible, snap), first, scale, rng, cube)
+        u = u[np.argsort(-value, kind="stable")[: max(_SCORED, 4 * n)]]
+        value = within(u)
     u = snap(u)
     return u[select_diverse(cube.embedded(u), value, cube.embedded(existing), n, cube.spread(scale))], len(u)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from sbt.problem.arrays import Points, Vector
 
@@ -34,6 +33,8 @@ def scores(margin: Vector) -> Vector:
     >>> scores(np.array([2.0, 0.1, np.inf])).round(2).tolist()
     [-0.48, -1.92, -0.08]
     """
+    from scipy.stats import rankdata  # half of the time in which a command starts
+
     return -(np.log(rankdata(margin) / (len(margin) + 1.0)) ** 2)
 
 

@@ -23,6 +23,8 @@ _FEWEST = 4  # runs that share the best uncritical value: two may do so by chanc
 _FEWEST_AROUND = 8  # other values, which make the slopes
 _EQUAL = 1e-6  # of the range of the margins
 _UNIFORM, _CHILDREN, _STEP = 1000, 8, 0.08  # candidates: uniform ones, and steps from each run of a plateau
+_BESIDE = 0.25  # share of the picks that look at slopes
+_ASIDE, _SLOPE = 0.15, 0.5  # steps from a floor to the slopes around it; how far above it those reach, in median margins
 _ALONG = 6  # points of the segment to a known failure: where none rises, the failure explains the place
 _BEST = 60  # candidates for which that is asked at once
 
@@ -41,8 +43,9 @@ def plateau(margin: Vector) -> Mask:
 
 
 def beneath_plateaus(
-    search: Search, seen: SearchData, u: Points, y: Vector, n: int, rng: np.random.Generator, pending: Points | None = None
-) -> Points:
+    search: Search, seen: SearchData, u: Points, y: Vector, n: int, rng: np.random.Generator, pending: Points | None = None,
+    *, beside: bool = False,
+) -> Points:  # fmt: skip
     """Return up to n points (k, d) beneath plateaus: deep by what the slopes say, and far from the runs there.
 
     Args:
@@ -53,6 +56,8 @@ def beneath_plateaus(
         n: points wanted.
         rng: the only source of randomness.
         pending: (k, d) runs in flight, to keep away from as well.
+        beside: the last quarter of the points looks at the slopes around floors beneath which no failure is known: they tell
+            where the middle is.
 
     Source:
         Censored values as the means of truncated normal ones: Tobin (1958), Econometrica 26.
@@ -73,8 +78,8 @@ def beneath_plateaus(
     at = search.cube.embedded
     there = u if pending is None else np.vstack([u, pending])
     square = cdist(at(points), at(there), "sqeuclidean").min(axis=1) if len(points) else np.empty(0)
-    picks = none
-    while len(picks) < n and (depth * square).any():
+    aside, picks = round(_BESIDE * n) if beside else 0, none
+    while len(picks) < n - aside and (depth * square).any():
         order = np.argsort(-depth * square, kind="stable")[:_BEST]
         fresh = order[~_explained(latent, points[order], floor - depth[order], hits)]
         if len(fresh) == 0:
@@ -84,6 +89,32 @@ def beneath_plateaus(
         picks = np.vstack([picks, best])
         square = np.minimum(square, cdist(at(points), at(best[None]), "sqeuclidean")[:, 0])
         square[fresh[0]] = 0.0
+    return np.vstack([picks, _beside(search, seen, u[flat], latent, floor, hits, aside, rng, there)]) if len(picks) else none
+
+
+def _beside(
+    search: Search, seen: SearchData, flat: Points, latent: Callable[[Points], Vector], floor: float, hits: Points, n: int,
+    rng: np.random.Generator, there: Points,
+) -> Points:  # fmt: skip
+    """Return up to n points (k, d) on the slopes around floors that no known failure explains, far from the runs there.
+
+    Where all runs of a neighbourhood lie on the floor, nothing tells where its middle is.
+    """
+    around, picks = flat[~_explained(latent, flat, latent(flat), hits)], np.empty((0, flat.shape[1]))
+    if n <= 0 or len(around) == 0:
+        return picks
+    centres = around[rng.integers(len(around), size=_UNIFORM)]
+    points = np.clip(centres + _ASIDE * rng.standard_normal(centres.shape), 0.0, 1.0)
+    points = search.cube.flipped(points, centres, _ASIDE, rng)
+    points = points[seen.admissible(points)]
+    above = latent(points) - floor if len(points) else np.empty(0)
+    points = points[(above > 0.0) & (above <= _SLOPE)]
+    at = search.cube.embedded
+    square = cdist(at(points), at(there), "sqeuclidean").min(axis=1) if len(points) else np.empty(0)
+    while len(picks) < n and square.any():
+        best = points[int(np.argmax(square))]
+        picks = np.vstack([picks, best])
+        square = np.minimum(square, cdist(at(points), at(best[None]), "sqeuclidean")[:, 0])
     return picks
 
 

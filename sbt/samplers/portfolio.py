@@ -15,7 +15,7 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import Cube
 from sbt.samplers.drawn import propose_in_noise
 from sbt.samplers.noise import hidden_by_noise, more_repeats
-from sbt.samplers.plateaus import beneath_plateaus
+from sbt.samplers.plateaus import beneath_plateaus, plateau
 from sbt.samplers.regions import PATIENCE, Region, clusters, niches, regions
 from sbt.samplers.search import (
     Picks,
@@ -48,7 +48,7 @@ _CLEAR_OF_RUNS = 0.2 * _CLEAR  # the metamodel knows what a finished run says of
 
 def propose(
     search: Search, u: Points, y: Vector, n: int, rng: np.random.Generator, batch: Vector | None = None,
-    filling: Mask | None = None, *, repeats: bool = False, pending: Points | None = None,
+    filling: Mask | None = None, *, repeats: bool = False, pending: Points | None = None, around_floors: bool = False,
 ) -> Picks:  # fmt: skip
     """Return n points where the next failure may be, away from the failures that are known.
 
@@ -68,6 +68,8 @@ def propose(
         filling: (m,) the run fills space, whatever the results; None: all do.
         pending: (k, d) runs in flight: further picks keep away from them as from those of their own batch; Thompson draws are
             independent of them.
+        around_floors: beside a plateau some picks look at its slopes, half of the global picks fill space instead, and no run on
+            it founds a niche: for campaigns that look for all regions, and whose other picks do not fill space.
         repeats: where the simulator is noisy, up to a tenth of the n are repetitions that decide whether a basin is deflated.
 
     Returns:
@@ -85,6 +87,7 @@ def propose(
     if repeats and seen.noisy and hidden_by_noise(u, search.margins(y)):
         picks = propose_in_noise(search, seen, search.critical.margin(seen.y), n, rng)
         return Picks(picks, ("drawn",) * n, again)
+    seen = seen.thinned(search.critical.margin(seen.y), search.most_rows, rng)
     model = fit_warped(search, seen.u, seen.y, rng, seen.success)
     margin = search.critical.margin(seen.y) if not seen.noisy else model.critical.margin(model(seen.u).mu)
     fresh, fills = ~seen.flank, np.ones(len(u), dtype=bool) if filling is None else filling
@@ -96,9 +99,12 @@ def propose(
     hopeful = _hopeful(model, found, seen.admissible, rng, search.cube)
     stagnant = not seen.noisy and seen.runs_since(margin) >= _STAGNANT  # noise hides what is better
     pending = np.empty((0, d)) if pending is None else pending
-    under = beneath_plateaus(search, seen, u, y, round(_BENEATH * n), rng, pending)
-    small = _in_niches(model, seen, margin, [region for region, _ in hopeful], n - max(2, len(under)), rng, search.cube)
+    under = beneath_plateaus(search, seen, u, y, round(_BENEATH * n), rng, pending, beside=around_floors)
+    flat = plateau(search.margins(y))[seen.rows] & around_floors
+    small = _in_niches(model, seen, flat, margin, [region for region, _ in hopeful], n - max(2, len(under)), rng, search.cube)
     filled = round(_FILLING_LATE * (n - len(small))) if stagnant and len(under) == 0 else 0
+    if around_floors and len(under):  # P(critical) is alike all over a plateau
+        filled = (n - len(small) - len(under)) // 2
     thompson = min(round((_THOMPSON_LATE if stagnant else _THOMPSON) * n), n - len(small) - filled)
     thompson = thompson if len(small) == 0 else min(thompson, (n - len(small)) // 2)
     drawn = _thompson(model, hopeful, max(thompson - len(under), 0), d, rng)
@@ -120,15 +126,16 @@ def _repeats(search: Search, seen: SearchData, u: Points, y: Vector, n: int) -> 
 
 
 def _in_niches(
-    model: WarpedModel, seen: SearchData, margin: Vector, others: list[Region], most: int, rng: np.random.Generator, cube: Cube
-) -> Points:
-    """Return up to `most` points in the niches: in each the best of a sample path, and random ones."""
+    model: WarpedModel, seen: SearchData, flat: Mask, margin: Vector, others: list[Region], most: int, rng: np.random.Generator,
+    cube: Cube,
+) -> Points:  # fmt: skip
+    """Return up to `most` points in the niches: in each the best of a sample path, and random ones; a `flat` run has none."""
     d, left_out, learned = seen.u.shape[1], getattr(model.predictor, "left_out", None), getattr(model.predictor, "u", ())
     picks = np.empty((0, d))
     kept = np.sort(np.unique(model.columns(seen.u), axis=0, return_index=True)[1])  # equal runs are learned from once
     if left_out is None or seen.noisy or len(kept) < _FEWEST_FOR_NICHES or len(learned) != len(kept):
         return picks
-    u, margin, flank, warped = seen.u[kept], margin[kept], seen.flank[kept], model.warp.values(seen.y[kept])
+    u, margin, flank, warped = seen.u[kept], margin[kept], (seen.flank | flat)[kept], model.warp.values(seen.y[kept])
     lone = clusters(u, margin, cube)
     surprise = np.zeros(len(u))
     for (k, rows), (residual, std) in zip(lone, left_out([rows for _, rows in lone]), strict=True):

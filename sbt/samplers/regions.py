@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import CONTINUOUS, Cube
@@ -156,10 +157,10 @@ def _niche_side(margin: Vector, batch: Vector) -> tuple[float, int]:
 
 def clusters(u: Points, margin: Vector, cube: Cube = CONTINUOUS) -> list[tuple[int, tuple[int, ...]]]:
     """Return the runs that are the best of their neighbourhood, each with the rows of it, where it has few runs."""
+    if len(u) == 0:
+        return []
     at = cube.embedded(u)
-    found = []
-    for k in range(len(u)):
-        near = np.flatnonzero(np.abs(at - at[k]).max(axis=1) <= _CLUSTER)
-        if len(near) <= min(_MOST_IN_CLUSTER, len(u) - 2) and margin[k] <= margin[near].min():
-            found.append((k, tuple(int(i) for i in near)))
-    return found
+    tree, most = cKDTree(at), min(_MOST_IN_CLUSTER, len(u) - 2)
+    few = np.flatnonzero(tree.query_ball_point(at, _CLUSTER, p=np.inf, return_length=True) <= most)
+    around = tree.query_ball_point(at[few], _CLUSTER, p=np.inf, return_sorted=True)
+    return [(int(k), tuple(near)) for k, near in zip(few, around, strict=True) if margin[k] <= margin[near].min()]

@@ -59,6 +59,7 @@ class Search:
         feasible: (n, d) unit-cube points to (n,) booleans.
         deflation: see `DEFLATION`.
         cube: which coordinates take single values: distances and steps know that choices have no order.
+        most_rows: runs that the metamodel learns from at most: those nearest to M_c are a tenth, the others are drawn.
     """
 
     critical: CriticalInterval
@@ -67,6 +68,7 @@ class Search:
     feasible: Callable[[Points], Mask] = lambda u: np.ones(len(u), dtype=bool)
     deflation: float = DEFLATION
     cube: Cube = CONTINUOUS
+    most_rows: int = 4000
 
     def margins(self, y: Vector) -> Vector:
         """Return (n,) distances of y (n,) to M_c, inf where a run failed."""
@@ -233,6 +235,16 @@ class SearchData:
     last_hit: float = -np.inf
     undecided: tuple[int, ...] = ()
     success: LogSuccess | None = None
+
+    def thinned(self, margin: Vector, most: int, rng: np.random.Generator) -> SearchData:
+        """Return the same with at most so many runs to learn from: a tenth of them of least margin (m,), the others drawn."""
+        if len(self.u) <= most:
+            return self
+        order = np.argsort(margin, kind="stable")
+        first = most // 10
+        kept = np.sort(np.concatenate([order[:first], rng.permutation(order[first:])[: most - first]]))
+        mine = {name: getattr(self, name)[kept] for name in ("u", "y", "batch", "flank", "rows")}
+        return replace(self, **mine)
 
     def runs_since(self, margin: Vector) -> int:
         """Return the number of runs since the last critical one, and the last one that was better than all before (m,)."""

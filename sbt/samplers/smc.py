@@ -21,6 +21,7 @@ __all__ = ["SmcDraw", "smc"]
 
 _MOVES = 4  # Metropolis steps a level: resampled duplicates have moved apart
 _TARGET_ESS = 0.5  # share of the effective sample size that a tempering step leaves, the usual choice
+_CORRECTED_ESS = 0.2  # the same of a step from the rough score's density to the score's: there is no other to go through
 _TARGET_ACCEPTANCE = 0.3  # of the Metropolis steps: near the optimal 0.234 to 0.44 (Roberts and Rosenthal 2001)
 _MAX_LEVELS = 40  # each halves the region: 2^-40 of the space
 _FIRST_SCALE, _SCALES = 0.3, (0.01, 1.5)  # of a step relative to the difference of two particles: at first, and its range
@@ -48,6 +49,7 @@ class SmcDraw:
 def smc(
     score: Callable[[Points], Vector], dimension: int, rng: np.random.Generator, *, particles: int = 1024, start: int = 4096,
     bound: Callable[[Points], Vector] | None = None, cube: Cube = CONTINUOUS, uniform: Points | None = None,
+    rough: Callable[[Points], Vector] | None = None,
 ) -> SmcDraw | None:  # fmt: skip
     """Draw particles with a density proportional to exp(score(u)) on the unit cube.
 
@@ -61,6 +63,8 @@ def smc(
         cube: which coordinates take single values.
         uniform: (m, d) points to begin with, uniform in the part of the cube outside of which the score is -inf; `log_mean`
             is then that of this part. None: `start` points of the cube.
+        rough: about the score and many times quicker: the particles move to its density first, and from there to that of the
+            score. None: straight to the latter.
 
     Returns:
         The particles; None where no uniform point has a score above -inf.
@@ -75,6 +79,9 @@ def smc(
     if not 2 <= particles <= start:
         raise InputError(f"smc needs 2 <= particles <= start, but got particles = {particles}, start = {start}")
     u = rng.random((start, dimension)) if uniform is None else uniform
+    if rough is not None:
+        first = smc(rough, dimension, rng, particles=particles, start=start, cube=cube, uniform=u)
+        return None if first is None else _corrected(first, score, rough, bound, rng, cube)
     log_score = _checked(score, u)
     if np.isneginf(log_score).all():
         return None
@@ -89,6 +96,40 @@ def smc(
     return SmcDraw(u, log_score, log_mean, levels)
 
 
+def _corrected(
+    draw: SmcDraw, score: Callable[[Points], Vector], rough: Callable[[Points], Vector],
+    bound: Callable[[Points], Vector] | None, rng: np.random.Generator, cube: Cube,
+) -> SmcDraw | None:  # fmt: skip
+    """Return particles moved on from a rough score's density, along exp((1 - t) rough + t score), to that of the score."""
+    u, log_rough, log_score = draw.u, draw.log_score, _checked(score, draw.u)
+    temper, log_mean, scale, levels = 0.0, draw.log_mean, _FIRST_SCALE, draw.levels
+    while temper < 1.0:
+        gain = log_score - log_rough
+        if np.isneginf(gain).all():
+            return None
+        step = _next(gain, temper, _CORRECTED_ESS) if levels < _MAX_LEVELS else 1.0 - temper
+        log_weight = np.where(np.isneginf(gain), -np.inf, step * gain)
+        log_mean += float(logsumexp(log_weight) - np.log(len(log_weight)))
+        keep = _systematic(np.exp(log_weight - logsumexp(log_weight)), len(u), rng)
+        u, temper, levels = u[keep], min(temper + step, 1.0), levels + 1
+        if temper == 1.0:
+            u, log_score, scale = _move(score, bound, u, log_score[keep], 1.0, scale, rng, cube)
+            break
+        t = temper
+
+        def between(v: Points, t: float = t) -> Vector:
+            return (1.0 - t) * rough(v) + t * score(v)
+
+        def most(v: Points, t: float = t) -> Vector:
+            return (1.0 - t) * rough(v) + (0.0 if bound is None else t * bound(v))
+
+        at = (1.0 - t) * log_rough[keep] + t * log_score[keep]
+        u, at, scale = _move(between, None if bound is None else most, u, at, 1.0, scale, rng, cube)
+        log_rough = _checked(rough, u)
+        log_score = (at - (1.0 - t) * log_rough) / t
+    return SmcDraw(u, log_score, log_mean, levels)
+
+
 def _checked(score: Callable[[Points], Vector], u: Points) -> Vector:
     found = np.asarray(score(u), dtype=np.float64)
     if np.isnan(found).any():
@@ -96,8 +137,8 @@ def _checked(score: Callable[[Points], Vector], u: Points) -> Vector:
     return found
 
 
-def _next(log_score: Vector, temper: float) -> float:
-    """Return the largest step of the temperature that keeps half of the effective sample size."""
+def _next(log_score: Vector, temper: float, kept: float = _TARGET_ESS) -> float:
+    """Return the largest step of the temperature that keeps this share of the effective sample size."""
     left = 1.0 - temper
 
     def size(step: float) -> float:
@@ -105,12 +146,12 @@ def _next(log_score: Vector, temper: float) -> float:
         return float(np.exp(2 * logsumexp(log_weight) - logsumexp(2 * log_weight)))
 
     alive = int((~np.isneginf(log_score)).sum())
-    if size(left) >= _TARGET_ESS * alive:
+    if size(left) >= kept * alive:
         return left
     low, high = 0.0, left
     for _ in range(40):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if size(middle) >= _TARGET_ESS * alive else (low, middle)
+        low, high = (middle, high) if size(middle) >= kept * alive else (low, middle)
     return max(low, 1e-12)
 
 

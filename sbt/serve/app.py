@@ -121,7 +121,8 @@ class _View:
         return await _answered(request, lambda: self.campaigns.status(request.path_params["key"]))
 
     async def explorer(self, request: Request) -> Response:
-        return await _answered(request, lambda: self.campaigns.explorer(request.path_params["key"]))
+        first = request.query_params.get("first") == "1"
+        return await _answered(request, lambda: self.campaigns.explorer(request.path_params["key"], first=first))
 
     async def film(self, request: Request) -> Response:
         return await _answered(request, lambda: self.campaigns.film(request.path_params["key"], request.path_params["run"]))

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from sbt.errors import InputError, SbtError
 from sbt.problem.plain import Json
-from sbt.workflows.live import LiveCampaign
+from sbt.workflows.live import LiveCampaign, first_look
 from sbt.workflows.status import read_status, writer_of
 
 __all__ = ["Campaigns", "key_of"]
@@ -139,14 +139,15 @@ class Campaigns:
                 return str(folder.relative_to(root.parent)) if folder != root else (folder.name or str(folder.resolve().name))
         return folder.name
 
-    def explorer(self, key: str) -> Json:
-        """Return what the explorer shows.
+    def explorer(self, key: str, *, first: bool = False) -> Json:
+        """Return what the explorer shows: of all runs, or first of some of them, which takes no time however many there are.
 
         Raises:
             StoreError: the store is damaged.
         """
         watched = self[key]
-
+        if first:
+            return first_look(watched.folder)
         return watched.reader.submit(lambda: watched.opened().explorer()).result()
 
     def _critical(self, watched: _Watched, found: Json) -> int | None:

@@ -61,20 +61,34 @@ const showStatus = async status => {
   at("report").hidden = !status.report;
   at("report").href = `/c/${KEY}/report`;
   const more = status.done - shown;
-  at("newer").hidden = shown < 0 || more <= 0;
+  at("newer").hidden = shown <= 0 || more <= 0;
   at("newer").textContent = `Show ${whole(more)} more runs`;
-  if (shown < 0 && status.done && !status.error) await load(status.done);
+  if (shown < 0 && status.done && !status.error) load(status.done).catch(error => { at("said").textContent = error.message; });
+};
+const LARGE = 4000;  // of more runs some are shown first, evenly spaced
+const show = async data => {
+  const before = window.explorer && window.explorer.view, run = before && before.run !== null ? window.explorer.data.index[before.run] : null;
+  const films = window.explorer ? window.explorer.data.filmOf : new Map(), lanes = window.explorer ? window.explorer.data.lanes : [];
+  at("sentences").replaceChildren(...data.sentences.map(sentence => element("p", {}, sentence)));
+  at("explore").replaceWith(blank.cloneNode(true));
+  const fresh = opened(data);
+  if (films.size) { fresh.filmOf = films; fresh.lanes = lanes; }  // those that were made on demand
+  await explore(fresh, before && { x: before.x, y: before.y, run });
+  at("explore").querySelector("[data-part=films]").previousElementSibling.hidden = !data.films.length;
 };
 const load = async done => {
   if (loading) return;
   loading = true;
   at("newer").disabled = true;
   try {
-    const data = await asked(`/api/${KEY}/explorer`);
-    at("sentences").replaceChildren(...data.sentences.map(sentence => element("p", {}, sentence)));
-    at("explore").replaceWith(blank.cloneNode(true));
-    await explore(opened(data));
-    at("explore").querySelector("[data-part=films]").previousElementSibling.hidden = !data.films.length;
+    if (done > LARGE && shown < 0) {
+      await show(await asked(`/api/${KEY}/explorer?first=1`));
+      at("said").textContent = `These are ${whole(window.explorer.data.index.length)} of ${whole(done)} runs, evenly spaced; the others are being read.`;
+      shown = 0;
+      await new Promise(then => setTimeout(then, 300));
+    }
+    await show(await asked(`/api/${KEY}/explorer`));
+    at("said").textContent = "";
     shown = done;
   } finally {
     loading = false;

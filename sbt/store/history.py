@@ -102,11 +102,14 @@ class Rows:
             values = columns.get(name)
             if values is None:
                 values = [None] * k if name in ("log_q", "warm_up") else [0] * k
-            self._put(name, np.fromiter((convert(v) for v in values), dtype, k), 0)
+            self._put(name, np.fromiter(map(convert, values), dtype, k), 0)
         for name in _TEXTS:
-            shared = [self._texts.setdefault(v, v) for v in columns.get(name, [""] * k)]  # equal texts are kept once
+            values = columns.get(name, ())
             texts = np.empty(k, dtype=object)
-            texts[:] = shared
+            if not len(values) or all(v is values[0] or v == values[0] for v in values):  # of a million runs most are alike
+                texts[:] = self._texts.setdefault(values[0], values[0]) if len(values) else ""
+            else:
+                texts[:] = [self._texts.setdefault(v, v) for v in values]  # equal texts are kept once
             self._put(name, texts, "")
         for name in dict.fromkeys(name for row in metrics for name in row):
             self._put(f"y.{name}", np.fromiter((row.get(name, np.nan) for row in metrics), np.float64, k), np.nan)
@@ -248,6 +251,11 @@ class History:
         keep = np.asarray(mask, dtype=bool)
         return History(self.names, {name: column[keep] for name, column in self.columns.items()}, self.choices)
 
+    def at_level(self, level: int) -> History:
+        """Return the runs of a level of fidelity, 0 the scenario's own."""
+        mine = self.columns["level"] == level
+        return self if mine.all() else self.where(mine)
+
     def recoded(self, choices: Mapping[str, tuple[str, ...]]) -> History:
         """Return the runs with inputs among these choices, their positions counted in them."""
         if self.choices == choices:
@@ -274,11 +282,16 @@ class History:
         log_q, warm_up = float(c["log_q"][row]), int(c["warm_up"][row])
         return Record(
             int(c["index"][row]), str(c["stage"][row]), int(c["iteration"][row]), self.inputs(row), int(c["seed"][row]),
-            str(c["status"][row]), {name: float(self.y(name)[row]) for name in self.metrics} if self.ok[row] else {},
+            str(c["status"][row]), self._metrics(row) if self.ok[row] else {},
             str(c["reason"][row]), None if np.isnan(log_q) else log_q, float(c["seconds"][row]), str(c["collisions"][row]),
             str(c["versions"][row]), bool(c["seed_chosen"][row]), int(c["level"][row]), None if warm_up < 0 else warm_up,
             str(c["unconfirmed"][row]),
         )  # fmt: skip
+
+    def _metrics(self, row: int) -> dict[str, float]:
+        """Return the metrics of one row by name; a coarse run may have fewer than others."""
+        found = {name: float(self.y(name)[row]) for name in self.metrics}
+        return {name: value for name, value in found.items() if not np.isnan(value)}
 
     def inputs(self, row: int) -> dict[str, Value]:
         """Return the inputs of one row by name, choices as text."""

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import sqlite3
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from sbt.errors import StoreError
 
-__all__ = ["DATABASE", "OUTCOME", "PLAN", "SCHEMA", "VERSION", "checksum_of", "damaged", "refuse_damage", "reported"]
+__all__ = [
+    "DATABASE", "OUTCOME", "PLAN", "SCHEMA", "VERSION", "checksum_of", "checksums_of", "damaged", "refuse_damage", "reported",
+]  # fmt: skip
 
 DATABASE = "campaign.sqlite"
 VERSION = 2
+BROKEN = f"the structure of its {DATABASE} is broken"
 SCHEMA = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum INTEGER NOT NULL);
 CREATE TABLE runs (
@@ -36,17 +39,23 @@ def checksum_of(*parts: Any) -> int:
     return zlib.crc32(repr(parts).encode("utf-8", "surrogatepass"))
 
 
+def checksums_of(rows: Iterable[tuple[Any, ...]]) -> list[int]:
+    """Return `checksum_of` of many rows; in one loop, since a million runs have five million of them."""
+    crc32 = zlib.crc32
+    return [crc32(repr(row).encode("utf-8", "surrogatepass")) for row in rows]
+
+
 @contextmanager
 def reported(folder: Path) -> Iterator[None]:
     """Turn what the disk or SQLite refuses into one clear error; committed runs stay."""
     try:
         yield
     except UnicodeDecodeError as error:  # messages of SQLite's that quote what is broken
-        raise damaged(folder, str(error)) from error
+        raise damaged(folder, BROKEN) from error
     except (sqlite3.Error, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         if _is_damage(error):
-            raise damaged(folder, reason) from error
+            raise damaged(folder, f"its {DATABASE} is not a database" if "not a database" in reason else BROKEN) from error
         raise StoreError(f"the store must be readable and writable, but {folder} is not: {reason}") from error
 
 
@@ -58,7 +67,7 @@ def _is_damage(error: Exception) -> bool:
 
 
 def damaged(folder: Path, what: str) -> StoreError:
-    """Return the error of a damaged store."""
+    """Return the error of a damaged store; `doctor` tells what SQLite says of its file."""
     return StoreError(f"{folder} is damaged: {what}; sumo-sbt doctor {folder} says what can be saved, and saves it")
 
 
@@ -71,4 +80,4 @@ def refuse_damage(folder: Path, db: sqlite3.Connection) -> None:
     with reported(folder):
         found = [str(row[0]) for row in db.execute("PRAGMA quick_check(3)")]
     if found != ["ok"]:
-        raise damaged(folder, "; ".join(found))
+        raise damaged(folder, BROKEN)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, overload
 
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Value, Values
+from sbt.store.history import PLANNED
+from sbt.store.layout import checksum_of
 
-__all__ = ["PlannedPoints", "PlannedRun", "dump", "dump_inputs", "dump_metrics"]
+__all__ = ["PlannedPoints", "PlannedRun", "dump", "dump_inputs", "dump_metrics", "plan_rows"]
 
 dump: Callable[[Any], str] = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 """JSON without spaces, of finite numbers."""
@@ -28,6 +30,7 @@ class PlannedRun:
         seed: where it was chosen for what it draws; None: it is drawn.
         level: of fidelity, 0 the scenario's own.
         warm_up: number of the warm-up to start from; None: that of its seed, where the campaign has warm-ups.
+        blind: the seed is given, but was drawn like any other, without a look at what it draws.
     """
 
     stage: str
@@ -36,6 +39,7 @@ class PlannedRun:
     seed: int | None = None
     level: int = 0
     warm_up: int | None = None
+    blind: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +73,20 @@ class PlannedPoints(Sequence[PlannedRun]):
     def __iter__(self) -> Iterator[PlannedRun]:
         """Yield the runs."""
         return (PlannedRun(self.stage, self.named(row)) for row in self.x)
+
+
+def plan_rows(
+    iteration: int, runs: Iterable[tuple[int, PlannedRun, int]], names: Sequence[str], warm_ups: int
+) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of planned runs with their index and drawn seed, for a store with these inputs and warm-ups."""
+    for index, run, drawn in runs:
+        values = run.inputs
+        inputs = dump_inputs([values[name] for name in names])
+        chosen, seed = run.seed is not None and not run.blind, drawn if run.seed is None else run.seed
+        log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
+        warm_up = int(seed) % warm_ups if warm_ups and run.warm_up is None else run.warm_up
+        row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, warm_up, log_q)
+        yield (*row, checksum_of(*row), PLANNED)
 
 
 def dump_inputs(values: Sequence[Value]) -> str:

@@ -15,9 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from sbt.errors import StoreError
+from sbt.problem.plain import JsonMapping
+from sbt.processes import own_name, remove_abandoned
 from sbt.store.connection import connected
 from sbt.store.history import PLANNED
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, reported
+from sbt.store.planning import dump
 
 __all__ = ["Diagnosis", "examine", "save"]
 
@@ -74,36 +77,43 @@ def examine(folder: Path) -> Diagnosis:
     """Return what of a store is whole; reads every row.
 
     Raises:
-        StoreError: the folder holds no store, or nothing of its file can be read.
+        StoreError: the folder holds no store.
     """
     return _read(Path(folder))[0]
 
 
-def save(folder: Path, target: Path) -> tuple[int, int]:
+def save(folder: Path, target: Path, configuration: JsonMapping | None = None) -> tuple[int, int]:
     """Write a new store of what is whole, from which `run` goes on.
 
     Args:
         folder: of the damaged store, which stays as it is.
         target: a folder without a store; made where there is none.
+        configuration: as it stands beside the store, in place of a damaged one.
 
     Returns:
         How many runs it has, and how many of them are planned again.
 
     Raises:
-        StoreError: the configuration is damaged, so that nothing can go on, or there is a store in the target.
+        StoreError: the configuration is damaged and none is given, or no run can be read, so that nothing can go on, or there
+            is a store in the target.
     """
     folder, target = Path(folder), Path(target)
     found, content = _read(folder)
+    if "configuration" not in content.meta and configuration is not None:
+        text = dump(dict(configuration))
+        content.meta["configuration"] = ("configuration", text, checksum_of("configuration", text))
     if "configuration" not in content.meta:
         raise StoreError(f"a store is saved with its configuration, but that of {folder} is damaged: begin a new campaign")
+    if not found.whole and not content.runs:
+        raise StoreError(f"a store is saved with its runs, but of {folder} none can be read: begin a new campaign")
     if (target / DATABASE).exists():
         raise StoreError(f"what is saved needs a folder without a store, but there is one in {target}")
     end = _first_unknown(found, content)
     runs = [row for row in content.runs.values() if row[2] < end]
     with reported(target):
         target.mkdir(parents=True, exist_ok=True)
-        part = target / f"{DATABASE}.part"
-        part.unlink(missing_ok=True)
+        remove_abandoned(target)
+        part = target / f"{own_name(f'.{DATABASE}')}.part"
         with closing(sqlite3.connect(part, isolation_level=None)) as db:
             db.executescript(f"BEGIN; {SCHEMA}")
             kept = [row for key, row in content.meta.items() if found.whole or key == "configuration"]
@@ -136,11 +146,11 @@ def _first_unknown(found: Diagnosis, content: _Content) -> int:
 
 def _read(folder: Path) -> tuple[Diagnosis, _Content]:
     """Return what is whole, and its rows."""
-    path = folder / DATABASE
-    if not path.is_file():
-        raise StoreError(f"a store is a folder with a campaign in its {DATABASE}, but there is none in {folder}")
     content, texts, plans, outcomes, steps, fits = _Content(), list[str](), list[int](), list[int](), list[int](), list[int]()
-    with reported(folder), closing(connected(path)) as db:
+    db = _opened(folder)
+    if isinstance(db, str):
+        return Diagnosis((db,), configuration=False, damaged_texts=("configuration",)), content
+    with reported(folder), closing(db):
         db.text_factory = lambda data: data.decode("utf-8", "replace")
         structure = _structure(db)
         for row in _rows(db, "meta", ("key", "value", "checksum"), "rowid"):
@@ -176,6 +186,19 @@ def _read(folder: Path) -> tuple[Diagnosis, _Content]:
         () if sharded else _missing([*content.runs, *plans]), tuple(steps), _missing([*content.iterations, *steps]), tuple(fits),
         tuple(texts),
     ), content  # fmt: skip
+
+
+def _opened(folder: Path) -> sqlite3.Connection | str:
+    """Return a connection to a store's file, or what SQLite says where nothing of it can be read."""
+    if not (folder / DATABASE).is_file():
+        raise StoreError(f"a store is a folder with a campaign in its {DATABASE}, but there is none in {folder}")
+    with reported(folder):
+        try:
+            return connected(folder / DATABASE)
+        except sqlite3.OperationalError:
+            raise
+        except sqlite3.DatabaseError as error:  # its first page is broken, or its end is missing
+            return str(error)
 
 
 def _structure(db: sqlite3.Connection) -> tuple[str, ...]:

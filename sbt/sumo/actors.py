@@ -13,8 +13,11 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 from sbt.errors import InputError
+from sbt.problem.trace import FieldOfView
 
-__all__ = ["KEEP", "Action", "Actor", "Controller", "EndCondition", "Obstacle", "Pose", "Scene", "State", "VehicleType"]
+__all__ = [
+    "KEEP", "Action", "Actor", "Controller", "EndCondition", "Obstacle", "Pose", "Scene", "State", "VehicleType", "view_of",
+]  # fmt: skip
 
 Pose = tuple[float, float, float]
 """x and y of the centre (m) and heading (rad)."""
@@ -76,11 +79,22 @@ class State:
 
 
 class Controller(Protocol):
-    """Controls one actor during one run; may have internal state."""
+    """Controls one actor during one run; may have internal state.
+
+    With a method `field_of_view(length, width)` of the size of its vehicle (m), which returns the `FieldOfView` of its sensor,
+    films show what it can see.
+    """
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the action from time `t` (s) until the next step."""
         ...
+
+
+def view_of(driver: object, length: float, width: float) -> FieldOfView | None:
+    """Return where the sensor of a controller in a vehicle of this size (m) sees something; None where it does not tell."""
+    tell = getattr(driver, "field_of_view", None)
+    found = tell(length, width) if callable(tell) else None
+    return found if isinstance(found, FieldOfView) else None
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,8 @@ def pieces_of(file: Template) -> tuple[tuple[Piece, ...], tuple[Equipment, ...]]
             return
         first, _, attributes, place = begun
         last = parser.CurrentByteIndex  # of <trip .../> already its end, otherwise the beginning of </trip>
-        last = data.index(b">", last) + 1 if data.startswith(b"</" + tag.encode(), last) else last
+        closing = re.compile(rb"</%b\s*>" % re.escape(tag.encode())).match(data, last)  # not the </routes> after <route .../>
+        last = last if closing is None else closing.end()
         varies = b"${" in data[first:last]
         if tag in DEPARTING or tag in DEFINITIONS:
             departs = attributes.get(DEPARTING.get(tag, ""))

@@ -9,6 +9,7 @@ import numpy as np
 
 from sbt.errors import InputError
 from sbt.problem.profile import Curve
+from sbt.problem.trace import FieldOfView
 from sbt.sumo.actors import KEEP, Action, Pose, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, Gust
 from sbt.sumo.sensors import PERIOD, RangeSensor, Target
@@ -75,6 +76,7 @@ class AccAeb:
         sensor = RangeSensor(
             rng, reach=sensor_range, margin=path_margin, gap_noise=gap_noise, speed_noise=speed_noise, smoothing=smoothing
         )
+        self._radar = (sensor_range, path_margin)
         self._sensor = sensor.__call__  # calling a bound method is faster than calling an object
         self._delay = DeadTime(reaction_time).__call__
         self._lag = FirstOrderLag(lag).__call__
@@ -82,6 +84,11 @@ class AccAeb:
         self._last = self._reached = 0.0
         self._due = 0.0
         self._target: Target | None = None
+
+    def field_of_view(self, length: float, width: float) -> FieldOfView:
+        """Return where the radar at the front sees somebody, in a vehicle of this size (m): in its path."""
+        reach, margin = self._radar
+        return FieldOfView(max(reach, 1e-9), 0.5 * length, half_width=0.5 * width + margin)
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the acceleration over the next step: the mean of the actuated values at its ends."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
-from sbt.sumo.actors import State
+from sbt.sumo.actors import Controller, State
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.ego import SUMO, Ego
 from sbt.sumo.formatting import plain
@@ -20,7 +20,7 @@ from sbt.sumo.guided import STRATEGIC_LANE_CHANGES
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, SPEED_MODE
 from sbt.sumo.models import vtype_attributes
 
-__all__ = ["EGO_TYPE", "ControlStep", "EgoVehicle"]
+__all__ = ["EGO_TYPE", "EgoControl", "EgoVehicle"]
 
 EGO_TYPE = "sbt_ego"
 """Id of the vehicle type of an ego that another model of SUMO drives."""
@@ -34,8 +34,18 @@ _COMFORTABLE_DECELERATION = 3.0
 _STOP_LINE_LENGTH, _STOP_LINE_WIDTH = 0.1, 3.0
 """Size of the obstacle that stands for a red light (m)."""
 
-ControlStep = Callable[[float, State, tuple[State, ...]], None]
-"""Called before every step with the time (s), the state of the ego, and the states of the others."""
+
+
+class EgoControl(NamedTuple):
+    """How an ego is driven.
+
+    Attributes:
+        step: called before every step with the time (s), the state of the ego, and the states of the others.
+        driver: the controller.
+    """
+
+    step: Callable[[float, State, tuple[State, ...]], None]
+    driver: Controller
 
 
 @dataclass(frozen=True)
@@ -83,7 +93,7 @@ class EgoVehicle:
         settings = vtype_attributes(dict(self.driver.settings))
         return '<vType id="{}" {}/>'.format(self.type_id, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
 
-    def take_over(self, sumo: Any, rng: np.random.Generator, *, walks: bool = False) -> ControlStep | None:
+    def take_over(self, sumo: Any, rng: np.random.Generator, *, walks: bool = False) -> EgoControl | None:
         """Give the ego its driver; to be called in the step in which it departs.
 
         Args:
@@ -92,7 +102,7 @@ class EgoVehicle:
             walks: it is a person, whom only SUMO's pedestrian model moves.
 
         Returns:
-            The function to be called before every step; None where SUMO drives.
+            How it is driven; None where SUMO drives.
         """
         if self.driver is None:
             return None
@@ -125,7 +135,7 @@ class EgoVehicle:
             if action.lane is not None:
                 sumo.vehicle.changeLane(self.id, plain(action.lane), LANE_REQUEST_DURATION)
 
-        return control
+        return EgoControl(control, controller)
 
     def _change_type(self, sumo: Any) -> None:
         """Give the ego the type with the other model; properties that the settings do not mention stay as they are."""

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from sbt.problem.trace import FieldOfView
 from sbt.sumo.actors import Action, Obstacle, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, JerkLimitedStop
 from sbt.sumo.occlusion import Occluders, outline
@@ -73,6 +74,7 @@ class PedestrianBraking:
         self._limit = friction * GRAVITY
         self._sight, self._camera = sight, camera
         self._occluders = Occluders((*o.pose, o.length, o.width) for o in obstacles)
+        self._hidden_by = tuple(o.name for o in obstacles)
         self._confirmations = confirmations
         self._delay, self._lag = DeadTime(reaction_time), FirstOrderLag(lag)
         self._range = (braking_min, braking_max)
@@ -81,6 +83,10 @@ class PedestrianBraking:
         self._next = self._conflicts = 0
         self._braking = False
         self._demand = self._reached = self._last = 0.0
+
+    def field_of_view(self, length: float, width: float) -> FieldOfView:
+        """Return where the camera sees somebody, in a vehicle of this size (m)."""
+        return FieldOfView(self._sight, 0.5 * length - self._camera, hidden_by=self._hidden_by)
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the acceleration over the next step: the mean of the actuated values at its ends."""
@@ -168,6 +174,10 @@ class EmergencyStop:
         self._first: float | None = None
         self._moved = 0.0
         self._stop: JerkLimitedStop | None = None
+
+    def field_of_view(self, length: float, width: float) -> FieldOfView:
+        """Return where the sensor at the front sees something, in a vehicle of this size (m)."""
+        return FieldOfView(ahead=0.5 * length)
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the pose and the speed at the end of the step."""

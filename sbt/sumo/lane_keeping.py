@@ -7,6 +7,7 @@ import math
 import numpy as np
 from scipy.linalg.lapack import dgesv
 
+from sbt.problem.trace import FieldOfView
 from sbt.sumo.actors import Action, Obstacle, State
 from sbt.sumo.dynamics import DeadTime, FirstOrderLag, SingleTrack
 from sbt.sumo.occlusion import Occluders
@@ -41,6 +42,7 @@ class MarkingSensor:
         noise: lateral standard deviation of a point (m).
 
     Attributes:
+        reach: as given.
         seen: number of points of the left and of the right marking in the last frame, weighted by their visibility.
     """
 
@@ -54,7 +56,7 @@ class MarkingSensor:
         self, rng: np.random.Generator, left: np.ndarray, right: np.ndarray, *, lane: float,
         obstacles: tuple[Obstacle, ...] = (), reach: float = 20.0, noise: float = 0.05,
     ):  # fmt: skip
-        self._rng, self._reach, self._noise = rng, reach, noise
+        self._rng, self.reach, self._noise = rng, reach, noise
         self._points = np.concatenate([left, right])
         self._x, self._y = np.ascontiguousarray(self._points.T)
         self._side = np.concatenate([np.full(len(left), 0.5 * lane), np.full(len(right), -0.5 * lane)])
@@ -69,11 +71,11 @@ class MarkingSensor:
         noise = self._noise * self._rng.standard_normal(2 * _NOISE_SLOTS)
         eye = np.array([own.x, own.y])
         east, north = self._x - own.x, self._y - own.y
-        (near,) = ((east * east + north * north < self._reach**2) & (east * own.cos + north * own.sin > 0.0)).nonzero()
+        (near,) = ((east * east + north * north < self.reach**2) & (east * own.cos + north * own.sin > 0.0)).nonzero()
         side, east, north = self._side[near], east[near], north[near]
         x = east * own.cos + north * own.sin
         y = north * own.cos - east * own.sin
-        seen = np.minimum(np.minimum(x, self._reach - np.sqrt(x * x + y * y)) / _FADE_LENGTH, 1.0)
+        seen = np.minimum(np.minimum(x, self.reach - np.sqrt(x * x + y * y)) / _FADE_LENGTH, 1.0)
         around = tuple([o for o, radius in self._obstacles if self._may_hide(own, o.pose[0] - own.x, o.pose[1] - own.y, radius)])
         if around:
             if around not in self._occluders:
@@ -87,14 +89,14 @@ class MarkingSensor:
         square = x * x
         terms = np.empty((4, len(x)))
         terms[0], terms[1], terms[2], terms[3] = 1.0, x, square, square * x
-        weighted = terms * (seen / (1.0 + square / self._reach**2))
+        weighted = terms * (seen / (1.0 + square / self.reach**2))
         normal = weighted @ terms.T + self._PRIOR_INFORMATION
         _, _, self._fit, _ = dgesv(normal, weighted @ y + self._PRIOR_WEIGHT * self._fit)  # np.linalg.solve without its checks
         return self._fit
 
     def _may_hide(self, own: State, east: float, north: float, radius: float) -> bool:
         """Return whether a circle overlaps the half disc in which points are detected."""
-        return math.hypot(east, north) < self._reach + radius and east * own.cos + north * own.sin > -radius
+        return math.hypot(east, north) < self.reach + radius and east * own.cos + north * own.sin > -radius
 
 
 class LaneKeeping:
@@ -132,11 +134,16 @@ class LaneKeeping:
         self.sensor = MarkingSensor(
             rng, none if left is None else left, none if right is None else right, lane=lane, obstacles=obstacles
         )
+        self._view = FieldOfView(self.sensor.reach, hidden_by=tuple(o.name for o in obstacles))
         self._speed, self._preview, self._gains, self._limit = set_speed, preview, (p, i, d), lateral_max
         self._model = SingleTrack(wheelbase)
         self._delay, self._lags = DeadTime(delay), (FirstOrderLag(lag_1), FirstOrderLag(lag_2))
         self._next = 0
         self._integral = self._wanted = self._steering = 0.0
+
+    def field_of_view(self, length: float, width: float) -> FieldOfView:
+        """Return where the camera sees markings: from the middle of a vehicle of any size (m)."""
+        return self._view
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the pose at the end of the step, driven with the mean of the steering angles at its ends."""

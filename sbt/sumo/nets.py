@@ -9,10 +9,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from sbt.errors import InputError
 from sbt.plugins import kept, noted
+from sbt.problem.arrays import Points
 
-__all__ = ["Lane", "lanes", "net_file", "nets_folder"]
+__all__ = ["Lane", "lanes", "net_file", "nets_folder", "pavements"]
 
 
 class Lane(NamedTuple):
@@ -80,6 +83,16 @@ def lanes(net: str) -> tuple[Lane, ...]:
             if element.tag != "lane":
                 element.clear()  # networks are large
     return tuple(found)
+
+
+@kept
+def pavements(file: str) -> dict[str, Points]:
+    """Return the (n, 2) shape of the rightmost lane of every edge of a network file, where people walk, by the edge's id."""
+    with _opened(Path(file)) as opened:
+        rightmost = {e.attrib["id"][:-2]: e.attrib["shape"] for e in ET.parse(opened).iter("lane") if e.get("index") == "0"}
+    return {
+        edge: np.array([[float(v) for v in pair.split(",")[:2]] for pair in shape.split()]) for edge, shape in rightmost.items()
+    }
 
 
 def _lane(element: ET.Element, function: str) -> list[Lane]:

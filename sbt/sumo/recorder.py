@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -20,10 +20,11 @@ from sbt.errors import InputError, RunError
 from sbt.metrics.conflict_types import from_behind
 from sbt.problem.outcome import STRUCK, Status
 from sbt.problem.trace import ActorTrace, Trace
+from sbt.sumo.actors import view_of
 from sbt.sumo.appearances import AppearanceMonitor
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, listed_only, unconfirmed_contact
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture
-from sbt.sumo.ego_vehicle import ControlStep, EgoVehicle
+from sbt.sumo.ego_vehicle import EgoControl, EgoVehicle
 from sbt.sumo.guided import Placed
 from sbt.sumo.surroundings import Surroundings
 
@@ -100,7 +101,7 @@ class Recorder:
         """Number of the step in which the ego departed; None before."""
         self._dt = float(sumo.simulation.getDeltaT())
         self._surroundings = Surroundings(sumo, self._ego, settings.within, settings.named, self._dt)
-        self._control: ControlStep | None = None
+        self._control: EgoControl | None = None
         self._collisions: list[str] = []
         self._listed: dict[str, float] = {}
         self._differing: dict[str, str] = {}
@@ -147,7 +148,7 @@ class Recorder:
         if self._control is not None and self._departed:
             near = self._surroundings
             others = tuple(near.states[name] for name in near.present if name != self._ego)
-            self._control(self._t, near.states[self._ego], others)
+            self._control.step(self._t, near.states[self._ego], others)
 
     def after_step(self) -> None:
         """Record the step.
@@ -275,4 +276,7 @@ class Recorder:
         """
         if not len(self._surroundings):
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must depart, but had not when the loop ended at {self._now()}")
-        return self._surroundings.trace(ended, self._collisions, [*self._differing.values(), *self._struck])
+        found = self._surroundings.trace(ended, self._collisions, [*self._differing.values(), *self._struck])
+        own = self._surroundings.states[self._ego]
+        view = None if self._control is None else view_of(self._control.driver, own.length, own.width)
+        return found if view is None else replace(found, view=view)

@@ -59,18 +59,18 @@ def libsumo() -> Any:
     """Import libsumo once (0.8 s), without its message on standard output."""
     with contextlib.redirect_stdout(io.StringIO()):
         import libsumo as module
-    _keep_xml(module)
     return module
 
 
-def _keep_xml(module: Any) -> None:
+@cache
+def _keep_xml() -> None:
     """Keep the tables of SUMO's XML reader, which it would make again in every load: half the time of a small one.
 
     The reader (Xerces) counts who has begun to use it, and drops them with the last; this is one that never ends. Where its
     function has another name nothing is kept.
     """
     with contextlib.suppress(OSError, AttributeError):
-        begin = getattr(ctypes.CDLL(module.libsumo._libsumo.__file__), _XML_BEGIN)
+        begin = getattr(ctypes.CDLL(libsumo().libsumo._libsumo.__file__), _XML_BEGIN)
         begin.argtypes, begin.restype = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p, ctypes.c_void_p], None
         begin(b"en_US", None, None, None)
 
@@ -174,7 +174,9 @@ class Session:
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
 
     @contextlib.contextmanager
-    def run(self, setup: Loadable, seed: int, isolation: str, state: Path | None = None) -> Iterator[Any]:
+    def run(
+        self, setup: Loadable, seed: int, isolation: str, state: Path | None = None, *, reference: bool = False
+    ) -> Iterator[Any]:
         """Provide libsumo with an empty simulation of this setup, for one run or for one run per replica.
 
         Args:
@@ -182,10 +184,13 @@ class Session:
             seed: of the run.
             isolation: level; all but `fresh` go on with the simulation that is there, if it is of this setup.
             state: what SUMO has saved, loaded then.
+            reference: keep nothing at all from one load to the next that is not there already.
 
         Raises:
             RunError: SUMO raised an error; the reason includes what it wrote to file descriptor 2.
         """
+        if not reference:
+            _keep_xml()
         with self._captured():
             try:
                 self._load(setup, seed, isolation)

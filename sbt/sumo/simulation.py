@@ -16,6 +16,7 @@ from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
+from sbt.sumo.acting import Period, periods_of
 from sbt.sumo.actors import Scene
 from sbt.sumo.batch import simulate_many
 from sbt.sumo.ego import Ego
@@ -135,7 +136,8 @@ class SumoSimulation:
         """
         scene = self.build_scene(values, seed)
         limit = math.inf if self.timeout is None else self.timeout
-        with session().run(self.setup(scene), seed, self.isolation_level) as sumo:
+        reference = self.isolation == "fresh" != self.isolations[-1]  # asked for although less would do
+        with session().run(self.setup(scene), seed, self.isolation_level, reference=reference) as sumo:
             insert(sumo, scene)
             sumo.simulationStep()
             verify(sumo, scene)
@@ -174,6 +176,11 @@ class SumoSimulation:
     def isolation_level(self) -> str:
         """The isolation level of the runs."""
         return self.isolation or self.isolations[-1]
+
+    @property
+    def periods(self) -> tuple[Period, ...]:
+        """In which times drivers act, where that is not every step."""
+        return periods_of([self.ego])
 
     @property
     def batched(self) -> bool:

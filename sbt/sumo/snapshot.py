@@ -108,17 +108,19 @@ class Snapshot:
 
 
 def snapshot_of(
-    files: SumoFiles, egos: tuple[str, ...], space: ParameterSpace, step: float, asked: WarmUp | None, until: float | None = None
-) -> Snapshot:
+    files: SumoFiles, moved: tuple[str, ...], space: ParameterSpace, step: float, asked: WarmUp | None,
+    until: float | None = None, *, adding: bool = False,
+) -> Snapshot:  # fmt: skip
     """Return how traffic is divided between the warm-up and the runs of a space.
 
     Args:
         files: of the simulation.
-        egos: vehicles under test.
+        moved: vehicles under test, and others that this package moves.
         space: of the inputs.
         step: SUMO's step (s).
         asked: what the scenario asks for; None: nothing.
         until: end of the warm-up (s) where that is decided already.
+        adding: whether a loop may add vehicles of its own to a run, the one under test too.
 
     Raises:
         NoSnapshot: a condition does not hold; the message says which, and where.
@@ -128,9 +130,11 @@ def snapshot_of(
     if begin is None:
         raise NoSnapshot(f"the option begin must be a number, but is '{files.options['begin']}'")
     pieces = [piece for one in files.templates if one.root[0] != "net" for piece in pieces_of(one)[0]]
-    varies = _varying(pieces, egos)
+    varies = _varying(pieces, moved)
     constant = [piece for piece, changes in zip(pieces, varies, strict=True) if not changes]
     varying = tuple(piece for piece, changes in zip(pieces, varies, strict=True) if changes)
+    if not adding and not any(piece.is_traffic for piece in varying):
+        raise NoSnapshot("the ego is not in the files")
     end = _end_of_warm_up(varying, space, begin, step, asked) if until is None else until
     moving = [(_constant_departure(piece, begin), piece) for piece in constant if piece.is_traffic]
     moving.sort(key=lambda each: each[0])
@@ -150,6 +154,8 @@ def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: fl
     end = _in_steps(earliest - _SETTLING if wanted is None else wanted, begin, step)
     if end <= begin and wanted is not None:
         raise NoSnapshot(f"the simulation begins at {begin:g} s, and the warm-up ends at {wanted:g} s")
+    if first is None:  # a loop adds what depends on inputs, from the end of the warm-up on
+        return end
     if end <= begin:
         least = begin + _SETTLING + step
         raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s; before {least:g} s there is nothing to warm up")
@@ -185,10 +191,10 @@ def _check_surroundings(files: SumoFiles) -> None:
         raise NoSnapshot(f"warmed states were tested with libsumo {', '.join(_TESTED)}, but this is {found}")
 
 
-def _varying(pieces: list[Piece], egos: tuple[str, ...]) -> list[bool]:
-    """Return what varies: what has a placeholder, the vehicles under test, and what names a type or route that varies."""
-    under_test = {name for ego in egos for name in (ego, ego.rpartition(".")[0]) if name}
-    varies = [piece.varies or (piece.is_traffic and piece.id in under_test) for piece in pieces]
+def _varying(pieces: list[Piece], moved: tuple[str, ...]) -> list[bool]:
+    """Return what varies: what has a placeholder, the vehicles that are moved, and what names a type or route that varies."""
+    ids = {name for one in moved for name in (one, one.rpartition(".")[0]) if name}
+    varies = [piece.varies or (piece.is_traffic and piece.id in ids) for piece in pieces]
     names: set[str] = set()
     while True:
         found = {name for piece, changes in zip(pieces, varies, strict=True) if changes for name in piece.defines}
@@ -209,11 +215,11 @@ def _points(space: ParameterSpace, varying: tuple[Piece, ...]) -> list[Values]:
     return [space.named(x) for x in space.from_unit(grid)]
 
 
-def _earliest(varying: tuple[Piece, ...], points: list[Values], begin: float) -> tuple[Piece, float]:
-    """Return what departs first of all that varies, and when (s)."""
+def _earliest(varying: tuple[Piece, ...], points: list[Values], begin: float) -> tuple[Piece | None, float]:
+    """Return what departs first of all that varies, and when (s); None, and never, where nothing does."""
     traffic = [piece for piece in varying if piece.is_traffic]
     if not traffic:
-        raise NoSnapshot("the ego is not in the files")
+        return None, math.inf
     times = {piece: min(_departure(piece, values) for values in points) for piece in traffic}
     first = min(traffic, key=lambda piece: times[piece])
     return first, max(times[first], begin)

@@ -13,7 +13,7 @@ from sbt.errors import RunError
 from sbt.metrics.geometry import contact_part
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
-from sbt.sumo.actors import KEEP, Action, Actor, Obstacle, Scene, State
+from sbt.sumo.actors import KEEP, Action, Actor, Obstacle, Scene, State, view_of
 from sbt.sumo.appearances import refuse_overlap_at_start
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, unconfirmed_contact
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
@@ -144,6 +144,7 @@ class SumoRun:
             tuple(self._collisions),
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
             unconfirmed=self._unconfirmed,
+            view=view_of(actors[0].driver, float(actors[0].type.length), float(actors[0].type.width)),
         )
 
 

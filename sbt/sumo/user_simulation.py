@@ -22,6 +22,8 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sbt.errors import InputError, RunError
 from sbt.problem.isolation import SNAPSHOT, Isolation
 from sbt.problem.outcome import Status
@@ -29,13 +31,15 @@ from sbt.problem.plain import Values
 from sbt.problem.profile import Profile
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
+from sbt.seeds import stream
+from sbt.sumo.acting import Period, periods_of
 from sbt.sumo.connecting import traci_connection
 from sbt.sumo.ego import Ego
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.forking import in_fork
 from sbt.sumo.formatting import plain_values
 from sbt.sumo.friction import Friction
-from sbt.sumo.guided import Participant
+from sbt.sumo.guided import GuidedVehicle, Participant
 from sbt.sumo.levels import levels_of
 from sbt.sumo.phases import Stopwatch
 from sbt.sumo.recorder import RecordingSettings, RunEnded
@@ -44,7 +48,7 @@ from sbt.sumo.snapshot import CAN_FORK, NoSnapshot, Snapshot, WarmUp, snapshot_o
 from sbt.sumo.traci_proxy import Loop, TraciProxy, step_until_over
 from sbt.sumo.warming import WarmedFiles, warmed_files
 
-__all__ = ["Loop", "TraciProxy", "UserSimulation", "step_until_over"]
+__all__ = ["Covariates", "Loop", "TraciProxy", "UserSimulation", "step_until_over"]
 
 WARM_UPS = 8
 """Warm-ups of a scenario that states no number, outside campaigns."""
@@ -54,6 +58,9 @@ _GRACE = 1.0
 """Time by which a run may exceed its limit before its process is ended (s): most runs stop themselves."""
 Connect = Callable[[SumoFiles, Values], AbstractContextManager[Any]]
 """Starts SUMO with the files of a run and provides its client module: libsumo or traci."""
+
+Covariates = Callable[[Mapping[str, Any], np.random.Generator], Mapping[str, float]]
+"""Values of the inputs and the generator of the loop to named numbers, which are known before the run."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,7 @@ class UserSimulation:
         warm: the warm-up that is asked for; None: none.
         space: of the inputs, for the conditions of a snapshot; None: not known, and every run begins afresh.
         decided: the isolation of a campaign; None: as the conditions are.
+        covariates: what a run's seed draws, before the run; it gets the generator that the loop gets. None: nothing is told.
 
     Raises:
         InputError: a step is not a whole number of milliseconds, or neither files nor a loop are given.
@@ -91,6 +99,7 @@ class UserSimulation:
     warm: WarmUp | None = None
     space: ParameterSpace | None = None
     decided: Isolation | None = None
+    covariates: Covariates | None = None
 
     def __post_init__(self) -> None:
         if self.files is None and self.loop is step_until_over:
@@ -104,6 +113,11 @@ class UserSimulation:
         """The step as far as it is known before a run (s); NaN where the loop decides it."""
         of_files = self.files.step_length() if self.files is not None else math.nan
         return self.step if self.step is not None else 0.1 if of_files is None else of_files
+
+    @property
+    def periods(self) -> tuple[Period, ...]:
+        """In which times drivers act, where that is not every step."""
+        return periods_of([one.driver for one in (self.recording.ego, *self.recording.further)], self.files)
 
     def configured(
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
@@ -151,17 +165,21 @@ class UserSimulation:
         Raises:
             NoSnapshot: it cannot be.
         """
-        if self.files is None or self.loop is not step_until_over:
-            raise NoSnapshot("a loop of one's own drives the simulation from its beginning")
+        if self.files is None:
+            raise NoSnapshot("a loop that calls sumo.start drives from the beginning: let the scenario name its files (sumo)")
+        own_loop, asked = self.loop is not step_until_over, self.warm
+        if own_loop and (asked is None or asked.until is None):
+            raise NoSnapshot("a loop of one's own drives from the beginning of the simulation, unless warm_up.until says when")
         if space is None:
             raise NoSnapshot("the inputs are not known")
-        if self.participants:
-            raise NoSnapshot("actors, recorded road users and friction act from the beginning of the simulation")
+        guided = tuple(one.id for one in self.participants if isinstance(one, GuidedVehicle))
+        if len(guided) < len(self.participants):
+            raise NoSnapshot("recorded road users and friction act from the beginning of the simulation")
         if math.isnan(self.step_length):
             raise NoSnapshot("the step depends on an input")
-        egos = tuple(one.id for one in (self.recording.ego, *self.recording.further))
-        asked = WarmUp() if self.warm is None and self.level == SNAPSHOT else self.warm
-        return snapshot_of(self.files, egos, space, self.step_length, asked, until)
+        moved = (*(one.id for one in (self.recording.ego, *self.recording.further)), *guided)
+        asked = WarmUp() if asked is None and self.level == SNAPSHOT else asked
+        return snapshot_of(self.files, moved, space, self.step_length, asked, until, adding=own_loop)
 
     @cached_property
     def _warmed(self) -> WarmedFiles:
@@ -186,6 +204,14 @@ class UserSimulation:
         """Make the state of one warm-up where it is not there yet."""
         if self.isolation.warm:
             self._warmed.state(snapshot, self.isolation.states)
+
+    def known_before(self, values: Values, seed: int) -> Mapping[str, float] | None:
+        """Return what a seed draws by the user's function, at no simulation; None where there is none."""
+        if self.covariates is None:
+            return None
+        curves = {profile.name: profile.curve(plain_values(values)) for profile in self.profiles}
+        with contextlib.chdir(self.folder):
+            return self.covariates({**plain_values(values), **curves}, stream(seed, "loop"))
 
     def with_friction(self, low: float, high: float) -> UserSimulation:
         """Return a copy on roads of this friction.

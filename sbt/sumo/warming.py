@@ -12,6 +12,7 @@ import gzip
 import hashlib
 import os
 import re
+import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -137,10 +138,18 @@ class WarmedFiles:
                 path.parent.mkdir(parents=True, exist_ok=True)
             if not os.access(path.parent, os.W_OK):  # a store that is only read
                 path = self.path_of(number, "")
-            with _locked(path.with_suffix(".lock")):
-                if not path.is_file():
-                    self._warm_up_apart(number, path)
+            self._make(number, path)
+        with contextlib.suppress(OSError, EOFError, zlib.error, UnicodeDecodeError):
+            return _read(path)
+        path.unlink()  # damaged: a warm-up is the same whenever it is made
+        self._make(number, path)
         return _read(path)
+
+    def _make(self, number: int, path: Path) -> None:
+        """Make a state where no other process has made it meanwhile."""
+        with _locked(path.with_suffix(".lock")):
+            if not path.is_file():
+                self._warm_up_apart(number, path)
 
     def path_of(self, number: int, states: str) -> Path:
         """Return the file of a state."""

@@ -1,7 +1,8 @@
 """Analytic problems with known truth, as logical scenarios: `testbed:NAME`.
 
 They serve to assess campaigns against exact or precise reference values. `testbed:NAME:box` is the same problem
-with all inputs uniform in a box, for searches that do not use the distribution.
+with all inputs uniform in a box, for searches that do not use the distribution. `testbed:NAME:coarse` is a coarse level of
+fidelity of a noisy problem.
 
 >>> scenario = from_name("four_branch_7", Path())
 >>> scenario.space.names, scenario.requirement.critical.high
@@ -26,7 +27,7 @@ __all__ = ["Problem", "Truth", "analytic", "find", "from_name", "names", "truth"
 
 _ROOMS = (reliability, traffic, search, failing, many_inputs, stochastic, thin)
 _PROBLEMS = {p.name: p for room in _ROOMS for p in room.PROBLEMS}
-_BOX = ":box"
+_BOX, _COARSE = ":box", ":coarse"
 
 
 def names() -> list[str]:
@@ -54,7 +55,7 @@ def from_name(name: str, folder: Path) -> LogicalScenario:
     Raises:
         InputError: there is no testbed of this name.
     """
-    return find(name).scenario()
+    return find(name.removesuffix(_COARSE)).coarse().scenario() if name.endswith(_COARSE) else find(name).scenario()
 
 
 def truth(name: str) -> Truth:

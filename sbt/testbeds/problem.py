@@ -16,7 +16,7 @@ from sbt.problem.distribution import Distribution
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario
+from sbt.problem.scenario import LogicalScenario, Metric
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 
@@ -28,6 +28,8 @@ METRIC = "y"
 """The only metric of an analytic scenario."""
 NEGATIVE = CriticalInterval(high=0.0)
 """The critical interval of a limit-state function."""
+_COARSE = 0.4
+"""Error of a coarse level of fidelity, of the noise: what both levels draw correlates by 0.93."""
 
 Function = Callable[[Points], Vector]
 """(n, d) physical values to (n,) metrics; a row does not depend on the others."""
@@ -69,6 +71,7 @@ class Problem:
         noise: standard deviation of normal noise on y, drawn from the seed of the run.
         box: (low, high) of each input for searches that do not use the distribution; None: the bounds of the
             parameters, which are the 1e-6 quantiles if an input is unbounded.
+        error: standard deviation of a further normal error, drawn from the seed of the run: that of a coarse level of fidelity.
     """
 
     name: str
@@ -79,6 +82,7 @@ class Problem:
     truth: Truth
     noise: float = 0.0
     box: tuple[tuple[float, float], ...] | None = None
+    error: float = 0.0
 
     def in_box(self) -> Problem:
         """Return the same problem with all inputs uniform in the box, for boundary identification and falsification."""
@@ -91,12 +95,17 @@ class Problem:
         truth = replace(self.truth, probability=share, std_error=error, modes=self.truth.modes if uniform else None)
         return replace(self, name=f"{self.name}:box", parameters=parameters, truth=truth, box=None)
 
+    def coarse(self) -> Problem:
+        """Return a coarse level of fidelity of a noisy problem: the same noise for the same seed, and an error of 40 % of it."""
+        return replace(self, error=_COARSE * self.noise)
+
     def scenario(self) -> LogicalScenario:
         """Return the logical scenario `testbed:NAME`."""
         space = ParameterSpace(self.parameters)
         return LogicalScenario(
             name=f"testbed:{self.name}", space=space, requirement=Requirement(METRIC, self.critical.low, self.critical.high),
-            evaluate=_Pointwise(self.name, space.names, self.function, self.noise), metric_names=(METRIC,),
+            evaluate=_Pointwise(self.name, space.names, self.function, self.noise, self.error),
+            metrics=(Metric(METRIC, direction="high" if math.isinf(self.critical.high) else "low"),),
             description=f"{self.title}\n{_documentation(self.function)}",
         )  # fmt: skip
 
@@ -172,12 +181,15 @@ class _Pointwise:
     inputs: tuple[str, ...]
     function: Function
     noise: float
+    error: float = 0.0
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
         x = as_points([[values[name] for name in self.inputs]], len(self.inputs))
         y = float(as_vector(self.function(x), 1)[0])
         if self.noise:
             y += self.noise * float(stream(seed, "testbed", self.name).standard_normal())
+        if self.error:
+            y += self.error * float(stream(seed, "coarse", self.name).standard_normal())
         return {METRIC: y}
 
 

@@ -27,6 +27,7 @@ from sbt.sumo.files import SumoFiles
 from sbt.sumo.suggesting import units_apart
 from sbt.workflows.comparing import compared_times
 from sbt.workflows.drawn import covariates_first
+from sbt.workflows.fidelity import fidelity_findings
 from sbt.workflows.findings import Finding
 from sbt.workflows.rehearsal import rehearse
 from sbt.workflows.snapshots import snapshot_findings, which_isolation
@@ -101,6 +102,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     yield _in_worker(spec, jobs, first, points)
     yield from _isolations(spec, jobs, points)
     yield from snapshot_findings(spec, points, seed, _digest)
+    yield from fidelity_findings(spec, asked, seed)
     yield from _physics(first, points)
     yield _sides([run for run in first if not run.problem], asked)
     for name, said in compared_times(asked, jobs):

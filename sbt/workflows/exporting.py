@@ -31,7 +31,7 @@ def export_store(folder: Path, form: str = "csv", *, objects: Objects | None = N
         objects: what was given in Python when the store was made.
 
     Raises:
-        InputError: an unknown form, a library that is not installed, or (boundary) no metamodel.
+        InputError: an unknown form, a library that is not installed, or (boundary) no metamodel, or no boundary.
         StoreError: the folder holds no campaign.
     """
     if form not in FORMS:
@@ -43,8 +43,13 @@ def export_store(folder: Path, form: str = "csv", *, objects: Objects | None = N
 
 
 def _frame(store: Store, study: Study) -> pd.DataFrame:
-    """Return a row a run, with its verdict, and what reference drivers made of it where they were asked."""
-    return with_judgements(store.history().to_frame(study.scenario.requirement), store.judgements)
+    """Return a row a run, with its verdict, and what reference drivers made of it where they were asked.
+
+    Coarse runs have a row and a level, but no verdict: they are none of the scenario's.
+    """
+    frame = with_judgements(store.history(level=None).to_frame(study.scenario.requirement), store.judgements)
+    frame.loc[frame["level"] > 0, "critical"] = None
+    return frame
 
 
 def _as_csv(store: Store, study: Study) -> Path:
@@ -72,7 +77,12 @@ def _as_boundary(store: Store, study: Study) -> Path:
     from sbt.campaigns.boundary import boundary_points
 
     space = study.scenario.space
-    points = _cells(pd.DataFrame(named_columns(boundary_points(study.settings, store.history()), space.names, space.choices)))
+    found = boundary_points(study.settings, store.history())
+    if len(found) == 0:
+        share = study.scenario.requirement.critical_runs(store.history()).sum()
+        rule = "a boundary needs places where the metamodel's P(critical) is 0.5, but it finds none"
+        raise InputError(f"{rule} (of {len(store.history())} runs {share} are critical); no file is written")
+    points = _cells(pd.DataFrame(named_columns(found, space.names, space.choices)))
     return write_atomically(store.folder / "exports" / "boundary.csv", lambda part: points.to_csv(part, index=False))
 
 

@@ -46,6 +46,7 @@ class CampaignKeys(TypedDict, total=False):
     gate: Mapping[str, float] | None
     warm_start: JsonMapping | str | Path | None
     covariates: bool | str | None
+    fidelity: JsonMapping | None
     judges: Sequence[str] | None
     executor: Setting
     store: str | Path

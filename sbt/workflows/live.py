@@ -12,10 +12,14 @@ from sbt.report.projection import influence_from_runs
 from sbt.report.reel import Reels
 from sbt.report.words import Findings, conclusion_sentences
 from sbt.store.database import Store
+from sbt.store.history import PLANNED
 from sbt.workflows.filming import film_runs
 from sbt.workflows.study import RESOLVED, Study
 
-__all__ = ["LiveCampaign", "check_resumable", "film_of", "live_parts"]
+__all__ = ["LiveCampaign", "check_resumable", "film_of", "first_look", "live_parts"]
+
+_FIRST = 2000
+"""Runs of a first look at a large store."""
 
 
 class LiveCampaign:
@@ -43,6 +47,20 @@ class LiveCampaign:
         weights = influence_from_runs(found.history, study.scenario.requirement)
         data = explorer_data(found, study.scenario, None, np.nan_to_num(weights))
         return {**data, "sentences": conclusion_sentences(found) if ended else []}
+
+
+def first_look(folder: Path) -> Json:
+    """Return what the explorer shows of some runs, evenly spaced, with the sentences as they were concluded.
+
+    Raises:
+        StoreError: the folder holds no campaign, or a damaged one.
+    """
+    with Store.read(folder) as store:
+        study, ended, counts = Study.from_store(store), store.conclusion, store.counts
+        found = Findings.of(store, study.scenario, None, history=store.sample(_FIRST))
+        data = explorer_data(found, study.scenario, None, np.nan_to_num(influence_from_runs(found.history, found.requirement)))
+    done = sum(counts.values()) - counts.get(PLANNED, 0)
+    return {**data, "total": done, "sentences": [] if ended is None else list(ended.get("sentences") or [])}
 
 
 def live_parts() -> Json:

@@ -6,14 +6,13 @@ shards: rows, batches, fits and the conclusion come about as they would have wit
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 from sbt.errors import InputError
-from sbt.files import move_atomically
+from sbt.files import move_atomically, scratch_in
 from sbt.loop.running import run_stages
 from sbt.loop.stages import Shard
 from sbt.problem.description import is_complete
@@ -69,7 +68,7 @@ def merge_shards(folders: Sequence[Path], into: Path, *, report: bool = True) ->
     with Store.read(parts[0].folder) as first:
         study = Study.from_store(first).with_store(into)
     into.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".merge-", dir=into) as folder:
+    with scratch_in(into, "merge") as folder:
         result = _run(study, parts, Path(folder))
         for name in (RESOLVED, DATABASE):  # the database last: with it the folder becomes a store
             move_atomically(Path(folder) / name, into / name)

@@ -29,7 +29,7 @@ from sbt.workflows.portable import place_of
 from sbt.workflows.running import Replay, replay_run
 from sbt.workflows.study import Study
 
-__all__ = ["Pinned", "PinnedRun", "pin_runs"]
+__all__ = ["Pinned", "PinnedRun", "pin_runs", "uncritical"]
 
 _OF_THE_SEARCH = (
     "seed", "budget", "initial", "batch", "acquisition", "metamodel", "validation", "stop", "gate", "judges", "store",
@@ -150,6 +150,14 @@ def pin_runs(folder: Path, runs: Sequence[str], into: Path) -> Path:
     if path.is_file() and path.read_text(encoding="utf-8") != page:
         raise InputError(f"a pin replaces no other one, but {path} is there and differs; remove it, or choose another folder")
     return write_atomically(path, page)
+
+
+def uncritical(folder: Path, runs: Sequence[str]) -> list[int]:
+    """Return the indices, of runs given as to `pin_runs`, of those that violate nothing: there is no failure to guard."""
+    with Store.read(folder) as store:
+        study, history, conclusion = Study.from_store(store), store.history(), (store.conclusion or {}).get("conclusion", {})
+    wanted = np.isin(history.index, [_index(run, conclusion) for run in runs])
+    return [int(k) for k in history.index[wanted & history.ok & ~study.scenario.requirement.critical_runs(history)]]
 
 
 def _runs(runs: Sequence[int]) -> str:

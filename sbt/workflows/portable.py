@@ -6,7 +6,6 @@ import io
 import json
 import os
 import sysconfig
-import tempfile
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 from sbt.config.source import read_yaml, yaml_reader
 from sbt.errors import InputError
-from sbt.files import write_atomically
+from sbt.files import scratch_in, write_atomically
 from sbt.plugins import read_files
 from sbt.problem.plain import Json, JsonMapping
 from sbt.store.connection import copy_database
@@ -95,7 +94,7 @@ def write_bundle(store: Path, folder: Path, target: Path) -> list[Path]:
     name = target.name.removesuffix(".zip")
 
     def write(part: Path) -> None:
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".bundle-") as scratch:
+        with scratch_in(target.parent, "bundle") as scratch:
             copy = Path(scratch) / DATABASE
             copy_database(store / DATABASE, copy)
             with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as bundle:

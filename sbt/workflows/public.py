@@ -28,7 +28,7 @@ from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario as Scenario
 from sbt.problem.scenario import Metric, Roles
 from sbt.problem.space import ParameterSpace
-from sbt.problem.trace import Trace
+from sbt.problem.trace import FieldOfView, Trace
 from sbt.store.database import PlannedRun
 from sbt.workflows.front import Run
 from sbt.workflows.front import check_target as check
@@ -48,6 +48,7 @@ __all__ = [
     "Distribution",
     "Empirical",
     "Exponential",
+    "FieldOfView",
     "Film",
     "Gumbel",
     "InputError",

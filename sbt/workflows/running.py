@@ -28,6 +28,7 @@ from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import Record
 from sbt.workflows.asking import sensitivities_in
+from sbt.workflows.fidelity import COARSE_COST
 from sbt.workflows.filming import film_runs
 from sbt.workflows.judging import judge_campaign
 from sbt.workflows.portable import write_bundle
@@ -35,7 +36,7 @@ from sbt.workflows.study import RESOLVED, Study, changed_since
 
 __all__ = ["Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
 
-_MAY_CHANGE = {"budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
+_MAY_CHANGE = {COARSE_COST, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
 
@@ -143,17 +144,20 @@ def _tell(store: Store, study: Study, listener: Callable[[Progress], None], acti
 
 
 def _check_code(store: Store, study: Study, executor: Executor) -> None:
-    """Refuse to go on with a store whose runs the user's code would not give again: the first and the last are tried."""
+    """Refuse to go on with a store whose runs the user's code would not give again.
+
+    The first and the last with metrics are tried, and the first that could not be: code may change just what is invalid.
+    """
     config, history = study.config, store.history()
     code = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
     if not any(name.startswith(OBJECT) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code):
         return
-    ok = np.flatnonzero(history.ok)
-    records = [history.record(int(row)) for row in dict.fromkeys([*ok[:1], *ok[-1:]])]
+    ok, invalid = np.flatnonzero(history.ok), np.flatnonzero(history.status == str(Status.INVALID))
+    records = [history.record(int(row)) for row in dict.fromkeys([*ok[:1], *ok[-1:], *invalid[:1]])]
     for outcome in executor.run([Job(record.index, record.inputs, record.seed) for record in records]):
         record = next(each for each in records if each.index == outcome.index)
         if dict(outcome.metrics) != dict(record.metrics):
-            now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics)
+            now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics) or record.reason
             rule = f"code and files must give the runs of {store.folder} again to go on, but run {record.index} now gives {now}"
             remedy = "choose another store for what has changed"
             raise InputError(f"{rule}, not {stored}{changed_since(store.folder)}; {remedy}")
@@ -243,7 +247,7 @@ def replay_run(folder: Path, index: int, *, objects: Objects | None = None) -> R
         InputError: the store has no finished run of this index, or its code is needed and not approved.
     """
     with Store.read(folder) as store:
-        study, history = Study.from_store(store, objects=objects), store.history()
+        study, history = Study.from_store(store, objects=objects), store.history(level=None)
     rows = np.flatnonzero(history.index == index)
     if len(rows) == 0:
         have = f"{history.index[0]} to {history.index[-1]}" if len(history) else "none yet"
@@ -253,8 +257,10 @@ def replay_run(folder: Path, index: int, *, objects: Objects | None = None) -> R
         stored = Outcome(index, Status(record.status), record.metrics, record.reason, record.seconds)
         return Replay(record, stored, None, study.scenario, executed=False)
     with study.loaded.scope.naming():
-        scenario = study.runnable
-        outcome, trace = run_traced(study.spec.resolve(), Job(index, record.inputs, record.seed))
+        scenario, runs = study.runnable, study.spec.at_level(record.level).resolve()
+        outcome, trace = run_traced(runs, Job(index, record.inputs, record.seed, record.level))
+        if record.level:
+            scenario = replace(scenario, simulate=runs.simulate, metrics=runs.metrics)
     return Replay(record, outcome, trace, scenario)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,7 +14,7 @@ from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of, s
 from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, read_text, resumed
 from sbt.config.model import Configuration, WarmStart
 from sbt.config.source import ConfigError
-from sbt.errors import InputError, PluginError, SbtError
+from sbt.errors import InputError, PluginError
 from sbt.execution.dask import DaskExecutor
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
@@ -32,6 +31,8 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History
 from sbt.workflows.earlier import usable_runs
+from sbt.workflows.fidelity import COARSE_COST, stated_cost
+from sbt.workflows.mistakes import further_mistakes
 from sbt.workflows.portable import place_of, where_it_is
 
 if TYPE_CHECKING:
@@ -51,10 +52,6 @@ def changed_since(folder: Path) -> str:
     """Return in words which of the scenario's files were changed after the campaign in a folder last began; "" for none."""
     names = [str(path) for path in newer(folder / RESOLVED)]
     return f"; changed since: {', '.join(names)}" if names else ""
-
-
-_AT_KEY = re.compile(r"(?:--set |.*?:\d+:\d+: )(?P<key>\w+)")
-"""The key at the top that an error of a configuration is about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +85,7 @@ class Study:
         try:
             return cls(load(path, overrides, **more))
         except ConfigError as error:
-            raise ConfigError([*error.errors, *_further(place, overrides, error)]) from None
+            raise ConfigError([*error.errors, *further_mistakes(place, overrides, error)]) from None
 
     @classmethod
     def from_mapping(cls, data: JsonMapping, *, name: str, scope: Scope) -> Study:
@@ -230,6 +227,17 @@ class Study:
             )
         return found
 
+    @cached_property
+    def coarse_cost(self) -> float | None:
+        """What a coarse run costs, in runs: as configured, as the store remembers, or measured now; None: there are none.
+
+        Raises:
+            InputError: coarse runs fail where those of the scenario do not.
+        """
+        if self.config.fidelity is None or COARSE_COST in self.kept:
+            return self.kept.get(COARSE_COST)
+        return stated_cost(self.config, self.spec, self.scenario) if self.live else None
+
     @property
     def learns(self) -> bool:
         """Whether there is a metamodel, and its code is at hand."""
@@ -259,7 +267,7 @@ class Study:
             acquisition=self._assembly.acquisition if self.live else None, method=config.acquisition.kind,
             stop=config.stop.model_dump(), gate=None if config.gate is None else Gate(**config.gate.model_dump()),
             prior_runs=self._prior_runs(), transfer=self._transfer(), ahead=config.ahead,
-            covariates=self.covariates,
+            covariates=self.covariates, coarse_cost=self.coarse_cost,
         )  # fmt: skip
 
     @cached_property
@@ -312,7 +320,7 @@ class Study:
             "described": described, **where_it_is(self.loaded.folder, Path(config.store)),
             "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
-            **self._told_names(),
+            **self._told_names(), **({} if self.coarse_cost is None else {COARSE_COST: self.coarse_cost}),
             **({"isolation": self.isolation.described()} if self.isolation is not None and self.isolation.warm else {}),
         }  # fmt: skip
 
@@ -383,17 +391,3 @@ class Study:
         ego = None if config.ego is None else config.ego.model_dump()
         friction = config.simulation.friction
         return (name, ego, config.simulation.step_length, *(() if friction is None else (friction.min, friction.max)))
-
-
-def _further(path: Path, overrides: Sequence[str], error: ConfigError) -> list[str]:
-    """Return what only the scenario can tell to be wrong with a configuration, beside what is wrong with its keys."""
-    keys = {found["key"] for found in map(_AT_KEY.match, error.errors) if found}
-    if not keys or keys & {"campaign", "scenario"}:
-        return []
-    try:
-        assemble(parse(read_text(path), overrides, name=str(path), folder=path.resolve().parent, without=keys))
-    except ConfigError as more:
-        return [line for line in more.errors if line not in error.errors]
-    except SbtError:
-        return []
-    return []

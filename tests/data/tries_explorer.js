@@ -22,6 +22,7 @@ const picture = () => part("film").querySelector("canvas").toDataURL();
     told.seconds = (performance.now() - start) / 1000;
     told.run = explorer.data.index[trace.rows[at]];
     told.title = part("run-title").textContent;
+    await wait(() => part("facts").querySelector("pre")?.textContent.includes(` ${told.run} `));
     told.command = part("facts").querySelector("pre").textContent;
     const slider = part("film").querySelector("input[type=range]");
     await wait(() => part("curves").querySelector(".main-svg"));

@@ -1,0 +1,71 @@
+"""The spread between warm-ups of what is estimated: runs that begin with the same warmed traffic are a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbt.campaigns.counting import DRAWN, counted_iterations
+from sbt.campaigns.gate import Limits
+from sbt.estimators.clusters import clustered_error, reach
+from sbt.estimators.intervals import CountedBatch
+from sbt.loop.stages import Log
+from sbt.problem.arrays import Mask, Vector
+from sbt.store.history import History
+
+__all__ = ["Spread", "spread_of_draws", "spread_of_share"]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How an estimate differs between warm-ups.
+
+    Attributes:
+        warm_ups: number of those that counted runs began with.
+        std_error: of the estimate, from the spread between warm-ups; None: it is not known from one, or from repeats.
+    """
+
+    warm_ups: int
+    std_error: float | None
+
+    def widened(self, limits: Limits, value: float | None) -> Limits:
+        """Return limits that are at least as far from the estimate as the spread says."""
+        error, k = self.std_error, self.warm_ups
+        if error is None or value is None:
+            return limits
+        return Limits(
+            lambda c: max(min(limits.lower(c), value - reach(error, k, c)), 0.0),
+            lambda c: min(max(limits.upper(c), value + reach(error, k, c)), 1.0),
+        )
+
+    def exceeds(self, cov: float, value: float) -> bool:
+        """Return whether the coefficient of variation is above a limit by the spread alone."""
+        return self.std_error is not None and self.std_error > cov * value
+
+
+def spread_of_draws(log: Log, batches: Sequence[CountedBatch]) -> Spread | None:
+    """Return the spread of an estimate from weighted batches; None where runs simulate their traffic from the beginning."""
+    history = log.history
+    drawn = history.stage == DRAWN
+    rows = [np.flatnonzero(drawn & (history.iteration == number)) for number in counted_iterations(log)][: len(batches)]
+    weights = np.array([np.sqrt(t + 1.0) * len(b.critical) for t, b in enumerate(batches)])
+    weights /= weights.sum()  # as `combine_estimates` has them
+    terms = np.concatenate([w * b.errors for w, b in zip(weights, batches, strict=True)])
+    return _spread(history, np.concatenate(rows), terms)
+
+
+def spread_of_share(history: History, among: Mask, critical: Mask) -> Spread | None:
+    """Return the spread of the critical share among some runs; None where runs simulate their traffic from the beginning."""
+    rows = np.flatnonzero(among)
+    hits = critical[rows].astype(np.float64)
+    return _spread(history, rows, (hits - hits.mean()) / len(rows)) if len(rows) else None
+
+
+def _spread(history: History, rows: NDArray[np.intp], terms: Vector) -> Spread | None:
+    cluster = history.columns["warm_up"][rows]
+    if not (cluster >= 0).any():
+        return None
+    return Spread(len(np.unique(cluster)), clustered_error(terms, cluster))

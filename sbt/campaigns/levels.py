@@ -1,0 +1,159 @@
+"""Two levels of fidelity in a log: pairs of inputs and seed that were run at both, and what to conclude from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.campaigns.counting import DRAWN, LEARNED
+from sbt.campaigns.records import EstimationProposal
+from sbt.campaigns.settings import Settings
+from sbt.campaigns.wording import number, plural
+from sbt.loop.stages import Log
+from sbt.metamodels.belief import within_reach
+from sbt.problem.arrays import Points, Vector
+from sbt.store.history import History
+from sbt.store.records import Iteration
+
+__all__ = ["COARSE", "LevelsTold", "Pairs", "coarse_runs", "is_two_level", "levels_told", "spent"]
+
+COARSE = "coarse"
+"""Stage of runs at the coarse level."""
+_FEWEST = 3
+
+
+def is_two_level(batch: Iteration) -> bool:
+    """Return whether a batch of an estimation was drawn in two levels."""
+    return "levels" in batch.proposal
+
+
+def coarse_runs(log: Log) -> History:
+    """Return the coarse runs; none where there are none yet."""
+    return log.history.where(np.zeros(len(log.history), dtype=bool)) if log.coarse is None else log.coarse
+
+
+def spent(log: Log, settings: Settings) -> float:
+    """Return what the runs so far cost, in runs of the scenario."""
+    return len(log.history) + (settings.coarse_cost or 0.0) * len(coarse_runs(log))
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """What the pairs of a log teach.
+
+    Attributes:
+        margin: (n,) of the scenario's runs of pairs that were run at both levels, <= 0 critical; the largest where a run failed.
+        weight: (n,) of these pairs under the inputs' distribution.
+        before, after: (n, k) what is known of them without, and (n, l) with their coarse run.
+        coarse_before, coarse_after: the same of all coarse runs.
+        alone: (a, k) what is known of pairs that were run at the scenario's level alone.
+        alone_margin: (a,) of these.
+    """
+
+    margin: Vector
+    weight: Vector
+    before: Points
+    after: Points
+    coarse_before: Points
+    coarse_after: Points
+    alone: Points
+    alone_margin: Vector
+
+    @classmethod
+    def of(cls, log: Log, settings: Settings) -> Pairs:
+        """Return the pairs of a log."""
+        scenario, coarse = settings.scenario, coarse_runs(log)
+        runs = log.history.where(np.isin(log.history.stage, (DRAWN, LEARNED)))
+        place = {(x.tobytes(), int(seed)): k for k, (x, seed) in enumerate(zip(coarse.x, coarse.seed, strict=True))}
+        at = np.array([place.get((x.tobytes(), int(s)), -1) for x, s in zip(runs.x, runs.seed, strict=True)], dtype=np.intp)
+        margin = scenario.requirement.margins(runs)
+        known = margin[np.isfinite(margin)]
+        margin = np.where(np.isfinite(margin), margin, max(float(known.max(initial=0.0)), 1.0))
+        weight = np.exp(scenario.space.log_density(runs.x) - runs.log_q)
+        paired, inputs = at >= 0, cls.inputs(settings, runs.x)
+        before, after = cls.inputs(settings, coarse.x), cls.known_after(log, settings, coarse)
+        if not len(known):
+            margin, paired = margin[:0], paired[:0]
+        return cls(
+            margin[paired], weight[paired], before[at[paired]], after[at[paired]], before, after, inputs[~paired],
+            margin[~paired],
+        )  # fmt: skip
+
+    @staticmethod
+    def inputs(settings: Settings, x: Points) -> Points:
+        """Return (n, k) what is known of inputs x (n, d) before any run."""
+        space = settings.scenario.space
+        return space.metamodel_inputs(np.clip(space.to_unit(x), 0.0, 1.0))
+
+    @classmethod
+    def known_after(cls, log: Log, settings: Settings, runs: History) -> Points:
+        """Return (n, l) what is known of some coarse runs of a log: their inputs and all their metrics."""
+        coarse = coarse_runs(log)
+        names = [name for name in coarse.metrics if name in settings.scenario.measured]
+        metrics = within_reach(np.column_stack([coarse.y(name) for name in names])) if names else np.empty((len(coarse), 0))
+        mine = np.isin(coarse.index, runs.index)
+        return np.column_stack([cls.inputs(settings, runs.x), metrics[mine]])
+
+
+@dataclass(frozen=True)
+class LevelsTold:
+    """What two levels of fidelity did for an estimate.
+
+    Attributes:
+        coarse, fine: runs at the coarse level and of the scenario.
+        cost: of a coarse run, in runs of the scenario.
+        correlation: of the ranks of the metric at both levels, over pairs that were run at both whatever the coarse run gave.
+        pairs: number of these.
+        pays: whether coarse runs are worth their cost, as it was last judged; None: there was no round.
+        two_levels, one_level: variance times cost as it was last judged, with coarse runs and without.
+    """
+
+    coarse: int
+    fine: int
+    cost: float
+    correlation: float | None
+    pairs: int
+    pays: bool | None
+    two_levels: float | None = None
+    one_level: float | None = None
+
+    def sentence(self) -> str:
+        """Return it in words."""
+        alike = f" and correlates with it by {number(self.correlation, 2)} ({self.pairs} pairs)" if self.correlation else ""
+        taught = f"{plural(self.coarse, 'coarse run')} taught {plural(self.fine, 'run')}"
+        told = f"{taught}: a coarse run costs {number(self.cost, 2)} of a run{alike}"
+        if self.pays is None:
+            return f"{told}. They were not used further: equal inputs give equal metrics, or the budget was used up."
+        if self.two_levels is None or self.one_level is None or self.two_levels <= 0.0:
+            return f"{told}."
+        if self.pays:
+            times = self.one_level / self.two_levels
+            return f"{told}, so that without them equal precision would take {number(times, 2)} times the runs."
+        times = self.two_levels / self.one_level if self.one_level > 0.0 else float("inf")
+        much = f"with them equal precision would take {number(times, 2)} times the runs"
+        return f"{told}. They do not pay, and were left out: {much}."
+
+
+def levels_told(log: Log, settings: Settings) -> LevelsTold | None:
+    """Return what two levels did; None where there is one."""
+    if settings.coarse_cost is None:
+        return None
+    coarse, runs = coarse_runs(log), log.history.where(log.history.drawn & log.history.ok)
+    margins = settings.scenario.requirement.margins
+    place = {(x.tobytes(), int(s)): y for x, s, y in zip(coarse.x, coarse.seed, margins(coarse), strict=True)}
+    both = np.array(
+        [(y, place.get((x.tobytes(), int(s)), np.nan)) for x, s, y in zip(runs.x, runs.seed, margins(runs), strict=True)]
+    ).reshape(-1, 2)
+    both = both[np.isfinite(both).all(axis=1)]
+    told = len(both) >= _FEWEST and np.ptp(both, axis=0).min() > 0.0
+    rounds = [found for batch in log.iterations if (found := batch.read(EstimationProposal).levels) is not None]
+    last = rounds[-1] if rounds else None
+    judged: tuple[bool | None, float | None, float | None] = (None, None, None)
+    if last is not None:
+        pays = last.two_levels < last.one_level if last.two_levels is not None and last.one_level is not None else last.coarse
+        judged = (pays, last.two_levels, last.one_level)
+    from scipy.stats import spearmanr  # takes half a second to load
+
+    correlation = float(spearmanr(*both.T)[0]) if told else None
+    return LevelsTold(len(coarse), len(log.history), settings.coarse_cost, correlation, len(both), *judged)

@@ -1,0 +1,64 @@
+"""Runs that gave no metric, in the sentences of conclusions: what is not known, and what more runs cannot mend."""
+
+from __future__ import annotations
+
+from sbt.campaigns.wording import percent, plural
+from sbt.loop.stages import Facts
+
+__all__ = ["decides_bound", "decides_share", "lost_runs", "none_gave_a_metric", "nothing_known", "repetitions", "why_they_fail"]
+
+_HALF = 0.5
+"""Of an interval or a bound: where failed runs alone make up as much, twice the precision is out of reach."""
+
+
+def none_gave_a_metric(facts: Facts) -> bool:
+    """Return whether there are runs, and none gave a metric."""
+    return len(facts.history) > 0 and not facts.history.ok.any()
+
+
+def nothing_known(facts: Facts) -> list[str]:
+    """Return that so few runs gave a metric that nothing follows from them, and what to do."""
+    n, ok = len(facts.history), int(facts.history.ok.sum())
+    of = f" of {facts.scenario}" if facts.scenario else ""
+    return [
+        f"Nothing is known{of}: {f'only {ok:,}' if ok else 'none'} of {plural(n, 'run')} gave a metric.",
+        f"Next: {why_they_fail()}.",
+    ]
+
+
+def why_they_fail() -> str:
+    """Return the advice for runs that fail."""
+    return "look at why they failed (the table of failed runs; replay of one), mend it, and run the campaign in a new store"
+
+
+def lost_runs(lost: int, n: int) -> str:
+    """Return how many runs gave no metric, and how ends of an interval count them."""
+    return f"{lost:,} of {plural(n, 'run')} gave no metric: the lower end counts them as uncritical, the upper end as critical"
+
+
+def decides_share(lost: int, n: int, low: float, high: float) -> bool:
+    """Return whether failed runs make up half of the width of an interval of a share, which more runs then never halve."""
+    return lost > 0 and lost / max(n, 1) >= _HALF * (high - low)
+
+
+def decides_bound(worst: float, bound: float) -> str | None:
+    """Return that more runs hardly lower a bound, where failed runs make up half of it; None where they do not.
+
+    Args:
+        worst: estimate with every failed run as critical.
+        bound: upper one.
+    """
+    if worst <= 0.0 or worst < _HALF * bound:
+        return None
+    return f"failed runs decide the bound, and more runs never lower it much below {percent(worst)}: {why_they_fail()}"
+
+
+def repetitions(again: int, n: int, lost: int, how: str = "") -> str:
+    """Return in how many of n repetitions a run was critical again, beside those that gave no metric.
+
+    >>> repetitions(2, 3, 0), repetitions(2, 3, 1)
+    ('2 of 3 repetitions', '2 of the 2 repetitions that gave a metric (1 gave none)')
+    """
+    if not lost:
+        return f"{again} of {n} repetitions{how}"
+    return f"{again} of the {n - lost} repetitions{how} that gave a metric ({lost} gave none)"

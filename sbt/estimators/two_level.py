@@ -1,0 +1,179 @@
+"""Estimation by two levels of fidelity: coarse runs of many pairs, runs of the scenario where the coarse ones say it matters.
+
+    P = (1/N) [ sum over the pool of g1 + sum over coarse runs of (g2 - g1) / r1 + sum over fine runs of (1 - g2) / (r1 r2) ]
+
+over a pool of N pairs (x, seed) from the inputs' distribution. g1 is the belief that a pair is critical before any run of it,
+g2 the one after its coarse run; r1 and r2 are the known probabilities with which pairs were run. Unbiased for any beliefs that
+were learned from earlier pairs only: each sum corrects the one before it.
+
+Source:
+    Neyman (1938), doi 10.1080/01621459.1938.10503378: double sampling; Saerndal, Swensson and Wretman (1992), chapter 9: the
+    difference estimator in two phases.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from sbt.estimators.importance import at_most_one, rows_at
+from sbt.problem.arrays import Vector
+
+__all__ = ["Shares", "TwoPhases", "drawn", "inclusion", "split", "split_as_if_normal"]
+
+_EVEN = 0.2
+"""Share of the draws that no belief has a say in: it bounds what a belief misses."""
+_LARGEST_CORRELATION = 0.995
+_LEAST = 0.05
+"""Share of the coarse runs that runs of the scenario follow at least."""
+_NO_DOUBT = 1e-6
+_THRESHOLDS = 40
+
+
+def inclusion(size: Vector, weight: Vector, n: int) -> Vector:
+    """Return (m,) probabilities of being drawn, sum n: in proportion to a size, a fifth to the weight alone, none above 1.
+
+    Args:
+        size: (m,) what a draw would tell: weight times the standard deviation of what it corrects.
+        weight: (m,) > 0, of a point under the inputs' distribution.
+        n: number of draws, at most m.
+    """
+    if n >= len(size):
+        return np.ones(len(size))
+    told = size / size.sum() if size.sum() > 0.0 else weight / weight.sum()
+    return at_most_one((1.0 - _EVEN) * told + _EVEN * weight / weight.sum(), n)
+
+
+def drawn(probability: Vector, order: Vector, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return rows drawn with these probabilities (m,), whose sum is a whole number, systematically along an order."""
+    rows, n = np.argsort(order, kind="stable"), round(float(probability.sum()))
+    if n >= len(rows):
+        return rows
+    return np.unique(rows[rows_at(probability[rows], (np.arange(n) + rng.random()) / max(n, 1))])
+
+
+@dataclass(frozen=True, eq=False)
+class TwoPhases:
+    """What a batch estimates before its fine runs, and how those correct it.
+
+    Args:
+        pool: number of pairs N.
+        total, squares: sums of g1 and of its square over the pool.
+        before: (m,) g1 of the pairs that were run coarse.
+        first: (m,) r1 of these.
+        after: (m,) g2 of these; g1 again where there is no coarse run.
+        second: (m,) r2 of these, 0 < r2 <= 1.
+    """
+
+    pool: int
+    total: float
+    squares: float
+    before: Vector
+    first: Vector
+    after: Vector
+    second: Vector
+
+    @property
+    def _corrections(self) -> Vector:
+        """(m,) what coarse runs add to the first sum."""
+        return np.asarray((self.after - self.before) / self.first)
+
+    @property
+    def prior(self) -> float:
+        """The first two sums."""
+        return (self.total + float(self._corrections.sum())) / self.pool
+
+    @property
+    def pool_variance(self) -> float:
+        """Variance of the first two sums: through the pool, and through which of its pairs were run coarse."""
+        corrected = self.before + self._corrections
+        squares = self.squares + float((corrected**2 - self.before**2).sum())
+        return max(squares / self.pool - self.prior**2, 0.0) / self.pool
+
+    def coefficient(self, chosen: NDArray[np.intp]) -> Vector:
+        """Return (n,) n / (N r1 r2) of the fine runs: those of the pairs `chosen` (n,)."""
+        return np.asarray(len(chosen) / (self.pool * self.first[chosen] * self.second[chosen]))
+
+    def anticipated(self, n: int) -> float:
+        """Return the variance of one of n fine draws if the belief after the coarse runs is right."""
+        terms = self.after * (1.0 - self.after) / (self.first**2 * self.second)
+        return n * float(terms.sum()) / self.pool**2
+
+
+@dataclass(frozen=True)
+class Shares:
+    """What two levels are worth, in variance times cost (runs of the scenario): smaller is better.
+
+    Attributes:
+        two_levels: with coarse runs.
+        one_level: with runs of the scenario alone, drawn by what is believed before any run, or at random, whichever is better.
+        fine: share of the coarse runs that a run of the scenario best follows.
+    """
+
+    two_levels: float
+    one_level: float
+    fine: float
+
+    @property
+    def pays(self) -> bool:
+        """Whether coarse runs are worth their cost."""
+        return self.two_levels < self.one_level
+
+
+def split(critical: Vector, before: Vector, after: Vector, weight: Vector, cost: float) -> Shares:
+    """Return what coarse runs are worth, by pairs run at both levels.
+
+    Args:
+        critical: (n,) 1 where the run of the scenario was critical.
+        before: (n,) belief before any run of the pair, learned without it.
+        after: (n,) belief after its coarse run, learned without it.
+        weight: (n,) of the pair under the inputs' distribution, any scale.
+        cost: of a coarse run, in runs of the scenario.
+    """
+    w = weight / weight.sum()
+    p = float(w @ critical)
+    return _shares(w, before, after, ((critical - before) ** 2, (critical - after) ** 2), p, cost)
+
+
+def split_as_if_normal(before: float, after: float, p: float, cost: float) -> Shares:
+    """Return what coarse runs are worth for an event of which too few were met, as if all were normal.
+
+    The rarer the event, the fewer runs of the scenario need follow the coarse ones.
+
+    Args:
+        before: correlation of the metric with what is predicted before any run of the pair.
+        after: with what is predicted after its coarse run.
+        p: probability of the event, 0 < p < 1.
+        cost: of a coarse run, in runs of the scenario.
+    """
+    low, high = np.clip([before, after], 0.0, _LARGEST_CORRELATION)
+    high = max(high, low + 1e-3)
+    z = np.linspace(-8.0, 8.0, 401)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
+    w = np.outer(np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum(), weights / weights.sum()).ravel()
+    share = low / high
+    coarse = (share * z[:, None] + math.sqrt(1.0 - share**2) * nodes).ravel()
+    t = ndtri(p)
+    one = np.repeat(ndtr((t - low * z) / math.sqrt(1.0 - low**2)), len(nodes))
+    two = ndtr((t - high * coarse) / math.sqrt(1.0 - high**2))
+    return _shares(w, one, two, (one * (1.0 - one), two * (1.0 - two)), p, cost)
+
+
+def _shares(w: Vector, before: Vector, after: Vector, errors: tuple[Vector, Vector], p: float, cost: float) -> Shares:
+    """Return what coarse runs are worth by the mean squares of what each belief misses.
+
+    A pair that was not run coarse cannot be run further: however few the pairs are that matter, the coarse runs must find them.
+    """
+    size, left = (np.sqrt(np.maximum(g * (1.0 - g), _NO_DOUBT)) for g in (before, after))
+    first = (1.0 - _EVEN) * size / (w @ size) + _EVEN
+    best, fine = math.inf, 1.0
+    for threshold in np.geomspace(float(left.max()), float(left.min()), _THRESHOLDS):
+        second = np.clip(left / threshold, _LEAST, 1.0)
+        variance, runs = w @ (((after - before) ** 2 + errors[1] / second) / first), w @ (first * (cost + second))
+        if variance * runs < best:
+            best, fine = float(variance * runs), float(w @ (first * second))
+    return Shares(best, min(float(w @ (errors[0] / first)), p * (1.0 - p)), fine)

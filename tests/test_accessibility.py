@@ -1,0 +1,68 @@
+"""Accessibility: axe-core finds nothing serious on any page, in light and dark, at the width of a screen and of a phone."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser import PROGRAM, Browser
+from test_explorer import film_of, films_of
+from test_report import fill, predict, scenario_of
+
+from sbt.report.html import write_report
+from sbt.report.versus import write_versus
+
+_AXE = importlib.util.find_spec("axe_core_python")
+pytestmark = [
+    pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium"),
+    pytest.mark.skipif(_AXE is None, reason="axe-core-python is not installed"),
+]
+SERIOUS = """axe.run().then(found => found.violations.filter(v => ["serious", "critical"].includes(v.impact))
+    .map(v => `${v.id}: ${v.nodes.length} times, ${v.nodes[0].html.slice(0, 200)}`))"""
+DRAWN = "window.explorer && window.Plotly && document.querySelector('[data-part=curves] .main-svg')"
+
+
+def faults(browser: Browser) -> list[str]:
+    """Return what axe-core finds on the page that is open, in light and dark; nothing of it is left out of view."""
+    assert _AXE is not None
+    script = Path(str(_AXE.origin)).parent / "axe.min.js"
+    browser.ask("document.documentElement.style.setProperty('scroll-behavior', 'auto')")
+    browser.ask(script.read_text(encoding="utf-8") + ";0")
+    found: list[str] = []
+    for width, dark in ((1280, False), (390, True)):
+        browser.size(width, 1600, dark=dark)
+        browser.ask("new Promise(then => setTimeout(then, 300))")
+        found += browser.ask(SERIOUS)
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browser() as found:
+        yield found
+
+
+def test_the_report_has_no_serious_fault(browser: Browser, tmp_path: Path) -> None:
+    """With its explorer, a film, slices, figures and tables."""
+    scenario = scenario_of(3)
+    with fill(tmp_path, scenario, runs=16, held_out=10) as store:
+        page = write_report(store, scenario, predict, None, film=films_of)
+    browser.open(f"file://{page}")
+    browser.wait(DRAWN)
+    assert faults(browser) == []
+
+
+def test_the_comparison_has_no_serious_fault(browser: Browser, tmp_path: Path) -> None:
+    """With two films in step."""
+    pairs = [("fixed", film_of(1), film_of(2))]
+    side = {"probability": 0.1, "low": 0.05, "high": 0.2, "failed": 0}
+    result = {
+        "fixed": [{"run": 1, "inputs": {"d_v": 3.0}, "seed": 7}], "new": [], "pairs": 10, "still": 0,
+        "before": side, "after": side, "difference": -0.1, "low": -0.2, "high": 0.0, "confidence": 0.95, "verdict": "fell",
+    }  # fmt: skip
+    page = write_versus(tmp_path, "Two egos", result, pairs, units={"d_v": "m/s"}, commands="sumo-sbt replay DIR 1")
+    browser.open(f"file://{page}")
+    browser.wait("window.versus && window.Plotly && document.querySelector('#pairs .main-svg')")
+    assert faults(browser) == []

@@ -1,0 +1,203 @@
+"""Two levels of fidelity: coarse runs teach, and are none of the scenario's."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sbt.config.source import ConfigError
+from sbt.errors import InputError
+from sbt.estimators.two_level import TwoPhases, drawn, inclusion, split_as_if_normal
+from sbt.seeds import stream
+from sbt.store.database import Store
+from sbt.workflows.exporting import FORMS
+from sbt.workflows.running import Summary, replay_run, run_study
+from sbt.workflows.study import Study
+from tests.warm_networks import town
+
+NOISY = {"campaign": "estimation", "scenario": "testbed:two_hollows_noisy", "budget": 60, "stop": {"cov": None}, "initial": 10}
+COARSE = {"scenario": "testbed:two_hollows_noisy:coarse", "cost": 0.2}
+
+STEP = 0.1
+LEFT_TURN = {"campaign": "estimation", "scenario": "unprotected_left_turn"}
+
+
+def study(folder: Path, data: dict[str, Any], **more: Any) -> Study:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "c.yaml").write_text(json.dumps({**data, "store": str(folder / "store"), **more}))
+    return Study.from_file(folder / "c.yaml")
+
+
+def run(folder: Path, data: dict[str, Any], **more: Any) -> Summary:
+    return run_study(study(folder, data, **{"executor": {"kind": "serial"}, **more}), report=False)
+
+
+def rows(folder: Path) -> list[Any]:
+    with Store.read(folder / "store") as store:
+        return [(r.index, r.stage, r.iteration, dict(r.inputs), r.seed, r.level, r.seed_chosen, r.log_q, dict(r.metrics))
+                for r in store.history(level=None).records]  # fmt: skip
+
+
+def test_the_estimate_of_two_phases_is_unbiased_for_any_belief() -> None:
+    """By enumeration of all draws, with independent inclusion, of a pool of three pairs."""
+    critical, before, after = np.array([1.0, 0.0, 1.0]), np.array([0.2, 0.7, 0.1]), np.array([0.9, 0.3, 0.05])
+    first, second = np.array([0.5, 0.3, 0.8]), np.array([0.4, 0.9, 0.25])
+    mean = 0.0
+    for one in itertools.product([False, True], repeat=3):
+        rows = np.flatnonzero(one)
+        p_one = float(np.prod(np.where(one, first, 1.0 - first)))
+        phases = TwoPhases(3, float(before.sum()), float((before**2).sum()), before[rows], first[rows], after[rows], second[rows])
+        for two in itertools.product([False, True], repeat=len(rows)):
+            chosen = np.flatnonzero(two)
+            p_two = float(np.prod(np.where(two, second[rows], 1.0 - second[rows])))
+            error = critical[rows][chosen] - after[rows][chosen]
+            correction = float((phases.coefficient(chosen) * error).mean()) if len(chosen) else 0.0
+            mean += p_one * p_two * (phases.prior + correction)
+    assert mean == pytest.approx(critical.mean())
+
+
+def test_pairs_are_drawn_as_often_as_is_known() -> None:
+    rng = stream(1, "drawn")
+    size, order = rng.gamma(0.2, size=40), rng.random(40)
+    probability = inclusion(size, np.ones(40), 12)
+    assert probability.sum() == pytest.approx(12.0)
+    assert probability.max() <= 1.0 + 1e-12
+    assert probability.min() > 0.0
+    times = np.zeros(40)
+    for k in range(3000):
+        rows = drawn(probability, order, stream(k, "drawn"))
+        assert len(rows) == 12
+        times[rows] += 1
+    assert np.abs(times / 3000 - probability).max() < 0.04
+
+
+def test_coarse_runs_pay_where_they_are_cheap_and_alike_and_the_event_is_rare() -> None:
+    assert split_as_if_normal(0.4, 0.93, 0.004, 0.5).pays
+    assert not split_as_if_normal(0.4, 0.93, 0.28, 0.55).pays
+    assert not split_as_if_normal(0.4, 0.45, 0.01, 0.9).pays
+    cheap, dear = (split_as_if_normal(0.4, 0.9, 0.01, cost) for cost in (0.1, 0.4))
+    assert cheap.two_levels < dear.two_levels
+    assert cheap.fine <= dear.fine
+    assert cheap.one_level == dear.one_level
+
+
+def test_coarse_runs_are_none_of_the_scenarios(tmp_path: Path) -> None:
+    summary = run(tmp_path, NOISY, fidelity=COARSE)
+    with Store.read(tmp_path / "store") as store:
+        fine, every = store.history(), store.history(level=None)
+        coarse = store.history(level=1)
+        assert (summary.runs, store.coarse, sum(store.counts.values())) == (len(fine), len(coarse), len(fine))
+        assert len(coarse) > 20
+        assert len(fine) + len(coarse) == len(every)
+        assert not np.isin(fine.training.index, coarse.index).any()
+        frame = pd.read_csv(FORMS["csv"](store, study(tmp_path / "again", NOISY)))
+        at = int(coarse.index[3])
+    told = summary.conclusion.to_dict()["fidelity"]
+    assert told["coarse"] == len(coarse)
+    assert told["fine"] == len(fine)
+    assert 0.5 < told["correlation"] <= 1.0
+    assert len(fine) + 0.2 * len(coarse) <= 60 + 1e-9
+    assert frame.loc[frame["level"] > 0, "critical"].isna().all()
+    assert frame.loc[frame["level"] == 0, "critical"].notna().all()
+    pairs = {(tuple(x), s) for x, s in zip(coarse.x, coarse.seed, strict=True)}
+    both = [(tuple(x), s) in pairs for x, s in zip(fine.x, fine.seed, strict=True)]
+    assert sum(both) >= 12, "the same inputs and the same seed at both levels"
+    assert replay_run(tmp_path / "store", at).identical, "a coarse run replays coarse"
+    chosen = fine.columns["seed_chosen"]
+    assert chosen.any()
+    assert not chosen[~np.array(both)].any(), "whose seed was looked at, and only that, does not tell of rates"
+
+
+def test_rows_are_a_function_of_the_log(tmp_path: Path) -> None:
+    run(tmp_path / "whole", NOISY, fidelity=COARSE)
+    run(tmp_path / "workers", NOISY, fidelity=COARSE, executor={"kind": "local", "workers": 2})
+    assert rows(tmp_path / "whole") == rows(tmp_path / "workers")
+    seen = 0
+
+    class Killed(Exception):
+        pass
+
+    def kill(progress: Any) -> None:
+        nonlocal seen
+        seen += progress.activity == "simulating"
+        if seen == 60:
+            raise Killed
+
+    killed = study(tmp_path / "killed", NOISY, fidelity=COARSE, executor={"kind": "serial"})
+    with pytest.raises(Killed):
+        run_study(killed, progress=kill, report=False)
+    run_study(killed, report=False)
+    assert rows(tmp_path / "whole") == rows(tmp_path / "killed")
+
+
+def test_what_does_not_pay_is_left_out_and_said(tmp_path: Path) -> None:
+    dear = run(tmp_path / "dear", NOISY, fidelity={**COARSE, "cost": 0.95})
+    assert any("do not pay" in sentence for sentence in dear.sentences)
+    exact = {**NOISY, "scenario": "testbed:four_branch_7", "budget": 40}
+    same = run(tmp_path / "exact", exact, fidelity={"scenario": "testbed:four_branch_7", "cost": 0.5})
+    assert any("equal inputs give equal metrics" in sentence for sentence in same.sentences)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"fidelity": {"step_length": [0.1, 0.25]}}, "a multiple of the fine one"),
+        ({"fidelity": {"step_length": [0.05, 0.5]}}, "must be the scenario's own step, 0.1 s"),
+        ({"fidelity": {"step_length": [0.1, 0.5], "scenario": "cut_in"}}, "but got both"),
+        ({"fidelity": {"cost": 0.5}}, "but got neither"),
+        ({"fidelity": {"step_length": [0.1, 0.5], "cost": 0}}, "between 0 and 1 run"),
+        ({"fidelity": {"scenario": "cut_in"}}, "inputs of the scenario"),
+        ({"scenario": "testbed:two_hollows_noisy", "fidelity": {"step_length": [0.1, 0.5]}}, "has none"),
+        ({"campaign": "boundary", "fidelity": {"step_length": [0.1, 0.5]}}, "but the campaign is boundary"),
+        ({"fidelity": {"step_length": [0.1, 0.5]}, "ego": {"kind": "sumo", "actionStepLength": 0.2}}, "is 0.2 s"),
+    ],
+)  # fmt: skip
+def test_a_coarse_level_that_is_none_is_refused(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    with pytest.raises((ConfigError, InputError)) as error:
+        study(tmp_path, {**LEFT_TURN, "budget": 50}, **change).campaign  # noqa: B018
+    assert said in str(error.value)
+
+
+@pytest.mark.sumo
+def test_check_says_what_coarse_runs_cost_and_how_alike_they_are(tmp_path: Path) -> None:
+    from sbt.workflows.fidelity import fidelity_findings
+
+    found = study(tmp_path, LEFT_TURN, fidelity={"step_length": [0.1, 0.5]})
+    runs, told = fidelity_findings(found.spec, found.scenario, 1)
+    assert runs.ok
+    assert told.numbers["pairs"] >= 25
+    assert 0.05 <= told.numbers["cost"] < 1.0
+    assert told.numbers["correlation"] > 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.sumo
+def test_coarse_runs_begin_with_coarse_warm_ups_and_replay_so(tmp_path: Path) -> None:
+    scenario = town(tmp_path / "town")
+    summary = run(
+        tmp_path, {"campaign": "estimation", "scenario": str(scenario), "budget": 8, "stop": {"cov": None}},
+        fidelity={"step_length": [STEP, 2 * STEP], "cost": 0.5},
+    )  # fmt: skip
+    with Store.read(tmp_path / "store") as store:
+        coarse = store.history(level=1)
+        assert coarse.ok.all()
+        assert (coarse.columns["warm_up"] >= 0).all()
+        assert store.configuration["isolation"]["level"] == "snapshot"
+    assert summary.failed == 0
+    assert len(list((tmp_path / "store" / "snapshots").glob("*.state.xml.gz"))) == 4, "two warm-ups, each at both steps"
+    assert replay_run(tmp_path / "store", int(coarse.index[0])).identical
+
+
+@pytest.mark.sumo
+def test_an_action_step_of_the_files_is_named_by_its_line(tmp_path: Path) -> None:
+    scenario = town(tmp_path / "town")
+    cars = tmp_path / "town" / "cars.rou.xml"
+    cars.write_text(cars.read_text().replace('<vType id="slow"', '<vType actionStepLength="0.1" id="slow"'))
+    with pytest.raises(ConfigError, match=r"cars\.rou\.xml:3: actionStepLength is 0\.1 s and the step 0\.2 s"):
+        study(tmp_path, LEFT_TURN, scenario=str(scenario), fidelity={"step_length": [STEP, 2 * STEP]}).campaign  # noqa: B018
