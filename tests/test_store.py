@@ -7,6 +7,7 @@ import json
 import os
 import random
 import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -194,6 +195,29 @@ def test_one_writer_any_number_of_readers(tmp_path: Path):
     with Store.open(tmp_path, CONFIGURATION) as store:
         store.close()
         store.close()
+
+
+def test_a_batch_planned_while_a_reader_reads_is_not_half_seen(tmp_path: Path):
+    """Between any two statements of a reader the writer may plan runs and finish some; no row is then damaged, or passed over."""
+    with planned(tmp_path) as writer, Store.read(tmp_path) as reader:
+        for k in range(5):
+            writer.append(outcome(k))
+        statements: list[str] = []
+
+        def plans(statement: str) -> None:
+            statements.append(statement)
+            if "FROM runs WHERE idx >=" in statement and writer.end == 5:  # the reader has asked which run is unfinished: none
+                writer.plan(1, "initial", BATCH, [20, 21, 22, 23, 24], {})
+                writer.append(outcome(7))
+
+        reader._db.set_trace_callback(plans)
+        assert list(reader.history().index) == [0, 1, 2, 3, 4]
+        assert writer.end == 10, statements  # it did plan between two statements
+        reader._db.set_trace_callback(None)
+        assert list(reader.history().index) == [0, 1, 2, 3, 4, 7]
+        for k in (5, 6, 8, 9):
+            writer.append(outcome(k))
+        assert list(reader.history().index) == list(range(10))
 
 
 def test_a_store_of_another_version_is_refused_and_untouched(tmp_path: Path):
@@ -400,3 +424,35 @@ def test_what_is_whole_is_saved_and_goes_on_to_the_same_rows(finished: Path, tmp
         assert rows(folder / "new")["runs"] == rows(finished)["runs"]
     done = CliRunner().invoke(app, ["doctor", str(finished)])
     assert (done.exit_code, done.stdout) == (0, f"{finished} is whole: 120 runs\n")
+
+
+def test_a_damaged_configuration_is_taken_from_the_file_beside_it(finished: Path, tmp_path: Path, rows: Any):
+    shutil.copytree(finished, tmp_path / "s")
+    content = (finished / DATABASE).read_bytes()
+    assert content.count(b'"described":') == 1
+    (tmp_path / "s" / DATABASE).write_bytes(content.replace(b'"described":', b'"descrixed":'))
+    done = CliRunner().invoke(app, ["doctor", str(tmp_path / "s")])
+    assert "damaged: configuration" in done.stdout
+    assert f"with the configuration of {tmp_path / 's' / 'config.resolved.yaml'}" in done.stdout
+    saved = CliRunner().invoke(app, ["doctor", str(tmp_path / "s"), "--save", str(tmp_path / "new"), "--json"])
+    assert json.loads(saved.stdout)["saved"] == {"store": str(tmp_path / "new"), "runs": 120, "planned_again": 0}
+    sbt.run(**CAMPAIGN, store=tmp_path / "new", report=False)
+    assert rows(tmp_path / "new") == rows(finished)
+    (tmp_path / "s" / "config.resolved.yaml").unlink()
+    lost = CliRunner().invoke(app, ["doctor", str(tmp_path / "s"), "--save", str(tmp_path / "other")])
+    assert (lost.exit_code, "begin a new campaign" in lost.output) == (1, True)
+
+
+@pytest.mark.parametrize("size", [0, 50, 3000, 9000])
+def test_of_a_truncated_store_doctor_says_what_can_be_done(finished: Path, tmp_path: Path, size: int):
+    (tmp_path / DATABASE).write_bytes((finished / DATABASE).read_bytes()[:size])
+    shutil.copy(finished / "config.resolved.yaml", tmp_path)
+    done = CliRunner().invoke(app, ["doctor", str(tmp_path)])
+    assert done.exit_code == 1
+    anew = f"  nothing can be saved; the same campaign anew: sumo-sbt run {tmp_path / 'config.resolved.yaml'} --store NEW"
+    assert done.stdout.splitlines()[-1] == anew
+    again = CliRunner().invoke(app, ["doctor", str(tmp_path), "--save", str(tmp_path / "new")])
+    assert again.exit_code == 1
+    assert again.stderr == f"a store is saved with its runs, but of {tmp_path} none can be read: begin a new campaign\n"
+    told = CliRunner().invoke(app, ["status", str(tmp_path)])
+    assert "malformed" not in told.output

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import tempfile
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
-__all__ = ["connected", "copy_database", "set_journal"]
+from sbt.processes import scratch
+
+__all__ = ["connected", "copy_database", "one_moment", "set_journal"]
 
 
 def connected(path: Path) -> sqlite3.Connection:
@@ -28,7 +30,7 @@ def connected(path: Path) -> sqlite3.Connection:
 
 def _copied(path: Path, log: Path) -> sqlite3.Connection:
     """Open a copy of a file with its log; the copy lives as long as the connection."""
-    with tempfile.TemporaryDirectory(prefix="sbt-read-") as folder:
+    with scratch("read") as folder:
         for file in (path, log):
             shutil.copyfile(file, Path(folder, file.name))
         with closing(sqlite3.connect(Path(folder, path.name), isolation_level=None)) as copy:
@@ -52,3 +54,17 @@ def set_journal(db: sqlite3.Connection, *, durable: bool) -> str:
         db.execute("PRAGMA journal_mode = DELETE")
     db.execute(f"PRAGMA synchronous = {'FULL' if durable else 'OFF'}")
     return str(mode)
+
+
+@contextmanager
+def one_moment(db: sqlite3.Connection) -> Iterator[None]:
+    """Let all statements read the file as it was at one moment; between two statements of its own a writer may plan a batch."""
+    if db.in_transaction:
+        yield
+        return
+    db.execute("BEGIN")
+    try:
+        yield
+    finally:
+        if db.in_transaction:  # SQLite ends it itself where the disk refuses
+            db.execute("COMMIT")

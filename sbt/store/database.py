@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -24,10 +24,10 @@ from sbt.errors import StoreError
 from sbt.problem.description import described_choices
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Json, JsonMapping
-from sbt.store.connection import connected, set_journal
+from sbt.store.connection import connected, one_moment, set_journal
 from sbt.store.history import PLANNED, History, Rows, as_numbers
-from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, damaged, refuse_damage, reported
-from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_inputs, dump_metrics
+from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, checksums_of, damaged, refuse_damage, reported
+from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_metrics, plan_rows
 from sbt.store.records import FitRecord, Iteration, Judgement, from_json, to_json
 from sbt.store.writer import locked, released, written
 
@@ -149,6 +149,12 @@ class Store:
         if stored != checksum_of(*parts):
             raise damaged(self.folder, f"{what} has a wrong checksum")
 
+    def _check_all(self, what: str, rows: Sequence[tuple[Any, ...]], stored: Sequence[int]) -> None:
+        """Refuse rows, of which the first field says which run they are of, that are not what was written."""
+        for row, written_then, now in zip(rows, stored, checksums_of(rows), strict=True):
+            if written_then != now:
+                raise damaged(self.folder, f"{what} {row[0]} has a wrong checksum")
+
     @contextmanager
     def _transaction(self, *, waits: bool = True) -> Iterator[None]:
         """Return a transaction that waits for the disk at its end, and there takes along those before that did not."""
@@ -231,7 +237,7 @@ class Store:
         """
         start = self.end
         places = range(start, start + len(runs)) if indices is None else indices
-        rows = self._plan_rows(iteration, zip(places, runs, seeds, strict=True))
+        rows = plan_rows(iteration, zip(places, runs, seeds, strict=True), self._known.names, self._warm_ups)
         text = dump(proposal if isinstance(proposal, dict) else to_json(proposal))
         with self._transaction():
             self._db.executemany(
@@ -240,17 +246,6 @@ class Store:
             self._db.execute(
                 "INSERT INTO iterations VALUES (?, ?, ?, ?)", (iteration, stage, text, checksum_of(iteration, stage, text))
             )
-
-    def _plan_rows(self, iteration: int, runs: Iterable[tuple[int, PlannedRun, int]]) -> Iterator[tuple[Any, ...]]:
-        """Yield the rows of planned runs with their index and their drawn seed."""
-        names, warm_ups = self._known.names, self._warm_ups
-        for index, run, drawn in runs:
-            inputs = dump_inputs([run.inputs[name] for name in names])
-            chosen, seed = run.seed is not None, drawn if run.seed is None else run.seed
-            log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
-            warm_up = int(seed) % warm_ups if warm_ups and run.warm_up is None else run.warm_up
-            row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, warm_up, log_q)
-            yield (*row, checksum_of(*row), PLANNED)
 
     def append(self, outcome: Outcome, versions: str = "") -> None:
         """Write one run's outcome."""
@@ -261,12 +256,12 @@ class Store:
         now = time.monotonic()
         waits = now - self._waited >= _TOGETHER
         self._waited = now if waits else self._waited
-        rows = []
-        for o in outcomes:
-            row = (str(o.status), dump_metrics(o.metrics), o.reason, float(o.seconds), o.collisions, o.unconfirmed, versions)
-            rows.append((*row, checksum_of(o.index, *row), o.index))
+        rows = [
+            (o.index, str(o.status), dump_metrics(o.metrics), o.reason, float(o.seconds), o.collisions, o.unconfirmed, versions)
+            for o in outcomes
+        ]
         with self._transaction(waits=waits):
-            self._db.executemany(_OUTCOME_OF, rows)
+            self._db.executemany(_OUTCOME_OF, ((*r[1:], c, r[0]) for r, c in zip(rows, checksums_of(rows), strict=True)))
 
     def add_fit(self, fit: FitRecord) -> None:
         """Keep what is known of the metamodel that learned from the first `fit.runs` rows."""
@@ -288,11 +283,16 @@ class Store:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of runs by status, `planned` for those without an outcome."""
-        found = dict(self._select("SELECT status, COUNT(*) FROM runs GROUP BY status"))
+        """Number of runs of the scenario itself by status, `planned` for those without an outcome."""
+        found = dict(self._select("SELECT status, COUNT(*) FROM runs WHERE level = 0 GROUP BY status"))
         if unknown := set(found) - {PLANNED, *map(str, Status)}:
             raise damaged(self.folder, f"a run has the status {min(map(repr, unknown))}")
         return found
+
+    @property
+    def coarse(self) -> int:
+        """Number of finished runs of a coarser level of fidelity."""
+        return int(self._select("SELECT COUNT(*) FROM runs WHERE level > 0 AND status != ?", (PLANNED,))[0][0])
 
     @cached_property
     def _warm_ups(self) -> int:
@@ -311,10 +311,9 @@ class Store:
         """Return the planned runs from index `since` on that have no outcome yet; the first `most` of them, -1: all."""
         query = f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE status = ? AND idx >= ? ORDER BY idx LIMIT ?"
         rows = self._select(query, (PLANNED, since, most))
-        for row in rows:
-            self._checked(f"run {row[0]}", row[-1], *row[:-1])
-        names = self._known.names
-        return [Job(row[0], dict(zip(names, json.loads(row[3]), strict=True)), row[4]) for row in rows]
+        self._check_all("run", [row[:-1] for row in rows], [row[-1] for row in rows])
+        names, values = self._known.names, json.loads(f"[{','.join([row[3] for row in rows])}]")
+        return [Job(row[0], dict(zip(names, each, strict=True)), row[4], row[6]) for row, each in zip(rows, values, strict=True)]
 
     @property
     def first_unfinished(self) -> int | None:
@@ -325,8 +324,7 @@ class Store:
     def pending(self, since: int) -> History:
         """Return the runs from index `since` on as they were planned, whether they have an outcome or not."""
         rows = self._select(f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE idx >= ? ORDER BY idx", (since,))
-        for row in rows:
-            self._checked(f"run {row[0]}", row[-1], *row[:-1])
+        self._check_all("run", [row[:-1] for row in rows], [row[-1] for row in rows])
         found = Rows(self._known.names, self._known.choices)
         columns = dict(zip(PLAN, zip(*rows, strict=True), strict=False)) if rows else {}
         x = as_numbers([json.loads(text) for text in columns.pop("inputs", ())], found.names, found.choices)
@@ -351,9 +349,17 @@ class Store:
             self._fits.append(from_json(FitRecord, json.loads(text)))
         return list(self._fits)
 
-    def history(self, until: int | None = None) -> History:
-        """Return all finished runs as columns, or those of the batches up to `until`; nothing is decoded twice."""
-        with reported(self.folder):
+    def history(self, until: int | None = None, *, level: int | None = 0) -> History:
+        """Return all finished runs of a level of fidelity as columns, or those of the batches up to `until`; None: of any level.
+
+        Level 0 is the scenario itself; coarser runs only teach, and are not among its runs. Nothing is decoded twice.
+        """
+        found = self._finished(until)
+        return found if level is None else found.at_level(level)
+
+    def _finished(self, until: int | None) -> History:
+        """Return all finished runs, or those of the batches up to `until`."""
+        with reported(self.folder), one_moment(self._db):
             done = self._known
             pending = self._db.execute("SELECT MIN(idx) FROM runs WHERE status = ?", (PLANNED,)).fetchone()[0]
             end = "" if pending is None else f" AND idx < {int(pending)}"
@@ -368,17 +374,24 @@ class Store:
             self._read_into(some, f"idx > {int(pending)} AND status != '{PLANNED}'")
             return done.history() if some.count == 0 else done.history().extended(some.history())
 
+    def sample(self, most: int) -> History:
+        """Return at most so many finished runs, evenly spaced by their index: not all are read."""
+        end = self.end
+        places = range(end) if end <= most else [k * end // most for k in range(most)]
+        some = Rows(self._known.names, self._known.choices)
+        with reported(self.folder):
+            self._read_into(some, f"idx IN ({','.join(map(str, places))}) AND status != '{PLANNED}'")
+        return some.history().at_level(0)
+
     def _read_into(self, rows: Rows, condition: str) -> None:
         """Append the rows that meet a condition, in the order of their index."""
         query = f"SELECT {', '.join((*PLAN, *OUTCOME))}, plan_checksum, checksum FROM runs WHERE {condition} ORDER BY idx"
         cursor = self._db.execute(query)
         n = len(PLAN)
         while found := cursor.fetchmany(_READ):
-            for row in found:
-                self._checked(f"run {row[0]}", row[-2], *row[:n])
-                self._checked(f"the outcome of run {row[0]}", row[-1], row[0], *row[n:-2])
+            self._check_all("run", [row[:n] for row in found], [row[-2] for row in found])
+            self._check_all("the outcome of run", [(row[0], *row[n:-2]) for row in found], [row[-1] for row in found])
             columns = dict(zip((*PLAN, *OUTCOME), zip(*found, strict=True), strict=False))
             x = as_numbers(json.loads(f"[{','.join(columns['inputs'])}]"), rows.names, rows.choices)
             metrics = json.loads(f"[{','.join(columns['metrics'])}]")
             rows.append(x, {"index": columns["idx"], **{name: columns[name] for name in _FIELDS}}, metrics)
-
