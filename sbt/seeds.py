@@ -17,14 +17,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["run_seed", "run_seeds", "stream"]
+__all__ = ["SEED_END", "run_seed", "run_seeds", "stream"]
 
+SEED_END = 2**31 - 1
+"""Seeds of runs are integers from 0, below this: what SUMO's `--seed` takes."""
 _HASHED, _MIXED, _OUT = (0x43B0D7E5, 0x931E8875), (0xCA01F9DD, 0x4973F715), (0x8B51F9DD, 0x58F38DED)
 """Constants of NumPy's `SeedSequence`."""
 _POOL, _WORDS = 4, 8
 _PCG, _MASK_32, _MASK_64, _MASK_128 = 0x2360ED051FC65DA44385DF649FCCF645, 2**32 - 1, 2**64 - 1, 2**128 - 1
 _LEAST_AT_ONCE, _MOST_AT_ONCE = 16, 4096
-_REJECTED = (2**31 + 1) % (2**31 - 1)
+_REJECTED = (2**31 + 1) % SEED_END
 
 
 def stream(seed: int, *path: int | str) -> np.random.Generator:
@@ -49,7 +51,7 @@ def _digest(key: str) -> bytes:
 
 def run_seed(seed: int, index: int) -> int:
     """Return the seed of run `index`: a 31-bit integer, as SUMO's `--seed` takes."""
-    return int(stream(seed, "run", index).integers(0, 2**31 - 1))
+    return int(stream(seed, "run", index).integers(0, SEED_END))
 
 
 def run_seeds(seed: int, indices: Sequence[int]) -> list[int]:
@@ -103,11 +105,11 @@ def _mixed(x: NDArray[np.uint32], y: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def _first_below(state: int, increment: int) -> int | None:
-    """Return the first `integers(0, 2**31 - 1)` of `PCG64` begun with these two; None where its first draw is rejected."""
+    """Return the first `integers(0, SEED_END)` of `PCG64` begun with these two; None where its first draw is rejected."""
     step = (increment << 1 | 1) & _MASK_128
     state = ((state + step) * _PCG + step) & _MASK_128  # as seeded
     state = (state * _PCG + step) & _MASK_128
     turn, value = state >> 122, (state >> 64 ^ state) & _MASK_64
     low = (value >> turn | value << (64 - turn)) & _MASK_32
-    product = low * (2**31 - 1)
+    product = low * SEED_END
     return None if product & _MASK_32 < _REJECTED else product >> 32

@@ -13,7 +13,7 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.samplers.sobol import SobolSequence
-from sbt.seeds import stream
+from sbt.seeds import SEED_END, stream
 
 __all__ = ["OUTSIDE", "Outside"]
 
@@ -111,7 +111,7 @@ class Tpe:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        number = int(stream(seed, "compare", "tpe").integers(0, 2**31 - 1))
+        number = int(stream(seed, "compare", "tpe").integers(0, SEED_END))
         sampler = optuna.samplers.TPESampler(seed=number, n_startup_trials=initial, constant_liar=True)
         self._study = optuna.create_study(sampler=sampler)
         self._dimension, self._trials, self._choices = dimension, list[Any](), dict(cube.nominal)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sbt.campaigns.counting import DRAWN, counted_iterations
 from sbt.campaigns.gate import Limits
+from sbt.campaigns.wording import plural
 from sbt.estimators.clusters import clustered_error, reach
 from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
@@ -40,6 +41,12 @@ class Spread:
             lambda c: max(min(limits.lower(c), value - reach(error, k, c)), 0.0),
             lambda c: min(max(limits.upper(c), value + reach(error, k, c)), 1.0),
         )
+
+    def sentence(self) -> str:
+        """Return what the result is conditional on."""
+        known = self.std_error is not None
+        spread = "the interval has the spread between them" if known else "how others would change it is not in the interval"
+        return f"The result is conditional on the traffic of {plural(self.warm_ups, 'warm-up')}; {spread}."
 
     def exceeds(self, cov: float, value: float) -> bool:
         """Return whether the coefficient of variation is above a limit by the spread alone."""

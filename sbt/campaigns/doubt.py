@@ -13,7 +13,7 @@ from sbt.metamodels.risk_forest import fit_risk
 from sbt.problem.arrays import Points
 from sbt.samplers.noise import scores
 from sbt.samplers.search import fill_uniformly
-from sbt.seeds import stream
+from sbt.seeds import SEED_END, stream
 from sbt.store.history import VALIDATION, History
 
 __all__ = ["TrafficDoubt", "traffic_doubt"]
@@ -22,7 +22,6 @@ _FEWEST, _EITHER = 100, 10
 """Runs, and critical and safe ones among them, from which on shares are stated."""
 _POINTS, _SEEDS = 256, 8
 """Points of the space, and fresh seeds at each."""
-_SEED_END = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -62,11 +61,11 @@ def traffic_doubt(settings: Settings, history: History) -> TrafficDoubt | None:
     space, rng = scenario.space, stream(settings.seed, "doubt", len(runs))
 
     def inputs(x: Points, told: Points) -> Points:
-        return np.column_stack([space.metamodel_inputs(np.clip(space.to_unit(x), 0.0, 1.0)), told])
+        return np.column_stack([space.metamodel_inputs_at(x), told])
 
     margin = np.where(runs.ok, np.nan_to_num(scenario.requirement.margins(runs), nan=np.inf, posinf=np.inf), np.inf)
     u = fill_uniformly(lambda v: space.feasible(space.from_unit(v)), _POINTS, space.dimension, rng)
-    x, seeds = np.repeat(space.from_unit(u), _SEEDS, axis=0), rng.integers(0, _SEED_END, _POINTS * _SEEDS).tolist()
+    x, seeds = np.repeat(space.from_unit(u), _SEEDS, axis=0), rng.integers(0, SEED_END, _POINTS * _SEEDS).tolist()
     with threadpool_limits(1):
         risk = fit_risk(inputs(runs.x, covariates.at(runs.x, runs.seed.tolist())), scores(margin), critical, rng)
         p = np.exp(risk(inputs(x, covariates.at(x, seeds, keep=False)))[0]).reshape(_POINTS, _SEEDS)

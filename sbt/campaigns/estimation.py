@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sbt.campaigns.clustering import Spread
 from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
@@ -21,7 +22,7 @@ from sbt.campaigns.stopping import FEWEST_BATCHES
 from sbt.campaigns.summing import SummingStage, summed, sums, took_sum
 from sbt.campaigns.telling import tell_estimation
 from sbt.campaigns.two_level import TwoLevelStage
-from sbt.campaigns.warmed import WarmTraffic, warmed_traffic
+from sbt.campaigns.warmed import warmed_traffic
 from sbt.campaigns.wording import number, plural
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
@@ -95,7 +96,7 @@ class EstimationConclusion:
     gate: GateVerdict | None = optional()
     simulator_noise: SimulatorNoise | None = optional()
     requirements: tuple[RequirementEstimate, ...] | None = optional()
-    warmed_traffic: WarmTraffic | None = optional()
+    warmed_traffic: Spread | None = optional()
     combinations: int | None = optional()
     fidelity: LevelsTold | None = optional()
     pairs: int | None = optional()
@@ -184,7 +185,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
     return Campaign((stage,), conclude)
 
 
-def _on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: WarmTraffic) -> Concluded:
+def _on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread) -> Concluded:
     """Return the conclusion with an interval that has the spread between warm-ups."""
     value, error = found.probability, traffic.std_error
     limits, tail = traffic.widened(limits, value), 0.5 * (1.0 + _CONFIDENCE)

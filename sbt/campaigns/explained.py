@@ -52,7 +52,7 @@ def explained_variance(settings: Settings, history: History) -> ExplainedVarianc
     y = requirement.told(runs)
     if len(runs) < _FEWEST or np.ptp(y) == 0.0:
         return None
-    inputs = space.metamodel_inputs(np.clip(space.to_unit(runs.x), 0.0, 1.0))
+    inputs = space.metamodel_inputs_at(runs.x)
     both = np.column_stack([inputs, covariates.at(runs.x, runs.seed.tolist())])
     alone = out_of_bag(inputs, y, stream(settings.seed, "explained", len(y)))
     whole = max(out_of_bag(both, y, stream(settings.seed, "explained", len(y))), alone)

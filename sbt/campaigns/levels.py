@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbt.campaigns.counting import DRAWN, LEARNED
 from sbt.campaigns.records import EstimationProposal
@@ -65,8 +66,7 @@ class Pairs:
         """Return the pairs of a log."""
         scenario, coarse = settings.scenario, coarse_runs(log)
         runs = log.history.where(np.isin(log.history.stage, (DRAWN, LEARNED)))
-        place = {(x.tobytes(), int(seed)): k for k, (x, seed) in enumerate(zip(coarse.x, coarse.seed, strict=True))}
-        at = np.array([place.get((x.tobytes(), int(s)), -1) for x, s in zip(runs.x, runs.seed, strict=True)], dtype=np.intp)
+        at = _same_pair(runs, coarse)
         margin = scenario.requirement.margins(runs)
         known = margin[np.isfinite(margin)]
         margin = np.where(np.isfinite(margin), margin, max(float(known.max(initial=0.0)), 1.0))
@@ -83,8 +83,7 @@ class Pairs:
     @staticmethod
     def inputs(settings: Settings, x: Points) -> Points:
         """Return (n, k) what is known of inputs x (n, d) before any run."""
-        space = settings.scenario.space
-        return space.metamodel_inputs(np.clip(space.to_unit(x), 0.0, 1.0))
+        return settings.scenario.space.metamodel_inputs_at(x)
 
     @classmethod
     def known_after(cls, log: Log, settings: Settings, runs: History) -> Points:
@@ -94,6 +93,12 @@ class Pairs:
         metrics = within_reach(np.column_stack([coarse.y(name) for name in names])) if names else np.empty((len(coarse), 0))
         mine = np.isin(coarse.index, runs.index)
         return np.column_stack([cls.inputs(settings, runs.x), metrics[mine]])
+
+
+def _same_pair(runs: History, coarse: History) -> NDArray[np.intp]:
+    """Return the row of each run's inputs and seed (n,) among the coarse runs; -1: they were not run there."""
+    place = {(x.tobytes(), int(seed)): k for k, (x, seed) in enumerate(zip(coarse.x, coarse.seed, strict=True))}
+    return np.array([place.get((x.tobytes(), int(s)), -1) for x, s in zip(runs.x, runs.seed, strict=True)], dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -140,11 +145,8 @@ def levels_told(log: Log, settings: Settings) -> LevelsTold | None:
     if settings.coarse_cost is None:
         return None
     coarse, runs = coarse_runs(log), log.history.where(log.history.drawn & log.history.ok)
-    margins = settings.scenario.requirement.margins
-    place = {(x.tobytes(), int(s)): y for x, s, y in zip(coarse.x, coarse.seed, margins(coarse), strict=True)}
-    both = np.array(
-        [(y, place.get((x.tobytes(), int(s)), np.nan)) for x, s, y in zip(runs.x, runs.seed, margins(runs), strict=True)]
-    ).reshape(-1, 2)
+    margins, at = settings.scenario.requirement.margins, _same_pair(runs, coarse)
+    both = np.column_stack([margins(runs)[at >= 0], margins(coarse)[at[at >= 0]]])
     both = both[np.isfinite(both).all(axis=1)]
     told = len(both) >= _FEWEST and np.ptp(both, axis=0).min() > 0.0
     rounds = [found for batch in log.iterations if (found := batch.read(EstimationProposal).levels) is not None]

@@ -32,7 +32,7 @@ from sbt.problem.requirement import Requirement
 from sbt.samplers.noise import scores
 from sbt.samplers.pairs import propose_pairs
 from sbt.samplers.search import Search
-from sbt.seeds import stream
+from sbt.seeds import SEED_END, stream
 from sbt.store.database import PlannedRun
 from sbt.store.history import VALIDATION, History
 
@@ -40,7 +40,6 @@ __all__ = ["PairStage", "pairs_of", "pairs_words"]
 
 Seeds = NDArray[np.int64]
 
-_SEEDS = 2**31 - 1
 """Seeds of runs are uniform below, as those of `sbt.seeds.run_seed`."""
 _SHARES = (0.8, 0.2, 0.0, 0.0)
 """Of the draws: in proportion to the metamodel's uncertainty, and to the pool. No draw counts for more than five, whatever the
@@ -191,12 +190,12 @@ class PairStage:
 
     def _inputs(self, x: Points, covariates: Points) -> Points:
         space = self.settings.scenario.space
-        return np.column_stack([space.metamodel_inputs(np.clip(space.to_unit(x), 0.0, 1.0)), covariates])
+        return np.column_stack([space.metamodel_inputs_at(x), covariates])
 
     def _drawn(self, n: int, rng: np.random.Generator) -> _Pool:
         """Return n pairs as they come: inputs by their distribution, seeds uniform."""
         x = self.settings.scenario.space.sample(n, rng)
-        seeds = rng.integers(0, _SEEDS, n)
+        seeds = rng.integers(0, SEED_END, n)
         return _Pool(x, seeds, self._inputs(x, self._covariates.at(x, seeds.tolist(), keep=False)))
 
     def _ratio(self, log: Log) -> float:

@@ -344,11 +344,6 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
                 " fewer where the metamodel goes on to learn"
             )
         return "more runs than can be asked for here narrow it; change the metamodel, or the requirement to a milder one"
-    if found.failed_as_critical is not None and found.failed_as_critical > (1.0 + 2.0 * _PRECISE) * found.probability:
-        return (
-            "mend what makes runs fail and run again: the figure is as narrow as asked but for them, which count as safe for the"
-            " lower end and as critical for the upper one"
-        )
     unseen = 3.0 / max(found.probability, 1e-300)
     if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
         return (

@@ -34,7 +34,7 @@ from sbt.estimators.two_level import Shares, TwoPhases, drawn, inclusion, split,
 from sbt.loop.stages import Batch, Log
 from sbt.metamodels.belief import Belief, cross_fitted, fit_belief, fit_mean, fit_score
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.seeds import stream
+from sbt.seeds import SEED_END, stream
 from sbt.store.database import PlannedRun
 
 __all__ = ["TwoLevelStage"]
@@ -45,7 +45,6 @@ _BOTH = 0.15  # of a round, pairs that are run at both levels whatever is believ
 _POOL, _LEAST_POOL, _MOST_POOL = 10, 2_000, 50_000  # pairs of a pool for a coarse run; at least and at most
 _EVENT = 30  # critical pairs from which on what coarse runs are worth is judged by them, and not by correlations
 _HOPELESS = 1.5  # variance times cost with coarse runs, of that without, from which on no more of them are made to look again
-_LARGEST = 2**31 - 1  # a seed is below
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class TwoLevelStage:
     def _pool(self, n: int, iteration: int) -> tuple[Points, NDArray[np.int64]]:
         """Return n fresh pairs: x (n, d) and seeds (n,)."""
         rng = stream(self.settings.seed, "pairs", iteration)
-        return self.settings.scenario.space.sample(n, rng), rng.integers(0, _LARGEST, n)
+        return self.settings.scenario.space.sample(n, rng), rng.integers(0, SEED_END, n)
 
     def _runs(
         self, x: Points, seeds: NDArray[np.int64], coefficient: Vector, stage: str, blind: Mask | bool = True

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
@@ -14,24 +12,7 @@ from sbt.campaigns.wording import plural
 from sbt.loop.stages import Log
 from sbt.store.history import History
 
-__all__ = ["WarmTraffic", "conditional_on", "warmed_traffic"]
-
-
-@dataclass(frozen=True)
-class WarmTraffic(Spread):
-    """The warmed traffic that an estimate rests on."""
-
-    def sentence(self) -> str:
-        """Return what the result is conditional on."""
-        known = self.std_error is not None
-        spread = "the interval has the spread between them" if known else "how others would change it is not in the interval"
-        return f"The result is conditional on the traffic of {plural(self.warm_ups, 'warm-up')}; {spread}."
-
-
-def warmed_traffic(log: Log, settings: Settings) -> WarmTraffic | None:
-    """Return the warm-ups behind an estimate; None where runs simulate their traffic from the beginning."""
-    spread = _spread(log, settings)
-    return None if spread is None else WarmTraffic(spread.warm_ups, spread.std_error)
+__all__ = ["conditional_on", "warmed_traffic"]
 
 
 def conditional_on(history: History) -> list[str]:
@@ -41,8 +22,11 @@ def conditional_on(history: History) -> list[str]:
     return [f"Runs began with the traffic of {plural(found, 'warm-up')}: the result is conditional on it."] if found else []
 
 
-def _spread(log: Log, settings: Settings) -> Spread | None:
-    """Return the spread between warm-ups; its error is not known where repeats are counted."""
+def warmed_traffic(log: Log, settings: Settings) -> Spread | None:
+    """Return the spread between the warm-ups behind an estimate; None where runs simulate their traffic from the beginning.
+
+    Its error is not known where repeats are counted.
+    """
     history = log.history
     batches = counted_batches(log, settings)
     if batches:

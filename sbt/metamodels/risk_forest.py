@@ -6,6 +6,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import expit
 
 from sbt.metamodels.joint import LogPair
 from sbt.problem.arrays import Mask, Points, Vector
@@ -21,7 +23,7 @@ Risk = Callable[[Points], LogPair]
 _TREES = 60  # of each forest
 _SCORE_LEAF, _LABEL_LEAF = 3, 2  # runs in a leaf of the two forests
 _FEWEST, _EVENT = 10, 5  # runs to learn from; critical and safe ones among them, below which labels alone teach nothing
-_STEPS, _PENALTY = 50, 0.3  # of Newton's method, and on squared slopes of standardised scores
+_PENALTY = 0.3  # on squared slopes of standardised scores
 
 
 def fit_risk(inputs: Points, score: Vector, critical: Mask, rng: np.random.Generator) -> Risk:
@@ -101,27 +103,19 @@ def _linear(columns: Points, weight: Vector) -> Vector:
 
 
 def _logistic(columns: Points, event: Mask) -> Vector:
-    """Return the (k + 1,) slopes and intercept of a logistic regression with a ridge penalty on its slopes (Newton's method)."""
-    x = np.column_stack([columns, np.ones(len(columns))])
-    penalty = np.diag([_PENALTY] * columns.shape[1] + [1e-6])
-    weight = np.zeros(x.shape[1])
-    for _ in range(_STEPS):
-        p = 1.0 / (1.0 + np.exp(-np.clip(x @ weight, -30.0, 30.0)))
-        step = np.linalg.solve((x.T * (p * (1.0 - p))) @ x + penalty, x.T @ (event - p) - penalty @ weight)
-        weight = weight + step * min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-300))
-        if np.abs(step).max() < 1e-10:
-            break
-    return weight
+    """Return the (k + 1,) slopes and intercept of a logistic regression with a ridge penalty on its slopes."""
+    if event.all() or not event.any():
+        return np.zeros(columns.shape[1] + 1)  # nothing to tell apart; the intercept comes from the share
+    from sklearn.linear_model import LogisticRegression
+
+    fitted = LogisticRegression(C=1.0 / _PENALTY, solver="newton-cholesky", tol=1e-8).fit(columns, event)
+    return np.append(fitted.coef_[0], fitted.intercept_[0])
 
 
 def _intercept(log_odds: Vector, hits: float, n: float) -> float:
     """Return what is added to the log odds of runs, so that their mean P is `hits` of n."""
-    low, high = -40.0, 40.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        too_many = (1.0 / (1.0 + np.exp(-np.clip(log_odds + middle, -700.0, 700.0)))).mean() > hits / n
-        low, high = (low, middle) if too_many else (middle, high)
-    return 0.5 * (low + high)
+    target, reach = float(np.log(hits / (n - hits))), float(np.abs(log_odds).max(initial=0.0)) + 1.0
+    return float(brentq(lambda shift: expit(log_odds + shift).mean() - hits / n, target - reach, target + reach))
 
 
 def _pair(log_odds: Vector) -> LogPair:

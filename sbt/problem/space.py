@@ -229,6 +229,10 @@ class ParameterSpace:
         derived = [(np.asarray(f(columns)) - lo) / (hi - lo) for (_, f), (lo, hi) in zip(self.features, ranges, strict=True)]
         return np.column_stack([own, *derived])
 
+    def metamodel_inputs_at(self, x: Points) -> Points:
+        """Return `metamodel_inputs` of values x (n, d); of values beyond a range, those at its end."""
+        return self.metamodel_inputs(np.clip(self.to_unit(x), 0.0, 1.0))
+
     @cached_property
     def _feature_ranges(self) -> tuple[tuple[float, float], ...]:
         u = _even_points(self.dimension, 4096)

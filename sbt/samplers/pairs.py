@@ -16,6 +16,7 @@ from sbt.metamodels.extra_trees import ExtraTrees, ForestPredictor
 from sbt.problem.arrays import Points, Vector
 from sbt.samplers.noise import scores
 from sbt.samplers.search import Search, fill_uniformly
+from sbt.seeds import SEED_END
 
 __all__ = ["PairPicks", "propose_pairs"]
 
@@ -26,7 +27,6 @@ _FOREST = ExtraTrees(trees=60)
 _SCREENED = 2000  # uniform points, of which inputs alone choose
 _PROMISING, _ANY = 200, 100  # points that are given traffic: the best of them, and any
 _BEST, _STEPS, _STEP = 20, 5, 0.1  # runs and pairs of the lowest scores, steps from each, their std in the unit cube
-_LARGEST = 2**31 - 1  # a seed is below
 _DARING = 5  # of so many picks one is the best by a few trees alone
 _FEW_TREES = 8
 
@@ -121,7 +121,7 @@ def _fresh(n: int, rng: np.random.Generator, taken: set[int]) -> NDArray[np.int6
     """Return n different seeds that no run has."""
     found: dict[int, None] = {}
     while len(found) < n:
-        found |= dict.fromkeys(int(s) for s in rng.integers(0, _LARGEST, n) if int(s) not in taken)
+        found |= dict.fromkeys(int(s) for s in rng.integers(0, SEED_END, n) if int(s) not in taken)
     return np.array(list(found)[:n], dtype=np.int64)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
-from sbt.seeds import stream
+from sbt.seeds import SEED_END, stream
 from sbt.sumo.demand import excerpts, pieces_of, without_pieces
 from sbt.sumo.files import Launch, SumoFiles
 from sbt.sumo.forking import in_fork
@@ -170,7 +170,7 @@ class WarmedFiles:
 
     def _warm_up(self, number: int, path: Path) -> None:
         """Simulate the traffic up to the end of the warm-up, and save its state."""
-        seed = int(stream(number, "warm-up").integers(0, 2**31 - 1))
+        seed = int(stream(number, "warm-up").integers(0, SEED_END))
         saved = self.folder / f"warm-{number}.xml"
         with session().run(self.warming, seed, "fresh") as sumo:
             sumo.simulationStep(self.snapshot.until)
