@@ -70,6 +70,17 @@ def check_ego(folder: Path, case: Path) -> None:
 
 @needs_tools
 @pytest.mark.sumo
+def test_a_vehicle_called_ego_is_the_one_under_test(tmp_path):
+    config = make("numeric", tmp_path / "case")
+    trips = tmp_path / "case" / "t.trips.xml"
+    trips.write_text(trips.read_text().replace('id="40"', 'id="Ego"'))
+    called("new", tmp_path / "study", "--from", config)
+    assert ET.fromstring((tmp_path / "study" / "ego.rou.xml").read_text())[1].get("id") == "Ego"
+    check_ego(tmp_path / "study", tmp_path / "case")
+
+
+@needs_tools
+@pytest.mark.sumo
 @pytest.mark.parametrize("name", QUICK)
 def test_what_new_writes_runs(name, tmp_path):
     folder, _ = new(name, tmp_path)

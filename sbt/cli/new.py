@@ -17,7 +17,7 @@ def new(
     *,
     config: Annotated[Path, typer.Option("--from", metavar="MY.sumocfg", help="Your SUMO configuration.")],
     ego: Annotated[
-        str | None, typer.Option(metavar="ID", help="The vehicle under test; default: one from the midst of the traffic.")
+        str | None, typer.Option(metavar="ID", help="The vehicle under test; default: 'ego', or one of the traffic's midst.")
     ] = None,
 ) -> None:
     """Write a commented scenario.yaml and campaign.yaml for your own SUMO files, which stay as they are."""

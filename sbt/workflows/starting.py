@@ -120,6 +120,8 @@ class _Trial:
         """Yield what a user wants to know, a line each."""
         runs = len(self.problems) + len(self.required)
         span = f", ttc_path_min {min(self.required):.2g} to {max(self.required):.2g} {self.unit}" if self.required else ""
+        if self.required and all(value == self.without for value in self.required):
+            span += ": it meets nobody; --ego ID takes another vehicle"
         yield f"tried at the ends of its inputs: {len(self.required)} of {runs} runs are right, {self.seconds:.2g} s each{span}"
         yield from self.problems
 
@@ -136,9 +138,9 @@ class _Draft:
 def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Written:
     """Write scenario.yaml, campaign.yaml and what they need into a folder.
 
-    Where the files have no placeholders yet, the traffic is watched once, a vehicle is chosen from its midst (`ego` names
-    another), and it gets a type of its own with inputs in it; the first of some choices that runs at every end of every
-    input is taken. Where they have placeholders, those are the inputs.
+    Where the files have no placeholders yet, the traffic is watched once, the vehicle called ego or one from its midst is
+    chosen (`ego` names another), and it gets a type of its own with inputs in it; the first of some choices that runs at
+    every end of every input is taken. Where they have placeholders, those are the inputs.
 
     Raises:
         InputError: the configuration cannot be read or run, has no such vehicle, or there is a scenario already.
@@ -186,7 +188,8 @@ def _drafts(files: SumoFiles, config: Path, folder: Path, ego: str | None) -> It
             raise InputError(f"--ego must depart, but '{ego}' did not while the traffic was watched")
         choice = [chosen]
     else:
-        choice = candidates(traffic)[:_TRIED]
+        named = [v for v in traffic.vehicles if v.id.lower() == "ego"]
+        choice = named[:1] or candidates(traffic)[:_TRIED]
     for one in choice:
         yield _draft(files, config, folder, traffic, one, step)
 
