@@ -1,6 +1,6 @@
 """What batches that are chosen ahead cost in sample efficiency, and what they gain in the use of the workers.
 
-    python benchmarks/ahead.py [--seeds 5] [--budget 160] [--batch 10] [--only boundary,falsification,estimation]
+    python benchmarks/ahead.py [--seeds 5] [--budget 160] [--batch 10] [--cells boundary:wavy_level_d3 ...]
     python benchmarks/ahead.py --use        # share of the workers' time that is used, with runs of 50 ms
 
 Boundary: F1 of P(critical) > 0.5 at 20,000 uniform points against the truth. Falsification: critical runs, and runs to the first.
@@ -25,8 +25,8 @@ import sbt
 from sbt.execution.spec import ScenarioSpec
 
 CELLS = [
-    ("boundary", "four_branch_7"), ("boundary", "wavy_level_d3"), ("falsification", "four_branch_7"),
-    ("falsification", "hartmann6_1e-3"), ("estimation", "four_branch_7"),
+    "boundary:four_branch_7", "boundary:wavy_level_d3", "falsification:four_branch_7", "falsification:hartmann6_1e-3",
+    "estimation:four_branch_7",
 ]  # fmt: skip
 TRUTH = {"four_branch_7": 2.223e-3}
 SLOW = """
@@ -97,16 +97,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--budget", type=int, default=160)
     parser.add_argument("--batch", type=int, default=10)
-    parser.add_argument("--only", default="boundary,falsification,estimation")
+    parser.add_argument("--cells", nargs="+", default=CELLS, metavar="CAMPAIGN:TESTBED")
     parser.add_argument("--use", action="store_true")
     args = parser.parse_args()
     if args.use:
         use(args)
         return
     print("| campaign | testbed | score | ahead 0 | ahead 1 |\n|---|---|---|---|---|", flush=True)
-    for kind, testbed in CELLS:
-        if kind not in args.only.split(","):
-            continue
+    for kind, testbed in (cell.split(":") for cell in args.cells):
         found = [[scores(kind, testbed, ahead, seed, args) for seed in range(args.seeds)] for ahead in (0, 1)]
         for name in found[0][0]:
             cells = [np.array([one[name] for one in each]) for each in found]

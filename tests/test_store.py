@@ -186,7 +186,7 @@ def test_one_writer_any_number_of_readers(tmp_path: Path):
     with planned(tmp_path) as store:
         with pytest.raises(StoreError, match="takes one writer, but another process is writing"):
             Store.open(tmp_path, CONFIGURATION)
-        with Store.read(tmp_path) as one, Store.read(tmp_path) as two:
+        with Store.read(tmp_path, live=True) as one, Store.read(tmp_path, live=True) as two:
             store.append(outcome(0))
             assert len(one.history()) == len(two.history()) == 1
             with pytest.raises(StoreError, match="must be readable and writable"):
@@ -199,7 +199,7 @@ def test_one_writer_any_number_of_readers(tmp_path: Path):
 
 def test_a_batch_planned_while_a_reader_reads_is_not_half_seen(tmp_path: Path):
     """Between any two statements of a reader the writer may plan runs and finish some; no row is then damaged, or passed over."""
-    with planned(tmp_path) as writer, Store.read(tmp_path) as reader:
+    with planned(tmp_path) as writer, Store.read(tmp_path, live=True) as reader:
         for k in range(5):
             writer.append(outcome(k))
         statements: list[str] = []
@@ -218,6 +218,59 @@ def test_a_batch_planned_while_a_reader_reads_is_not_half_seen(tmp_path: Path):
         for k in (5, 6, 8, 9):
             writer.append(outcome(k))
         assert list(reader.history().index) == list(range(10))
+
+
+def test_a_store_is_read_as_it_was_at_one_moment(tmp_path: Path):
+    """What a campaign writes while its store is read, its end too, is seen by those who open it later, whole."""
+    with planned(tmp_path) as writer:
+        writer.append(outcome(0))
+        with Store.read(tmp_path) as before, Store.read(tmp_path, live=True) as live:
+            writer.plan(1, "boundary", BATCH, [20, 21, 22, 23, 24], {})
+            for k in range(1, 10):
+                writer.append(outcome(k))
+            writer.conclude({"conclusion": {}})
+            assert (len(before.history()), len(before.iterations()), before.conclusion) == (1, 1, None)
+            assert before.counts == {"ok": 1, "planned": 4}
+            with live.one_moment():
+                assert len(live.history()) == 10
+                writer.plan(2, "boundary", BATCH, [30, 31, 32, 33, 34], {})
+                assert len(live.iterations()) == 2
+            assert len(live.iterations()) == 3
+        with Store.read(tmp_path) as after:
+            assert (len(after.history()), len(after.iterations()), after.conclusion) == (10, 3, {"conclusion": {}})
+
+
+def test_a_store_that_is_locked_is_not_read_past_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Only where nothing may be written beside the file is it read as one that does not change."""
+    planned(tmp_path).close()
+    opened, connect = list[str](), sqlite3.connect
+
+    class Refusing:
+        def __init__(self, code: int):
+            self.error = sqlite3.OperationalError("said by a test")
+            self.error.sqlite_errorcode = code
+
+        def execute(self, _: str) -> None:
+            raise self.error
+
+        def close(self) -> None:
+            pass
+
+    def refused(code: int) -> None:
+        def connecting(address: object, *args: object, **options: object) -> object:
+            opened.append(str(address))
+            return connect(address, *args, **options) if "immutable" in str(address) else Refusing(code)
+
+        monkeypatch.setattr(sqlite3, "connect", connecting)
+        Store.read(tmp_path).close()
+
+    for code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_BUSY_RECOVERY, sqlite3.SQLITE_PROTOCOL):
+        with pytest.raises(StoreError, match="must be readable and writable"):
+            refused(code)
+    assert not any("immutable" in address for address in opened)
+    for code in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY_DIRECTORY):
+        refused(code)
+    assert any("immutable" in address for address in opened)
 
 
 def test_a_store_of_another_version_is_refused_and_untouched(tmp_path: Path):

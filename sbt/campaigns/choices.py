@@ -197,7 +197,8 @@ def _draw(
     )  # fmt: skip
     if draw.method == "short" and acquisition is not even:
         rough = None if fitted is None else _rough_score(settings, fitted, acquisition)
-        draw = _particles(settings, score, rough, bound, draw, label, n)
+        rough_bound = None if fitted is None or bound is None else fitted.sketch_bound
+        draw = _particles(settings, score, rough, bound, rough_bound, draw, label, n)
         if draw.method == "short":  # the score is -inf wherever one looks
             return _draw(settings, fitted, even, log, n, taken=taken, start=begin)
     if len(draw.u) < n and fitted is not None and fitted.log_success is not None:  # too little of the space is worth a run
@@ -209,7 +210,7 @@ def _draw(
 
 def _particles(
     settings: Settings, score: Callable[[Points], Vector], rough: Callable[[Points], Vector] | None,
-    bound: Callable[[Points], Vector] | None, draw: RoiDraw, label: str, n: int,
+    bound: Callable[[Points], Vector] | None, rough_bound: Callable[[Points], Vector] | None, draw: RoiDraw, label: str, n: int,
 ) -> RoiDraw:  # fmt: skip
     """Return the draw with points of a sequential Monte Carlo sampler instead of picks among the rejected."""
     rng, admissible = stream(settings.seed, "smc", label), _admissible(settings)
@@ -220,6 +221,7 @@ def _particles(
     found = smc(
         inside(score), settings.scenario.space.dimension, rng, particles=max(1024, 2 * n), start=max(4096, 2 * n), bound=bound,
         cube=settings.scenario.space.cube, uniform=_feasible(settings), rough=None if rough is None else inside(rough),
+        rough_bound=rough_bound,
     )  # fmt: skip
     if found is None:
         return draw

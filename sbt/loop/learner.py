@@ -49,6 +49,7 @@ class FittedMetamodel:
         log_ambiguity_bound: (n, d) points -> (n,) quick upper bounds of log a_BI; None: the metamodel has none.
         log_success: (n, d) points -> (n,) log P(a run gives a metric); None: all runs so far did.
         sketch: predicts about the same and many times quicker, to guide what `predict` judges; None: there is no such thing.
+        sketch_bound: as `log_ambiguity_bound`, of the sketch.
     """
 
     predict: Callable[[Points], Prediction]
@@ -57,6 +58,7 @@ class FittedMetamodel:
     log_ambiguity_bound: Callable[[Points], Vector] | None = None
     log_success: Callable[[Points], Vector] | None = None
     sketch: Callable[[Points], Prediction] | None = None
+    sketch_bound: Callable[[Points], Vector] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,18 +84,21 @@ class Learner:
             return None
         predictor = self.train(training)
         seconds = time.perf_counter() - start
-        predict, bound = self.on_inputs(predictor, len(training)), None
-        if isinstance(predictor, Screened):
-            critical, space = self.scenario.requirement.critical, self.scenario.space
-
-            def bound(points: Points) -> Vector:
-                return log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
-
+        predict = self.on_inputs(predictor, len(training))
         success = self.success(history)
         record = self._record(predict, predictor, history, len(training), success)
         rough = sketched(predictor, _SKETCH)
-        sketch = None if rough is predictor else self.on_inputs(rough, len(training))
-        return FittedMetamodel(predict, record, seconds, bound, success, sketch)
+        sketch, quick = None, None
+        if rough is not predictor:
+            sketch, quick = self.on_inputs(rough, len(training)), self._bound(rough)
+        return FittedMetamodel(predict, record, seconds, self._bound(predictor), success, sketch, quick)
+
+    def _bound(self, predictor: Predictor) -> Callable[[Points], Vector] | None:
+        """Return quick upper bounds of log a_BI at the inputs' (n, d) unit-cube points; None: the predictor has none."""
+        if not isinstance(predictor, Screened):
+            return None
+        critical, space = self.scenario.requirement.critical, self.scenario.space
+        return lambda points: log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
 
     def success(self, history: History) -> Callable[[Points], Vector] | None:
         """Return log P(a run gives a metric) at the inputs' (n, d) unit-cube points; None where all runs did, or none."""

@@ -26,6 +26,7 @@ from sbt.problem.requirement import CriticalInterval
 __all__ = ["Auto", "MixturePredictor", "ModelComparison"]
 
 _FEWEST = 10  # rows from which on models are compared: with three folds each learns from at least six
+_NEARLY = 0.85  # of the rows that are compared: one fold of 360 will do for 400, as another costs another fit of all models
 _WORTH = 0.03  # nats a row, of 0.5 to 2 in all: what is left to gain below it cannot be worth other models
 _LEAST = 0.02  # weight below which a model is left out: its predictions would cost more time than they change
 _PACED, _LEAST_PACED, _FASTEST = 1000, 200, 2.0  # rows below which the ensemble takes fewer steps; least; largest factor
@@ -133,7 +134,8 @@ class Auto:
             return self._mixed(models, {"gp": process}, comparison, u, y, rng)
         folds = max(self.folds, 5 if n < 1000 else 10 if self.compare_rows >= n else min(max(n // self.compare_rows, 5), 10))
         rivals = self._models(n, n - n // folds, target_aware=True)
-        others, rows = held_out_scores([rivals[k] for k in rivals if k != "gp"], u, y, folds, rng, bins, self.compare_rows)
+        enough = self.compare_rows if n < 1000 or self.compare_rows >= n else round(_NEARLY * self.compare_rows)
+        others, rows = held_out_scores([rivals[k] for k in rivals if k != "gp"], u, y, folds, rng, bins, enough)
         scores = np.vstack([own[rows], others])
         shares = shares[rows]
         weights = stacking_weights(scores, self.prior, 0.5 + 0.5 * len(rows) * shares / shares.sum())

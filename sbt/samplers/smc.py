@@ -49,7 +49,7 @@ class SmcDraw:
 def smc(
     score: Callable[[Points], Vector], dimension: int, rng: np.random.Generator, *, particles: int = 1024, start: int = 4096,
     bound: Callable[[Points], Vector] | None = None, cube: Cube = CONTINUOUS, uniform: Points | None = None,
-    rough: Callable[[Points], Vector] | None = None,
+    rough: Callable[[Points], Vector] | None = None, rough_bound: Callable[[Points], Vector] | None = None,
 ) -> SmcDraw | None:  # fmt: skip
     """Draw particles with a density proportional to exp(score(u)) on the unit cube.
 
@@ -65,6 +65,7 @@ def smc(
             is then that of this part. None: `start` points of the cube.
         rough: about the score and many times quicker: the particles move to its density first, and from there to that of the
             score. None: straight to the latter.
+        rough_bound: as `bound`, of the rough score.
 
     Returns:
         The particles; None where no uniform point has a score above -inf.
@@ -80,7 +81,7 @@ def smc(
         raise InputError(f"smc needs 2 <= particles <= start, but got particles = {particles}, start = {start}")
     u = rng.random((start, dimension)) if uniform is None else uniform
     if rough is not None:
-        first = smc(rough, dimension, rng, particles=particles, start=start, cube=cube, uniform=u)
+        first = smc(rough, dimension, rng, particles=particles, start=start, bound=rough_bound, cube=cube, uniform=u)
         return None if first is None else _corrected(first, score, rough, bound, rng, cube)
     log_score = _checked(score, u)
     if np.isneginf(log_score).all():

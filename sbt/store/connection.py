@@ -10,7 +10,9 @@ from pathlib import Path
 
 from sbt.processes import scratch
 
-__all__ = ["connected", "copy_database", "one_moment", "set_journal"]
+__all__ = ["connected", "copy_database", "is_never_waited_for", "one_moment", "set_journal"]
+
+_UNWRITABLE = (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
 
 
 def connected(path: Path) -> sqlite3.Connection:
@@ -19,8 +21,11 @@ def connected(path: Path) -> sqlite3.Connection:
     db = sqlite3.connect(f"{address}?mode=ro", uri=True, isolation_level=None)
     try:
         db.execute("PRAGMA schema_version").fetchone()
-    except sqlite3.OperationalError:  # beside the file nothing may be written, which WAL needs
+    except sqlite3.OperationalError as error:
         db.close()
+        if error.sqlite_errorcode & 0xFF not in _UNWRITABLE:  # a lock that was not released, say: it may be written right now
+            raise
+        # beside the file nothing may be written, which WAL needs
         log = path.with_name(f"{path.name}-wal")
         if log.is_file() and log.stat().st_size > 0:  # of a campaign that was killed: what it committed last is only there
             return _copied(path, log)
@@ -68,3 +73,8 @@ def one_moment(db: sqlite3.Connection) -> Iterator[None]:
     finally:
         if db.in_transaction:  # SQLite ends it itself where the disk refuses
             db.execute("COMMIT")
+
+
+def is_never_waited_for(db: sqlite3.Connection) -> bool:
+    """Return whether a writer goes on however long this connection reads: so it is with a write-ahead log alone."""
+    return str(db.execute("PRAGMA journal_mode").fetchone()[0]) == "wal"

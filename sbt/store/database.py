@@ -24,7 +24,8 @@ from sbt.errors import StoreError
 from sbt.problem.description import described_choices
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Json, JsonMapping
-from sbt.store.connection import connected, one_moment, set_journal
+from sbt.store.checks import check_row, check_rows
+from sbt.store.connection import connected, is_never_waited_for, one_moment, set_journal
 from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, checksums_of, damaged, refuse_damage, reported
 from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_metrics, plan_rows
@@ -105,12 +106,19 @@ class Store:
             self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @classmethod
-    def read(cls, folder: Path) -> Store:
-        """Open for reading only; works while a campaign writes."""
+    def read(cls, folder: Path, *, live: bool = False) -> Store:
+        """Open for reading only, also while a campaign writes: all of it is as it was at one moment.
+
+        Args:
+            folder: of the store.
+            live: every reading sees what was written meanwhile, but for those within `one_moment`.
+        """
         if not cls.begun(folder):
             raise StoreError(f"a store is a folder with a campaign in its {DATABASE}, but there is none in {folder}")
         with reported(Path(folder)):
             store = cls(Path(folder), connected(Path(folder) / DATABASE))
+            if not live and is_never_waited_for(store._db):
+                store._db.execute("BEGIN")
             store._check_version()
             refuse_damage(store.folder, store._db)
             return store
@@ -139,21 +147,16 @@ class Store:
             released(self._lock)
             self._lock = None
 
+    @contextmanager
+    def one_moment(self) -> Iterator[None]:
+        """Let all that is read within be as it was at one moment; short, as a writer may have to wait for its end."""
+        with reported(self.folder), one_moment(self._db):
+            yield
+
     def _check_version(self) -> None:
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
         if version != VERSION:
             raise StoreError(f"{self.folder}: this version reads stores of version {VERSION}, but got version {version}")
-
-    def _checked(self, what: str, stored: int, *parts: Any) -> None:
-        """Refuse a row that is not what was written."""
-        if stored != checksum_of(*parts):
-            raise damaged(self.folder, f"{what} has a wrong checksum")
-
-    def _check_all(self, what: str, rows: Sequence[tuple[Any, ...]], stored: Sequence[int]) -> None:
-        """Refuse rows, of which the first field says which run they are of, that are not what was written."""
-        for row, written_then, now in zip(rows, stored, checksums_of(rows), strict=True):
-            if written_then != now:
-                raise damaged(self.folder, f"{what} {row[0]} has a wrong checksum")
 
     @contextmanager
     def _transaction(self, *, waits: bool = True) -> Iterator[None]:
@@ -182,7 +185,7 @@ class Store:
         if not rows:
             return None
         text, checksum = rows[0]
-        self._checked(f"the {key}", checksum, key, text)
+        check_row(self.folder, f"the {key}", checksum, key, text)
         return json.loads(text)
 
     def _select(self, query: str, values: Sequence[Any] = ()) -> list[Any]:
@@ -311,7 +314,7 @@ class Store:
         """Return the planned runs from index `since` on that have no outcome yet; the first `most` of them, -1: all."""
         query = f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE status = ? AND idx >= ? ORDER BY idx LIMIT ?"
         rows = self._select(query, (PLANNED, since, most))
-        self._check_all("run", [row[:-1] for row in rows], [row[-1] for row in rows])
+        check_rows(self.folder, "run", [row[:-1] for row in rows], [row[-1] for row in rows])
         names, values = self._known.names, json.loads(f"[{','.join([row[3] for row in rows])}]")
         return [Job(row[0], dict(zip(names, each, strict=True)), row[4], row[6]) for row, each in zip(rows, values, strict=True)]
 
@@ -324,7 +327,7 @@ class Store:
     def pending(self, since: int) -> History:
         """Return the runs from index `since` on as they were planned, whether they have an outcome or not."""
         rows = self._select(f"SELECT {', '.join(PLAN)}, plan_checksum FROM runs WHERE idx >= ? ORDER BY idx", (since,))
-        self._check_all("run", [row[:-1] for row in rows], [row[-1] for row in rows])
+        check_rows(self.folder, "run", [row[:-1] for row in rows], [row[-1] for row in rows])
         found = Rows(self._known.names, self._known.choices)
         columns = dict(zip(PLAN, zip(*rows, strict=True), strict=False)) if rows else {}
         x = as_numbers([json.loads(text) for text in columns.pop("inputs", ())], found.names, found.choices)
@@ -337,7 +340,7 @@ class Store:
         last = self._iterations[-1].number if self._iterations else -1
         rows = self._select("SELECT * FROM iterations WHERE iteration > ? ORDER BY iteration", (last,))
         for number, stage, text, checksum in rows:
-            self._checked(f"iteration {number}", checksum, number, stage, text)
+            check_row(self.folder, f"iteration {number}", checksum, number, stage, text)
             self._iterations.append(Iteration(number, stage, json.loads(text)))
         return list(self._iterations)
 
@@ -345,7 +348,7 @@ class Store:
         """Return what is known of each fitted metamodel, in the order of the runs."""
         last = self._fits[-1].runs if self._fits else -1
         for runs, iteration, text, checksum in self._select("SELECT * FROM fits WHERE runs > ? ORDER BY runs", (last,)):
-            self._checked(f"the fit after {runs} runs", checksum, runs, iteration, text)
+            check_row(self.folder, f"the fit after {runs} runs", checksum, runs, iteration, text)
             self._fits.append(from_json(FitRecord, json.loads(text)))
         return list(self._fits)
 
@@ -359,7 +362,7 @@ class Store:
 
     def _finished(self, until: int | None) -> History:
         """Return all finished runs, or those of the batches up to `until`."""
-        with reported(self.folder), one_moment(self._db):
+        with self.one_moment():
             done = self._known
             pending = self._db.execute("SELECT MIN(idx) FROM runs WHERE status = ?", (PLANNED,)).fetchone()[0]
             end = "" if pending is None else f" AND idx < {int(pending)}"
@@ -376,10 +379,10 @@ class Store:
 
     def sample(self, most: int) -> History:
         """Return at most so many finished runs, evenly spaced by their index: not all are read."""
-        end = self.end
-        places = range(end) if end <= most else [k * end // most for k in range(most)]
         some = Rows(self._known.names, self._known.choices)
-        with reported(self.folder):
+        with self.one_moment():
+            end = self.end
+            places = range(end) if end <= most else [k * end // most for k in range(most)]
             self._read_into(some, f"idx IN ({','.join(map(str, places))}) AND status != '{PLANNED}'")
         return some.history().at_level(0)
 
@@ -389,8 +392,8 @@ class Store:
         cursor = self._db.execute(query)
         n = len(PLAN)
         while found := cursor.fetchmany(_READ):
-            self._check_all("run", [row[:n] for row in found], [row[-2] for row in found])
-            self._check_all("the outcome of run", [(row[0], *row[n:-2]) for row in found], [row[-1] for row in found])
+            check_rows(self.folder, "run", [row[:n] for row in found], [row[-2] for row in found])
+            check_rows(self.folder, "the outcome of run", [(row[0], *row[n:-2]) for row in found], [row[-1] for row in found])
             columns = dict(zip((*PLAN, *OUTCOME), zip(*found, strict=True), strict=False))
             x = as_numbers(json.loads(f"[{','.join(columns['inputs'])}]"), rows.names, rows.choices)
             metrics = json.loads(f"[{','.join(columns['metrics'])}]")

@@ -11,7 +11,7 @@ from sbt.report.explorer import explorer_data, library, scripts, styles
 from sbt.report.projection import influence_from_runs
 from sbt.report.reel import Reels
 from sbt.report.words import Findings, conclusion_sentences
-from sbt.store.database import Store
+from sbt.store.database import DATABASE, Store
 from sbt.store.history import PLANNED
 from sbt.workflows.filming import film_runs
 from sbt.workflows.study import RESOLVED, Study
@@ -31,22 +31,42 @@ class LiveCampaign:
 
     def __init__(self, folder: Path):
         """Open the store, which may be written meanwhile."""
-        self._store = Store.read(folder)
+        self._folder, self._file, self._store = folder, _file_of(folder), Store.read(folder, live=True)
+
+    def _current(self) -> Store:
+        """Return the store, opened again where the folder was emptied and another campaign begun in it."""
+        if (file := _file_of(self._folder)) != self._file:
+            opened = Store.read(self._folder, live=True)
+            self._store.close()
+            self._file, self._store = file, opened
+        return self._store
 
     def critical(self) -> int:
         """Return how many of the runs so far are critical."""
-        found = Study.from_store(self._store).scenario.requirement.critical_runs(self._store.history())
+        store = self._current()
+        with store.one_moment():
+            found = Study.from_store(store).scenario.requirement.critical_runs(store.history())
         return int(np.count_nonzero(found))
 
     def explorer(self) -> Json:
         """Return what the explorer shows of the runs so far; without a metamodel, which would take the workers' time."""
-        store = self._store
-        study, ended = Study.from_store(store), store.conclusion
-        conclusion = None if ended is None else study.conclusion(ended["conclusion"])
-        found = Findings.of(store, study.scenario, conclusion)
+        store = self._current()
+        with store.one_moment():
+            study, ended = Study.from_store(store), store.conclusion
+            conclusion = None if ended is None else study.conclusion(ended["conclusion"])
+            found = Findings.of(store, study.scenario, conclusion)
         weights = influence_from_runs(found.history, study.scenario.requirement)
         data = explorer_data(found, study.scenario, None, np.nan_to_num(weights))
         return {**data, "sentences": conclusion_sentences(found) if ended else []}
+
+
+def _file_of(folder: Path) -> tuple[int, int] | None:
+    """Return which file a store's database is; None: there is none. A file that is open keeps its number."""
+    try:
+        found = (folder / DATABASE).stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def first_look(folder: Path) -> Json:

@@ -29,9 +29,9 @@ def read_status(folder: Path) -> Json:
     Raises:
         StoreError: the folder holds no campaign.
     """
+    writer, alive = _at_work(folder)  # before the store: who was at work then may have concluded since, never the reverse
     with Store.read(folder) as store:
-        iterations, fits, counts = store.iterations(), store.fits(), store.counts
-        writer, conclusion = writer_of(folder), store.conclusion
+        iterations, fits, counts, conclusion = store.iterations(), store.fits(), store.counts, store.conclusion
         kept = store.configuration
         done, budget = sum(counts.values()) - counts.get(PLANNED, 0), _budget(kept)
         coarse = store.coarse
@@ -39,7 +39,7 @@ def read_status(folder: Path) -> Json:
             "store": str(folder),
             "campaign": kept.get("campaign"),
             "scenario": kept.get("scenario"),
-            **_progress(writer, done, budget, coarse, finished=conclusion is not None),
+            **_progress(writer, alive, done, budget, coarse, finished=conclusion is not None),
             "runs": counts,
             **({"coarse_runs": coarse} if coarse else {}),
             "iterations": len(iterations),
@@ -89,9 +89,19 @@ def _budget(configuration: JsonMapping) -> int | None:
     return None if budget is None else int(budget) + int((configuration.get("validation") or {}).get("reference") or 0)
 
 
-def _progress(writer: Writer | None, done: int, budget: int | None, coarse: int, *, finished: bool) -> Json:
-    """Return the state of a campaign with so many runs done, how fast it is and how long it takes; coarse runs have no budget."""
+def _at_work(folder: Path) -> tuple[Writer | None, bool | None]:
+    """Return who writes a store or was killed while it did, and whether it is alive; None: that cannot be known from here."""
+    writer = writer_of(folder)
     alive = False if writer is None else writer.alive
+    if writer is None or alive is not False or writer_of(folder) == writer:
+        return writer, alive
+    return None, False  # it ended in order meanwhile: only one that was killed is still named
+
+
+def _progress(
+    writer: Writer | None, alive: bool | None, done: int, budget: int | None, coarse: int, *, finished: bool
+) -> Json:  # fmt: skip
+    """Return the state of a campaign with so many runs done, how fast it is and how long it takes; coarse runs have no budget."""
     state = "elsewhere" if alive is None else "dead" if writer is not None else "interrupted"
     if alive or finished:
         state = "running" if alive else "finished"
