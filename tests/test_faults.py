@@ -314,9 +314,10 @@ def test_a_worker_that_lets_no_other_code_run_ends_with_its_driver(analytic: Pat
 STRAYING = """
 
 def stray(values, seed):
-    import os, tempfile
+    import os, sys, tempfile
     folder = tempfile.mkdtemp()
     os.chdir(folder)
+    sys.setrecursionlimit(150)
     os.rmdir(folder)
     if os.fork() == 0 and values["a"] > 0.5:
         raise SystemExit(3)

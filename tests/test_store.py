@@ -220,6 +220,17 @@ def test_a_batch_planned_while_a_reader_reads_is_not_half_seen(tmp_path: Path):
         assert list(reader.history().index) == list(range(10))
 
 
+@pytest.mark.parametrize("text", ["no file 'r\udcfcck.xml'", "x" * 10**7, "\x00\x1b[31m"])
+def test_any_message_of_a_run_can_be_kept(tmp_path: Path, text: str):
+    """A file's name that is no Unicode, or a dump of 10 MB: the campaign goes on, and the store stays small."""
+    with planned(tmp_path) as store:
+        store.append(Outcome(0, Status.FAILED, {}, text, 1.0, collisions=text[:20]))
+        (kept,) = store.history().reason
+    assert kept.startswith(text[:8])
+    assert len(kept) < 11_000
+    assert list(Store.read(tmp_path).history().reason) == [kept]
+
+
 def test_a_store_is_read_as_it_was_at_one_moment(tmp_path: Path):
     """What a campaign writes while its store is read, its end too, is seen by those who open it later, whole."""
     with planned(tmp_path) as writer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -101,13 +102,13 @@ class SerialExecutor:
         Raises:
             KeyboardInterrupt: Ctrl-C, after the run that was at work at the latest.
         """
-        place = Path.cwd()
+        place, depth = Path.cwd(), sys.getrecursionlimit()
         while queue:
             simulate = self._scenarios[queue[0].level].simulate
             together = isinstance(simulate, Batched) and simulate.batched
             with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
                 outcomes = self._together(queue) if together else self._alone(queue)
-            _restore(place)
+            _restore(place, depth)
             yield outcomes
 
     def _together(self, queue: deque[Job]) -> list[Outcome]:
@@ -125,8 +126,9 @@ class SerialExecutor:
         return outcomes
 
 
-def _restore(place: Path) -> None:
-    """Undo what a run may do to its process, so that the next one and the campaign find the working directory and the streams."""
+def _restore(place: Path, depth: int) -> None:
+    """Undo what a run may do to its process: the next one and the campaign find folder, streams and recursion limit."""
+    sys.setrecursionlimit(depth)
     open_missing()
     try:
         moved = Path.cwd() != place

@@ -28,7 +28,7 @@ from sbt.store.checks import check_row, check_rows
 from sbt.store.connection import connected, is_never_waited_for, one_moment, set_journal
 from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, checksums_of, damaged, refuse_damage, reported
-from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_metrics, plan_rows
+from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_metrics, plan_rows, storable, storable_reason
 from sbt.store.records import FitRecord, Iteration, Judgement, from_json, to_json
 from sbt.store.writer import locked, released, written
 
@@ -260,9 +260,9 @@ class Store:
         waits = now - self._waited >= _TOGETHER
         self._waited = now if waits else self._waited
         rows = [
-            (o.index, str(o.status), dump_metrics(o.metrics), o.reason, float(o.seconds), o.collisions, o.unconfirmed, versions)
-            for o in outcomes
-        ]
+            (o.index, str(o.status), dump_metrics(o.metrics), storable_reason(o.reason), float(o.seconds),
+             storable(o.collisions), storable(o.unconfirmed), versions) for o in outcomes
+        ]  # fmt: skip
         with self._transaction(waits=waits):
             self._db.executemany(_OUTCOME_OF, ((*r[1:], c, r[0]) for r, c in zip(rows, checksums_of(rows), strict=True)))
 

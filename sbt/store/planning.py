@@ -13,7 +13,10 @@ from sbt.problem.plain import Value, Values
 from sbt.store.history import PLANNED
 from sbt.store.layout import checksum_of
 
-__all__ = ["PlannedPoints", "PlannedRun", "dump", "dump_inputs", "dump_metrics", "plan_rows"]
+__all__ = ["PlannedPoints", "PlannedRun", "dump", "dump_inputs", "dump_metrics", "plan_rows", "storable", "storable_reason"]
+
+_MOST = 10_000
+"""Characters of a message that a store keeps: one with a whole dump in it says no more."""
 
 dump: Callable[[Any], str] = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 """JSON without spaces, of finite numbers."""
@@ -73,6 +76,24 @@ class PlannedPoints(Sequence[PlannedRun]):
     def __iter__(self) -> Iterator[PlannedRun]:
         """Yield the runs."""
         return (PlannedRun(self.stage, self.named(row)) for row in self.x)
+
+
+def storable(text: str) -> str:
+    r"""Return a text as a store can keep it: what is no Unicode (half a surrogate, in the name of a file) is escaped.
+
+    >>> storable("no file 'r\udcfcck.xml'")
+    "no file 'r\\udcfcck.xml'"
+    """
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def storable_reason(text: str) -> str:
+    """Return a `storable` message of a run, its end left out where it is very long.
+
+    >>> storable_reason("x" * 10_001)[-27:]
+    'xxx ... (10,001 characters)'
+    """
+    return storable(text if len(text) <= _MOST else f"{text[:_MOST]} ... ({len(text):,} characters)")
 
 
 def plan_rows(
