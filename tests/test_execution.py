@@ -440,3 +440,32 @@ def test_workers_are_replaced_after_so_many_runs(tmp_path: Path):
     found = run(LocalExecutor(ScenarioSpec("leaking.py:COUNT", str(tmp_path)), 1, recycle=20), work)
     assert len(found) == 50
     assert 20 <= max(o.metrics["y"] for o in found.values()) <= 20 + 64 / 2
+
+
+BREAKING = """
+import sys
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
+
+def breaks(values, seed):
+    if seed == 3:
+        sys.path.clear()
+        del sys.modules["sbt"]
+    return {"y": values["a"]}
+
+SCENARIO = LogicalScenario(
+    "breaking", ParameterSpace((Parameter("a", 0.0, 100.0),)), Requirement("y", high=0.0), evaluate=breaks, metric_names=("y",),
+)
+"""
+
+
+def test_a_run_that_breaks_the_modules_of_its_worker_is_the_only_one_that_is_lost(tmp_path: Path):
+    """Its worker cannot even say what the run gave."""
+    (tmp_path / "breaking.py").write_text(BREAKING)
+    work = [Job(k, {"a": float(k)}, seed=k) for k in range(8)]
+    with LocalExecutor(ScenarioSpec("breaking.py:SCENARIO", str(tmp_path)), 2) as executor:
+        found = {outcome.index: outcome for outcome in executor.run(work)}
+    assert {k: found[k].metrics for k in range(8) if k != 3} == {k: {"y": float(k)} for k in range(8) if k != 3}
+    assert (found[3].status, "could not hand over what it ran" in found[3].reason) == (Status.CRASHED, True)

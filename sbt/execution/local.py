@@ -61,6 +61,7 @@ class _Cause(Enum):
     DIED = auto()
     LATE = auto()
     LARGE = auto()
+    UNREADABLE = auto()
 
 
 class LocalExecutor:
@@ -153,6 +154,8 @@ class LocalExecutor:
             reason = f"a run must take at most {self._timeout:g} s: its process was stopped"
             return Outcome(job.index, Status.TIMEOUT, {}, reason, level=job.level)
         what = "the worker process died"
+        if cause is _Cause.UNREADABLE:
+            what = "the worker process could not hand over what it ran, as code of a run changed what it needs for that"
         if cause is _Cause.LARGE:
             what = f"a worker may use {(self._memory or 0) / 2**20:.0f} MiB of memory: its process was stopped"
         return Outcome(job.index, Status.CRASHED, {}, f"{what}, also when this run was tried again alone", level=job.level)
@@ -175,8 +178,11 @@ class LocalExecutor:
                     died = True
             done, _ = wait(submitted, timeout=_TICK, return_when=FIRST_COMPLETED)
             for future in done:
-                if isinstance(future.exception(), broken()):
-                    died = True
+                error = future.exception()
+                if error is not None and not isinstance(error, SbtError):
+                    died = True  # or a run broke its modules: the next ones need a process that is whole
+                    unreadable = () if isinstance(error, broken()) else submitted[future]
+                    stopped |= {job.index: _Cause.UNREADABLE for job in unreadable}
                     continue
                 del submitted[future]
                 yield self._measured(future.result())
