@@ -59,11 +59,12 @@ def with_event(batch: CountedBatch, stated: EventDraws) -> CountedBatch:
 
 
 def _counted(log: Log) -> Iterator[tuple[Iteration, PoolSummary, CountedDraws]]:
-    """Yield the batches that count, with their pool and draws."""
-    for batch in log.iterations:
-        proposal = batch.read(EstimationProposal)
-        if proposal.counted is not None and proposal.pool is not None:
-            yield batch, proposal.pool, proposal.counted
+    """Yield the batches that count, with their pool and draws; the first of two levels only where others follow it."""
+    proposals = [batch.read(EstimationProposal) for batch in log.iterations]
+    rounds = any(proposal.levels is not None for proposal in proposals)
+    for batch, proposal in zip(log.iterations, proposals, strict=True):
+        if proposal.counted is not None and (proposal.pool is not None or rounds):
+            yield batch, proposal.pool or PoolSummary(len(proposal.counted.pi), 0.0, 0.0, 1), proposal.counted
 
 
 def counted_iterations(log: Log) -> list[int]:

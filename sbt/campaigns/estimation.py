@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sbt.campaigns.clustering import Spread
-from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
-from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
+from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations
+from sbt.campaigns.crude import NOMINAL, MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
-from sbt.campaigns.levels import LevelsTold, is_two_level, levels_told
+from sbt.campaigns.levels import LevelsTold, is_two_level, left_two_levels, levels_told
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
 from sbt.campaigns.pairing import PairStage, pairs_of, pairs_words
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
@@ -308,9 +308,9 @@ def _nothing_critical(seen: Seen) -> Limits:
     return Limits(lambda _: 0.0, lambda c: seen.most(seen.failed, c))
 
 
-def _from_nominal(log: Log, settings: Settings) -> Concluded:
+def _from_nominal(log: Log, settings: Settings, stage: str = NOMINAL) -> Concluded:
     """Return what crude Monte Carlo says; its interval is exact, with few hits too."""
-    share = nominal_proportion(log, settings)
+    share = nominal_proportion(log, settings, stage)
     limits = Limits(share.lower, share.upper)
     rest: Json = {}
     if share.hits == 0:
@@ -328,7 +328,9 @@ def _from_either(log: Log, settings: Settings) -> Concluded:
 
 
 def _from_draws(log: Log, settings: Settings) -> Concluded:
-    """Return what crude Monte Carlo says where noise left it to that, else the draws of pools."""
+    """Return what crude Monte Carlo says where noise, or useless coarse runs, left it to that, else the draws of pools."""
+    if left_two_levels(log):
+        return _from_nominal(log, settings, DRAWN)
     return _from_nominal(log, settings) if took_monte_carlo(log) else _from_batches(log, settings)
 
 

@@ -17,7 +17,7 @@ from sbt.problem.arrays import Points, Vector
 from sbt.store.history import History
 from sbt.store.records import Iteration
 
-__all__ = ["COARSE", "LevelsTold", "Pairs", "coarse_runs", "is_two_level", "levels_told", "spent"]
+__all__ = ["COARSE", "LevelsTold", "Pairs", "coarse_runs", "is_two_level", "left_two_levels", "levels_told", "spent", "spent_by"]
 
 COARSE = "coarse"
 """Stage of runs at the coarse level."""
@@ -29,6 +29,14 @@ def is_two_level(batch: Iteration) -> bool:
     return "levels" in batch.proposal
 
 
+def left_two_levels(log: Log) -> bool:
+    """Return whether an estimation with a coarse level drew all its runs from the inputs' distribution."""
+    proposals = [batch.read(EstimationProposal) for batch in log.iterations]
+    counted = [(p.nominal, p.counted) for p in proposals if p.counted is not None]
+    even = all(nominal is not None and len(nominal.pi) == len(draws.pi) for nominal, draws in counted)
+    return any(map(is_two_level, log.iterations)) and even
+
+
 def coarse_runs(log: Log) -> History:
     """Return the coarse runs; none where there are none yet."""
     return log.history.where(np.zeros(len(log.history), dtype=bool)) if log.coarse is None else log.coarse
@@ -37,6 +45,11 @@ def coarse_runs(log: Log) -> History:
 def spent(log: Log, settings: Settings) -> float:
     """Return what the runs so far cost, in runs of the scenario."""
     return len(log.history) + (settings.coarse_cost or 0.0) * len(coarse_runs(log))
+
+
+def spent_by(pairs: int, settings: Settings) -> float:
+    """Return what pairs run at both levels cost, in runs of the scenario."""
+    return pairs * (1.0 + (settings.coarse_cost or 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +145,11 @@ class LevelsTold:
             return f"{told}. They were not used further: equal inputs give equal metrics, or the budget was used up."
         if self.two_levels is None or self.one_level is None or self.two_levels <= 0.0:
             return f"{told}."
+        times = self.one_level / self.two_levels
         if self.pays:
-            times = self.one_level / self.two_levels
             return f"{told}, so that without them equal precision would take {number(times, 2)} times the runs."
-        times = self.two_levels / self.one_level if self.one_level > 0.0 else float("inf")
-        much = f"with them equal precision would take {number(times, 2)} times the runs"
-        return f"{told}. They do not pay, and were left out: {much}."
+        much = f"equal precision would take {number(times, 2)} times the runs without them, as far as so few pairs tell"
+        return f"{told}. They do not clearly pay, and were left out: {much}."
 
 
 def levels_told(log: Log, settings: Settings) -> LevelsTold | None:
@@ -153,8 +165,7 @@ def levels_told(log: Log, settings: Settings) -> LevelsTold | None:
     last = rounds[-1] if rounds else None
     judged: tuple[bool | None, float | None, float | None] = (None, None, None)
     if last is not None:
-        pays = last.two_levels < last.one_level if last.two_levels is not None and last.one_level is not None else last.coarse
-        judged = (pays, last.two_levels, last.one_level)
+        judged = (last.coarse if last.pays is None else last.pays, last.two_levels, last.one_level)
     from scipy.stats import spearmanr  # takes half a second to load
 
     correlation = float(spearmanr(*both.T)[0]) if told else None

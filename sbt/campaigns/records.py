@@ -168,12 +168,14 @@ class LevelsRecord:
 
     Attributes:
         coarse: whether coarse runs were made for it.
-        two_levels, one_level: with coarse runs, and without; None: too little was known.
+        two_levels, one_level: with coarse runs, and without, over that of crude Monte Carlo; None: too little was known.
+        pays: whether coarse runs clearly pay; None: too little was known.
     """
 
     coarse: bool
     two_levels: float | None = None
     one_level: float | None = None
+    pays: bool | None = None
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Estimation with two levels of fidelity: pairs of inputs and seed are run coarse, and those that matter at the scenario's own.
 
-A round is two batches: coarse runs of a pool of pairs, drawn by what inputs tell, then runs of the scenario, drawn by what the
-coarse ones tell. Where coarse runs are not worth their cost, a round is one batch, drawn by what inputs tell. The budget counts
-a coarse run as its cost.
+A round is two batches: coarse runs of a pool of pairs, then runs of the scenario, drawn by what the coarse ones tell. That is
+done only where coarse runs clearly pay, by runs that the beliefs had not seen; and pairs are drawn by what inputs tell only where
+that clearly pays. Else a round is one batch from the inputs' distribution, as crude Monte Carlo draws it. While nothing critical
+was met, most runs are of that kind: they bound the probability. The budget counts a coarse run as its cost.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from sbt.campaigns.counting import DRAWN, LEARNED
-from sbt.campaigns.levels import COARSE, Pairs, coarse_runs, is_two_level, spent
+from sbt.campaigns.counting import DRAWN
+from sbt.campaigns.levels import COARSE, Pairs, coarse_runs, is_two_level, spent, spent_by
 from sbt.campaigns.records import (
     COUNT,
     LEARN,
@@ -32,7 +33,7 @@ from sbt.campaigns.settings import Settings
 from sbt.campaigns.stopping import is_precise
 from sbt.estimators.two_level import Shares, TwoPhases, drawn, inclusion, split, split_as_if_normal
 from sbt.loop.stages import Batch, Log
-from sbt.metamodels.belief import Belief, cross_fitted, fit_belief, fit_mean, fit_score
+from sbt.metamodels.belief import Belief, cross_fitted, fit_belief, fit_mean, fit_score, fit_trend
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.seeds import SEED_END, stream
 from sbt.store.database import PlannedRun
@@ -43,8 +44,10 @@ _FIRST, _FIRST_SHARE, _MOST_FIRST = 12, 0.12, 100  # pairs at both levels to beg
 _GROWTH = 0.35  # runs of a round, of those before it: what rounds learn from grows with what they cost
 _BOTH = 0.15  # of a round, pairs that are run at both levels whatever is believed: they bound what is not, and teach
 _POOL, _LEAST_POOL, _MOST_POOL = 10, 2_000, 50_000  # pairs of a pool for a coarse run; at least and at most
-_EVENT = 30  # critical pairs from which on what coarse runs are worth is judged by them, and not by correlations
-_HOPELESS = 1.5  # variance times cost with coarse runs, of that without, from which on no more of them are made to look again
+_EVENT = 10  # critical pairs from which on what coarse runs are worth is judged by them, and not by correlations
+_PILOT, _LOOKED = 0.06, 0.1  # of the budget, what coarse runs may cost to begin with, and before they are known to pay
+_UNMET = 0.25  # runs drawn by a belief, of those from the inputs' distribution, at most while nothing critical was met
+_REST = 1.5  # rounds in what is left of the budget below which it is one
 
 
 @dataclass(frozen=True)
@@ -75,9 +78,10 @@ class TwoLevelStage:
             return self._first()
         if _awaits_fine(log):
             return self._fine(log)
-        again = repeats_wanted(log.history, s.scenario, 2) if not any(map(is_two_level, log.iterations)) else ()
-        if again and len(log.iterations) == 1:
-            return Batch(again, EstimationProposal(LEARN, "repeats"))
+        if len(log.iterations) == 1:
+            again = repeats_wanted(log.history, s.scenario, min(int(s.budget - spent(log, s)), 2))
+            if again:
+                return Batch(again, EstimationProposal(LEARN, "repeats"))
         return self._without.propose(log) if self._hands_over(log) else self._round(log)
 
     def _hands_over(self, log: Log) -> bool:
@@ -95,15 +99,19 @@ class TwoLevelStage:
     @property
     def _pairs_first(self) -> int:
         """Number of pairs that are run at both levels to begin with."""
-        s = self.settings
-        wanted = min(max(_FIRST, int(_FIRST_SHARE * s.budget)), _MOST_FIRST)
-        return max(min(wanted, int(s.budget / (1.0 + (s.coarse_cost or 0.0)))), 1)
+        s, cost = self.settings, self.settings.coarse_cost or 1.0
+        wanted = min(max(_FIRST, int(min(_FIRST_SHARE, _PILOT / cost) * s.budget)), _MOST_FIRST)
+        return max(min(wanted, int(s.budget / (1.0 + cost))), 1)
 
     def _first(self) -> Batch:
         """Return pairs of the inputs' distribution at both levels."""
-        x, seeds = self._pool(self._pairs_first, 0)
-        runs = [*self._runs(x, seeds, np.ones(len(x)), COARSE), *self._runs(x, seeds, np.ones(len(x)), LEARNED)]
-        return Batch(tuple(runs), EstimationProposal(LEARN, "pairs", nominal=NominalDraws((1.0,) * len(x))))
+        n = self._pairs_first
+        x, seeds = self._pool(n, 0)
+        fine = self._runs(x, seeds, np.ones(n), DRAWN)
+        coarse = self._runs(x, seeds, np.ones(n), COARSE) if spent_by(n, self.settings) <= self.settings.budget else []
+        counted = CountedDraws(0.0, (1.0,) * n, (0.0,) * n, (1.0,) * n)
+        kept = EstimationProposal(LEARN, "difference", counted=counted, nominal=NominalDraws((1.0,) * n))
+        return Batch((*coarse, *fine), kept)
 
     def _pool(self, n: int, iteration: int) -> tuple[Points, NDArray[np.int64]]:
         """Return n fresh pairs: x (n, d) and seeds (n,)."""
@@ -123,21 +131,35 @@ class TwoLevelStage:
     def _round(self, log: Log) -> Batch:
         """Return the first batch of a round."""
         s, cost = self.settings, self.settings.coarse_cost or 1.0
+        left, used = s.budget - spent(log, s), spent(log, s)
+        size = max(float(s.batch), _GROWTH * used)
+        size = left if left < _REST * size else size
         pairs = Pairs.of(log, s)
         if not len(pairs.margin):  # nothing gave a metric: there is nothing to believe
-            return self._alone(log, None, s.batch, LevelsRecord(coarse=False))
+            return self._alone(log, None, size, LevelsRecord(coarse=False))
         shares = self._worth(pairs, log.iteration)
-        used = spent(log, s)
-        size = min(max(float(s.batch), _GROWTH * used), s.budget - used)
-        coarse = shares.pays and size >= 2.0 * (1.0 + cost)
-        found = LevelsRecord(coarse, shares.two_levels, shares.one_level)
-        before = self._before(pairs, log.iteration)
-        if not coarse:
-            return self._alone(log, before, size, found, again=shares.two_levels < _HOPELESS * shares.one_level)
+        told = shares.two_levels, shares.one_level, shares.pays
+        before = self._before(pairs, log.iteration) if shares.by_inputs else None
         both = max(round(_BOTH * size / (1.0 + cost)), 1)
-        left = max(size - both * (1.0 + cost), 1.0)
-        m = max(int(left / (cost + shares.fine)), 1)
-        return self._coarse(log, before, m, both, min(max(round(shares.fine * m), 1), m), found)
+        room = size - both * (1.0 + cost)
+        fine = int(shares.fine * room / (cost + shares.fine))
+        m = int(room / (cost + shares.fine)) if fine else int((room - 1.0) / cost)
+        fine, most = max(fine, 1), self._most_believed(log, both)
+        if shares.pays and m >= fine and fine <= most:
+            return self._coarse(log, before, m, both, fine, LevelsRecord(True, *told))
+        found = LevelsRecord(False, *told)
+        look = not shares.pays and cost * len(coarse_runs(log)) < _LOOKED * s.budget
+        believed = before is not None and size <= most
+        return self._alone(log, before if believed else None, size, found, again=look)
+
+    def _most_believed(self, log: Log, nominal: int) -> float:
+        """Return how many runs a belief may draw beside so many others: any number once something critical was met."""
+        if self.settings.scenario.requirement.critical_runs(log.history).any():
+            return math.inf
+        proposals = [batch.read(EstimationProposal) for batch in log.iterations]
+        drawn = sum(len(p.counted.pi) for p in proposals if p.counted is not None)
+        even = sum(len(p.nominal.pi) for p in proposals if p.nominal is not None)
+        return _UNMET * (even + nominal) - (drawn - even)
 
     def _worth(self, pairs: Pairs, iteration: int) -> Shares:
         """Return what coarse runs are worth by the pairs so far; while few are critical, by correlations."""
@@ -147,12 +169,13 @@ class TwoLevelStage:
         critical = (pairs.margin <= 0.0).astype(np.float64)
         if min(critical.sum(), len(critical) - critical.sum()) >= _EVENT:
             after = cross_fitted(fit_belief, pairs.after, pairs.margin, rng)
-            return split(critical, cross_fitted(fit_mean, pairs.before, after, rng), after, pairs.weight, cost)
+            return split(critical, cross_fitted(fit_mean, pairs.before, after, rng), after, pairs.weight, cost, rng)
         score = ndtri(rankdata(pairs.margin) / (len(pairs.margin) + 1.0))
-        told = (cross_fitted(fit_score, known, score, rng) for known in (pairs.before, pairs.after))
+        told = (0.5 * (cross_fitted(fit_score, k, score, rng) + fit_trend(k, score)[1]) for k in (pairs.before, pairs.after))
         low, high = (max(_correlation(each, score, pairs.weight), 0.0) for each in told)
         p = float(pairs.weight @ critical + 0.5) / (float(pairs.weight.sum()) + 1.0)
-        return split_as_if_normal(low, high, p, cost)
+        known = float(pairs.weight.sum() ** 2 / (pairs.weight**2).sum())
+        return split_as_if_normal(low, high, p, cost, known)
 
     def _after(self, pairs: Pairs, iteration: int) -> Belief:
         return fit_belief(pairs.after, pairs.margin, stream(self.settings.seed, "after", iteration))
@@ -167,19 +190,25 @@ class TwoLevelStage:
         alone, share = fit_belief(pairs.alone, pairs.alone_margin, rng), len(pairs.alone) / (len(pairs.alone) + len(stated))
         return lambda known: share * alone(known) + (1.0 - share) * coarse(known)
 
-    def _coarse(self, log: Log, before: Belief, m: int, both: int, fine: int, found: LevelsRecord) -> Batch:
-        """Return the coarse runs of a round."""
-        x, seeds = self._pool(int(np.clip(_POOL * m, _LEAST_POOL, _MOST_POOL)) + both, log.iteration)
-        g = before(Pairs.inputs(self.settings, x))
-        probability = np.ones(len(x))
-        rest = slice(both, None)
-        probability[rest] = inclusion(np.sqrt(g[rest] * (1.0 - g[rest])), np.ones(len(x) - both), m)
-        chosen = drawn(probability[rest], g[rest], stream(self.settings.seed, "coarse", log.iteration))
-        rows = np.concatenate([np.arange(both), both + chosen])
+    def _coarse(self, log: Log, before: Belief | None, m: int, both: int, fine: int, found: LevelsRecord) -> Batch:
+        """Return the coarse runs of a round; without a belief before them, all of the pool."""
+        x, seeds = self._pool((m if before is None else int(np.clip(_POOL * m, _LEAST_POOL, _MOST_POOL))) + both, log.iteration)
+        g, probability, rows = self._first_phase(log, before, x, both, m, "coarse")
         told = tuple(g[rows].tolist()), tuple(probability[rows].tolist())
         kept = CoarseDraws(len(x), float(g.sum()), float((g**2).sum()), *told, both, fine)
         runs = self._runs(x[rows], seeds[rows], len(rows) / (len(x) * probability[rows]), COARSE)
         return Batch(tuple(runs), EstimationProposal(COARSE, "two_level", drawn_coarse=kept, levels=found))
+
+    def _first_phase(
+        self, log: Log, before: Belief | None, x: Points, both: int, m: int, name: str
+    ) -> tuple[Vector, Vector, NDArray[np.intp]]:
+        """Return (n,) beliefs of pairs before any run, (n,) probabilities of being drawn, and the rows drawn: `both` and m."""
+        if before is None:
+            return np.zeros(len(x)), np.ones(len(x)), np.arange(len(x))
+        g, probability, rest = before(Pairs.inputs(self.settings, x)), np.ones(len(x)), slice(both, None)
+        probability[rest] = inclusion(np.sqrt(g[rest] * (1.0 - g[rest])), np.ones(len(x) - both), m)
+        chosen = drawn(probability[rest], g[rest], stream(self.settings.seed, name, log.iteration))
+        return g, probability, np.concatenate([np.arange(both), both + chosen])
 
     def _fine(self, log: Log) -> Batch:
         """Return the runs of the scenario that follow coarse ones."""
@@ -200,25 +229,21 @@ class TwoLevelStage:
         return self._counted(phases, rows, mine.x[rows], mine.seed[rows], kept.both, blind, found)
 
     def _alone(self, log: Log, before: Belief | None, size: float, found: LevelsRecord, *, again: bool = False) -> Batch:
-        """Return a round without coarse runs: drawn by what inputs tell, some of them by nothing.
+        """Return a round without coarse runs: drawn by what inputs tell, some of them by nothing; without a belief, all of them.
 
-        `again`: the latter are run coarse as well, so that it can be judged again what that is worth.
+        `again`: some of the latter are run coarse as well, so that it can be judged again what that is worth.
         """
-        n = max(round(size), 1)
-        both = max(round(_BOTH * n), 1) if before is not None else n
-        rest_of_pool = int(np.clip(_POOL * n, _LEAST_POOL, _MOST_POOL)) if before is not None else 0
-        x, seeds = self._pool(rest_of_pool + both, log.iteration)
-        g = np.full(len(x), 0.5) if before is None else before(Pairs.inputs(self.settings, x))
-        probability, rows = np.ones(len(x)), np.arange(both)
-        if before is not None and n > both:
-            rest = slice(both, None)
-            probability[rest] = inclusion(np.sqrt(g[rest] * (1.0 - g[rest])), np.ones(len(x) - both), n - both)
-            chosen = drawn(probability[rest], g[rest], stream(self.settings.seed, "fine", log.iteration))
-            rows = np.concatenate([rows, both + chosen])
+        cost = (self.settings.coarse_cost or 0.0) * again
+        n = max(int(size / (1.0 + _BOTH * cost) + 1e-9), 1)
+        look = min(int((size - n) / cost), n) if again else 0
+        both = n if before is None else min(max(round(_BOTH * n), look, 1), n)
+        rest = int(np.clip(_POOL * n, _LEAST_POOL, _MOST_POOL)) if n > both else 0
+        x, seeds = self._pool(both + rest, log.iteration)
+        g, probability, rows = self._first_phase(log, before if rest else None, x, both, n - both, "fine")
         sums = float(g.sum()), float((g**2).sum())
         phases = TwoPhases(len(x), *sums, g[rows], probability[rows], g[rows], np.ones(len(rows)))
         batch = self._counted(phases, np.arange(len(rows)), x[rows], seeds[rows], both, True, found)
-        further = self._runs(x[:both], seeds[:both], np.ones(both), COARSE) if again else []
+        further = self._runs(x[:look], seeds[:look], np.ones(look), COARSE)
         return replace(batch, runs=(*batch.runs, *further))
 
     def _counted(

@@ -32,6 +32,10 @@ _LEAST = 0.05
 """Share of the coarse runs that runs of the scenario follow at least."""
 _NO_DOUBT = 1e-6
 _THRESHOLDS = 40
+_CLEARLY, _AS_IF = 0.95, 0.8
+"""Variance times cost over that without, below which what was learned is used: by critical pairs, and as if all were normal."""
+_RESAMPLES, _SURELY, _DOUBT = 60, 0.9, 1.0
+"""Resamples of the pairs, and in what share of them it must be so; standard deviations that a correlation is lowered by."""
 
 
 def inclusion(size: Vector, weight: Vector, n: int) -> Vector:
@@ -106,26 +110,27 @@ class TwoPhases:
 
 @dataclass(frozen=True)
 class Shares:
-    """What two levels are worth, in variance times cost (runs of the scenario): smaller is better.
+    """What ways to draw are worth, in variance times cost over that of crude Monte Carlo: smaller is better.
 
     Attributes:
         two_levels: with coarse runs.
-        one_level: with runs of the scenario alone, drawn by what is believed before any run, or at random, whichever is better.
+        one_level: with runs of the scenario alone: 1 at random, less where they are drawn by what inputs tell.
         fine: share of the coarse runs that a run of the scenario best follows.
+        by_inputs: what inputs tell clearly pays, so that pairs are drawn by it.
+        pays: coarse runs clearly pay.
     """
 
     two_levels: float
     one_level: float
     fine: float
-
-    @property
-    def pays(self) -> bool:
-        """Whether coarse runs are worth their cost."""
-        return self.two_levels < self.one_level
+    by_inputs: bool
+    pays: bool
 
 
-def split(critical: Vector, before: Vector, after: Vector, weight: Vector, cost: float) -> Shares:
+def split(critical: Vector, before: Vector, after: Vector, weight: Vector, cost: float, rng: np.random.Generator) -> Shares:
     """Return what coarse runs are worth, by pairs run at both levels.
+
+    What is learned is used only where it pays by far in nine of ten resamples of the pairs: its beliefs are as uncertain.
 
     Args:
         critical: (n,) 1 where the run of the scenario was critical.
@@ -133,47 +138,82 @@ def split(critical: Vector, before: Vector, after: Vector, weight: Vector, cost:
         after: (n,) belief after its coarse run, learned without it.
         weight: (n,) of the pair under the inputs' distribution, any scale.
         cost: of a coarse run, in runs of the scenario.
+        rng: the only source of randomness.
     """
-    w = weight / weight.sum()
-    p = float(w @ critical)
-    return _shares(w, before, after, ((critical - before) ** 2, (critical - after) ** 2), p, cost)
+    n = len(critical)
+    times = np.vstack([np.ones(n), rng.multinomial(n, np.ones(n) / n, _RESAMPLES)])
+    w = times * weight
+    w = w[(w @ critical > 0.0) & (w @ (1.0 - critical) > 0.0)]
+    w /= w.sum(axis=1, keepdims=True)
+    p = w @ critical
+    errors = (critical - before) ** 2, (critical - after) ** 2
+    one = _one_level(w, before, errors[0]) / (p * (1.0 - p))
+    by_inputs = bool(np.quantile(one, _SURELY) < _CLEARLY)
+    prior = before if by_inputs else np.full(n, p[0])
+    two, fine = _two_levels(w, prior, after, errors[1], cost)
+    two /= p * (1.0 - p)
+    rest = one if by_inputs else np.ones(len(one))
+    return Shares(float(two[0]), float(rest[0]), fine, by_inputs, bool(np.quantile(two / rest, _SURELY) < _CLEARLY))
 
 
-def split_as_if_normal(before: float, after: float, p: float, cost: float) -> Shares:
+def split_as_if_normal(before: float, after: float, p: float, cost: float, pairs: float = math.inf) -> Shares:
     """Return what coarse runs are worth for an event of which too few were met, as if all were normal.
 
-    The rarer the event, the fewer runs of the scenario need follow the coarse ones.
+    The rarer the event, the fewer runs of the scenario need follow the coarse ones. Whether they pay is judged by correlations
+    that are lower by what so few pairs leave open.
 
     Args:
         before: correlation of the metric with what is predicted before any run of the pair.
         after: with what is predicted after its coarse run.
         p: probability of the event, 0 < p < 1.
         cost: of a coarse run, in runs of the scenario.
+        pairs: number of them, by which correlations are known.
     """
-    low, high = np.clip([before, after], 0.0, _LARGEST_CORRELATION)
-    high = max(high, low + 1e-3)
     z = np.linspace(-8.0, 8.0, 401)
     nodes, weights = np.polynomial.hermite_e.hermegauss(40)
-    w = np.outer(np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum(), weights / weights.sum()).ravel()
-    share = low / high
-    coarse = (share * z[:, None] + math.sqrt(1.0 - share**2) * nodes).ravel()
-    t = ndtri(p)
-    one = np.repeat(ndtr((t - low * z) / math.sqrt(1.0 - low**2)), len(nodes))
-    two = ndtr((t - high * coarse) / math.sqrt(1.0 - high**2))
-    return _shares(w, one, two, (one * (1.0 - one), two * (1.0 - two)), p, cost)
+    w = np.outer(np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum(), weights / weights.sum()).reshape(1, -1)
+    t, found = float(ndtri(p)), []
+    for lower in (0.0, _DOUBT / math.sqrt(max(pairs - 3.0, 1.0))):
+        low, high = (max(math.tanh(math.atanh(min(max(r, 0.0), _LARGEST_CORRELATION)) - lower), 0.0) for r in (before, after))
+        high = max(high, low + 1e-3)
+        share = low / high
+        coarse = (share * z[:, None] + math.sqrt(1.0 - share**2) * nodes).ravel()
+        one = np.repeat(ndtr((t - low * z) / math.sqrt(1.0 - low**2)), len(nodes))
+        two = ndtr((t - high * coarse) / math.sqrt(1.0 - high**2))
+        found.append((one, two, float(_one_level(w, one, one * (1.0 - one))[0]) / (p * (1.0 - p))))
+    by_inputs = found[1][2] < _AS_IF
+    prior = [one if by_inputs else np.full(w.size, p) for one, _, _ in found]
+    (two, fine), (surely, _) = (
+        _two_levels(w, g1, g2, g2 * (1.0 - g2), cost) for g1, (_, g2, _) in zip(prior, found, strict=True)
+    )
+    rest, surest = (found[0][2], found[1][2]) if by_inputs else (1.0, 1.0)
+    pays = float(surely[0]) / (p * (1.0 - p)) < _AS_IF * surest
+    return Shares(float(two[0]) / (p * (1.0 - p)), rest, fine, by_inputs, pays)
 
 
-def _shares(w: Vector, before: Vector, after: Vector, errors: tuple[Vector, Vector], p: float, cost: float) -> Shares:
-    """Return what coarse runs are worth by the mean squares of what each belief misses.
+def _draws(belief: Vector, w: Vector) -> tuple[Vector, Vector]:
+    """Return (m,) standard deviations that a belief leaves, and inclusion relative to an even one, mean 1 under w (m,)."""
+    size = np.sqrt(np.maximum(belief * (1.0 - belief), _NO_DOUBT))
+    return size, (1.0 - _EVEN) * size / (w @ size) + _EVEN
+
+
+def _one_level(w: NDArray[np.float64], before: Vector, errors: Vector) -> Vector:
+    """Return (k,) variance times cost of draws by a belief, under weights (k, m)."""
+    return np.asarray(w @ (errors / _draws(before, w[0])[1]))
+
+
+def _two_levels(w: NDArray[np.float64], before: Vector, after: Vector, errors: Vector, cost: float) -> tuple[Vector, float]:
+    """Return (k,) variance times cost with coarse runs, under weights (k, m), and the best share of fine ones under the first.
 
     A pair that was not run coarse cannot be run further: however few the pairs are that matter, the coarse runs must find them.
     """
-    size, left = (np.sqrt(np.maximum(g * (1.0 - g), _NO_DOUBT)) for g in (before, after))
-    first = (1.0 - _EVEN) * size / (w @ size) + _EVEN
-    best, fine = math.inf, 1.0
-    for threshold in np.geomspace(float(left.max()), float(left.min()), _THRESHOLDS):
-        second = np.clip(left / threshold, _LEAST, 1.0)
-        variance, runs = w @ (((after - before) ** 2 + errors[1] / second) / first), w @ (first * (cost + second))
-        if variance * runs < best:
-            best, fine = float(variance * runs), float(w @ (first * second))
-    return Shares(best, min(float(w @ (errors[0] / first)), p * (1.0 - p)), fine)
+    (left, _), (_, first) = _draws(after, w[0]), _draws(before, w[0])
+
+    def worth(weights: NDArray[np.float64], second: Vector) -> Vector:
+        variance = weights @ (((after - before) ** 2 + errors / second) / first)
+        return np.asarray(variance * (weights @ (first * (cost + second))))
+
+    thresholds = np.geomspace(float(left.max()), float(left.min()), _THRESHOLDS)
+    seconds = [np.clip(left / threshold, _LEAST, 1.0) for threshold in thresholds]
+    best = seconds[int(np.argmin([worth(w[:1], second)[0] for second in seconds]))]
+    return worth(w, best), float(w[0] @ (first * best))
