@@ -48,7 +48,7 @@ SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "overhead.py", "slice_t
 SUMO |= {"fuzz.py", "noise.py", "pairs.py", "physics.py", "run_price.py", "throughput.py", "transfer.py", "watcher.py"}
 SUMO |= {"report_speed.py"}  # and Chromium
 LONG = {"batch_size.py", "benchmark_page.py", "known_before.py", "snapshots.py"}  # hours, or minutes
-SHARED = {"disturbing.py", "fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
+SHARED = {"coarse_problems.py", "disturbing.py", "fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
 
 
 def test_every_script_is_known():

@@ -201,3 +201,36 @@ def test_an_action_step_of_the_files_is_named_by_its_line(tmp_path: Path) -> Non
     cars.write_text(cars.read_text().replace('<vType id="slow"', '<vType actionStepLength="0.1" id="slow"'))
     with pytest.raises(ConfigError, match=r"cars\.rou\.xml:3: actionStepLength is 0\.1 s and the step 0\.2 s"):
         study(tmp_path, LEFT_TURN, scenario=str(scenario), fidelity={"step_length": [STEP, 2 * STEP]}).campaign  # noqa: B018
+
+
+@pytest.mark.parametrize(("scenario", "budget", "cost"), [("four_branch_7", 10, 0.5), ("two_hollows_noisy", 10, 0.5),
+                                                          ("two_hollows_noisy", 1, 0.95), ("two_hollows_noisy", 33, 0.35)])  # fmt: skip
+def test_the_budget_is_kept(tmp_path: Path, scenario: str, budget: int, cost: float) -> None:
+    coarse = {"scenario": f"testbed:{scenario}" + ("" if scenario == "four_branch_7" else ":coarse"), "cost": cost}
+    run(tmp_path, {**NOISY, "scenario": f"testbed:{scenario}", "budget": budget, "initial": 1}, fidelity=coarse)
+    with Store.read(tmp_path / "store") as store:
+        spent = len(store.history()) + cost * store.coarse
+    assert budget - 2.0 < spent <= budget + 1e-9
+
+
+def test_where_coarse_runs_tell_nothing_the_rest_is_crude_monte_carlo(tmp_path: Path) -> None:
+    """And where nothing critical is met, hardly a run is spent on what a belief promises."""
+    (tmp_path / "own.py").write_text(
+        "import sbt\nfrom sbt.seeds import stream\n"
+        "def scenario(name):\n"
+        "    return sbt.Scenario(name, inputs=[sbt.Parameter('a', 0, 1)], requirement=sbt.Requirement('y', high=0.2),\n"
+        "        evaluate=lambda values, seed: {'y': float(stream(seed, name).random())})\n"
+        "FINE, COARSE = scenario('fine'), scenario('coarse')\n"
+    )
+    own = {**NOISY, "scenario": str(tmp_path / "own.py:FINE"), "budget": 100}
+    summary = run(tmp_path / "unlike", own, fidelity={"scenario": str(tmp_path / "own.py:COARSE"), "cost": 0.2})
+    told = summary.conclusion.to_dict()
+    assert any("do not clearly pay" in sentence for sentence in summary.sentences)
+    assert told["fidelity"]["coarse"] * 0.2 <= 12
+    with Store.read(tmp_path / "unlike" / "store") as store:
+        drawn = store.history().where(store.history().stage == "estimation")
+    critical = drawn.y("y") <= 0.2
+    assert told["probability"] == pytest.approx(critical.mean()), "every run counts, the first ones too"
+    never = run(tmp_path / "never", {**NOISY, "requirement": {"metric": "y", "critical": [-1e9, -1e8]}}, fidelity=COARSE)
+    found = never.conclusion.to_dict()
+    assert found["exact_bound"] <= 1.4 * (1.0 - 0.05 ** (1.0 / found["fidelity"]["fine"]))

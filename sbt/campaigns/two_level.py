@@ -220,7 +220,7 @@ class TwoLevelStage:
         after = self._after(Pairs.of(log, s), log.iteration)(Pairs.known_after(log, s, mine))
         first, second = np.array(kept.probability), np.ones(len(mine))
         rest, n = slice(kept.both, None), min(kept.fine, len(mine) - kept.both)
-        second[rest] = inclusion(np.sqrt(after[rest] * (1.0 - after[rest])) / first[rest], 1.0 / first[rest], n)
+        second[rest] = inclusion(np.sqrt(after[rest] * (1.0 - after[rest])) / first[rest], 1.0 / first[rest], n, fine=True)
         chosen = drawn(second[rest], after[rest], stream(s.seed, "fine", log.iteration))
         rows = np.concatenate([np.arange(kept.both), kept.both + chosen])
         phases = TwoPhases(kept.pool, kept.total, kept.squares, np.array(kept.before), first, after, second)

@@ -23,7 +23,7 @@ class FidelityChoice(BaseModel):
         default=None, description="Or a coarser scenario of one's own, with the same inputs and metrics."
     )
     cost: Annotated[float, Field(gt=0, lt=1)] | Literal["auto"] = Field(
-        default="auto", description="Of a coarse run, in runs; auto: CPU time, measured once when the campaign begins."
+        default="auto", description="Of a coarse run, in runs; auto: CPU time, measured when the campaign begins, rounded."
     )
 
     @field_validator("cost", mode="before")

@@ -28,8 +28,8 @@ _PAIRS, _PAIRS_CHECKED = 12, 30
 """Pairs of inputs and seed, drawn from their distribution, of which the cost is measured, and which `check` compares."""
 _FEW_FAILED = 0.2
 """Share of the pairs of which the coarse run alone may fail: beyond, its step or model is none of the scenario's."""
-_ROUNDED = 0.05
-"""Costs are multiples of this, so that measuring again mostly gives the same plan."""
+_COSTS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.95)
+"""Costs that are told apart, so that measuring again mostly gives the same plan."""
 _DEADLINE = 900.0
 """Longest wait for the process that runs the pairs (s)."""
 
@@ -48,7 +48,7 @@ class _Pair:
 
 
 def stated_cost(config: Configuration, spec: ScenarioSpec, scenario: LogicalScenario) -> float | None:
-    """Return what a coarse run costs, in runs of the scenario: as configured, or measured, a multiple of 0.05.
+    """Return what a coarse run costs, in runs of the scenario: as configured, or the nearest of a few costs to the measured one.
 
     A few pairs are run at both levels in any case. None: there are no coarse runs.
 
@@ -127,8 +127,9 @@ def _cpu() -> float:
 
 
 def _cost(pairs: list[_Pair]) -> float:
-    fine, coarse = (sum(pair.seconds[k] for pair in pairs) for k in (0, 1))
-    return float(np.clip(round(coarse / max(fine, 1e-9) / _ROUNDED) * _ROUNDED, _ROUNDED, 1.0))
+    """Return the nearest of the costs that are told apart; what others do on the machine hardly disturbs a median."""
+    measured = float(np.median([coarse / max(fine, 1e-9) for fine, coarse in (pair.seconds for pair in pairs)]))
+    return min(_COSTS, key=lambda cost: abs(np.log(cost / max(measured, 1e-9))))
 
 
 def _problem(pairs: list[_Pair]) -> str:
