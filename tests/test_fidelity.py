@@ -203,8 +203,10 @@ def test_an_action_step_of_the_files_is_named_by_its_line(tmp_path: Path) -> Non
         study(tmp_path, LEFT_TURN, scenario=str(scenario), fidelity={"step_length": [STEP, 2 * STEP]}).campaign  # noqa: B018
 
 
-@pytest.mark.parametrize(("scenario", "budget", "cost"), [("four_branch_7", 10, 0.5), ("two_hollows_noisy", 10, 0.5),
-                                                          ("two_hollows_noisy", 1, 0.95), ("two_hollows_noisy", 33, 0.35)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scenario", "budget", "cost"),
+    [("four_branch_7", 10, 0.5), ("two_hollows_noisy", 10, 0.5), ("two_hollows_noisy", 1, 0.95), ("two_hollows_noisy", 33, 0.35)],
+)
 def test_the_budget_is_kept(tmp_path: Path, scenario: str, budget: int, cost: float) -> None:
     coarse = {"scenario": f"testbed:{scenario}" + ("" if scenario == "four_branch_7" else ":coarse"), "cost": cost}
     run(tmp_path, {**NOISY, "scenario": f"testbed:{scenario}", "budget": budget, "initial": 1}, fidelity=coarse)
