@@ -10,12 +10,14 @@ from __future__ import annotations
 import argparse
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
 
 import sbt
 from sbt.campaigns.failures import search_runs
+from sbt.seeds import stream
 from sbt.testbeds import find, values
 
 SHARES = {
@@ -25,10 +27,11 @@ SHARES = {
 """Critical shares: of 6,000 random runs; of the testbeds exact."""
 
 
-def cell(scenario: str, seed: int, budget: int) -> tuple[int, int, float, list[str]]:
-    """Return the critical runs, the distinct inputs among them, the best representative's rate, and the modes' rates in words.
+def cell(scenario: str, seed: int, budget: int) -> dict[str, Any]:
+    """Return the critical runs, the distinct inputs among them, and the rates of the modes.
 
-    The best representative is that of the largest measured rate; its rate is the exact one on a testbed, else the measured one.
+    The representative is that of the first mode, which its repetitions did not choose; its rate is the exact one on a
+    testbed, else the measured one. On a testbed also the largest rate there is, and how many of the stated intervals cover.
     """
     with tempfile.TemporaryDirectory() as folder:
         result = sbt.run(
@@ -38,17 +41,30 @@ def cell(scenario: str, seed: int, budget: int) -> tuple[int, int, float, list[s
         runs = search_runs(result.history)
         x = runs.x[result.scenario.requirement.critical_runs(runs)]
         modes = [mode for mode in result.conclusion.failure_modes if mode.failure_rate is not None]
-    modes.sort(key=lambda mode: -(mode.failure_rate.estimate or 0.0))
     rates = [mode.failure_rate for mode in modes]
-    best = np.nan
-    if modes:
-        best = rates[0].estimate or 0.0
-        if scenario.startswith("testbed:"):
-            at = np.array([list(modes[0].inputs.values())])
-            name = scenario.removeprefix("testbed:")
-            best = float(ndtr(-values(name, at)[0] / find(name).noise))
-    told = [f"{r.estimate or 0.0:.2f} ({r.low:.2f} to {r.high:.2f})" for r in rates if r is not None]
-    return len(x), len(np.unique(x, axis=0)), float(best), told
+    found = {
+        "seed": seed, "critical": len(x), "inputs": len(np.unique(x, axis=0)), "stated": len(rates), "covered": 0,
+        "rates": [f"{r.estimate or 0.0:.2f} ({r.low:.2f} to {r.high:.2f})" for r in rates],
+        "representative": (rates[0].estimate or 0.0) if rates else np.nan,
+    }  # fmt: skip
+    if modes and scenario.startswith("testbed:"):
+        name = scenario.removeprefix("testbed:")
+        at = np.array([list(mode.inputs.values()) for mode in modes])
+        exact = ndtr(-values(name, at) / find(name).noise)
+        found["representative"] = float(exact[0])
+        found["covered"] = sum(r.low <= p <= r.high for r, p in zip(rates, exact, strict=True))
+    return found
+
+
+def best_rate(scenario: str) -> float:
+    """Return the largest failure rate of a testbed, of 200,000 inputs; NaN where it is not known."""
+    if not scenario.startswith("testbed:"):
+        return np.nan
+    name = scenario.removeprefix("testbed:")
+    problem = find(name)
+    rng = stream(99, "rates")
+    u = rng.beta(0.5, 0.5, (200_000, len(problem.parameters)))  # the best place may be a corner
+    return float(ndtr(-values(name, u) / problem.noise).max())
 
 
 def main() -> None:
@@ -58,20 +74,24 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--budget", type=int, default=200)
     args = parser.parse_args()
-    print("| scenario | seed | critical runs | of distinct inputs | best representative | failure rates of the modes (95 %) |")
+    print("| scenario | seed | critical runs | of distinct inputs | rate of the first mode | stated rates (95 %) |")
     print("|---|---|---|---|---|---|")
     for scenario in args.scenarios.split(","):
-        distinct, best = [], []
+        rows, best = [], best_rate(scenario)
         for seed in range(args.first_seed, args.first_seed + args.seeds):
-            critical, inputs, rate, rates = cell(scenario, seed, args.budget)
-            distinct.append(inputs)
-            best.append(rate)
-            print(f"| {scenario} | {seed} | {critical} | {inputs} | {rate:.2f} | {'; '.join(rates)} |", flush=True)
-        chance = args.budget * SHARES[scenario]
-        print(
-            f"| {scenario} | median | | {np.median(distinct):.1f} (random {chance:.1f}) | {np.nanmedian(best):.2f} | |",
-            flush=True,
-        )
+            rows.append(cell(scenario, seed, args.budget))
+            r = rows[-1]
+            line = f"{r['critical']} | {r['inputs']} | {r['representative']:.3f} | {'; '.join(r['rates'])}"
+            print(f"| {scenario} | {seed} | {line} |", flush=True)
+        chance, rates = args.budget * SHARES[scenario], np.array([r["representative"] for r in rows])
+        distinct, near = np.median([r["inputs"] for r in rows]), int((rates >= 0.8 * best).sum())
+        print(f"| {scenario} | median | | {distinct:.1f} (random {chance:.1f}) | {np.nanmedian(rates):.3f} | |")
+        if np.isfinite(best):
+            covered, stated = (sum(r[k] for r in rows) for k in ("covered", "stated"))
+            print(
+                f"\n{scenario}: the first mode has 80 % of the largest rate, {best:.3f}, in {near} of {len(rows)} seeds; "
+                f"{covered} of {stated} intervals cover the exact rate\n", flush=True,
+            )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ class FalsificationConclusion:
         first_critical_run: index of the first critical run of the search, from 0; None: there is none.
         runs_to_first: how many runs of the search it took, from 1.
         critical_runs: of the search; confirmations are not counted.
-        failure_modes: the deepest first.
+        failure_modes: the deepest first; of a noisy simulator the likeliest to fail again.
         bound: where nothing critical was found, what the space-filling runs say about the critical share of the box.
         closest: where nothing critical was found, the run nearest to the critical interval.
         statement: what follows from the runs, and no more.

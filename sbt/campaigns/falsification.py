@@ -46,7 +46,7 @@ PAIR = "pair"
 """Criterion of the runs whose inputs and seed were chosen together."""
 _REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
 _MOST_REPEATS, _REPEATS_IN_ALL = 10, 30  # of a noisy simulator, whose modes have a failure rate
-_MOST_CONFIRMED = 10  # modes, the deepest first
+_MOST_CONFIRMED = 10  # modes, the first ones
 
 
 def recipe(settings: Settings) -> Campaign:

@@ -187,7 +187,10 @@ def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = Fal
 
 
 def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *, noisy: bool = False) -> list[Mode]:
-    """Return the failure modes, the one with the deepest run first.
+    """Return the failure modes, the one with the deepest run first; of a noisy simulator the likeliest to fail again first.
+
+    Repetitions of representatives do not decide the order: the rate of the one that failed most often in them would be stated
+    too large.
 
     Args:
         fitted: learned from these runs.
@@ -220,7 +223,8 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
         likely = int(rows[np.argmax(log_p[label == name])])
         safe = int(uncritical[cdist(at[[representative]], at[uncritical])[0].argmin()]) if len(uncritical) else None
         found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
-    return sorted(found, key=lambda mode: (depth[mode.representative], -worse[mode.representative], mode.representative))
+    rank = (-np.round(_RATE_STEPS * log_rate), depth, -worse, np.arange(len(history)))
+    return sorted(found, key=lambda mode: tuple(by[mode.representative] for by in rank))
 
 
 def representative_of(log_rate: Vector, depth: Vector, worse: Vector) -> int:

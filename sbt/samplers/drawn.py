@@ -14,22 +14,28 @@ from sbt.metamodels.base import check_prediction, named_errors, sample_paths
 from sbt.metamodels.bootstrap import drawn_regression
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.noise import scores
-from sbt.samplers.search import Search, SearchData, fill_uniformly
+from sbt.samplers.search import Picks, Search, SearchData, WarpedModel, fill_uniformly, fit_warped, log_repulsion, refine_best
 
 __all__ = ["propose_in_noise"]
 
 _UNIFORM = 3000  # candidates
 _LOG_AMONG = math.log(50.0), math.log(800.0)  # of the number that a draw decides among
+_LARGEST = 0.3  # share of the picks where the failure rate is believed to be largest; the others are draws
+_KINDS = 4  # of draws
+_CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
 _BEST, _STEPS, _STEP = 20, 10, 0.1  # runs of the lowest scores, steps from each, their standard deviation in the unit cube
 
 
-def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, rng: np.random.Generator) -> Points:
-    """Return n points (n, d), the one of the best mean score first: each is the best of a regression drawn for it.
+def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, rng: np.random.Generator) -> Picks:
+    """Return n points, those of the best mean score first: where the failure rate is believed to be largest, and draws.
 
-    In turn a draw is a line, a line and a few random trees, both fitted to randomly weighted scores (the Bayesian bootstrap), and
-    a sample path of the metamodel. Lines learn a trend from few runs, trees thresholds, a process
-    hollows. A draw decides among 50 to 800 random candidates: the best of few looks about, that of many looks closer. Runs that
-    failed have the worst score. No failure's neighbourhood is left out: its rate is to be learned, and is highest there.
+    Three of ten (`rate`) are where the metamodel of the metric has the largest P(critical), wherever that is: runs there correct
+    it, and those that are critical stand for their mode. The others (`drawn`) are each the best of a regression drawn for it. In
+    turn a draw is a line, a line and a few random trees, both fitted to randomly weighted scores (the Bayesian bootstrap), a
+    sample path of the metamodel of the scores, and one of that of the metric. Lines learn a trend from few runs, trees
+    thresholds, a process hollows. A draw decides among 50 to 800 random candidates: the best of few looks about, that of many
+    looks closer. Runs that failed have the worst score. No failure's neighbourhood is left out: its rate is to be learned, and
+    is highest there.
 
     Args:
         search: what is searched.
@@ -44,22 +50,40 @@ def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, r
     u = np.vstack([seen.u, seen.failed])
     score = scores(np.concatenate([margin, np.full(len(seen.failed), np.inf)]))
     score = (score - score.mean()) / max(float(score.std()), 1e-12)
-    candidates = _candidates(search, seen, u[np.argsort(score, kind="stable")[:_BEST]], rng)
+    best = u[np.argsort(score, kind="stable")[:_BEST]]
+    candidates = _candidates(search, seen, best, rng)
     inputs, at = search.columns(u), search.columns(candidates)
-    metamodel = search.for_noise(seen.u, seen.y).metamodel
-    with named_errors(metamodel, len(u)):
-        process = metamodel.fit(inputs, score, rng)
-    mean, picks = check_prediction(process(at), len(at)).mu, []
-    for k in range(n):
+    noisy = search.for_noise(seen.u, seen.y)
+    with named_errors(noisy.metamodel, len(u)):
+        process = noisy.metamodel.fit(inputs, score, rng)
+    model = fit_warped(noisy, seen.u, seen.y, rng, seen.success)
+    largest = _largest(search, seen, model, best[seen.admissible(best)], round(_LARGEST * n), rng)
+    picks: list[int] = []
+    for k in range(n - len(largest)):
         among = rng.choice(len(at), min(int(np.exp(rng.uniform(*_LOG_AMONG))), len(at)), replace=False)
-        points, kind = at[among], k % 3
-        if kind == 2:
+        points, kind = at[among], k % _KINDS
+        if kind == 3:
+            value = model.critical.margin(model.sample_paths(candidates[among], 1, rng))[0]
+        elif kind == 2:
             value = sample_paths(process, points, 1, rng)[0]
         else:
             value = drawn_regression(inputs, score, points, rng, trees=kind == 1)
         picks.append(int(among[np.argmin(value)]))
-    chosen = np.array(picks, dtype=np.intp)
-    return candidates[chosen[np.argsort(mean[chosen], kind="stable")]]
+    chosen = np.vstack([largest, candidates[np.array(picks, dtype=np.intp)]])
+    why = ("rate",) * len(largest) + ("drawn",) * len(picks)
+    order = np.argsort(check_prediction(process(search.columns(chosen)), n).mu, kind="stable")
+    return Picks(chosen[order], tuple(why[k] for k in order))
+
+
+def _largest(search: Search, seen: SearchData, model: WarpedModel, best: Points, n: int, rng: np.random.Generator) -> Points:
+    """Return up to n points (k, d) of the largest P(critical), apart from each other."""
+    candidates, value = refine_best(model.log_probability, best, seen.admissible, rng, search.cube)
+    at = search.cube.embedded(candidates)
+    found: list[int] = []
+    for _ in range(min(n, len(candidates))):
+        found.append(int(np.argmax(value)))
+        value = value + log_repulsion(at, at[found[-1:]], _CLEAR * math.sqrt(best.shape[1]))
+    return candidates[found]
 
 
 def _candidates(search: Search, seen: SearchData, best: Points, rng: np.random.Generator) -> Points:

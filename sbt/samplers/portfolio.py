@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -85,8 +86,7 @@ def propose(
     if len(seen.u) < 2:
         return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n, again)
     if repeats and seen.noisy and hidden_by_noise(u, search.margins(y)):
-        picks = propose_in_noise(search, seen, search.critical.margin(seen.y), n, rng)
-        return Picks(picks, ("drawn",) * n, again)
+        return replace(propose_in_noise(search, seen, search.critical.margin(seen.y), n, rng), repeat=again)
     seen = seen.thinned(search.critical.margin(seen.y), search.most_rows, rng)
     model = fit_warped(search, seen.u, seen.y, rng, seen.success)
     margin = search.critical.margin(seen.y) if not seen.noisy else model.critical.margin(model(seen.u).mu)
