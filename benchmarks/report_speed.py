@@ -1,8 +1,10 @@
-"""How soon a report shows its first paint, and the film of a run that was clicked, in a headless Chromium.
+"""How soon a report shows its first paint, and the film of a run whose point was clicked, in a headless Chromium.
 
     python benchmarks/report_speed.py --runs 10000 --scenario parking --clicks 8
 
-Clicks are real events of a mouse on the list of films; the time goes to the end of the frame that follows the click.
+A mouse presses and lets go of points of the scatter whose runs have films, the first as soon as the points are there,
+each other one `--pause` s after the film before. The time goes from the press to the end of the first frame with the
+clicked run's own title and film.
 """
 
 from __future__ import annotations
@@ -22,31 +24,45 @@ from browser import Browser
 
 import sbt
 
-READY = "window.explorer && window.Plotly && document.querySelector('[data-part=scatter] .main-svg')"
+READY = "window.explorer && window.explorer.listening"
 PAINT = "(performance.getEntriesByName('first-contentful-paint')[0] || { startTime: 0 }).startTime"
-WATCH = """window.took = [];
-document.addEventListener('click', event => {
-  const begun = event.timeStamp;
-  requestAnimationFrame(() => {
+WATCH = """window.took = null;
+addEventListener('pointerdown', event => {
+  const begun = event.timeStamp, { index, filmOf } = window.explorer.data;
+  window.took = null;
+  const look = () => {
+    const run = window.awaited, canvas = document.querySelector('[data-part=film] canvas');
+    const there = canvas && canvas.width > 0 && canvas.getAttribute('aria-label').startsWith(`run ${run} from above`)
+      && document.querySelector('[data-part=run-title]').textContent.startsWith(`Run ${run}:`);
+    if (!there) return requestAnimationFrame(look);
     const seen = new MessageChannel();
-    seen.port1.onmessage = () => window.took.push(performance.now() - begun);
+    seen.port1.onmessage = () => { window.took = performance.now() - begun; };
     seen.port2.postMessage(0);
-  });
+  };
+  requestAnimationFrame(look);
 }, true);"""
-PLACE = """(k => { const button = document.querySelectorAll('[data-part=films] button')[k];
-  button.scrollIntoView({ block: 'center' }); const box = button.getBoundingClientRect();
-  return [box.x + box.width / 2, box.y + box.height / 2]; })"""
+# Runs with films, and where the point of one lies in the window.
+FILMED = (
+    """(({ data, view }) => data.films.map(film => film.run).filter(run => data.rowOf.get(run) !== view.run))(window.explorer)"""
+)
+PLACE = """(run => {
+  const { data } = window.explorer, plot = document.querySelector('[data-part=scatter]'), { xaxis, yaxis } = plot._fullLayout;
+  plot.scrollIntoView({ block: 'center', behavior: 'instant' });
+  const box = plot.querySelector('.nsewdrag').getBoundingClientRect();
+  for (const trace of plot.data) for (const [k, row] of trace.rows.entries())
+    if (data.index[row] === run) return [box.x + xaxis.d2p(trace.x[k]), box.y + yaxis.d2p(trace.y[k])];
+})"""
 
 
-def clicked(browser: Browser, k: int) -> float:
-    """Return the milliseconds from a click on the k-th film of the list to the frame that shows it."""
-    x, y = browser.ask(f"{PLACE}({k})")
-    before = browser.ask("window.took.length")
+def clicked(browser: Browser, run: int) -> float | None:
+    """Return the milliseconds from a click on a run's point to the frame with its film; None where other points hide it."""
+    x, y = browser.ask(f"(window.awaited = {run}, {PLACE}({run}))")
+    browser.move(x, y)
+    if not browser.ask(f"document.querySelector('[data-part=tip]').textContent.startsWith('run {run},')"):
+        return None
     browser.click(x, y)
-    browser.wait(f"window.took.length > {before}", 20)
-    if not browser.ask("document.querySelector('[data-part=film] canvas')?.width > 0"):
-        raise SystemExit("no film is shown after the click")
-    return float(browser.ask("window.took.at(-1)"))
+    browser.wait("window.took !== null", 20)
+    return float(browser.ask("window.took"))
 
 
 def main() -> None:
@@ -55,6 +71,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--scenario", default="parking")
     parser.add_argument("--clicks", type=int, default=8)
+    parser.add_argument("--pause", type=float, default=0.5, help="seconds from a film to the next click")
     parser.add_argument("--opened", type=int, default=3, help="times that the report is opened")
     parser.add_argument("--store", type=Path, help="a store that is there already")
     args = parser.parse_args()
@@ -66,15 +83,19 @@ def main() -> None:
         report = Path(sbt.open(store).report()).resolve()
         cpu = time.process_time() - start
         with Browser(height=900) as browser:
-            paints = []
+            paints, times = [], []
             for k in range(args.opened):
                 browser.open(f"file://{report}?{k}")
                 browser.wait(READY)
+                browser.ask(WATCH)
+                for run in browser.ask(FILMED):
+                    took = clicked(browser, run) if len(times) < (k + 1) * args.clicks else None
+                    if took is not None:
+                        times.append(took)
+                        time.sleep(args.pause)
                 paints.append(float(browser.ask(PAINT)))
-            browser.ask(WATCH)
-            films = int(browser.ask("document.querySelectorAll('[data-part=films] button').length"))
-            times = [clicked(browser, k) for k in range(min(args.clicks, films))]
         load = os.getloadavg()[0]
+        print("clicks (ms):", *(f"{took:.0f}" for took in times))
         print("| runs | size (MB) | made (CPU s) | first paint (ms) | film after a click (ms): median | most | load |")
         print("|---|---|---|---|---|---|---|")
         told = " ".join(f"{paint:.0f}" for paint in paints)

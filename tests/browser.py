@@ -126,8 +126,13 @@ class Browser:
         for kind in ("mousePressed", "mouseReleased"):
             self._do(self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1))
 
-    def picture(self, file: Path) -> Path:
-        """Write the whole page as PNG."""
-        found = self._do(self._call("Page.captureScreenshot", format="png", captureBeyondViewport=True))
+    def move(self, x: float, y: float) -> None:
+        """Move the mouse to a place of the window (px)."""
+        self._do(self._call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y))
+
+    def picture(self, file: Path, area: tuple[int, int, int, int] | None = None) -> Path:
+        """Write the whole page, or an area of it (left, top, width, height in px), as PNG."""
+        clip = {} if area is None else {"clip": {**dict(zip(("x", "y", "width", "height"), area, strict=True)), "scale": 1}}
+        found = self._do(self._call("Page.captureScreenshot", format="png", captureBeyondViewport=True, **clip))
         file.write_bytes(base64.b64decode(found["data"]))
         return file

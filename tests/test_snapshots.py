@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import sbt
+from sbt.config.scenario_file import from_file
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import elsewhere
@@ -212,6 +213,28 @@ def test_vehicles_are_inserted_beside_warmed_traffic(tmp_path):
 def test_an_insertion_that_cannot_be_is_said(tmp_path, change, reason):
     with pytest.raises(InputError, match=reason):
         simulation(inserting(tmp_path, **change)).isolation.warm  # noqa: B018
+
+
+WRONG_NAMES = {  # what is written, what is written instead, where and what is said
+    "edge": ("edge: A2B2", "edge: A2B9", r"5:\d+: insert.ego.edge: an edge must be one of the network .*did you mean 'A2B2'"),
+    "to": ("to: C3D3", "to: C3D9", r"5:\d+: insert.ego.to: an edge must be one of the network .*did you mean 'C3D3'"),
+    "route": ("[A1B1, B1C1]", "[A1B1, C3D3]", r"6:\d+: insert.other.route.1: .*no lane of 'A1B1' leads to 'C3D3'"),
+    "type": ("type: car", "type: cars", r"5:\d+: insert.ego.type: a vehicle type must be .*did you mean 'car'"),
+    "lane": ("lane: 1, position: 25", "lane: 7, position: 25", r"insert.other.lane: a lane of 'A1B1' must be 0 to 2, but got 7"),
+    "position": ("position: 25", "position: 2500", r"6:\d+: insert.other.position: a position .* must be at most 79.2 m"),
+    "id": ("  other:", "  t56:", r"6:3: insert.t56: an inserted vehicle must have an id of its own, but 't56' is in cars.rou"),
+    "time": ("until: 42", "until: auto", r"5:8: insert.ego: a vehicle must have a time"),  # and the ego is there all the same
+    "input": ("gap: {min", "gab: {min", r"insert.ego: \${gap}: a placeholder must be one of v, gab, but got 'gap'"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_NAMES)
+def test_a_wrong_name_of_an_insertion_is_told_at_its_key_and_alone(tmp_path, wrong):
+    path, (old, new, said) = inserting(tmp_path), WRONG_NAMES[wrong]
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=said) as caught:
+        from_file(str(path), tmp_path)
+    assert len(str(caught.value).splitlines()) == (2 if wrong == "time" else 1)  # both vehicles lack the time
 
 
 LOOP = """

@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from sbt.config.inserted import insertion_file
 from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of, metrics_of_several
 from sbt.config.profiles import guided_vehicles, profile_of
@@ -31,7 +32,6 @@ from sbt.sumo.elements import person
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.friction import Friction, has_friction
 from sbt.sumo.guided import Participant
-from sbt.sumo.inserting import InsertedVehicle, inserted_file
 from sbt.sumo.recorded import RecordedTraffic
 from sbt.sumo.recorder import RecordingSettings
 from sbt.sumo.snapshot import WarmUp
@@ -112,12 +112,23 @@ def _is_id(path: Key) -> bool:
     return False
 
 
+def _read(files: SumoFiles) -> SumoFiles:
+    """Return files that were read.
+
+    Raises:
+        InputError: one of them is not as required.
+    """
+    files.templates  # noqa: B018  (reads and checks)
+    return files
+
+
 class _Builder:
     """Makes the parts, collecting what is wrong with each."""
 
     def __init__(self, model: ScenarioModel, folder: Path, problems: Problems):
         self._model, self._folder, self._problems = model, folder, problems
         self._profiles: dict[str, Profile] = {}
+        self._inserted: Path | None = None
 
     def scenario(self, path: Path) -> LogicalScenario:
         model, problems = self._model, self._problems
@@ -203,35 +214,13 @@ class _Builder:
         if self._model.sumo is None:
             return None
         entry = self._model.sumo
-        files = self._problems.attempt(("sumo",), lambda: SumoFiles.of(self._options(entry), self._folder, "sumo"))
-        if files is None:
-            return None
-        inserted = self._inserted()
-        if inserted is not None:
-            files = replace(files, routes=(*files.routes, inserted), compared=tuple(self._model.insert))
-        found = files
-        return files if self._problems.attempt(("sumo",), lambda: found.templates) is not None else None
-
-    def _inserted(self) -> Path | None:
-        """Return the route file of the vehicles that the scenario inserts; None without any."""
-        vehicles: dict[str, InsertedVehicle] = {}
-        warm_up = self._model.warm_up
-        for name, entry in self._model.insert.items():
-            at = entry.at if entry.at is not None or warm_up is None else warm_up.end
-            if at is None:
-                self._problems.add(("insert", name), "a vehicle must have a time: at (s), or warm_up: {until: SECONDS}")
-            elif entry.to is not None and entry.route:
-                self._problems.add(("insert", name), "a vehicle must have to or route, but got both")
-            elif entry.route and entry.route[0] != entry.edge:
-                rule = f"a route must begin with the edge on which the vehicle starts, '{entry.edge}'"
-                self._problems.add(("insert", name, "route"), f"{rule}, but begins with '{entry.route[0]}'")
-            else:
-                vehicles[name] = InsertedVehicle(
-                    str(at), entry.edge, str(entry.lane), str(entry.position), str(entry.speed), entry.type or "",
-                    (entry.to,) if entry.to is not None else entry.route, known_route=entry.to is None,
-                )  # fmt: skip
-        places = {name: self._problems.source.located(("insert", name), "").rstrip(": ") for name in vehicles}
-        return inserted_file(vehicles, places) if vehicles else None
+        files = self._problems.attempt(("sumo",), lambda: _read(SumoFiles.of(self._options(entry), self._folder, "sumo")))
+        inserted = None if files is None else insertion_file(self._model, files, self._problems)
+        if files is None or inserted is None:
+            return files
+        self._inserted = inserted
+        more = replace(files, routes=(*files.routes, inserted), compared=tuple(self._model.insert))
+        return self._problems.attempt(("insert",), lambda: _read(more))
 
     def _recorded(self) -> tuple[RecordedTraffic, ...]:
         """Return the recorded traffic, if there is any."""
@@ -367,6 +356,7 @@ class _Builder:
             for name in hole.formula.names():
                 used.add(name)
                 if name not in known:
+                    used.update(one for one in known if did_you_mean(name, known).endswith(f"'{one}'?)"))  # told by this
                     rule = must_be_one_of(f"${{{hole.formula.text}}}: a placeholder", name, known)
                     self._problems.add(("inputs",), f"{hole.place}: {rule}")
             if space is not None and not hole.formula.is_name:
@@ -376,7 +366,7 @@ class _Builder:
                     self._problems.add(("inputs",), f"{hole.place}: {error}")
         for name in known:
             if name not in used and self._model.simulate is None:
-                read_files = ", ".join(t.path.name for t in files.templates)
+                read_files = ", ".join("insert" if t.path == self._inserted else t.path.name for t in files.templates)
                 rule = f"an input must stand as a placeholder ${{{name}}} in the files ({read_files}), but does not"
                 if name in of_profile:
                     rule += f"; a profile may be followed instead: actors: {{ID: {{speed: {of_profile[name]}}}}}"

@@ -31,6 +31,7 @@ def plot_convergence(conclusion: EstimationConclusion, ax: Axes) -> Axes:
     if gate is not None:
         ax.axhline(gate.probability, color="black", linestyle="--", linewidth=1.0, label="gate")
     ax.set(xlabel="number of runs", ylabel="probability of a critical run", yscale="log")
+    ax.locator_params(axis="x", integer=True)
     ax.legend(loc="best")
     return ax
 

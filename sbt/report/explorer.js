@@ -1,5 +1,13 @@
 // The explorer: one chosen run, one set of filters; scatter, parallel coordinates, slices, table and film follow them.
 const within = (ranges, value) => ranges.some(([low, high]) => value >= low && value <= high);
+// Does work in pieces, between which a click is answered; ends early where `wanted` says no longer.
+const inPieces = async (pieces, wanted = () => true) => {
+  for (const piece of pieces) {
+    await new Promise(then => setTimeout(then));
+    if (!wanted()) return;
+    await piece();
+  }
+};
 
 class Explorer {
   constructor(place, data, kept) {
@@ -45,11 +53,14 @@ class Explorer {
     await drawScatter(scatter, data, view);
     if (!this.listening) this.listen(scatter);
     this.listening = true;
-    drawInfluence(this.part("influence"), data, k => { this.part("x").value = k; view.x = k; this.draw(); });
-    if (!webgl) this.part("parallel").textContent = "Parallel coordinates need WebGL, which this browser does not offer.";
-    else if (!this.parallel) this.parallelLater();
-    this.slice();
-    this.curves();
+    await inPieces([
+      () => drawInfluence(this.part("influence"), data, k => { this.part("x").value = k; view.x = k; this.draw(); }),
+      () => {
+        if (!webgl) this.part("parallel").textContent = "Parallel coordinates need WebGL, which this browser does not offer.";
+        else if (!this.parallel) this.parallelLater();
+      },
+      () => this.slice(), () => this.curves(),
+    ]);
   }
   // Parallel coordinates are drawn when they come into view: they take longest.
   parallelLater() {
@@ -70,11 +81,9 @@ class Explorer {
     scatter.on("plotly_hover", event => this.tip(tip, this.rowAt(event.points[0]), event.event));
     scatter.on("plotly_unhover", () => { tip.hidden = true; });
     scatter.on("plotly_click", event => this.choose(this.rowAt(event.points[0]), true));
-    scatter.on("plotly_selected", event => {
-      this.view.picked = event && event.points.length ? new Set(event.points.map(point => this.rowAt(point))) : null;
-      this.filter(false);
-    });
-    scatter.on("plotly_deselect", () => { this.view.picked = null; this.filter(false); });
+    const pick = picked => { if (picked || this.view.picked) { this.view.picked = picked; this.filter(false); } };  // every click on a point deselects
+    scatter.on("plotly_selected", event => pick(event && event.points.length ? new Set(event.points.map(point => this.rowAt(point))) : null));
+    scatter.on("plotly_deselect", () => pick(null));
   }
   rowAt(point) { return point.data.rows[point.pointNumber]; }
   tip(tip, row, event) {
@@ -109,16 +118,14 @@ class Explorer {
     this.view.run = row;
     this.title(row);
     this.film(row);
-    this.table.mark(row);
-    requestAnimationFrame(() => setTimeout(() => {
-      if (this.view.run !== row) return;
-      this.facts(row);
-      if (reveal) this.part("run").scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
-      if (!window.Plotly) return;
-      if (this.listening) Plotly.relayout(this.part("scatter"), { shapes: ring(this.data, this.view) });
-      this.slice();
-      this.curves();
-    }, 100));
+    const reduced = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    requestAnimationFrame(() => setTimeout(() => inPieces([
+      () => { this.table.mark(row); this.facts(row); },
+      () => { if (reveal) this.part("run").scrollIntoView({ block: "nearest", behavior: reduced ? "auto" : "smooth" }); },
+      () => { if (this.listening) Plotly.relayout(this.part("scatter"), { shapes: ring(this.data, this.view) }); },
+      () => { if (window.Plotly) this.slice(); },
+      () => { if (window.Plotly) this.curves(); },
+    ], () => this.view.run === row), 100));
   }
   title(row) {
     this.part("run-title").textContent = `Run ${this.data.index[row]}: ${VERDICTS[this.data.verdict[row]]}`;

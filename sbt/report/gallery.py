@@ -105,9 +105,10 @@ def _thinned(found: Findings) -> tuple[History, str]:
 
 def _markers(found: Findings) -> str:
     """Return what the markers mean, of those that are there."""
-    crosses = "" if found.history.ok.all() else ", crosses failed"
-    hollow = "; hollow markers are held out" if found.held_out.any() else ""
-    return f"Light circles are uncritical, dark triangles critical{crosses}{hollow}."
+    ok, critical = found.history.ok, found.critical
+    kinds = (("light circles are uncritical", ok & ~critical), ("dark triangles critical", critical), ("crosses failed", ~ok))
+    said = ", ".join(words for words, runs in kinds if runs.any())
+    return f"{said[:1].upper()}{said[1:]}{'; hollow markers are held out' if found.held_out.any() else ''}."
 
 
 def _runs_over_one(found: Findings, space: ParameterSpace, predict: Predict | None) -> Drawing:
@@ -164,9 +165,10 @@ def _lines_of(probability: Vector, *, whole: bool) -> str:
     if dashed:
         said += f"{';' if solid else ' Dashed:'}{' dashed:' if solid else ''} {' and '.join(f'{level:g}' for level in dashed)}"
     if not said:
-        if high < _NO_CHANCE:
-            return f" P is below {_NO_CHANCE:g} all over: no line is drawn."
-        return f" P is {low:.2g} to {high:.2g} all over: no line is drawn."
+        ends = (f"{low:.2g}", f"{high:.2g}")
+        span = f"about {ends[0]}" if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
+        span = f"below {_NO_CHANCE:g}" if high < _NO_CHANCE else f"above {1 - _NO_CHANCE:g}" if low > 1 - _NO_CHANCE else span
+        return f" P is {span} all over: no line is drawn."
     return f"{said}." + (" The gap between the dashed lines is its uncertainty." if whole and len(dashed) == 2 else "")
 
 
@@ -198,7 +200,7 @@ def _maps_by_choice(
         caption += " Markers: the runs it could learn from."
     else:
         caption += f" Each value is the mean over {planes[0].averaged} Sobol points of the other inputs (marginal P)."
-    caption += " Solid: P = 0.5; dashed: 0.1 and 0.9."
+    caption += _lines_of(np.concatenate([plane.probability.ravel() for plane in planes]), whole=False)
     return Drawing("probability", "Where critical runs are expected", caption, to_svg(figure, "probability"), wide=True)
 
 

@@ -64,6 +64,8 @@ def write_report(
     data = explorer_data(
         found, scenario, predict, order, influence=influence, films=films, note=film_note, commands=commands,
     )  # fmt: skip
+    coarse = store.history(level=None) if store.coarse else None
+    coarse = None if coarse is None else coarse.where(coarse.columns["level"] > 0)
     drawings = draw(found, scenario.space, fits, predict, order)
     for drawing in drawings:
         write_atomically(target / "figures" / f"{drawing.name}.svg", drawing.svg)
@@ -79,7 +81,7 @@ def write_report(
         "modes": mode_table(found, scenario.space),
         "sensitivity": sensitivity_table(sensitivity),
         "inputs": input_table(scenario, weights),
-        "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement),
+        "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement, coarse),
         "critical": critical_table(found.history, scenario.requirement, reference, store.judgements),
         "contacts": contact_table(found.history, scenario.requirement, commands["film"]),
         "failed": failed_table(found.history, reference),

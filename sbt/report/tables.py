@@ -36,7 +36,7 @@ __all__ = [
     "simulate_command",
 ]
 
-_MOST = 200
+_MOST, _LEAST_ERROR = 200, 0.001
 _LIST_SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
 
 
@@ -121,9 +121,13 @@ def sensitivity_table(rows: Sequence[Sensitivity]) -> Table:
 
 
 def iteration_table(
-    iterations: Sequence[Iteration], fits: Sequence[FitRecord], history: History, requirement: Requirement
+    iterations: Sequence[Iteration],
+    fits: Sequence[FitRecord],
+    history: History,
+    requirement: Requirement,
+    coarse: History | None = None,
 ) -> Table:
-    """Return how each batch was chosen, what it gave, and the scores of the metamodel fitted then."""
+    """Return how each batch was chosen, what it gave, and the scores of the metamodel then; `coarse`: runs that only teach."""
     critical, by_iteration = requirement.critical_runs(history), {fit.iteration: fit for fit in fits}
     scored = [key for key in _LIST_SCORES if any(fit.score(key) is not None for fit in fits)]
     mixes = any(fit.weights for fit in fits)
@@ -133,8 +137,9 @@ def iteration_table(
         weights = None if fit is None else fit.weights
         rows.append((
             Cell.of(batch.number), Cell(str(batch.stage)), Cell.of(int(mine.sum())),
+            *([] if coarse is None else [Cell.of(int((coarse.iteration == batch.number).sum()))]),
             Cell.of(int((mine & critical).sum())), Cell.of(int((mine & ~history.ok).sum())),
-            *(Cell.of(None if fit is None else fit.score(key), 3) for key in scored),
+            *(_score(key, None if fit is None else fit.score(key)) for key in scored),
             *([Cell(mixture_shares(weights or {}), "" if fit is None else fit.chosen_because)] if mixes else []),
             Cell(_listed(batch.proposal)),
         ))  # fmt: skip
@@ -142,24 +147,29 @@ def iteration_table(
         "iteration",
         "stage",
         "runs",
+        *([] if coarse is None else ["coarse runs"]),
         "critical",
         "failed",
         *(SCORES[key] for key in scored),
         *(["mixture"] if mixes else []),
         "how it was chosen",
     )
-    return Table(columns, tuple(rows), "Scores are those of the metamodel that chose the batch." if scored else "")
+    notes = ["Scores are those of the metamodel that chose the batch."] if scored else []
+    notes += [] if coarse is None else ["Coarse runs only teach; critical and failed ones are among the scenario's own."]
+    return Table(columns, tuple(rows), " ".join(notes))
+
+
+def _score(key: str, value: float | None) -> Cell:
+    """Return a score; errors of a probability have a thousandth as their least."""
+    tiny = key == "calibration_error" and value is not None and value < _LEAST_ERROR
+    return Cell(f"< {_LEAST_ERROR:g}", value) if tiny else Cell.of(value, 3)
 
 
 def _listed(proposal: JsonMapping) -> str:
-    """Return the keys and values of how a batch was chosen on one line; arrays as their length."""
-
-    def shown(value: Any) -> str:
-        if isinstance(value, Mapping):
-            return f"({_listed(value)})"
-        return f"{len(value)} values" if isinstance(value, list) else number(value)
-
-    return ", ".join(f"{key.replace('_', ' ')} {shown(value)}" for key, value in proposal.items() if value is not None)
+    """Return the keys and values of how a batch was chosen on one line; not its arrays, and what does not hold."""
+    told = {key: f"({_listed(value)})" if isinstance(value, Mapping) else value for key, value in proposal.items()}
+    given = {key: value for key, value in told.items() if not isinstance(value, list) and value not in (None, False, "()")}
+    return ", ".join(f"{key.replace('_', ' ')}{'' if value is True else f' {number(value)}'}" for key, value in given.items())
 
 
 def simulate_command(scenario: str, record: Record) -> str:
@@ -170,9 +180,7 @@ def simulate_command(scenario: str, record: Record) -> str:
     return shlex.join(["sumo-sbt", "simulate", scenario, *inputs, "--seed", str(record.seed)])
 
 
-def critical_table(
-    history: History, requirement: Requirement, reference: str, judgements: Sequence[Judgement] = ()
-) -> Table:
+def critical_table(history: History, requirement: Requirement, reference: str, judgements: Sequence[Judgement] = ()) -> Table:
     """Return the critical runs, the deepest in the critical interval first, at most 200, with who would have avoided them."""
     judged: dict[int, list[Judgement]] = {}
     for each in judgements:

@@ -15,7 +15,7 @@ from sbt.errors import InputError
 from sbt.plugins import kept, noted
 from sbt.problem.arrays import Points
 
-__all__ = ["Lane", "lanes", "net_file", "nets_folder", "pavements"]
+__all__ = ["Lane", "Roads", "lanes", "net_file", "nets_folder", "pavements", "roads"]
 
 
 class Lane(NamedTuple):
@@ -33,6 +33,18 @@ class Lane(NamedTuple):
     width: float
     kind: str = "road"
     height: float = 0.0
+
+
+class Roads(NamedTuple):
+    """The edges of a network, without those inside of junctions.
+
+    Attributes:
+        lengths: of the lanes of each edge, from the right (m).
+        connected: pairs of edges of which the first leads to the second.
+    """
+
+    lengths: dict[str, list[float]]
+    connected: set[tuple[str, str]]
 
 
 @cache
@@ -93,6 +105,27 @@ def pavements(file: str) -> dict[str, Points]:
     return {
         edge: np.array([[float(v) for v in pair.split(",")[:2]] for pair in shape.split()]) for edge, shape in rightmost.items()
     }
+
+
+@kept
+def roads(net: Path) -> Roads:
+    """Return the edges of a network file and how they are connected; each file is read once per process."""
+    found = Roads({}, set())
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        edge = attributes.get("id", "").rpartition("_")[0]
+        if tag == "edge" and attributes.get("function") is None:
+            found.lengths[attributes["id"]] = []
+        elif tag == "lane" and edge in found.lengths:
+            found.lengths[edge].append(float(attributes.get("length", "inf")))
+        elif tag == "connection" and "from" in attributes and "to" in attributes:
+            found.connected.add((attributes["from"], attributes["to"]))
+
+    parser = xml.parsers.expat.ParserCreate()
+    parser.StartElementHandler = start
+    with _opened(net) as file:
+        parser.ParseFile(file)
+    return found
 
 
 def _lane(element: ET.Element, function: str) -> list[Lane]:
