@@ -18,7 +18,7 @@ from sbt.errors import InputError
 from sbt.problem.parameter import Parameter
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import Store
-from sbt.workflows.prediction import MODEL, read_inputs
+from sbt.workflows.prediction import MODEL, inputs_from, read_inputs
 from sbt.workflows.study import Study
 
 ROWS = "b,note,x.a\n0.5,middle,0.5\n0.1,corner,0.9\n"
@@ -110,6 +110,23 @@ def test_a_wrong_table_is_refused(tmp_path, text, message):
     space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)))
     with pytest.raises(InputError, match=re.escape(message)):
         read_inputs(tmp_path / "rows.csv", space)
+
+
+def test_all_wrong_cells_are_told_and_what_breaks_constraints(tmp_path):
+    space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)), constraints=(("a < b", lambda v: v["a"] < v["b"]),))
+    rows, x = tmp_path / "rows.csv", np.array([[0.1, 7.0], [9.0, 0.5], *[[2.0, 2.0]] * 4])
+    rows.write_text("a,b\n0.1,x\n" + "9,9\n" * 4)
+    asked = (lambda: read_inputs(rows, space), "rows.csv:2: b must be a number"), (lambda: inputs_from(x, space), "row 0: b")
+    for ask, first in asked:
+        with pytest.raises(InputError, match=first) as caught:
+            ask()
+        lines = str(caught.value).splitlines()
+        assert (len(lines), lines[-1]) == (6, f"and {4 if first.startswith('rows') else 5} more")
+    rows.write_text("a,b\n0.1,0.2\n0.5,0.4\n")
+    with pytest.raises(InputError, match=r"rows.csv:3: inputs must satisfy 'a < b', but got a=0.5, b=0.4"):
+        read_inputs(rows, space)
+    with pytest.raises(InputError, match=r"row 1: inputs must satisfy 'a < b', but got a=0.5, b=0.4"):
+        inputs_from({"a": [0.1, 0.5], "b": [0.2, 0.4]}, space)
 
 
 def test_a_campaign_without_metamodel_says_so(campaign, tmp_path):

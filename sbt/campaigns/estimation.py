@@ -259,7 +259,7 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         failed_as_critical=max(_clipped(high.value), value) if failing else value,
         undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
         largest_weight_share=low.largest_share,
-        convergence=_convergence(log, safe, critical) if seen.critical else None,
+        convergence=_convergence(log, safe, critical) if seen.critical and seen.safe else None,
         counted=counted, exact_bound=exact_bound,
     ), limits  # fmt: skip
 

@@ -40,7 +40,7 @@ _CONFIRM = "confirm"  # stage of the runs that repeat a failure
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
-_WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is no boundary to learn"
+_WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"
 _SMALL_SHARE = 0.01  # bound of the critical share that a coverage of 300 runs without a critical one gives
 
 
@@ -289,6 +289,7 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     if found.exact_bound is not None:
         most = f"with {confidence} confidence the probability of {subject} is at most {number(found.exact_bound, 3)}"
         said = f"No critical run was drawn: {most}"
+        rests = f", by {_draws_of_bound(found, facts)} from the inputs' distribution among {plural(n, 'run')}"
         silent = "This does not tell that there is none: a smaller probability cannot be told from zero by so many draws"
     elif found.probability is None:
         said = f"The probability of {subject} is not known yet: no draw counts"
@@ -303,6 +304,8 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
             f"This does not tell of critical regions that no run has met: with {confidence} confidence they hold at most"
             f" {number(missed, 3)} more, which bounds the unseen and is no second estimate"
         )
+        if missed <= 0.0:
+            silent = f"This does not tell that every run is critical: up to {number(1.0 - found.low, 3)} may not be, which no run met"
         if every:
             silent = "This is a sum over all combinations: none is unseen. It does not tell of noise that repeats do not show"
         elif found.low == 0.0 and found.hits:
@@ -313,6 +316,14 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         elif missed > found.high:
             silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
+
+
+def _draws_of_bound(found: EstimationConclusion, facts: Facts) -> str:
+    """Return how many draws the exact bound of an event that none of them met rests on, where no run failed."""
+    bound = found.exact_bound or 0.0
+    if not 0.0 < bound < 1.0 or not facts.history.ok.all():
+        return "the draws"
+    return f"the {plural(round(math.log(1.0 - found.confidence) / math.log1p(-bound)), 'draw')}"
 
 
 def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
@@ -334,6 +345,8 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         )
     if found.combinations is not None and found.low == found.high:
         return "if equal inputs may end differently, acquisition: {kind: monte_carlo} gives an interval that holds then too"
+    if _all_critical(facts):
+        return _WIDEN
     if found.gate is not None and found.gate.verdict == "undecided":
         return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
     wide, counted = _too_wide(found), found.counted or n

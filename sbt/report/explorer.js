@@ -72,7 +72,9 @@ class Explorer {
   }
   parallelNow() {
     const place = this.part("parallel");
+    if (!this.watch) return;
     this.watch.disconnect();
+    this.watch = null;
     drawParallel(place, this.data, this.view);
     this.part("parallel-note").textContent = place.dataset.lines;
   }

@@ -20,4 +20,4 @@ class Finding:
     def __str__(self) -> str:
         """Return a line: whether the rule holds, or that it only informs."""
         mark = "note" if self.rule.startswith("for information") else "ok  "
-        return f"{mark if self.ok else 'FAIL'}  {self.rule}: {self.detail}"
+        return f"{mark if self.ok else 'FAIL'}  {self.rule}{': ' if self.detail else ''}{self.detail}"

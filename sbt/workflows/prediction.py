@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +25,7 @@ from sbt.metamodels.persistence import load, read_info, save
 from sbt.plugins import Objects
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
-from sbt.problem.plain import Json, Value
+from sbt.problem.plain import Json, Value, written
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import Store
 from sbt.store.history import History
@@ -37,6 +37,8 @@ MODEL = "metamodel.sbtmodel"
 """In the folder of a store: the metamodel that was fitted last by `predict`."""
 _CHUNK = 4096
 _TOLERANCE = 1e-9
+_MOST_TOLD = 5
+"""Wrong cells of a table that are told, each on a line."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def predict_inputs(
 
     Raises:
         InputError: the campaign has no metamodel or fewer than two runs to learn from, or the inputs are
-            no such table: columns missing, values that are no numbers or outside of the range.
+            no such table: columns missing, values that are no numbers, outside of the range or of the constraints.
         StoreError: the folder holds no campaign.
     """
     with Store.read(folder) as store:
@@ -196,20 +198,36 @@ def _column(name: str, head: list[str]) -> str:
 
 
 def _within(x: Points, space: ParameterSpace) -> Points:
-    """Return x with rounding at the ends of the ranges mended; refuse what lies outside."""
+    """Return x with rounding at the ends of the ranges mended; refuse what lies outside, or breaks the constraints."""
     low, high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
     with np.errstate(invalid="ignore"):
         size = np.where(np.isfinite(low) & np.isfinite(high), _TOLERANCE * np.maximum(np.abs(low), np.abs(high)), 0.0)
-    wrong = ~((x >= low - size) & (x <= high + size))
-    if wrong.any():
-        row, k = (int(i) for i in np.argwhere(wrong)[0])
-        p = space.parameters[k]
-        raise InputError(f"row {row}: {p.name} must be in {p.range}, but got {x[row, k]:g}")
-    for k, p in enumerate(space.parameters):
-        if p.discrete and (x[:, k] % 1 != 0).any():
-            row = int(np.argmax(x[:, k] % 1 != 0))
-            raise InputError(f"row {row}: {p.name} must be a whole number in {p.range}, but got {x[row, k]:g}")
-    return np.clip(x, low, high)
+    with np.errstate(invalid="ignore"):
+        outside = ~((x >= low - size) & (x <= high + size))
+        broken = outside | ((x % 1 != 0) & np.array([p.discrete for p in space.parameters]))
+    cells = np.argwhere(broken).tolist()
+    _refuse([
+        f"row {row}: {(p := space.parameters[k]).name} must be {'' if outside[row, k] else 'a whole number '}in {p.range},"
+        f" but got {x[row, k]:g}" for row, k in cells[:_MOST_TOLD]
+    ], len(cells))  # fmt: skip
+    x = np.clip(x, low, high)
+    _refuse_infeasible(x, space, "row {}".format)
+    return x
+
+
+def _refuse(problems: Sequence[str], total: int) -> None:
+    """Raise the first problems of a table on a line each, with how many more there are; nothing without any."""
+    if problems:
+        more = [f"and {total - len(problems):,} more"] if total > len(problems) else []
+        raise InputError("\n".join([*problems, *more]))
+
+
+def _refuse_infeasible(x: Points, space: ParameterSpace, place: Callable[[int], str]) -> None:
+    """Raise where rows (n, d) break the constraints of the inputs: no run is made there, and nothing was learned."""
+    rows = np.flatnonzero(~space.feasible(x)).tolist()
+    rules = " and ".join(text for text, _ in space.constraints)
+    told = rows[:_MOST_TOLD]
+    _refuse([f"{place(row)}: inputs must satisfy '{rules}', but got {written(space.named(x[row]))}" for row in told], len(rows))
 
 
 def _predictor(folder: Path, learner: Learner, training: History, settings: str, device: str | None) -> tuple[Predictor, str]:
@@ -269,12 +287,17 @@ def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, .
         named = ", ".join(name + did_you_mean(name, head) for name in missing)
         raise InputError(f"{path}:1: every input must be a column, but missing: {named}")
     where = [short.index(name) for name in space.names]
-    rows = [
-        [_value(path, number, line, column, p) for column, p in zip(where, space.parameters, strict=True)]
-        for number, line in enumerate(lines[1:], 2) if line
-    ]  # fmt: skip
-    others = tuple(name for k, name in enumerate(head) if k not in where)
-    return np.array(rows, dtype=np.float64).reshape(len(rows), space.dimension), others
+    numbered = [(number, line) for number, line in enumerate(lines[1:], 2) if line]
+    x, problems = np.empty((len(numbered), space.dimension)), []
+    for row, (number, line) in enumerate(numbered):
+        for k, (column, parameter) in enumerate(zip(where, space.parameters, strict=True)):
+            try:
+                x[row, k] = _value(path, number, line, column, parameter)
+            except InputError as error:
+                problems.append(str(error))
+    _refuse(problems[:_MOST_TOLD], len(problems))
+    _refuse_infeasible(x, space, lambda row: f"{path}:{numbered[row][0]}")
+    return x, tuple(name for k, name in enumerate(head) if k not in where)
 
 
 def _value(path: Path, number: int, line: list[str], column: int, parameter: Parameter) -> float:

@@ -65,7 +65,7 @@ def snapshot_findings(spec: ScenarioSpec, points: Sequence[Values], seed: int, d
         yield Finding(rule, ok=False, detail=str(error) or f"the process gave no answer within {_DEADLINE:g} s")
         return
     differing = [written(values) for (values, _), a, b in zip(jobs, forked, loaded, strict=True) if a != b]
-    yield Finding(rule, ok=not differing, detail=f"they differ at {'; '.join(differing)}" if differing else "")
+    yield Finding(rule, ok=not differing, detail=f"they differ at {'; '.join(differing)}" if differing else "bit-equal")
     differ = _digests(spec, [(jobs[0][0], another)], digest)[0] != forked[0]
     said = "they differ" if differ else "they give one run: in this traffic nothing is drawn after the warm-up"
     yield Finding("for information: two seeds from one warm-up", ok=True, detail=said, numbers={"differ": float(differ)})

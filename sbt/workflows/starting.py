@@ -119,9 +119,11 @@ class _Trial:
     def said(self) -> Iterator[str]:
         """Yield what a user wants to know, a line each."""
         runs = len(self.problems) + len(self.required)
-        span = f", ttc_path_min {min(self.required):.2g} to {max(self.required):.2g} {self.unit}" if self.required else ""
+        low, high = (f"{end(self.required):.2g}" for end in (min, max)) if self.required else ("", "")
+        seen = f"{low} {self.unit}" if low == high else f"{low} to {high} {self.unit}"
+        span = f", ttc_path_min {seen} in them (elsewhere it may be less or more)" if self.required else ""
         if self.required and all(value == self.without for value in self.required):
-            span += ": it meets nobody; --ego ID takes another vehicle"
+            span = f", ttc_path_min {seen}: it meets nobody; --ego ID takes another vehicle"
         yield f"tried at the ends of its inputs: {len(self.required)} of {runs} runs are right, {self.seconds:.2g} s each{span}"
         yield from self.problems
 
