@@ -113,7 +113,8 @@ def test_a_wrong_table_is_refused(tmp_path, text, message):
 
 
 def test_all_wrong_cells_are_told_and_what_breaks_constraints(tmp_path):
-    space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)), constraints=(("a < b", lambda v: v["a"] < v["b"]),))
+    rule = ("a < b", lambda v: v["a"] < v["b"])
+    space = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)), constraints=(rule,))
     rows, x = tmp_path / "rows.csv", np.array([[0.1, 7.0], [9.0, 0.5], *[[2.0, 2.0]] * 4])
     rows.write_text("a,b\n0.1,x\n" + "9,9\n" * 4)
     asked = (lambda: read_inputs(rows, space), "rows.csv:2: b must be a number"), (lambda: inputs_from(x, space), "row 0: b")

@@ -21,7 +21,7 @@ from sbt.campaigns.lost import (
     why_they_fail,
 )  # fmt: skip
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
-from sbt.estimators.binomial import interval
+from sbt.estimators.binomial import interval, unmet_draws
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 from sbt.loop.stages import Facts
 
@@ -289,7 +289,9 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     if found.exact_bound is not None:
         most = f"with {confidence} confidence the probability of {subject} is at most {number(found.exact_bound, 3)}"
         said = f"No critical run was drawn: {most}"
-        rests = f", by {_draws_of_bound(found, facts)} from the inputs' distribution among {plural(n, 'run')}"
+        exact = facts.history.ok.all() and 0.0 < found.exact_bound < 1.0
+        draws = plural(unmet_draws(found.exact_bound, found.confidence), "draw") if exact else "draws"
+        rests = f", by {draws} from the inputs' distribution among {plural(n, 'run')}"
         silent = "This does not tell that there is none: a smaller probability cannot be told from zero by so many draws"
     elif found.probability is None:
         said = f"The probability of {subject} is not known yet: no draw counts"
@@ -305,7 +307,7 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
             f" {number(missed, 3)} more, which bounds the unseen and is no second estimate"
         )
         if missed <= 0.0:
-            silent = f"This does not tell that every run is critical: up to {number(1.0 - found.low, 3)} may not be, which no run met"
+            silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"
         if every:
             silent = "This is a sum over all combinations: none is unseen. It does not tell of noise that repeats do not show"
         elif found.low == 0.0 and found.hits:
@@ -316,14 +318,6 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         elif missed > found.high:
             silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
-
-
-def _draws_of_bound(found: EstimationConclusion, facts: Facts) -> str:
-    """Return how many draws the exact bound of an event that none of them met rests on, where no run failed."""
-    bound = found.exact_bound or 0.0
-    if not 0.0 < bound < 1.0 or not facts.history.ok.all():
-        return "the draws"
-    return f"the {plural(round(math.log(1.0 - found.confidence) / math.log1p(-bound)), 'draw')}"
 
 
 def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:

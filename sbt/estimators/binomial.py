@@ -6,13 +6,15 @@ Source:
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import betaincinv
 
 from sbt.problem.arrays import Vector
 
-__all__ = ["interval", "lower", "upper"]
+__all__ = ["interval", "lower", "unmet_draws", "upper"]
 
 
 def lower(hits: ArrayLike, n: ArrayLike, confidence: float) -> Vector:
@@ -39,6 +41,15 @@ def upper(hits: ArrayLike, n: ArrayLike, confidence: float) -> Vector:
     """
     hits, n = np.asarray(hits, np.float64), np.asarray(n, np.float64)
     return np.where(hits < n, betaincinv(hits + 1.0, np.maximum(n - hits, 0.5), confidence), 1.0)
+
+
+def unmet_draws(bound: float, confidence: float) -> int:
+    """Return how many runs without a hit have this upper limit, in (0, 1), at this confidence: the inverse of `upper`.
+
+    >>> unmet_draws(float(upper(0, 24, 0.95)), 0.95)
+    24
+    """
+    return round(math.log1p(-confidence) / math.log1p(-bound))
 
 
 def interval(hits: ArrayLike, n: ArrayLike, confidence: float = 0.95) -> tuple[Vector, Vector]:
