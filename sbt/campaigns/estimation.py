@@ -242,7 +242,8 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         limits = Limits(lambda c: min(low.limit(c, side=-1), missed(c)), lambda _: 1.0)
         warnings.append("no counted draw was safe: only a lower bound is given")
     elif min(hits, misses) < FEW_HITS:
-        met = f"{hits} counted draws were critical" if hits < FEW_HITS else f"{misses} counted draws were safe"
+        few, what = (hits, "critical") if hits < FEW_HITS else (misses, "safe")
+        met = f"{few} counted draw{' was' if few == 1 else 's were'} {what}"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
     if len(safe) < FEWEST_BATCHES:
         counts = "1 batch counts" if len(safe) == 1 else f"{len(safe)} batches count"

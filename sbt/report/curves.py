@@ -181,6 +181,7 @@ def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
             linewidth=1.2,
             label=f"all runs at random: {rate * ends[1]:,.0f}",
         )
+    ax.locator_params(axis="y", integer=True)
     ax.set(xlabel="number of runs", ylabel="critical runs so far", xlim=(0, history.index[-1] + 1))
     ax.set_ylim(bottom=0, top=None if critical.any() else 1)
     ax.legend(loc="upper left")

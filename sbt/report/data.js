@@ -36,7 +36,7 @@ const digits = (value, n = 4) => {
   if (value === null || value === undefined || Number.isNaN(value)) return "\u2013";
   if (!Number.isFinite(value)) return value > 0 ? "\u221e" : "\u2212\u221e";
   const size = Math.abs(value);
-  const text = size !== 0 && (size < 1e-4 || size >= 1e7) ? value.toExponential(n - 1) : String(Number(value.toPrecision(n)));
+  const text = size !== 0 && (size < 1e-4 || size >= 1e7) ? Number(value.toPrecision(n)).toExponential() : String(Number(value.toPrecision(n)));
   return text.replace("-", "\u2212");
 };
 const withUnit = (text, unit) => unit ? `${text} ${unit.replace("^2", "\u00b2").replace("^3", "\u00b3")}` : text;

@@ -223,6 +223,8 @@ def _about_scores(found: Findings) -> list[str]:
     n, critical, error = scores.n, scores.n_critical, scores.calibration_error
     if not n:
         sentences.append("The metamodel was never tested: there are no held-out runs.")
+    elif critical == n:
+        sentences.append(f"All {number(n)} held-out runs are critical: the metamodel was not tested on uncritical ones.")
     elif critical < _FEW_CRITICAL:
         few = "No critical run" if critical == 0 else f"Only {critical} critical run{'s' if critical > 1 else ''}"
         sentences.append(
