@@ -224,6 +224,7 @@ WRONG_NAMES = {  # what is written, what is written instead, where and what is s
     "position": ("position: 25", "position: 2500", r"6:\d+: insert.other.position: a position .* must be at most 79.2 m"),
     "id": ("  other:", "  t56:", r"6:3: insert.t56: an inserted vehicle must have an id of its own, but 't56' is in cars.rou"),
     "time": ("until: 42", "until: auto", r"5:8: insert.ego: a vehicle must have a time"),  # and the ego is there all the same
+    "until": ("until: 42", "until: soon", r"3:18: warm_up.until: must be a number or 'auto', but got 'soon'"),
     "input": ("gap: {min", "gab: {min", r"insert.ego: \${gap}: a placeholder must be one of v, gab, but got 'gap'"),
 }
 
@@ -310,6 +311,7 @@ def test_plain_sumo_drives_an_export_as_the_run(tmp_path):
     trace = found(CENTRE, 4).actor("ego")
     found.write_files(CENTRE, 4, tmp_path / "export")
     end = str(T0 + 10)
+    assert f'<begin value="{T0:.3f}"' in (tmp_path / "export" / "run.sumocfg").read_text()  # SUMO warns where it is missing
     run_program(tmp_path / "export", "sumo", "-c", "run.sumocfg", "--fcd-output", "fcd.xml", "--precision", "9", "--end", end)
     seen = [v for v in ET.parse(tmp_path / "export" / "fcd.xml").getroot().iter("vehicle") if v.get("id") == "ego"]
     speeds = [float(v.get("speed", "nan")) for v in seen[: len(trace.speed)]]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -111,6 +112,12 @@ def read_text(path: str | Path) -> str:
         raise ConfigError([f"{path}: a configuration must be UTF-8 text, but byte {error.start} is not"]) from None
 
 
+_KIND = re.compile(
+    r"\[(key|number|keys)\]|(constrained|function)-.*|(literal|list|dict|tuple|union|nullable)\[.*\]|float|int|str|bool"
+)
+"""What pydantic names in the path of an error beside keys: which of several kinds a value was compared with."""
+
+
 def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wrong: Sequence[str] = ()) -> ConfigError:
     """Return what pydantic found as messages with places, after those that are known already.
 
@@ -120,8 +127,19 @@ def located(source: SourceMap, error: ValidationError, kind: type[BaseModel], wr
         kind: the model, whose keys near misses are compared with.
         wrong: messages known already.
     """
-    found = [_problem(e, kind) for e in error.errors() if e["type"] != "default_factory_not_called"]
-    return ConfigError([*wrong, *source.sorted(found)])
+    found = [_problem(e, kind, source) for e in error.errors() if e["type"] != "default_factory_not_called"]
+    return ConfigError([*wrong, *source.sorted(_joined(found))])
+
+
+def _joined(found: Sequence[tuple[Key, str, bool]]) -> list[tuple[Key, str, bool]]:
+    """Return the problems, with what a value of several kinds may be in one message."""
+    joined: dict[tuple[Key, str, bool], str] = {}
+    for path, message, at_key in found:
+        rule, but, got = message.rpartition(", but got ")
+        place = (path, but + got, at_key) if but else (path, message, at_key)
+        before = joined.get(place)
+        joined[place] = rule if before is None or not but else f"{before} or {rule.removeprefix('must be ')}"
+    return [(path, rule + rest, at_key) for (path, rest, at_key), rule in joined.items()]
 
 
 def parse(
@@ -288,9 +306,12 @@ def _with(data: Any, path: tuple[str, ...], value: Any) -> Json:
     return {**(data or {}), head: _with(inner, rest, value) if rest else value}
 
 
-def _problem(error: Any, model: type[BaseModel]) -> tuple[Key, str, bool]:
+def _problem(error: Any, model: type[BaseModel], source: SourceMap) -> tuple[Key, str, bool]:
     """Return path, message and whether the key is at fault, of one of pydantic's errors."""
-    path: Key = tuple(part for part in error["loc"] if part not in ("[key]", "[number]", "[keys]"))
+    path: Key = ()
+    for part in error["loc"]:
+        if not _KIND.fullmatch(str(part)) or (*path, part) in source.places:  # a kind of value is no key
+            path = (*path, part)
     kind = error["type"]
     if kind == "extra_forbidden":
         return path, _unknown_key(path, model), True

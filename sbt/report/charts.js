@@ -43,7 +43,7 @@ const drawScatter = (place, data, view) => {
         opacity: verdict === 0 && dense ? 0.5 : 0.85, line: { width: dense ? 0 : 0.5, color: colour("--card") } } };
   }).filter(trace => trace.rows.length);
   const frame = look({});
-  return Plotly.react(place, traces, look({ height: 460, dragmode: narrow() ? false : "select", hovermode: "closest", uirevision: `${view.x} ${view.y}`, shapes: ring(data, view),
+  return Plotly.react(place, traces, look({ height: 460, dragmode: narrow() ? false : "select", hovermode: "closest", uirevision: `${view.x} ${view.y}`, shapes: ring(data, view), showlegend: true,
     legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 }, margin: { l: 60, r: 14, t: 34, b: 52 },
     xaxis: { ...frame.xaxis, ...axisOf(x) }, yaxis: { ...frame.yaxis, ...axisOf(y) } }), TOOLS);
 };

@@ -203,8 +203,14 @@ class Player {
   }
 }
 
-// Curves over time, a panel each; returns a function that moves the line of the moment.
-const drawCurves = async (Plotly, place, film, look, end = film.time[film.time.length - 1]) => {
+// The range of a panel of curves that shows all of some curves, and their limits.
+const reachOf = (panel, curves) => {
+  const values = curves.filter(curve => curve.panel === panel).flatMap(curve => [...curve.values, ...(curve.limits || [])]).filter(Number.isFinite);
+  const low = Math.min(...values), high = Math.max(...values), air = 0.06 * (high - low) || 0.5;
+  return values.length ? [low - air, high + air] : undefined;
+};
+// Curves over time, a panel each, on axes for `all` curves; returns a function that moves the line of the moment.
+const drawCurves = async (Plotly, place, film, look, end = film.time[film.time.length - 1], all = null) => {
   const panels = [...new Set(film.curves.map(curve => curve.panel))];
   const colours = [ACTORS.ego, ACTORS.other];
   const n = panels.length, layout = look({ height: 40 + 96 * n, margin: { l: 52, r: 12, t: 8, b: 34 }, showlegend: false, shapes: [] });
@@ -217,7 +223,7 @@ const drawCurves = async (Plotly, place, film, look, end = film.time[film.time.l
   });
   panels.forEach((panel, p) => {
     const curve = film.curves.find(each => each.panel === panel), top = 1 - p / n;
-    layout[`yaxis${p ? p + 1 : ""}`] = { ...layout.yaxis, domain: [top - 1 / n + 0.04, top], zeroline: false, nticks: 4,
+    layout[`yaxis${p ? p + 1 : ""}`] = { ...layout.yaxis, domain: [top - 1 / n + 0.04, top], zeroline: false, nticks: 4, range: all ? reachOf(panel, all) : undefined,
       title: { text: safe(withUnit(panel, curve.unit ? `(${curve.unit})` : "")), font: { size: 11 } } };
     for (const limit of curve.limits || []) layout.shapes.push({ type: "line", xref: "paper", x0: 0, x1: 1, y0: limit, y1: limit,
       yref: `y${p ? p + 1 : ""}`, line: { color: colour("--critical"), width: 1, dash: "dash" } });

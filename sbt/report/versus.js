@@ -13,7 +13,8 @@ class Versus {
   open(k) {
     const pair = this.data.pairs[k];
     this.k = k;
-    this.films = pair.films.map(developed);
+    const widest = pair.films.reduce((a, b) => b.half[0] > a.half[0] ? b : a);  // both films to one scale
+    this.films = pair.films.map(film => developed({ ...film, half: widest.half, ratio: widest.ratio }));
     this.moved = [];
     const labels = ["before", "after"].map((name, j) => `${pair.title}, ${name}: ${pair.films[j].contacts.length ? "contact" : "no contact"}`);
     this.player.load(this.films, this.lanes, labels);
@@ -29,7 +30,8 @@ class Versus {
   async draw() {
     if (!window.Plotly) return;
     const k = this.k, moved = [];
-    for (let j = 0; j < this.films.length; j++) moved.push(await drawCurves(Plotly, this.curves[j], this.films[j], look, this.player.end));
+    const all = this.films.flatMap(film => film.curves);
+    for (let j = 0; j < this.films.length; j++) moved.push(await drawCurves(Plotly, this.curves[j], this.films[j], look, this.player.end, all));
     if (k !== this.k) return;
     this.moved = moved;
     moved.forEach(move => move(this.player.now));

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sbt.campaigns.wording import number, percent, plural
+from sbt.campaigns.wording import measured, number, percent, plural, written_unit
 from sbt.files import write_atomically
 from sbt.problem.plain import Json
 from sbt.report.explorer import library, packed, render, scripts, styles
@@ -65,7 +65,7 @@ def _lead(result: Mapping[str, Any]) -> str:
 
 
 def _interval(result: Mapping[str, Any], confidence: float) -> str:
-    return f"{confidence:.0%} interval {100 * result['low']:+.3g} to {100 * result['high']:+.3g}"
+    return f"{percent(confidence)} interval {100 * result['low']:+.3g} to {100 * result['high']:+.3g}"
 
 
 def _sentences(result: Mapping[str, Any]) -> list[str]:
@@ -97,13 +97,13 @@ def _bars(result: Mapping[str, Any]) -> Json:
 
 
 def _inputs(inputs: Mapping[str, Any], units: Mapping[str, str]) -> str:
-    return ", ".join(f"{name} {number(value, 4)} {units.get(name, '')}".strip() for name, value in inputs.items())
+    return ", ".join(measured(name, value, units.get(name, ""), 4) for name, value in inputs.items())
 
 
 def _table(title: str, found: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> Json:
     names = list(found[0]["inputs"]) if found else []
     return {
         "title": title, "count": f"{len(found):,}" + (f", the first {_LISTED}" if len(found) > _LISTED else ""),
-        "columns": ["run", *(f"{n} ({units[n]})" if units.get(n) else n for n in names), "seed"],
+        "columns": ["run", *(f"{n} ({written_unit(units[n])})" if units.get(n) else n for n in names), "seed"],
         "rows": [[r["run"], *(number(r["inputs"][n], 5) for n in names), r["seed"]] for r in found[:_LISTED]],
     }  # fmt: skip
