@@ -38,7 +38,7 @@ from sbt.problem.outcome import Status
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
-__all__ = ["parse", "robustness", "stl"]
+__all__ = ["FORMULA", "parse", "robustness", "stl"]
 
 Indices = NDArray[np.intp]
 _TIME_TOLERANCE = 1e-9
@@ -49,6 +49,10 @@ _POINTWISE: dict[str, Callable[[Vector, Vector], Vector]] = {
     ">": np.subtract, ">=": np.subtract, "<": lambda f, g: g - f, "<=": lambda f, g: g - f,
     "and": np.minimum, "or": np.maximum, "->": lambda p, q: np.maximum(-p, q),
 }  # fmt: skip
+
+
+FORMULA = "robustness of "
+"""How the description of a formula's metric begins; the formula follows."""
 
 
 def stl(text: str, name: str = "stl", ego: str = "ego", other: str | None = "co", margin: float = 0.0) -> Metric:
@@ -76,7 +80,7 @@ def stl(text: str, name: str = "stl", ego: str = "ego", other: str | None = "co"
         return float(robustness(formula, read, trace.time)[0])
 
     return Metric(
-        name, function, "", "low", description=f"robustness of {text}",
+        name, function, "", "low", description=f"{FORMULA}{text}",
         source="Donze and Maler (2010), Robust satisfaction of temporal logic over real-valued signals",
     )  # fmt: skip
 

@@ -24,7 +24,7 @@ from typing import NoReturn
 
 from sbt.errors import InputError
 
-__all__ = ["Binary", "Number", "Signal", "Term", "Unary", "is_formula", "parse"]
+__all__ = ["Binary", "Number", "Signal", "Term", "Unary", "horizon", "is_formula", "parse"]
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?![\w.])|(?P<name>[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)"
@@ -78,6 +78,17 @@ Term = Number | Signal | Unary | Binary
 def is_formula(term: Term) -> bool:
     """Return whether a term is logical, rather than numeric."""
     return isinstance(term, Unary | Binary) and term.op not in ("neg", "+", "-", "*", "/")
+
+
+def horizon(term: Term) -> float:
+    """Return how far a formula looks ahead where its intervals say so (s); to the end of a run, it asks for no time.
+
+    >>> horizon(parse("G[0,20](gap > 2 -> F[1,3](speed < 1))")), horizon(parse("G(gap > 2)"))
+    (23.0, 0.0)
+    """
+    inner = [horizon(part) for part in (getattr(term, name, None) for name in ("of", "left", "right")) if part is not None]
+    high = getattr(term, "high", math.inf)
+    return max(inner, default=0.0) + (high if math.isfinite(high) else 0.0)
 
 
 def parse(text: str, check: Callable[[str], None] = lambda name: None) -> Term:

@@ -17,6 +17,8 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import elsewhere
 from sbt.execution.warming import keeping_states
 from sbt.metrics.physics import breaches
+from sbt.metrics.stl import FORMULA
+from sbt.metrics.stl_grammar import horizon, parse
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Value, Values, written
 from sbt.problem.scenario import Batched, LogicalScenario
@@ -39,6 +41,8 @@ _CORNERS_UP_TO = 4
 _FEW_INVALID = 0.25
 """Largest share of the centre and corners that may be invalid."""
 _INSTANTLY = "; SUMO changes lanes within a step unless its option lanechange.duration is set (such as 3 s)"
+_STEP = 1.0
+"""How much shorter than a formula's horizon a run may be (s): a step of SUMO at most."""
 _WARNINGS = 3
 """Most warnings of the simulator that are shown."""
 _RUN_DEADLINE = 60.0
@@ -49,12 +53,13 @@ _WORKER_DEADLINE = 300.0
 
 @dataclass(frozen=True)
 class _Run:
-    """One run as plain data: its metrics, a digest of its trace, the laws of motion it breaks, or why there are none of these."""
+    """One run as plain data: its metrics, a digest and the length (s) of its trace, laws of motion it breaks; or a problem."""
 
     metrics: tuple[tuple[str, float], ...] = ()
     digest: str = ""
     breaches: tuple[str, ...] = ()
     problem: str = ""
+    length: float = math.inf
 
 
 def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | None = None) -> tuple[Finding, ...]:
@@ -93,6 +98,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     yield _finite(first, asked)
     yield from _warned(spec)
     yield from _units(spec, asked.space)
+    yield from _looks_beyond(first, asked)
     yield from rehearse(spec, asked, seed)
     if not run.ok:
         return
@@ -153,7 +159,8 @@ def _run(scenario: LogicalScenario, execute: Callable[[], Trace | dict[str, floa
         if not isinstance(result, Trace):
             return _Run(tuple(result.items()))
         broken = tuple(map(str, breaches(result, (scenario.roles.other or "",))))
-        return _Run(tuple(scenario.measure(result).items()), _digest(result), broken)
+        length = float(result.time[-1] - result.time[0])
+        return _Run(tuple(scenario.measure(result).items()), _digest(result), broken, length=length)
     except RunError as error:
         return _Run(problem=f"{error.status}: {error.reason}")
     except BaseException as error:
@@ -254,6 +261,16 @@ def _units(spec: ScenarioSpec, space: ParameterSpace) -> list[Finding]:
     files = getattr(spec.resolve().simulate, "files", None)
     found = units_apart(files, {p.name: p.unit for p in space.parameters}) if isinstance(files, SumoFiles) else ()
     return [Finding("for information: units", ok=True, detail="; ".join(found))] if found else []
+
+
+def _looks_beyond(runs: list[_Run], scenario: LogicalScenario) -> list[Finding]:
+    """Return the formulas that look further ahead than the longest run lasts."""
+    longest = max((run.length for run in runs if not run.problem), default=math.inf)
+    texts = {m.name: m.description.removeprefix(FORMULA) for m in scenario.metrics if m.description.startswith(FORMULA)}
+    far = {name: ahead for name, text in texts.items() if (ahead := horizon(parse(text))) > longest + _STEP}
+    said = [f"{name} looks {ahead:g} s ahead, but the longest run lasts {longest:.4g} s" for name, ahead in far.items()]
+    detail = "; ".join(said) + ": beyond its end the last values count"
+    return [Finding("for information: formulas", ok=True, detail=detail)] if said else []
 
 
 def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:
