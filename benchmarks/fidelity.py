@@ -1,6 +1,8 @@
 """What coarse runs do for an estimation: errors and intervals on problems of known truth, and CPU time (docs/traffic.md).
 
     python benchmarks/fidelity.py problems --budget 200 --seeds 50
+    python benchmarks/fidelity.py problems --campaign falsification --probabilities .003 --budget 100 --seeds 10
+    python benchmarks/fidelity.py highway_merge --campaign falsification --steps 0.1 0.5 --budget 150 --seeds 3
     python benchmarks/fidelity.py unprotected_left_turn --steps 0.1 0.5 --budget 2500 --seeds 2
     python benchmarks/fidelity.py testbed:two_hollows_noisy --cost 0.2 --budget 500 --seeds 50
 
@@ -43,6 +45,41 @@ def estimated(name: str, seed: int, budget: int, fidelity: Mapping[str, Any] | N
     }  # fmt: skip
 
 
+def falsified(name: str, seed: int, budget: int, fidelity: Mapping[str, Any] | None, **more: Any) -> dict[str, float]:
+    """Return critical runs of the search, runs to the first, failure modes, CPU seconds and runs of one falsification."""
+    with tempfile.TemporaryDirectory() as folder:
+        begun = time.process_time()
+        result = sbt.run(
+            campaign="falsification", scenario=name, seed=seed, budget=budget, fidelity=fidelity, judges=[],
+            executor="serial", store=Path(folder) / "store", report=False, **more,
+        )  # fmt: skip
+        spent, found = time.process_time() - begun, result.conclusion.to_dict()
+    told = found.get("fidelity") or {}
+    return {
+        "critical": found["critical_runs"], "first": found["runs_to_first"] or np.inf, "modes": len(found["failure_modes"]),
+        "cpu": spent, "fine": told.get("fine", budget), "coarse": told.get("coarse", 0),
+        "correlation": told.get("correlation", np.nan), "screened": told.get("screened", 0),
+    }  # fmt: skip
+
+
+def searched(given: argparse.Namespace) -> None:
+    """Print critical runs of falsifications with and without coarse runs, by seed."""
+    print("| scenario | coarse runs | critical runs with, by seed | without | fine, coarse runs | CPU s with, without |")
+    print("|---|---|---|---|---|---|", flush=True)
+    own = given.scenario != "problems"
+    for coarse in ("",) if own else given.only or COARSE:
+        level = {"step_length": list(given.steps)} if own else {"scenario": scenario_of(coarse)}
+        level |= {"cost": given.cost} if given.cost else {} if own else {"cost": 0.2}
+        name = given.scenario if own else scenario_of(None, coarse)
+        more = {} if own else {"requirement": {"metric": "y", "critical": [-np.inf, metric_at(given.probabilities[0], coarse)]}}
+        rows = [[falsified(name, seed, given.budget, way, **more) for seed in range(given.seeds)] for way in (level, None)]
+        found = [", ".join(f"{row['critical']:.0f}" for row in each) for each in rows]
+        cpu = [np.median([row["cpu"] for row in each]) for each in rows]
+        runs = ", ".join(f"{np.median([row[key] for row in rows[0]]):.0f}" for key in ("fine", "coarse"))
+        told = f"{given.steps[1]:g} s" if own else coarse
+        print(f"| {given.scenario} | {told} | {found[0]} | {found[1]} | {runs} | {cpu[0]:.1f}, {cpu[1]:.1f} |", flush=True)
+
+
 def problems(given: argparse.Namespace) -> None:
     """Print errors and intervals on problems of known truth, over those of crude Monte Carlo with as large a budget."""
     print("| coarse runs | P | RMSE / crude | mean / P | half width / crude | cover | pay | fine, coarse runs | CPU s |")
@@ -78,7 +115,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--only", nargs="*", help="with, without; of the problems, which coarse runs")
     parser.add_argument("--probabilities", type=float, nargs="*", default=(0.023, 0.38))
+    parser.add_argument("--campaign", choices=("estimation", "falsification"), default="estimation")
     given = parser.parse_args()
+    if given.campaign == "falsification":
+        return searched(given)
     if given.scenario == "problems":
         return problems(given)
     known = testbeds.truth(given.scenario.removeprefix(TESTBED)).probability if given.scenario.startswith(TESTBED) else None

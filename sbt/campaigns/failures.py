@@ -10,6 +10,7 @@ import numpy as np
 
 from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
+from sbt.campaigns.levels import ScreeningTold
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
 from sbt.campaigns.parts import share_among_held_out
@@ -100,6 +101,7 @@ class FalsificationConclusion:
         violates: of a combination, how many critical runs violate each requirement.
         independence: of the metrics of a combination, given the inputs.
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
+        fidelity: what coarse runs did for it, where there are some.
     """
 
     first_critical_run: int | None
@@ -114,6 +116,7 @@ class FalsificationConclusion:
     violates: Mapping[str, int] | None = optional()
     independence: Independence | None = optional()
     explained: ExplainedVariance | None = optional()
+    fidelity: ScreeningTold | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -131,6 +134,7 @@ class FalsificationConclusion:
         said += [*violations_words(self.violates), *independence_words(self.independence)]
         said += _rates(self.failure_modes)
         said += [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
+        said += [] if self.fidelity is None else [self.fidelity.sentence()]
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
         return [*said, *count_avoided(judged), *conditional_on(facts.history)]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,15 @@ from scipy.spatial.distance import cdist
 from sbt.acquisitions import even, is_greedy, log_scores
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.failures import CONFIRM, FILLING, FailureSearch, FalsificationConclusion, confirmations, search_runs
+from sbt.campaigns.levels import coarse_runs, screening_told
 from sbt.campaigns.parts import held_out_runs, named_inputs
 from sbt.campaigns.records import SearchProposal
 from sbt.campaigns.repeats import REPEAT, repeats_wanted
+from sbt.campaigns.screening import ScreenStage
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
-from sbt.loop.stages import Batch, Campaign, Log
+from sbt.loop.stages import Batch, Campaign, Log, Stage
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.covariates import Covariates
 from sbt.samplers import evolution, portfolio
@@ -42,6 +44,8 @@ _INITIAL, _SEARCH, _EVEN = "initial", "search", "even"
 _TRANSFER = "transfer"
 """Stage of runs that were critical in an earlier campaign of another setup."""
 _FILL_SHARE = 0.1  # of every batch that fills space, held-out runs included: what it finds is independent of the metamodel
+_SCREENED = "screened"
+"""Criterion of the runs that coarse runs chose."""
 PAIR = "pair"
 """Criterion of the runs whose inputs and seed were chosen together."""
 _REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
@@ -64,9 +68,16 @@ def recipe(settings: Settings) -> Campaign:
 
     def conclude(log: Log) -> tuple[FalsificationConclusion, FittedMetamodel | None]:
         fitted = learner.fit(log.history)
-        return failures.conclusion(log.history, None if fitted is None else fitted.record), fitted
+        found = failures.conclusion(log.history, None if fitted is None else fitted.record)
+        return replace(found, fidelity=screening_told(log, settings)), fitted
 
-    return Campaign((SearchStage(failures), ConfirmStage(failures)), conclude)
+    search: Stage = SearchStage(failures)
+    if settings.coarse_cost is not None:
+        if settings.method != "portfolio" or settings.scenario.pool is not None:
+            got = "recorded rows" if settings.scenario.pool is not None else f"acquisition.kind {settings.method or 'of its own'}"
+            raise InputError(f"fidelity goes with acquisition.kind portfolio and a scenario that can be run, but got {got}")
+        search = ScreenStage(SearchStage(failures))
+    return Campaign((search, ConfirmStage(failures, search)), conclude)
 
 
 @dataclass(frozen=True)
@@ -92,17 +103,27 @@ class SearchStage:
         if modes is not None and critical >= modes and len(self.failure_search.modes(runs)) >= modes:
             return "modes"
         asked = search_runs(log.planned)
-        if log.iterations and len(asked) - s.reference >= s.budget:
+        if log.iterations and s.budget - self.spent(log) < 1.0:
             return "budget"
         if s.scenario.pool is not None and len(asked) >= len(s.scenario.pool.x):
             return "no rows left"
         return ALL_RUN if log.iterations and all_run(s.scenario, asked) else None
 
-    def propose(self, log: Log) -> Batch:
-        """Return the next batch, the run of largest P(critical) first."""
+    def spent(self, log: Log) -> float:
+        """Return what the search has cost so far, in runs of the scenario."""
+        s = self.failure_search.settings
+        return max(len(search_runs(log.planned)) - s.reference, 0) + (s.coarse_cost or 0.0) * len(coarse_runs(log))
+
+    def picked(self, log: Log, runs: History, n: int) -> list[PlannedRun]:
+        """Return n runs by the configured method, as it learns from these runs."""
+        picks, asked = self._guided(log, search_runs(runs), n), search_runs(log.planned)
+        return [*self._seeded(picks), *self._snapped([(_SEARCH, picks.u[len(picks.seeds) :])], asked)]
+
+    def propose(self, log: Log, screened: Callable[[int], list[PlannedRun]] | None = None) -> Batch:
+        """Return the next batch, the run of largest P(critical) first; `screened` gives so many runs in place of the method."""
         s, first, runs = self.failure_search.settings, not log.iterations, search_runs(log.history)
         asked = search_runs(log.planned)
-        spent, number = len(asked) - (0 if first else s.reference), self._number(log)
+        spent, number = math.ceil(self.spent(log) - 1e-9), self._number(log)
         size = min(s.initial if first else s.batch, s.budget - spent)
         last = log.last(SearchProposal)
         start = 0 if last is None else last.next_position
@@ -115,12 +136,15 @@ class SearchStage:
         held_out = 0 if none else min(_share_of(s.holdout_fraction, spent, size), size - 1)
         filling = min(_share_of(max(_FILL_SHARE - s.holdout_fraction, 0.0), spent, size), size - 1 - held_out)
         again = repeats_wanted(asked, s.scenario, size - held_out - filling) if self._learns else ()
-        picks = self._guided(log, runs, size - held_out - filling - len(again))
+        n = size - held_out - filling - len(again)
+        picks = self._guided(log, runs, n if screened is None else 0)
+        found = [] if screened is None else screened(n)
         names, counts = np.unique(np.array(picks.why, dtype=np.str_), return_counts=True)
         criteria = {str(name): int(count) for name, count in zip(names, counts, strict=True)}
+        criteria |= {_SCREENED: len(found)} if found else {}
         filled, at = self._even(filling, start)
         chosen = [*self._seeded(picks), *self._snapped([(_SEARCH, picks.u[len(picks.seeds) :]), (_EVEN, filled)], asked)]
-        again = (*again, *(PlannedRun(REPEAT, runs.inputs(row)) for row in picks.repeat))
+        chosen, again = [*found, *chosen], (*again, *(PlannedRun(REPEAT, runs.inputs(row)) for row in picks.repeat))
         proposal = SearchProposal(s.method, at, criteria, filling, held_out, len(again) or None)
         return Batch((*chosen, *again, *held_out_runs(s, number, held_out)), proposal)
 
@@ -268,6 +292,7 @@ class ConfirmStage:
     """Repeats each mode's representative with fresh seeds: is the failure one of the scenario, or of a seed?"""
 
     failure_search: FailureSearch
+    search: Stage
     name: str = CONFIRM
 
     def _missing(self, log: Log) -> list[PlannedRun]:
@@ -285,7 +310,7 @@ class ConfirmStage:
 
     def stop(self, log: Log) -> str | None:
         """Return why the search was over, once the ten deepest modes are repeated."""
-        return None if self._missing(log) else SearchStage(self.failure_search).stop(log)
+        return None if self._missing(log) else self.search.stop(log)
 
     def propose(self, log: Log) -> Batch:
         """Return three runs a mode, up to ten with a noisy simulator, beside the budget."""
@@ -300,5 +325,5 @@ def _share_of(share: float, spent: int, size: int) -> int:
 
 FALSIFICATION = CampaignKind(
     "find critical concrete scenarios, and distinct failure modes", recipe, FalsificationConclusion, acquisition="portfolio",
-    methods=METHODS, stop={"failures": None, "modes": None}, most_initial=10, batch=10, takes_transfer=True,
+    methods=METHODS, stop={"failures": None, "modes": None}, most_initial=10, batch=10, takes_transfer=True, takes_fidelity=True,
 )  # fmt: skip

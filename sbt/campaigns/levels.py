@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.campaigns.counting import DRAWN, LEARNED
-from sbt.campaigns.records import EstimationProposal
+from sbt.campaigns.records import EstimationProposal, SearchProposal
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import number, plural
 from sbt.loop.stages import Log
@@ -17,11 +17,15 @@ from sbt.problem.arrays import Points, Vector
 from sbt.store.history import History
 from sbt.store.records import Iteration
 
-__all__ = ["COARSE", "LevelsTold", "Pairs", "coarse_runs", "is_two_level", "left_two_levels", "levels_told", "spent", "spent_by"]
+__all__ = [
+    "COARSE", "LevelsTold", "Pairs", "ScreeningTold", "coarse_runs", "is_two_level", "left_two_levels", "levels_told",
+    "screening_told", "spent", "spent_by", "twins",
+]  # fmt: skip
 
 COARSE = "coarse"
 """Stage of runs at the coarse level."""
 _FEWEST = 3
+_CONFIRM = "confirm"  # stage of repetitions beside the budget
 
 
 def is_two_level(batch: Iteration) -> bool:
@@ -50,6 +54,14 @@ def spent(log: Log, settings: Settings) -> float:
 def spent_by(pairs: int, settings: Settings) -> float:
     """Return what pairs run at both levels cost, in runs of the scenario."""
     return pairs * (1.0 + (settings.coarse_cost or 0.0))
+
+
+def twins(log: Log) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows of the runs of a log, and of its coarse runs, that have the same inputs and seed."""
+    coarse, runs = coarse_runs(log), log.history
+    place = {(x.tobytes(), int(seed)): k for k, (x, seed) in enumerate(zip(coarse.x, coarse.seed, strict=True))}
+    at = np.array([place.get((x.tobytes(), int(s)), -1) for x, s in zip(runs.x, runs.seed, strict=True)], dtype=np.intp)
+    return np.flatnonzero(at >= 0), at[at >= 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,3 +182,56 @@ def levels_told(log: Log, settings: Settings) -> LevelsTold | None:
 
     correlation = float(spearmanr(*both.T)[0]) if told else None
     return LevelsTold(len(coarse), len(log.history), settings.coarse_cost, correlation, len(both), *judged)
+
+
+@dataclass(frozen=True)
+class ScreeningTold:
+    """What coarse runs did for a falsification.
+
+    Attributes:
+        coarse, fine: runs at the coarse level and of the search.
+        cost: of a coarse run, in runs of the scenario.
+        correlation: of the ranks of the metric at both levels, over pairs that no coarse run chose.
+        pairs: number of these.
+        screened: runs that coarse runs chose among more candidates.
+        times: candidates for each run as last judged; 1: screening does not pay.
+        gain: critical runs for the same cost over those without, as last judged; None: too little was known.
+    """
+
+    coarse: int
+    fine: int
+    cost: float
+    correlation: float
+    pairs: int
+    screened: int
+    times: int
+    gain: float | None = None
+
+    def sentence(self) -> str:
+        """Return it in words."""
+        told = (
+            f"{plural(self.coarse, 'coarse run')} chose {plural(self.screened, 'run')} of {self.fine:,}: a coarse run costs"
+            f" {number(self.cost, 2)} of a run and correlates with it by {number(self.correlation, 2)}"
+            f" ({self.pairs} pairs that none chose). A coarse run counts as no failure"
+        )
+        if self.times > 1 and self.gain is not None:
+            return f"{told}; by these numbers there are {number(self.gain, 2)} times as many critical runs for the same cost."
+        return f"{told}. Screening did not pay in the end, and was left out: {self._why}."
+
+    @property
+    def _why(self) -> str:
+        if self.gain is None:
+            return "there are too few pairs to tell"
+        return f"at equal cost it would give {number(self.gain, 2)} times the critical runs"
+
+
+def screening_told(log: Log, settings: Settings) -> ScreeningTold | None:
+    """Return what coarse runs did for a falsification; None where there is one level."""
+    if settings.coarse_cost is None:
+        return None
+    records = [found for batch in log.iterations if (found := batch.read(SearchProposal).coarse) is not None]
+    last, at = records[-1] if records else None, twins(log)[0]
+    screened = int((log.history.iteration[at] > 0).sum())
+    told = (0.0, 0, screened, 1, None) if last is None else (last.correlation, last.pairs, screened, last.times, last.gain)
+    fine = int((log.history.stage != _CONFIRM).sum())
+    return ScreeningTold(len(coarse_runs(log)), fine, settings.coarse_cost, *told)

@@ -9,7 +9,7 @@ from sbt.store.records import optional
 
 __all__ = [
     "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CoarseDraws", "CountedDraws", "EstimationProposal", "EventDraws",
-    "LevelsRecord", "NominalDraws", "PoolSummary", "SearchProposal",
+    "LevelsRecord", "NominalDraws", "PoolSummary", "ScreenRecord", "SearchProposal",
 ]  # fmt: skip
 
 EXPLORE, LEARN, COUNT = "explore", "learn", "count"
@@ -48,6 +48,27 @@ class BatchProposal:
 
 
 @dataclass(frozen=True)
+class ScreenRecord:
+    """What coarse runs were worth to a falsification when a batch was chosen.
+
+    Attributes:
+        times: candidates that are run coarse for each run; 1: screening did not pay, and there were none.
+        rate: share of the candidates that are critical.
+        correlation: of the ranks of the metric at both levels, over pairs that no coarse run chose.
+        pairs: number of these.
+        gain: critical runs for the same cost over those without; None: too little was known.
+        random: of the batch, its first runs, which no coarse run chose.
+    """
+
+    times: int
+    rate: float
+    correlation: float
+    pairs: int
+    gain: float | None = None
+    random: int = 0
+
+
+@dataclass(frozen=True)
 class SearchProposal:
     """How a batch of a falsification was chosen.
 
@@ -58,6 +79,7 @@ class SearchProposal:
         even: runs that fill the space.
         held_out: random runs that only score the metamodel.
         repeats: runs that repeat inputs with other seeds.
+        coarse: with two levels of fidelity, what coarse runs were worth.
     """
 
     method: str
@@ -66,6 +88,7 @@ class SearchProposal:
     even: int = 0
     held_out: int = 0
     repeats: int | None = optional()
+    coarse: ScreenRecord | None = optional()
 
 
 @dataclass(frozen=True)
