@@ -236,3 +236,38 @@ def test_where_coarse_runs_tell_nothing_the_rest_is_crude_monte_carlo(tmp_path: 
     never = run(tmp_path / "never", {**NOISY, "requirement": {"metric": "y", "critical": [-1e9, -1e8]}}, fidelity=COARSE)
     found = never.conclusion.to_dict()
     assert found["exact_bound"] <= 1.4 * (1.0 - 0.05 ** (1.0 / found["fidelity"]["fine"]))
+
+
+SEARCH = {**NOISY, "campaign": "falsification", "budget": 40, "stop": {}, "requirement": {"metric": "y", "critical": [-1e9, 0.0]}}
+
+
+def test_a_falsification_screens_its_candidates_and_counts_no_coarse_run(tmp_path: Path) -> None:
+    summary = run(tmp_path / "whole", SEARCH, fidelity=COARSE)
+    told = summary.conclusion.to_dict()
+    with Store.read(tmp_path / "whole" / "store") as store:
+        fine, coarse = store.history(), store.history(level=1)
+    searched = fine.where(fine.stage != "confirm")
+    assert told["fidelity"]["screened"] >= 5
+    assert len(coarse) > told["fidelity"]["screened"]
+    assert 40 - 1.2 < len(searched) + 0.2 * len(coarse) <= 40 + 1e-9
+    assert told["critical_runs"] == int((searched.y("y") <= 0.0).sum())
+    pairs = {(tuple(x), s) for x, s in zip(coarse.x, coarse.seed, strict=True)}
+    screened = np.array([(tuple(x), s) in pairs for x, s in zip(searched.x, searched.seed, strict=True)])
+    assert screened.sum() >= told["fidelity"]["screened"], "the same inputs and the same seed at both levels"
+    assert any("A coarse run counts as no failure" in sentence for sentence in summary.sentences)
+    run(tmp_path / "workers", SEARCH, fidelity=COARSE, executor={"kind": "local", "workers": 2})
+    assert rows(tmp_path / "whole") == rows(tmp_path / "workers")
+
+
+def test_a_falsification_leaves_coarse_runs_out_that_predict_nothing(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "import sbt\nfrom sbt.seeds import stream\n"
+        "def scenario(name):\n"
+        "    return sbt.Scenario(name, inputs=[sbt.Parameter('a', 0, 1)], requirement=sbt.Requirement('y', high=0.1),\n"
+        "        evaluate=lambda values, seed: {'y': float(stream(seed, name).random())})\n"
+        "FINE, COARSE = scenario('fine'), scenario('coarse')\n"
+    )
+    own = {"campaign": "falsification", "scenario": str(tmp_path / "own.py:FINE"), "budget": 30}
+    summary = run(tmp_path / "unlike", own, fidelity={"scenario": str(tmp_path / "own.py:COARSE"), "cost": 0.2})
+    assert summary.conclusion.to_dict()["fidelity"]["coarse"] <= 10
+    assert any("Screening did not pay" in sentence for sentence in summary.sentences)
