@@ -197,14 +197,15 @@ requirement: {{metric: ttc_path_min, critical: [-.inf, 1.0]}}
 def test_a_scenario_file_names_the_covariates_of_its_loop(tmp_path: Path) -> None:
     (tmp_path / "loop.py").write_text(LOOP)
     path = tmp_path / "scenario.yaml"
-    path.write_text(SCENARIO.format(covariates="loop.py:covariates"))
-    found = Covariates.of(from_file(str(path), tmp_path))
-    assert found is not None
-    assert found.names == ("first",)
     drawn = stream(7, "loop").exponential(6.0, 3).cumsum()[0]
-    assert found.at(np.array([[2.0]]), [7])[0, 0] == drawn - 2.0, "what the loop's generator draws first"
+    for right in ("loop.py:covariates", "auto"):
+        path.write_text(SCENARIO.format(covariates=right))
+        found = Covariates.of(from_file(str(path), tmp_path))
+        assert found is not None
+        assert found.names == ("first",)
+        assert found.at(np.array([[2.0]]), [7])[0, 0] == drawn - 2.0, "what the loop's generator draws first"
     for wrong, said in (
-        ("auto", "covariates must be file.py:NAME"),
+        ("own", "covariates must be auto or file.py:NAME"),
         ("loop.py:LENGTH", "must be a function covariates"),
         ("loop.py:covariate", "covariates"),
     ):

@@ -322,7 +322,7 @@ class Configuration(_Strict):
         "true: also by a general set, an error where nothing can be told; false: never.",
     )  # fmt: skip
     fidelity: FidelityChoice | None = Field(
-        default=None, description="Estimation: cheaper runs of the same inputs and seeds that teach; null: none."
+        default=None, description="Estimation, falsification: cheaper runs of the same inputs and seeds that teach; null: none."
     )
     judges: Annotated[tuple[Name, ...], Field(strict=False, max_length=20), AfterValidator(each_once)] | None = Field(
         default=None, description="Egos to run failures again with; default: falsification, the four reference drivers.",

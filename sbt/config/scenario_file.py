@@ -272,6 +272,12 @@ class _Builder:
         name = self._model.covariates
         if name is None:
             return None
+        if name == "auto":
+            if self._model.simulate is None:
+                rule = "what SUMO itself draws from files is not known before the run: covariates need a loop (simulate) that draws"
+                self._problems.add(("covariates",), f"{rule} its traffic, but there is none")
+                return None
+            name = f"{self._model.simulate.rpartition(':')[0]}:covariates"
         found: Covariates | None = self._problems.attempt(("covariates",), lambda: load("scenarios", name, self._folder))
         if found is not None and not callable(found):
             self._problems.add(("covariates",), f"covariates must be a function covariates(values, rng), but '{name}' is not")

@@ -215,7 +215,8 @@ class ScenarioModel(_Strict):
     sumo: Annotated[SumoEntry, _under("config")] | None = Field(default=None, description="The files, or just a .sumocfg.")
     simulate: Name | None = Field(default=None, description="file.py:NAME of a loop simulate(sumo, values, rng).")
     covariates: Name | None = Field(
-        default=None, description="file.py:NAME of covariates(values, rng): what the run's seed draws, by name, before the run."
+        default=None, description="file.py:NAME of covariates(values, rng): what the run's seed draws, by name, before the run; "
+        "auto: the function covariates in the file of the loop."
     )
     inputs: dict[str, InputEntry] = Field(min_length=1, description="By name; ${name} in the files.")
     correlation: Annotated[tuple[CorrelationEntry, ...], Field(strict=False, max_length=1000)] = Field(
@@ -265,8 +266,8 @@ class ScenarioModel(_Strict):
     @field_validator("covariates")
     @classmethod
     def _known_before(cls, value: str | None) -> str | None:
-        if value is not None and ".py:" not in value:
-            rule = "covariates must be file.py:NAME (what SUMO itself draws from files is not known before the run)"
+        if value is not None and value != "auto" and ".py:" not in value:
+            rule = "covariates must be auto or file.py:NAME (what SUMO itself draws from files is not known before the run)"
             raise ValueError(f"{rule}, but got '{value}'")
         return value
 
