@@ -274,8 +274,8 @@ class _Builder:
             return None
         if name == "auto":
             if self._model.simulate is None:
-                rule = "what SUMO itself draws from files is not known before the run: covariates need a loop (simulate) that draws"
-                self._problems.add(("covariates",), f"{rule} its traffic, but there is none")
+                rule = "what SUMO itself draws from files is not known before the run: covariates: auto needs a loop"
+                self._problems.add(("covariates",), f"{rule} (simulate), but there is none")
                 return None
             name = f"{self._model.simulate.rpartition(':')[0]}:covariates"
         found: Covariates | None = self._problems.attempt(("covariates",), lambda: load("scenarios", name, self._folder))
