@@ -106,8 +106,10 @@ def _thinned(found: Findings) -> tuple[History, str]:
 def _markers(found: Findings) -> str:
     """Return what the markers mean, of those that are there."""
     ok, critical = found.history.ok, found.critical
-    kinds = (("light circles are uncritical", ok & ~critical), ("dark triangles critical", critical), ("crosses failed", ~ok))
-    said = ", ".join(words for words, runs in kinds if runs.any())
+    circles, triangles = ("light circles", "uncritical", ok & ~critical), ("dark triangles", "critical", critical)
+    kinds = (circles, triangles, ("crosses", "failed", ~ok))
+    there = [(marker, verdict) for marker, verdict, runs in kinds if runs.any()]
+    said = ", ".join(f"{marker}{'' if k else ' are'} {verdict}" for k, (marker, verdict) in enumerate(there))
     return f"{said[:1].upper()}{said[1:]}{'; hollow markers are held out' if found.held_out.any() else ''}."
 
 
