@@ -41,7 +41,7 @@ SMALLEST = {
     "pairs.py": "crossing_pedestrian --seeds 1 --runs 30",
     "report_speed.py": "--runs 20 --scenario cut_in --clicks 2 --opened 1",
     "run_price.py": "--runs 2 --repeats 1 --only crossing_pedestrian",
-    "fidelity.py": "testbed:two_hollows_noisy --cost 0.2 --budget 60 --seeds 1",
+    "fidelity.py": "problems --budget 40 --seeds 1 --only useless --probabilities 0.38",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py"}
