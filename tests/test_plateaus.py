@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sbt
+from sbt.campaigns.records import BatchProposal
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.persistence import load, save
 from sbt.metamodels.stepped import Step, SteppedPredictor, better_stepped
@@ -15,6 +18,7 @@ from sbt.samplers.plateaus import beneath_plateaus, plateau
 from sbt.samplers.search import Search, search_data
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
+from sbt.store.database import Store
 
 LOW = CriticalInterval(high=0.0)
 CENTRE = np.array([0.35, 0.6])
@@ -89,3 +93,32 @@ def test_a_jump_is_widened_only_where_that_predicts_the_sides_better():
     assert wrong[1] < 0.5 * wrong[0]
     smooth = np.sin(5.0 * u[:, 0]) + u[:, 1] - 0.5
     assert better_stepped(PROCESS, PROCESS.fit(u, smooth, rng), LOW, u, smooth, shares, rng) is None
+
+
+def test_a_boundary_beside_plateaus_explores_in_whole_batches_and_looks_about_what_it_knows(tmp_path: Path):
+    """A disc of radius 0.04 beneath a funnel; batches of ten, though 20 are asked for, that explore or look about the disc."""
+
+    def evaluate(values: Mapping[str, float], seed: int) -> dict[str, float]:
+        distance = float(np.hypot(*(np.array([values["a"], values["b"]]) - CENTRE)))
+        return {"m": -1.0 if distance < 0.04 else max(distance - 0.2, 0.0) + 0.02}
+
+    inputs = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)]
+    scenario = sbt.Scenario("floors", inputs, sbt.Requirement("m", high=0.0), evaluate=evaluate)
+    result = sbt.run(
+        campaign="boundary", scenario=scenario, metamodel="gp", budget=60, initial=20, batch=20, seed=2, executor="serial",
+        store=tmp_path / "s", report=False,
+    )  # fmt: skip
+    with Store.read(tmp_path / "s") as store:
+        batches, history, about = [batch.read(BatchProposal) for batch in store.iterations()], store.history(), 0
+    u, hit = history.x, result.scenario.requirement.critical_runs(history)
+    for k, part in list(enumerate(batches))[2:]:  # the first 20 runs show the plateau
+        rows = np.flatnonzero(history.iteration == k)
+        before = u[hit & (history.iteration < k)]
+        if not part.explored and len(before) and len(rows) == 10:
+            guided = rows[(part.filling or 0) :][: (part.representative or 0) + (part.greedy or 0)]
+            assert (np.abs(u[guided][:, None] - before[None]).max(axis=2).min(axis=1) < 0.3).all()  # boxes that touch are one
+            about += len(guided)
+        elif part.explored:
+            assert len(rows) == 10
+            assert not part.representative
+    assert about > 0

@@ -14,6 +14,7 @@ from sbt.campaigns.combinations import EveryCombination, every_combination
 from sbt.campaigns.doubt import TrafficDoubt, traffic_doubt
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
+from sbt.campaigns.exploration import largest_batch
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place
@@ -142,7 +143,8 @@ def recipe(settings: Settings) -> Campaign:
             every,
         ), fitted  # fmt: skip
 
-    stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even)
+    most = largest_batch if settings.acquisition is None else None
+    stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even, most=most)
     return Campaign((stage,), conclude)
 
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sbt.acquisitions import boundary, even, log_scores
-from sbt.campaigns.exploration import exploration_share, explore, should_explore
+from sbt.campaigns.exploration import about_regions, exploration_share, explore, should_explore
 from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
@@ -89,11 +89,14 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
     least uncertainty far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
     nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
-    the mean P(critical) is below 1 %, half of the batch explores first (see `explore`), or more (see `exploration_share`).
+    the mean P(critical) is below 1 %, half of the batch explores first (see `explore`); beside plateaus all of it does, or
+    none, which then looks about the known regions (see `exploration_share`).
     """
     if fitted is None:
         return evenly(settings, fitted, log, n)
-    share = exploration_share(settings, log) if should_explore(settings, fitted, log) else 0.0
+    exploring = should_explore(settings, fitted, log)
+    share = exploration_share(settings, log) if exploring else 0.0
+    fitted = _within(fitted, about_regions(settings, log) if exploring else None)
     looking = explore(settings, log, min(_rounded(share * n, log), n))
     filling = min(_rounded(max(_FILLING - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
@@ -110,6 +113,19 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
         filling=len(fill), representative=len(typical), greedy=len(greedy),
     )  # fmt: skip
     return Chosen(so_far, proposal)
+
+
+def _within(fitted: FittedMetamodel, places: Callable[[Points], Mask] | None) -> FittedMetamodel:
+    """Return the metamodel for which runs elsewhere show nothing; None: they do."""
+    if places is None:
+        return fitted
+    success = fitted.log_success
+
+    def log_success(u: Points) -> Vector:
+        there = np.where(places(u), 0.0, -np.inf)
+        return there if success is None else there + success(u)
+
+    return replace(fitted, log_success=log_success)
 
 
 def _typical(settings: Settings, fitted: FittedMetamodel, log: Log, n: int, taken: Points, start: int) -> tuple[RoiDraw, Points]:

@@ -6,6 +6,8 @@ elsewhere, as a falsification does, until enough exploratory runs have found no 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial.distance import cdist
 
@@ -18,17 +20,18 @@ from sbt.metamodels.base import simplest
 from sbt.problem.arrays import Mask, Points
 from sbt.samplers.plateaus import plateau
 from sbt.samplers.portfolio import propose
-from sbt.samplers.search import DEFLATION, Search
+from sbt.samplers.search import DEFLATION, FreeRegion, Search
 from sbt.seeds import stream
-from sbt.store.history import VALIDATION
+from sbt.store.history import VALIDATION, History
 
-__all__ = ["exploration_share", "explore", "fruitless_runs", "should_explore", "space_filling"]
+__all__ = ["about_regions", "exploration_share", "explore", "fruitless_runs", "largest_batch", "should_explore", "space_filling"]
 
-_SHARE, _SHARE_HIDDEN, _SHARE_UNKNOWN = 0.5, 0.75, 0.9
-"""Shares of a batch that explore; where plateaus may hide regions; and there before the first critical run."""
+_SHARE = 0.5  # of a batch that explores
+_RUNS_ABOUT, _REACH = 8, 0.15  # beside plateaus: runs an input about each known region, and their distance to its critical runs
+_FEWEST_IN_BATCH, _BATCHES = 10, 30  # beside a plateau: runs of a batch at least, and into how many the budget is split at most
 _RARE = 0.01  # critical share of the space below which a region is easily missed
 _MOST_ROWS = 1000  # that the search learns from: it looks for regions, not for their edges, and costs the square of them
-_PATIENCE = 0.2  # of the budget: exploratory runs without a new region that end the exploration
+_PATIENCE, _PATIENCE_HIDDEN = 0.2, 0.4  # of the budget: exploratory runs without a new region that end the exploration
 
 
 def should_explore(settings: Settings, fitted: FittedMetamodel, log: Log) -> bool:
@@ -40,17 +43,61 @@ def should_explore(settings: Settings, fitted: FittedMetamodel, log: Log) -> boo
     """
     if settings.scenario.pool is not None:
         return False
-    runs = log.history.where(space_filling(log))
-    n, hits = int(runs.ok.sum()), int(settings.scenario.requirement.critical_runs(runs).sum())
+    n, hits = _filling_hits(settings, log)
     believed = fitted.record.critical_fraction < _RARE and float(interval(hits, n)[0]) <= _RARE
-    return (hits <= _RARE * n or believed) and fruitless_runs(settings, log) < _PATIENCE * settings.budget
+    return (hits <= _RARE * n or believed) and not _in_vain(settings, log)
+
+
+def _filling_hits(settings: Settings, log: Log) -> tuple[int, int]:
+    """Return how many runs that fill the space gave a metric, and how many of them were critical."""
+    runs = log.history.where(space_filling(log))
+    return int(runs.ok.sum()), int(settings.scenario.requirement.critical_runs(runs).sum())
+
+
+def _in_vain(settings: Settings, log: Log) -> bool:
+    """Return whether exploratory runs worth 20 % of the budget found no new region; 40 % where plateaus may hide regions."""
+    return fruitless_runs(settings, log) >= (_PATIENCE_HIDDEN if _hidden(settings, log) else _PATIENCE) * settings.budget
 
 
 def exploration_share(settings: Settings, log: Log) -> float:
-    """Return the share of the next batch that explores, if it does: where plateaus hide regions most of it until one is known."""
+    """Return the share of the next batch that explores, if it does: a half; where plateaus may hide regions, all or nothing.
+
+    There whole batches explore, because the search beside a plateau has several things to look at, and others look at the edges
+    of the regions that are known (see `about_regions`), until each has had eight runs an input.
+    """
     if not _hidden(settings, log):
         return _SHARE
-    return _SHARE_HIDDEN if settings.scenario.requirement.critical_runs(log.history).any() else _SHARE_UNKNOWN
+    known = len(_about_hits(settings, log.history).low)
+    parts = [batch.read(BatchProposal) for batch in log.iterations]
+    looked = sum((part.representative or 0) + (part.greedy or 0) for part in parts)
+    return float(looked >= _RUNS_ABOUT * settings.scenario.space.dimension * known)
+
+
+def about_regions(settings: Settings, log: Log) -> Callable[[Points], Mask] | None:
+    """Return which points (n, d) of the unit cube are near a critical run, where plateaus may hide others; else None.
+
+    The metamodel is uncertain all over a plateau, of which next to nothing is critical: its edges are where critical runs are.
+    """
+    free, at = _about_hits(settings, log.history), settings.scenario.space.cube.embedded
+    return (lambda u: ~free(at(u))) if len(free.low) and _hidden(settings, log) else None
+
+
+def _about_hits(settings: Settings, history: History) -> FreeRegion:
+    """Return the complement of boxes about the critical runs, one for those whose boxes touch."""
+    space, hit = settings.scenario.space, settings.scenario.requirement.critical_runs(history)
+    return FreeRegion.without(space.cube.embedded(np.clip(space.to_unit(history.x[hit]), 0.0, 1.0)), _REACH)
+
+
+def largest_batch(settings: Settings, log: Log) -> int:
+    """Return how many runs the next batch has at most.
+
+    While plateaus may hide small regions, and looking beneath them is not in vain, a thirtieth of the budget, at least ten: what
+    a few runs find tells where the next ones look.
+    """
+    n, hits = _filling_hits(settings, log)
+    if settings.scenario.pool is not None or hits > _RARE * n or not _hidden(settings, log) or _in_vain(settings, log):
+        return settings.batch
+    return min(settings.batch, max(settings.budget // _BATCHES, _FEWEST_IN_BATCH))
 
 
 def _hidden(settings: Settings, log: Log) -> bool:
@@ -110,5 +157,10 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
     y = scenario.requirement.values(seen)
     u = np.clip(space.to_unit(seen.x), 0.0, 1.0)
     pending = None if log.pending is None else np.clip(space.to_unit(log.pending.x), 0.0, 1.0)
-    picks = propose(search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration, pending=pending)
+    hidden = _hidden(settings, log)
+    filling = space_filling(log)[log.history.stage != VALIDATION] if hidden else None
+    picks = propose(
+        search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration, filling, pending=pending,
+        around_floors=hidden,
+    )  # fmt: skip
     return space.from_unit(np.clip(picks.u, 1e-12, 1 - 1e-12))

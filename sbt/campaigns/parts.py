@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -70,12 +71,14 @@ class BatchStage:
         settings: of the campaign.
         choose: the rule.
         repeats: two early runs repeat inputs with other seeds, to learn whether the simulator is noisy.
+        most: gives the largest number of runs of the next batch; None: those of the settings.
     """
 
     name: str
     settings: Settings
     choose: ChoiceRule
     repeats: bool = False
+    most: Callable[[Settings, Log], int] | None = None
 
     @property
     def ahead(self) -> int:
@@ -113,7 +116,8 @@ class BatchStage:
         """Return the next batch."""
         s, first = self.settings, log.iteration == 0
         spent = len(log.planned) - (0 if first else s.reference)
-        size = min(s.initial if first else s.batch, s.budget - spent)
+        batch = s.batch if self.most is None or first else self.most(s, log)
+        size = min(s.initial if first else batch, s.budget - spent)
         held_out = math.floor(s.holdout_fraction * (spent + size)) - math.floor(s.holdout_fraction * spent)
         held_out = min(held_out, size - 1) if size > 1 else 0
         held_out = 0 if self.repeats and few(s.scenario, log.planned, s.budget) else held_out
