@@ -130,6 +130,16 @@ def test_all_wrong_cells_are_told_and_what_breaks_constraints(tmp_path):
         inputs_from({"a": [0.1, 0.5], "b": [0.2, 0.4]}, space)
 
 
+def test_a_row_of_too_many_fields_is_told(tmp_path):
+    space, rows = ParameterSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0))), tmp_path / "rows.csv"
+    rows.write_text("a,b\n0.1,0.2\n0,1,0,8\n")
+    with pytest.raises(InputError, match=r"rows.csv:3: a row must have 2 fields, as the first line has, but has 4"):
+        read_inputs(rows, space)
+    rows.write_text("a;b\n0.1;0.2\n")
+    with pytest.raises(InputError, match="missing: a, b; commas separate columns"):
+        read_inputs(rows, space)
+
+
 def test_a_campaign_without_metamodel_says_so(campaign, tmp_path):
     campaign(campaign="coverage", budget=20, metamodel=None, store=str(tmp_path / "s"))
     (tmp_path / "rows.csv").write_text(ROWS)

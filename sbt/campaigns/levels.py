@@ -159,8 +159,8 @@ class LevelsTold:
             return f"{told}."
         times = self.one_level / self.two_levels
         if self.pays:
-            return f"{told}, so that without them equal precision would take {number(times, 2)} times the runs."
-        much = f"equal precision would take {number(times, 2)} times the runs without them, as far as so few pairs tell"
+            return f"{told}, which promise that equal precision would take {number(times, 2)} times the runs without them."
+        much = f"without them equal precision would take {number(times, 2)} times the runs, as far as these pairs tell"
         return f"{told}. They do not clearly pay, and were left out: {much}."
 
 
@@ -215,8 +215,9 @@ class ScreeningTold:
             f" ({self.pairs} pairs that none chose). A coarse run counts as no failure"
         )
         if self.times > 1 and self.gain is not None:
-            return f"{told}; by these numbers there are {number(self.gain, 2)} times as many critical runs for the same cost."
-        return f"{told}. Screening did not pay in the end, and was left out: {self._why}."
+            promised = f"these pairs promise {number(self.gain, 2)} times as many critical runs for the same cost"
+            return f"{told}; {promised}, which no run measured."
+        return f"{told}. Screening did not pay, and was left out: {self._why}."
 
     @property
     def _why(self) -> str:

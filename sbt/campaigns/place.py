@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit
 
+from sbt.campaigns.wording import measured, number
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
@@ -16,6 +17,8 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
 
 __all__ = ["BoundaryPlace", "Cut", "Stretch", "boundary_place"]
+
+_MOST_FIXED = 4  # inputs beside the two that a sentence names
 
 LogOdds = Callable[[Points], Vector]
 """(n, d) points of the unit cube -> (n,) log P(critical) - log P(uncritical): it still differs where both are near 0 or 1."""
@@ -70,6 +73,41 @@ class BoundaryPlace:
     cuts: tuple[Cut, ...]
     fixed: Mapping[str, Value]
     weights: Mapping[str, float]
+
+    @property
+    def vague(self) -> bool:
+        """Whether an edge is less certain than the critical stretch beside it is wide."""
+        return any(cut.unsure >= min(s.high - s.low for s in cut.critical) for cut in self.cuts)
+
+    def words(self, units: Mapping[str, str]) -> str:
+        """Return where critical meets uncritical, in words."""
+        first, unit = self.inputs[0], units.get(self.inputs[0], "")
+        second = self.inputs[1] if len(self.inputs) > 1 else ""
+        parts = []
+        for k, cut in enumerate(self.cuts):
+            at = "" if cut.at is None else f" at {measured('' if k else second, cut.at, units.get(second, '')).strip()}"
+            parts.append(f"{' and '.join(self._stretches(cut, unit))}{at}")
+        unsure = measured("", max(cut.unsure for cut in self.cuts), unit, 2).strip()
+        said = f"{first} is {', '.join(parts)} (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)"
+        if self.fixed:
+            names = sorted(self.fixed, key=lambda name: -self.weights.get(name, 0.0))
+            told = [measured(name, self.fixed[name], units.get(name, "")) for name in names[:_MOST_FIXED]]
+            told += [f"{len(names) - _MOST_FIXED} more inputs fixed too"] if len(names) > _MOST_FIXED else []
+            said += f", in the section with {', '.join(told)}"
+        return said
+
+    def _stretches(self, cut: Cut, unit: str) -> list[str]:
+        """Return the critical stretches of the first input, without ends that are those of its range."""
+        said = []
+        for stretch in cut.critical[:3]:
+            low, high = number(stretch.low, 3), measured("", stretch.high, unit).strip()
+            if stretch.low <= self.low:
+                said.append(f"below {high}")
+            elif stretch.high >= self.high:
+                said.append(f"above {measured('', stretch.low, unit).strip()}")
+            else:
+                said.append(f"{low} to {high}")
+        return said
 
 
 def boundary_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int) -> BoundaryPlace | None:

@@ -6,7 +6,6 @@ The first can be pasted: it names the scenario, the requirement, the interval, a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,11 +30,9 @@ if TYPE_CHECKING:
     from sbt.campaigns.failures import FalsificationConclusion
     from sbt.campaigns.modes import FailureMode
     from sbt.campaigns.parts import CriticalShare
-    from sbt.campaigns.place import BoundaryPlace, Cut
 
 __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
-_MOST_FIXED = 4  # inputs beside the two of a boundary that the sentence names
 _CONFIRM = "confirm"  # stage of the runs that repeat a failure
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
@@ -88,15 +85,17 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     else:
         sure = "no held-out run tested it"
     if found.place is not None:
-        where = _where(found.place, facts.units)
+        where = found.place.words(facts.units)
         lead = f"{_of(facts, 'In').strip() or 'Here'}, a run is critical ({_condition(facts)}) where {where}"
-        if _vague(found.place):
+        if found.place.vague:
             lead = (
                 f"Where runs{_of(facts)} are critical ({_condition(facts)}) is not known sharply yet: edges are less certain than"
                 f" the critical part is wide. The metamodel's best guess is that a run is critical where {where}"
             )
     else:
         lead = f"{percent(found.critical_fraction)} of the parameter space{_of(facts)} is critical ({_condition(facts)})"
+    if _none_critical(facts):
+        lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
     rests = f"the metamodel learned that from {plural(learned, 'run')}"
     missing = "an uncritical" if _all_critical(facts) else "a critical"
     denied = " The held-out runs deny its figures (below): do not rely on it yet." if _denied(found, measured_share) else ""
@@ -109,53 +108,21 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     return [*said, *_reconciled(found, measured_share), *_too_sure(found)]
 
 
-def _vague(place: BoundaryPlace) -> bool:
-    """Return whether an edge is less certain than the critical stretch beside it is wide."""
-    return any(cut.unsure >= min(s.high - s.low for s in cut.critical) for cut in place.cuts)
-
-
 def _denied(found: BoundaryConclusion, runs: CriticalShare) -> bool:
     """Return whether held-out runs deny the share of the metamodel, or its certainty."""
     share = found.critical_fraction or 0.0
     return bool(_too_sure(found)) or (runs.critical_fraction is not None and not runs.low <= share <= runs.high)
 
 
-def _where(place: BoundaryPlace, units: Mapping[str, str]) -> str:
-    """Return where critical meets uncritical, in words."""
-    first, unit = place.inputs[0], units.get(place.inputs[0], "")
-    second = place.inputs[1] if len(place.inputs) > 1 else ""
-    parts = []
-    for k, cut in enumerate(place.cuts):
-        at = "" if cut.at is None else f" at {measured('' if k else second, cut.at, units.get(second, '')).strip()}"
-        parts.append(f"{' and '.join(_stretches(cut, place, unit))}{at}")
-    unsure = measured("", max(cut.unsure for cut in place.cuts), unit, 2).strip()
-    said = f"{first} is {', '.join(parts)} (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)"
-    if place.fixed:
-        names = sorted(place.fixed, key=lambda name: -place.weights.get(name, 0.0))
-        told = [measured(name, place.fixed[name], units.get(name, "")) for name in names[:_MOST_FIXED]]
-        told += [f"{len(names) - _MOST_FIXED} more inputs fixed too"] if len(names) > _MOST_FIXED else []
-        said += f", with {', '.join(told)}"
-    return said
-
-
-def _stretches(cut: Cut, place: BoundaryPlace, unit: str) -> list[str]:
-    """Return the critical stretches of the first input, without ends that are those of its range."""
-    said = []
-    for stretch in cut.critical[:3]:
-        low, high = number(stretch.low, 3), measured("", stretch.high, unit).strip()
-        if stretch.low <= place.low:
-            said.append(f"below {high}")
-        elif stretch.high >= place.high:
-            said.append(f"above {measured('', stretch.low, unit).strip()}")
-        else:
-            said.append(f"{low} to {high}")
-    return said
-
-
 def _all_critical(facts: Facts) -> bool:
     """Return whether every run that gave a metric was critical."""
     ok = facts.history.ok
     return bool(ok.any() and facts.requirement.critical_runs(facts.history)[ok].all())
+
+
+def _none_critical(facts: Facts) -> bool:
+    """Return whether there are runs with a metric, and none of them was critical."""
+    return bool(facts.history.ok.any() and not facts.requirement.critical_runs(facts.history).any())
 
 
 def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:
@@ -188,8 +155,8 @@ def _reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
     alone = f"the {plural(runs.counted, 'held-out run')} alone say {percent(runs.critical_fraction)} ({_ends(runs)})"
     if not runs.low <= share <= runs.high:
         return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
-    sharper = "the metamodel's figure, which rests on all runs, is the sharper one"
-    return [f"{said}; {alone}. They agree: it lies within that interval{f'; {sharper}' if runs.counted < _MANY else ''}."]
+    sharper = "; the metamodel's figure, which rests on all runs, is the sharper one" if share and runs.counted < _MANY else ""
+    return [f"{said}; {alone}. They agree: it lies within that interval{sharper}."]
 
 
 def _too_sure(found: BoundaryConclusion) -> list[str]:
@@ -212,6 +179,11 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         return _nothing_found(found, facts)
     modes = found.failure_modes
     worst = f"; {_worst(modes[0], facts)}" if modes else ""
+    often = max(modes, key=lambda mode: mode.confirmed or 0.0, default=None)  # the first of equals
+    if often is not None and often is not modes[0]:
+        n, lost = often.confirmation_runs, often.confirmations_lost or 0
+        again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
+        worst += f"; run {often.representative} came back most often of all modes, in {again}"
     searched = int((facts.history.stage != _CONFIRM).sum())
     said = (
         f"The requirement{_of(facts)} is falsified: {found.critical_runs:,} of {plural(searched, 'run')} of the search"
@@ -225,7 +197,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
             f"; the {plural(random.counted, 'run')} among them drawn at random say {percent(random.critical_fraction)} of the"
             f" parameter space ({_ends(random)}), {few}"
         )
-    look = f"look at run {modes[0].representative} (replay) and keep it as a test (pin); " if modes else ""
+    look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin); "
     more = f"{look}campaign: estimation says how probable failures are, a larger budget looks for more modes"
     return [said, f"{silent}.", f"Next: {more}."]
 

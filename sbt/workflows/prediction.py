@@ -285,11 +285,16 @@ def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, .
     missing = [name for name in space.names if name not in short]
     if missing:
         named = ", ".join(name + did_you_mean(name, head) for name in missing)
-        raise InputError(f"{path}:1: every input must be a column, but missing: {named}")
+        hint = "; commas separate columns" if len(head) == 1 and any(mark in head[0] for mark in ";\t") else ""
+        raise InputError(f"{path}:1: every input must be a column, but missing: {named}{hint}")
     where = [short.index(name) for name in space.names]
     numbered = [(number, line) for number, line in enumerate(lines[1:], 2) if line]
     x, problems = np.empty((len(numbered), space.dimension)), []
     for row, (number, line) in enumerate(numbered):
+        if len(line) > len(head):
+            rule = f"a row must have {len(head)} fields, as the first line has"
+            problems.append(f"{path}:{number}: {rule}, but has {len(line)} (numbers have points, no commas)")
+            continue
         for k, (column, parameter) in enumerate(zip(where, space.parameters, strict=True)):
             try:
                 x[row, k] = _value(path, number, line, column, parameter)
