@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 import sbt
 from sbt.benchmark.compare import compare, table
-from sbt.campaigns.falsification import CONFIRM
+from sbt.campaigns.records import CONFIRM
 from sbt.config.load import parse
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.samplers.portfolio import propose

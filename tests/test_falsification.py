@@ -15,7 +15,8 @@ from studies import run_loaded
 from typer.testing import CliRunner
 
 from sbt.benchmark.compare import compare, table
-from sbt.campaigns.falsification import CONFIRM, METHODS
+from sbt.campaigns.falsification import METHODS
+from sbt.campaigns.records import CONFIRM
 from sbt.cli import app
 from sbt.config.load import parse
 from sbt.errors import InputError

@@ -262,12 +262,16 @@ def test_a_falsification_screens_its_candidates_and_counts_no_coarse_run(tmp_pat
 def test_a_falsification_leaves_coarse_runs_out_that_predict_nothing(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(
         "import sbt\nfrom sbt.seeds import stream\n"
-        "def scenario(name):\n"
+        "def scenario(name, times=1.0):\n"
         "    return sbt.Scenario(name, inputs=[sbt.Parameter('a', 0, 1)], requirement=sbt.Requirement('y', high=0.1),\n"
-        "        evaluate=lambda values, seed: {'y': float(stream(seed, name).random())})\n"
-        "FINE, COARSE = scenario('fine'), scenario('coarse')\n"
+        "        evaluate=lambda values, seed: {'y': 0.5 + times * (float(stream(seed, name).random()) - 0.5)})\n"
+        "FINE, COARSE, CONSTANT = scenario('fine'), scenario('coarse'), scenario('constant', 0.0)\n"
     )
     own = {"campaign": "falsification", "scenario": str(tmp_path / "own.py:FINE"), "budget": 30}
-    summary = run(tmp_path / "unlike", own, fidelity={"scenario": str(tmp_path / "own.py:COARSE"), "cost": 0.2})
-    assert summary.conclusion.to_dict()["fidelity"]["coarse"] <= 10
-    assert any("Screening did not pay" in sentence for sentence in summary.sentences)
+    for coarse, correlates in [("COARSE", True), ("CONSTANT", False)]:
+        summary = run(tmp_path / coarse, own, fidelity={"scenario": str(tmp_path / f"own.py:{coarse}"), "cost": 0.2})
+        told = summary.conclusion.to_dict()["fidelity"]
+        assert told["coarse"] <= 10
+        assert (told["correlation"] is not None) == correlates
+        said = [sentence for sentence in summary.sentences if "Screening did not pay" in sentence]
+        assert [("correlates" in sentence) for sentence in said] == [correlates]

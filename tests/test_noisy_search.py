@@ -12,8 +12,9 @@ from scipy.special import ndtr
 from scipy.stats import qmc
 
 import sbt
-from sbt.campaigns.failures import CONFIRM, search_runs
+from sbt.campaigns.failures import search_runs
 from sbt.campaigns.modes import modes_of
+from sbt.campaigns.records import CONFIRM
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from sbt.benchmark.outside import OUTSIDE
-from sbt.campaigns.falsification import CONFIRM, METHODS
+from sbt.campaigns.falsification import METHODS
+from sbt.campaigns.records import CONFIRM
 from sbt.config.assemble import assemble, scenario_of
 from sbt.config.load import Loaded
 from sbt.errors import InputError

@@ -15,6 +15,7 @@ from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
+from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.telling import tell_failures
@@ -32,11 +33,9 @@ from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord, Independence, Validation, optional, to_json
 
 __all__ = [
-    "CONFIRM", "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs",
+    "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs",
 ]  # fmt: skip
 
-CONFIRM = "confirm"
-"""Stage of the runs that repeat a failure mode's representative with fresh seeds; they come beside the budget."""
 _TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
 FILLING = ("initial", "even", VALIDATION)
 """Stages of runs that fill the space, whatever the results."""

@@ -12,10 +12,10 @@ from scipy.spatial.distance import cdist
 
 from sbt.acquisitions import even, is_greedy, log_scores
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
-from sbt.campaigns.failures import CONFIRM, FILLING, FailureSearch, FalsificationConclusion, confirmations, search_runs
+from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, confirmations, search_runs
 from sbt.campaigns.levels import coarse_runs, screening_told
 from sbt.campaigns.parts import held_out_runs, named_inputs
-from sbt.campaigns.records import SearchProposal
+from sbt.campaigns.records import CONFIRM, SearchProposal
 from sbt.campaigns.repeats import REPEAT, repeats_wanted
 from sbt.campaigns.screening import ScreenStage
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -35,7 +35,7 @@ from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 from sbt.store.history import History
 
-__all__ = ["CONFIRM", "FALSIFICATION", "METHODS", "recipe"]
+__all__ = ["FALSIFICATION", "METHODS", "recipe"]
 
 METHODS = ("portfolio", *CRITERIA, "cma_es")
 """Ways to choose a batch, as in `acquisition.kind`; any acquisition function is one more."""

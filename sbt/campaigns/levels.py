@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.campaigns.counting import DRAWN, LEARNED
-from sbt.campaigns.records import EstimationProposal, SearchProposal
+from sbt.campaigns.records import CONFIRM, EstimationProposal, SearchProposal
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import number, plural
 from sbt.loop.stages import Log
@@ -18,14 +18,16 @@ from sbt.store.history import History
 from sbt.store.records import Iteration
 
 __all__ = [
-    "COARSE", "LevelsTold", "Pairs", "ScreeningTold", "coarse_runs", "is_two_level", "left_two_levels", "levels_told",
-    "screening_told", "spent", "spent_by", "twins",
+    "COARSE", "LevelsTold", "Pairs", "ScreeningTold", "Twins", "coarse_runs", "is_two_level", "left_two_levels", "levels_told",
+    "rank_correlation", "screening_told", "spent", "twins",
 ]  # fmt: skip
 
 COARSE = "coarse"
 """Stage of runs at the coarse level."""
 _FEWEST = 3
-_CONFIRM = "confirm"  # stage of repetitions beside the budget
+
+Twins = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Rows of runs, and of coarse runs, that have the same inputs and seed."""
 
 
 def is_two_level(batch: Iteration) -> bool:
@@ -51,17 +53,17 @@ def spent(log: Log, settings: Settings) -> float:
     return len(log.history) + (settings.coarse_cost or 0.0) * len(coarse_runs(log))
 
 
-def spent_by(pairs: int, settings: Settings) -> float:
-    """Return what pairs run at both levels cost, in runs of the scenario."""
-    return pairs * (1.0 + (settings.coarse_cost or 0.0))
-
-
-def twins(log: Log) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def twins(log: Log) -> Twins:
     """Return the rows of the runs of a log, and of its coarse runs, that have the same inputs and seed."""
-    coarse, runs = coarse_runs(log), log.history
-    place = {(x.tobytes(), int(seed)): k for k, (x, seed) in enumerate(zip(coarse.x, coarse.seed, strict=True))}
-    at = np.array([place.get((x.tobytes(), int(s)), -1) for x, s in zip(runs.x, runs.seed, strict=True)], dtype=np.intp)
+    at = _same_pair(log.history, coarse_runs(log))
     return np.flatnonzero(at >= 0), at[at >= 0]
+
+
+def rank_correlation(a: Vector, b: Vector) -> float | None:
+    """Return the correlation of the ranks of a and b (n,); None of fewer than three, or where one of them is constant."""
+    from scipy.stats import spearmanr  # takes half a second to load
+
+    return float(spearmanr(a, b)[0]) if len(a) >= _FEWEST and np.ptp(a) > 0.0 and np.ptp(b) > 0.0 else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,16 +174,12 @@ def levels_told(log: Log, settings: Settings) -> LevelsTold | None:
     margins, at = settings.scenario.requirement.margins, _same_pair(runs, coarse)
     both = np.column_stack([margins(runs)[at >= 0], margins(coarse)[at[at >= 0]]])
     both = both[np.isfinite(both).all(axis=1)]
-    told = len(both) >= _FEWEST and np.ptp(both, axis=0).min() > 0.0
     rounds = [found for batch in log.iterations if (found := batch.read(EstimationProposal).levels) is not None]
     last = rounds[-1] if rounds else None
     judged: tuple[bool | None, float | None, float | None] = (None, None, None)
     if last is not None:
         judged = (last.coarse if last.pays is None else last.pays, last.two_levels, last.one_level)
-    from scipy.stats import spearmanr  # takes half a second to load
-
-    correlation = float(spearmanr(*both.T)[0]) if told else None
-    return LevelsTold(len(coarse), len(log.history), settings.coarse_cost, correlation, len(both), *judged)
+    return LevelsTold(len(coarse), len(log.history), settings.coarse_cost, rank_correlation(*both.T), len(both), *judged)
 
 
 @dataclass(frozen=True)
@@ -191,7 +189,7 @@ class ScreeningTold:
     Attributes:
         coarse, fine: runs at the coarse level and of the search.
         cost: of a coarse run, in runs of the scenario.
-        correlation: of the ranks of the metric at both levels, over pairs that no coarse run chose.
+        correlation: of the ranks of the metric at both levels, over pairs that no coarse run chose; None: they tell none.
         pairs: number of these.
         screened: runs that coarse runs chose among more candidates.
         times: candidates for each run as last judged; 1: screening does not pay.
@@ -201,7 +199,7 @@ class ScreeningTold:
     coarse: int
     fine: int
     cost: float
-    correlation: float
+    correlation: float | None
     pairs: int
     screened: int
     times: int
@@ -209,10 +207,10 @@ class ScreeningTold:
 
     def sentence(self) -> str:
         """Return it in words."""
+        alike = "" if self.correlation is None else f" and correlates with it by {number(self.correlation, 2)}"
         told = (
             f"{plural(self.coarse, 'coarse run')} chose {plural(self.screened, 'run')} of {self.fine:,}: a coarse run costs"
-            f" {number(self.cost, 2)} of a run and correlates with it by {number(self.correlation, 2)}"
-            f" ({self.pairs} pairs that none chose). A coarse run counts as no failure"
+            f" {number(self.cost, 2)} of a run{alike} ({self.pairs} pairs that none chose). A coarse run counts as no failure"
         )
         if self.times > 1 and self.gain is not None:
             promised = f"these pairs promise {number(self.gain, 2)} times as many critical runs for the same cost"
@@ -233,6 +231,6 @@ def screening_told(log: Log, settings: Settings) -> ScreeningTold | None:
     records = [found for batch in log.iterations if (found := batch.read(SearchProposal).coarse) is not None]
     last, at = records[-1] if records else None, twins(log)[0]
     screened = int((log.history.iteration[at] > 0).sum())
-    told = (0.0, 0, screened, 1, None) if last is None else (last.correlation, last.pairs, screened, last.times, last.gain)
-    fine = int((log.history.stage != _CONFIRM).sum())
+    told = (None, 0, screened, 1, None) if last is None else (last.correlation, last.pairs, screened, last.times, last.gain)
+    fine = int((log.history.stage != CONFIRM).sum())
     return ScreeningTold(len(coarse_runs(log)), fine, settings.coarse_cost, *told)

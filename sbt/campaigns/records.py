@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from sbt.store.records import optional
 
 __all__ = [
-    "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CoarseDraws", "CountedDraws", "EstimationProposal", "EventDraws",
+    "CONFIRM", "COUNT", "EXPLORE", "LEARN", "BatchProposal", "CoarseDraws", "CountedDraws", "EstimationProposal", "EventDraws",
     "LevelsRecord", "NominalDraws", "PoolSummary", "ScreenRecord", "SearchProposal",
 ]  # fmt: skip
 
 EXPLORE, LEARN, COUNT = "explore", "learn", "count"
 """Phases of an estimation: a search for modes, draws that only teach, draws that count."""
+CONFIRM = "confirm"
+"""Stage of the runs that repeat a failure mode's representative with fresh seeds; they come beside the budget."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class ScreenRecord:
     Attributes:
         times: candidates that are run coarse for each run; 1: screening did not pay, and there were none.
         rate: share of the candidates that are critical.
-        correlation: of the ranks of the metric at both levels, over pairs that no coarse run chose.
+        correlation: of the ranks of the metric at both levels, over pairs that no coarse run chose; None: they tell none.
         pairs: number of these.
         gain: critical runs for the same cost over those without; None: too little was known.
         random: of the batch, its first runs, which no coarse run chose.
@@ -62,7 +64,7 @@ class ScreenRecord:
 
     times: int
     rate: float
-    correlation: float
+    correlation: float | None
     pairs: int
     gain: float | None = None
     random: int = 0

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from sbt.campaigns.failures import FailureSearch
-from sbt.campaigns.levels import COARSE, coarse_runs, twins
+from sbt.campaigns.levels import COARSE, Twins, coarse_runs, rank_correlation, twins
 from sbt.campaigns.parts import named_inputs
 from sbt.campaigns.records import ScreenRecord, SearchProposal
 from sbt.campaigns.repeats import simulator_noise
@@ -151,9 +151,9 @@ class ScreenStage:
     def _chosen(self, log: Log) -> Batch:
         """Return runs of the scenario: candidates by their coarse runs, some at random, and what else a batch has."""
         s, last = self.search.failure_search.settings, log.last(SearchProposal)
-        every = coarse_runs(log)
-        left = ~np.isin(np.arange(len(every)), twins(log)[1])
-        mine, order = every.where(left), self._order(log, left)
+        every, pairs = coarse_runs(log), twins(log)
+        left = ~np.isin(np.arange(len(every)), pairs[1])
+        mine, order = every.where(left), self._order(log, pairs, left)
         newest = np.flatnonzero(mine.iteration == log.iteration - 1)
         deterministic = simulator_noise(log.history, s.scenario.requirement).noisy is False
         rng = stream(s.seed, "screened", log.iteration)
@@ -178,9 +178,9 @@ class ScreenStage:
         record = None if last is None or last.coarse is None else replace(last.coarse, random=count)
         return replace(batch, proposal=replace(_proposal(batch), coarse=record))
 
-    def _order(self, log: Log, mine: Mask) -> NDArray[np.intp]:
+    def _order(self, log: Log, pairs: Twins, mine: Mask) -> NDArray[np.intp]:
         """Return the rows of some coarse runs, the likeliest to be critical first; further seeds of a point last."""
-        expected, likely = (values[mine] for values in self._expected(log))
+        expected, likely = (values[mine] for values in self._expected(log, pairs))
         likely = np.minimum(likely, _SURE)
         worst = np.lexsort((np.where(likely >= _SURE, 0.0, expected), -likely))
         _, point = np.unique(coarse_runs(log).x[mine], axis=0, return_inverse=True)
@@ -190,20 +190,20 @@ class ScreenStage:
             times[point[row]] += 1
         return worst[np.argsort(turn[worst], kind="stable")]
 
-    def _expected(self, log: Log) -> tuple[Vector, Vector]:
+    def _expected(self, log: Log, pairs: Twins) -> tuple[Vector, Vector]:
         """Return (n,) expected margins of the scenario's runs at all coarse runs, and (n,) P(critical)."""
         requirement = self.search.failure_search.settings.scenario.requirement
-        coarse, (fine, at) = _margins(requirement.margins(coarse_runs(log))), twins(log)
+        coarse, (fine, at) = _margins(requirement.margins(coarse_runs(log))), pairs
         margin = _margins(requirement.margins(log.history))[fine]
         line, left_out = fit_trend(coarse[at, None], margin)
         expected, std = line(coarse[:, None]), max(float(np.sqrt(((margin - left_out) ** 2).mean())), 1e-12)
         return expected, ndtr(-expected / std)
 
-    def _rate(self, log: Log) -> float:
+    def _rate(self, log: Log, pairs: Twins) -> float:
         """Return how often the latest candidates are critical: by their coarse runs, or as they were run without."""
         history, coarse = log.history, coarse_runs(log)
         critical = self.search.failure_search.settings.scenario.requirement.critical_runs(history).astype(np.float64)
-        likely, found = self._expected(log)[1], np.empty(0)
+        likely, found = self._expected(log, pairs)[1], np.empty(0)
         for batch in log.iterations:
             proposal, rows = batch.read(SearchProposal), history.iteration == batch.number
             if proposal.method == _SCREEN:
@@ -218,15 +218,16 @@ class ScreenStage:
         """Return how many candidates there should be for each run, and why."""
         s = self.search.failure_search.settings
         requirement, history = s.scenario.requirement, log.history
-        coarse, (fine, at) = _margins(requirement.margins(coarse_runs(log))), twins(log)
+        coarse, both = _margins(requirement.margins(coarse_runs(log))), twins(log)
+        fine, at = both
         margin, blind = _margins(requirement.margins(history)), _unselected(log, self.name)
         known = blind[fine]
-        correlation = _rank_correlation(margin[fine[known]], coarse[at[known]])
+        correlation = rank_correlation(margin[fine[known]], coarse[at[known]])
         pairs = int(known.sum())
         if pairs < _FEWEST:
             return ScreenRecord(1, 0.0, correlation, pairs)
-        rate = self._rate(log)
-        sure = math.tanh(max(math.atanh(min(abs(correlation), 0.995)) - 1.0 / math.sqrt(pairs - 3.0), 0.0))
+        rate = self._rate(log, both)
+        sure = math.tanh(max(math.atanh(min(abs(correlation or 0.0), 0.995)) - 1.0 / math.sqrt(pairs - 3.0), 0.0))
         times, gain = max(((k, _gain(k, sure, rate, s.coarse_cost or 0.0)) for k in _TIMES), key=lambda each: each[1])
         return ScreenRecord(times if gain > _PAYS else 1, rate, correlation, pairs, gain)
 
@@ -241,12 +242,6 @@ def _gain(times: int, correlation: float, rate: float, cost: float) -> float:
 def _margins(margin: Vector) -> Vector:
     """Return margins, or metrics, (n,) within reach of each other; a missing one as large."""
     return within_reach(margin[:, None])[:, 0] if len(margin) else margin
-
-
-def _rank_correlation(a: Vector, b: Vector) -> float:
-    from scipy.stats import spearmanr  # takes half a second to load
-
-    return float(spearmanr(a, b)[0]) if len(a) > 2 and np.ptp(a) > 0.0 and np.ptp(b) > 0.0 else 0.0
 
 
 def _unselected(log: Log, stage: str) -> Mask:

@@ -19,6 +19,7 @@ from sbt.campaigns.lost import (
     repetitions,
     why_they_fail,
 )  # fmt: skip
+from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
-_CONFIRM = "confirm"  # stage of the runs that repeat a failure
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
@@ -184,7 +184,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         n, lost = often.confirmation_runs, often.confirmations_lost or 0
         again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
         worst += f"; run {often.representative} came back most often of all modes, in {again}"
-    searched = int((facts.history.stage != _CONFIRM).sum())
+    searched = int((facts.history.stage != CONFIRM).sum())
     said = (
         f"The requirement{_of(facts)} is falsified: {found.critical_runs:,} of {plural(searched, 'run')} of the search"
         f" {'was' if found.critical_runs == 1 else 'were'} critical ({_condition(facts)}), the first after"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sbt.campaigns.counting import DRAWN
-from sbt.campaigns.levels import COARSE, Pairs, coarse_runs, is_two_level, spent, spent_by
+from sbt.campaigns.levels import COARSE, Pairs, coarse_runs, is_two_level, spent
 from sbt.campaigns.records import (
     COUNT,
     LEARN,
@@ -105,10 +105,10 @@ class TwoLevelStage:
 
     def _first(self) -> Batch:
         """Return pairs of the inputs' distribution at both levels."""
-        n = self._pairs_first
+        s, n = self.settings, self._pairs_first
         x, seeds = self._pool(n, 0)
         fine = self._runs(x, seeds, np.ones(n), DRAWN)
-        coarse = self._runs(x, seeds, np.ones(n), COARSE) if spent_by(n, self.settings) <= self.settings.budget else []
+        coarse = self._runs(x, seeds, np.ones(n), COARSE) if n * (1.0 + (s.coarse_cost or 0.0)) <= s.budget else []
         counted = CountedDraws(0.0, (1.0,) * n, (0.0,) * n, (1.0,) * n)
         kept = EstimationProposal(LEARN, "difference", counted=counted, nominal=NominalDraws((1.0,) * n))
         return Batch((*coarse, *fine), kept)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sbt.campaigns.levels import rank_correlation
 from sbt.config.model import Configuration
 from sbt.errors import InputError
 from sbt.execution.spec import ScenarioSpec
@@ -77,8 +78,6 @@ def fidelity_findings(spec: ScenarioSpec, scenario: LogicalScenario, seed: int) 
         scenario: as configured.
         seed: of the pairs.
     """
-    from scipy.stats import spearmanr  # takes half a second to load
-
     if spec.coarse is None:
         return
     pairs = _run_pairs(spec, _jobs(scenario, seed, _PAIRS_CHECKED))
@@ -90,12 +89,13 @@ def fidelity_findings(spec: ScenarioSpec, scenario: LogicalScenario, seed: int) 
     names = [name for name in scenario.measured if all(name in pair.outcomes[1].metrics for pair in both)]
     values = [{name: np.array([p.outcomes[k].metrics[name] for p in both]) for name in names} for k in (0, 1)]
     fine, coarse = (scenario.requirement.margins(Pool(np.empty((len(both), 0)), each)) for each in values)
-    tied = np.ptp(fine) == 0.0 or np.ptp(coarse) == 0.0
-    correlation = float("nan") if tied else float(spearmanr(fine, coarse)[0])
+    correlation = rank_correlation(fine, coarse)
     same = int(((fine <= 0.0) == (coarse <= 0.0)).sum())
-    said = "the metric is the same in all of them" if tied else f"ranks of the metric correlate by {correlation:.2f}"
+    said, alike = "the metric is the same in all of them", {}
+    if correlation is not None:
+        said, alike = f"ranks of the metric correlate by {correlation:.2f}", {"correlation": correlation}
     cost = f"a coarse run costs {_cost(pairs):.2f} of a run (CPU time, {len(pairs)} pairs)"
-    numbers = {"cost": _cost(pairs), "pairs": len(both), "same_verdict": same} | ({} if tied else {"correlation": correlation})
+    numbers = {"cost": _cost(pairs), "pairs": len(both), "same_verdict": same} | alike
     detail = f"{cost}; {said}; {same} of {len(both)} have one verdict"
     yield Finding("for information: fidelity", ok=True, detail=detail, numbers=numbers)
 

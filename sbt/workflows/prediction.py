@@ -202,7 +202,6 @@ def _within(x: Points, space: ParameterSpace) -> Points:
     low, high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
     with np.errstate(invalid="ignore"):
         size = np.where(np.isfinite(low) & np.isfinite(high), _TOLERANCE * np.maximum(np.abs(low), np.abs(high)), 0.0)
-    with np.errstate(invalid="ignore"):
         outside = ~((x >= low - size) & (x <= high + size))
         broken = outside | ((x % 1 != 0) & np.array([p.discrete for p in space.parameters]))
     cells = np.argwhere(broken).tolist()
