@@ -149,6 +149,7 @@ def test_a_browser_goes_from_a_point_to_its_film(tmp_path):
     told = json.loads(unquote(base64.b64decode(answer.group(1)).decode()))
     assert told["errors"] == []
     assert told["loaded"] == 0, "nothing is asked from outside"
+    assert told["shares"] == 0, "and no button sends anything there"
     assert told["title"] == f"Run {told['run']}: critical" != told["other"]
     assert f"run {told['run']}, critical" in told["tip"]
     assert "d_v: " in told["tip"]

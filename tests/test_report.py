@@ -9,6 +9,7 @@ import shlex
 import time
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from sbt.campaigns.boundary import BoundaryConclusion
 from sbt.campaigns.coverage import CoverageConclusion
 from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.failures import FalsificationConclusion
+from sbt.campaigns.modes import NearestSafe
 from sbt.campaigns.parts import CriticalShare
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.distribution import Distribution
@@ -30,9 +32,10 @@ from sbt.report.explorer import explorer_data
 from sbt.report.gallery import _lines_of
 from sbt.report.html import write_report
 from sbt.report.influence import influence_of
+from sbt.report.modes import _change
 from sbt.report.projection import influence_from_runs, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
-from sbt.report.tables import critical_table
+from sbt.report.tables import critical_table, iteration_table
 from sbt.report.words import Findings, requirement_words, warnings_for
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import VALIDATION
@@ -205,7 +208,8 @@ def test_all_failed(tmp_path, d):
 
 
 @pytest.mark.parametrize(
-    ("d", "held_out", "predictor"), [(1, 50, predict), (1, 0, None), (3, 50, predict), (7, 50, None), (20, 0, predict)]
+    ("d", "held_out", "predictor"),
+    [(1, 50, predict), (1, 0, None), (2, 12, predict), (3, 50, predict), (7, 50, None), (20, 0, predict)],
 )
 def test_any_number_of_inputs(tmp_path, d, held_out, predictor):
     scenario = scenario_of(d)
@@ -213,7 +217,7 @@ def test_any_number_of_inputs(tmp_path, d, held_out, predictor):
         page = page_of(store, scenario, predictor)
     assert {"runs", "metric", "progress"} <= set(page.ids)
     assert ("probability" in page.ids) == (predictor is not None)
-    assert ("reliability" in page.ids) == (predictor is not None and held_out > 0)
+    assert ("reliability" in page.ids) == (predictor is not None and held_out >= 20), "of a handful nothing can be read"
 
 
 def test_thousands_of_runs_stay_a_small_file(tmp_path):
@@ -248,7 +252,7 @@ def test_says_what_limits_the_conclusion(tmp_path):
     done = EstimationConclusion(0.1, 0.0, 0.2, warnings=("own warning",))
     assert "not concluded: 110 of 110" in warned(tmp_path / "a")
     text = warned(tmp_path / "b", done, {"n_critical": 3, "calibration_error": 0.3})
-    for part in ("Only 3 critical runs", "Poor calibration", "own warning", "3 of 110 runs failed"):
+    for part in ("Only 3 critical runs", "Poor calibration", "Own warning.", "3 of 110 runs failed"):
         assert part in text
     assert "not concluded" not in text
     fine = warned(tmp_path / "c", EstimationConclusion(0.1, 0.0, 0.2), {})
@@ -408,8 +412,25 @@ def test_of_runs_with_the_same_margin_the_hardest_impact_comes_first(tmp_path):
     assert np.frombuffer(base64.b64decode(data["rank"]), "<i4").tolist() == [2, 0, 1, 3]
 
 
+def test_a_batch_is_of_the_stages_that_its_runs_name(tmp_path):
+    with Store.open(tmp_path, {"names": ["d_t", "d_v"], "scenario": "w", "campaign": "coverage"}, durable=False) as store:
+        stages = ("initial", "repeat", "initial")
+        store.plan(0, "search", [PlannedRun(stage, {"d_t": 1.0, "d_v": 2.0}) for stage in stages], [1, 2, 3], {})
+        for k in range(3):
+            store.append(Outcome(k, Status.OK, {"ttc_min": 1.0}))
+        table = iteration_table(store.iterations(), [fit_record(3, 9)], store.history(), Requirement("ttc_min", high=0.5))
+    assert table.rows[0][1].text == "initial, repeat"
+    assert table.columns == ("iteration", "stage", "runs", "critical", "failed", "how it was chosen"), "no column without a value"
+
+
+def test_what_spares_a_failure_may_be_the_seed_alone():
+    mode = SimpleNamespace(nearest_safe=NearestSafe(27, {}, 0.3544, {}))
+    assert _change(mode, scenario_of(2).space) == "another seed: 0.3544 (run 27)"
+
+
 def test_a_caption_speaks_of_the_lines_there_are():
     assert "no line is drawn" in _lines_of(np.full((3, 3), 0.02), whole=True)
+    assert "P is at most 0.064 all over" in _lines_of(np.array([[1e-7, 0.064]]), whole=True)
     both = _lines_of(np.array([[0.0, 1.0]]), whole=True)
     assert "Solid: P = 0.5" in both
     assert "dashed: 0.1 and 0.9" in both

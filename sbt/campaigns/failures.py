@@ -127,7 +127,7 @@ class FalsificationConclusion:
         if none_gave_a_metric(facts):
             return nothing_known(facts)
         said = tell_failures(self, share_among_held_out(facts), facts)
-        said += [self.statement] if self.statement and self.statement != _plain(facts.history, self) else []
+        said += _more(self, facts)
         if self.simulator_noise is not None:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         said += [*violations_words(self.violates), *independence_words(self.independence)]
@@ -269,6 +269,16 @@ def _counted(hits: int, n: int, modes: int) -> str:
     return f"{hits} of {n} runs of the search were critical, in {plural(modes, 'failure mode')}."
 
 
-def _plain(history: History, found: FalsificationConclusion) -> str:
-    """Return the statement that says no more than the first sentence of the conclusion."""
-    return _counted(found.critical_runs, len(search_runs(history)), len(found.failure_modes))
+def _more(found: FalsificationConclusion, facts: Facts) -> list[str]:
+    """Return what of the statement the first sentences of the conclusion do not say."""
+    bound, runs, said = found.bound, search_runs(facts.history), []
+    if bound is not None and (sobol := bound.space_filling_runs - bound.random_runs):
+        of = f"{sobol} of the {bound.space_filling_runs} space-filling runs"
+        said.append(f"The bound is that of random runs, and approximate, as {of} are scrambled Sobol points.")
+    failed = int((~runs.ok).sum())
+    if found.critical_runs and found.critical_runs == len(runs) - failed:
+        said.append("Every run that gave a metric was critical: no boundary was met.")
+    unsure = [mode for mode in found.failure_modes[1:] if mode.confirmed is not None and _uncritical(mode.confirmed, mode)]
+    said += [f"Of the other modes {len(unsure)} did not fail in every repetition with fresh seeds."] if unsure else []
+    says = "says" if failed == 1 else "say"
+    return [*said, *([f"{plural(failed, 'run')} of the search failed and {says} nothing about safety."] if failed else [])]

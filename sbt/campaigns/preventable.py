@@ -50,12 +50,15 @@ def count_avoided(modes: Sequence[Sequence[Judgement]]) -> list[str]:
     if not modes:
         return []
     drivers = dict.fromkeys(each.driver for mode in modes for each in mode)
-    counts = (f"{name} {sum(each.avoided is True for mode in modes for each in mode if each.driver == name)}" for name in drivers)
+    avoided = {name: sum(each.avoided is True for mode in modes for each in mode if each.driver == name) for name in drivers}
     unjudged = sum(all(each.avoided is None for each in mode) for mode in modes)
     rest = f"; to {unjudged} the models are not applicable" if unjudged else ""
     if unjudged == len(modes):
         return [f"The reference drivers' models are not applicable to {plural(unjudged, 'failure mode')}: nothing was judged."]
     judged = plural(len(modes), "judged failure mode")
+    if not any(avoided.values()):
+        return [f"Of {judged}, none of the reference drivers in the place of ego ({', '.join(avoided)}) avoids any{rest}."]
+    counts = (f"{name} {count}" for name, count in avoided.items())
     return [f"Of {judged}, reference drivers in the place of ego avoid: {', '.join(counts)}{rest}."]
 
 

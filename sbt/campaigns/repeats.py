@@ -66,7 +66,7 @@ class SimulatorNoise:
         again = f"{plural(self.repeats, 'run')} repeated inputs with other seeds"
         if not self.noisy:
             missed = percent(1.0 - _DOUBT ** (1.0 / self.repeats))
-            pairs = "in the only pair" if self.repeats == 1 else f"in all {self.repeats} pairs"
+            pairs = {1: "in the only pair", 2: "in both pairs"}.get(self.repeats, f"in all {self.repeats} pairs")
             said = f"No noise was met: metrics were equal {pairs} of runs with the same inputs and other seeds"
             sure = percent(1.0 - _DOUBT)
             return [f"{said}; with {sure} confidence, noise shows in less than {missed} of such pairs."]

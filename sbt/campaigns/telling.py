@@ -197,7 +197,8 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
             f"; the {plural(random.counted, 'run')} among them drawn at random say {percent(random.critical_fraction)} of the"
             f" parameter space ({_ends(random)}), {few}"
         )
-    look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin); "
+    never = "" if often is None or often.confirmed != 0.0 else ", with its own seed, as no repetition failed"
+    look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "
     more = f"{look}campaign: estimation says how probable failures are, a larger budget looks for more modes"
     return [said, f"{silent}.", f"Next: {more}."]
 

@@ -72,7 +72,7 @@ def requirement_words(requirement: Requirement, unit: str, units: Mapping[str, s
     """Return when a run is critical; `units` by metric are those of a combination's."""
     if isinstance(requirement, CombinedRequirement):
         joint, units = " or " if requirement.how == "any" else " and ", units or {}
-        said = [requirement_words(item, units.get(item.metric, ""), units) for item in requirement.items]
+        said = [requirement_words(item, units.get(item.metric, ""), units) + _called(item) for item in requirement.items]
         nested = (isinstance(item, CombinedRequirement) for item in requirement.items)
         return joint.join(f"({words})" if inner else words for words, inner in zip(said, nested, strict=True))
     low, high, name = requirement.critical.low, requirement.critical.high, requirement.metric
@@ -82,6 +82,11 @@ def requirement_words(requirement: Requirement, unit: str, units: Mapping[str, s
     if math.isinf(high):
         return f"{name} ≥ {low:g}{tail}"
     return f"{name} in [{low:g}, {high:g}]{tail}"
+
+
+def _called(requirement: Requirement) -> str:
+    """Return the name of one of several requirements, where it has one of its own."""
+    return f" ({requirement.name})" if requirement.name and requirement.name != requirement.metric else ""
 
 
 def mixture_shares(weights: Mapping[str, float]) -> str:

@@ -1,5 +1,5 @@
 // Figures by Plotly; it reads some markup in texts, which therefore are escaped.
-const PLAIN = { displaylogo: false, responsive: true, displayModeBar: false };
+const PLAIN = { displaylogo: false, responsive: true, displayModeBar: false, showSendToCloud: false, plotlyServerURL: "" };  // nothing leaves the page
 const narrow = () => window.innerWidth < 700;
 const TOOLS = { ...PLAIN, displayModeBar: !narrow(), modeBarButtonsToRemove: ["toImage", "autoScale2d", "zoomIn2d", "zoomOut2d"] };
 const safe = text => shortened(String(text)).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
@@ -57,7 +57,7 @@ const drawParallel = (place, data, view) => {
   const most = Math.min(LINES, Math.floor(CROSSINGS / (data.inputs.length + 1)));
   const critical = thinned(all.filter(row => data.verdict[row] === 1), Math.floor(most / 2));
   const rows = [...thinned(all.filter(row => data.verdict[row] === 0), most - critical.length), ...critical];
-  place.classList.toggle("empty", !rows.length);
+  place.closest(".panel").hidden = !rows.length;
   if (!rows.length) { place.textContent = "No run gave a number to draw."; return undefined; }
   place.dataset.lines = rows.length < all.length ? `Shown are ${rows.length} of ${all.length} runs; ranges filter all.` : "";
   const columns = [data.told, ...data.ranked];
@@ -87,8 +87,9 @@ const drawParallel = (place, data, view) => {
 };
 
 const drawInfluence = (place, data, chosen) => {
-  if (!data.inputs.some(input => input.influence) && !data.weights.some(weight => weight > 0)) { place.textContent = "The runs tell of none yet."; return undefined; }
-  const known = data.inputs.some(input => input.influence);
+  const known = data.inputs.some(input => input.influence), none = !known && !data.weights.some(weight => weight > 0);
+  place.parentNode.nextElementSibling.hidden = none;
+  if (none) { place.textContent = "The runs tell of none yet."; return undefined; }
   const ranked = [...data.ranked].reverse();
   const value = input => known ? input.influence[0] : data.weights[data.inputs.indexOf(input)];
   const errors = known ? { error_x: { type: "data", symmetric: false, color: colour("--ink"), thickness: 1.2, width: 3,
@@ -96,9 +97,9 @@ const drawInfluence = (place, data, chosen) => {
   const frame = look({});
   const trace = { type: "bar", orientation: "h", x: ranked.map(value), y: ranked.map((_, k) => k), marker: { color: colour("--model") }, ...errors,
     hovertemplate: "%{x:.3f}<extra></extra>" };
-  const title = known ? "total Sobol index of P(critical)" : "influence on the metric, relative";
-  const drawn = Plotly.react(place, [trace], look({ height: 90 + 24 * ranked.length, bargap: 0.35,
-    xaxis: { ...frame.xaxis, title: { text: title }, rangemode: "tozero" },
+  const title = known ? "total Sobol index" : "relative influence";
+  const drawn = Plotly.react(place, [trace], look({ height: 90 + 24 * ranked.length, bargap: 0.35, ...(ranked.length > 8 ? { margin: { l: 56, r: 14, t: 48, b: 10 } } : {}),
+    xaxis: { ...frame.xaxis, title: { text: title }, rangemode: "tozero", side: ranked.length > 8 ? "top" : "bottom" },  // of a long list the top is in view
     yaxis: { ...frame.yaxis, tickvals: ranked.map((_, k) => k), ticktext: ranked.map(input => safe(shortened(input.name, 22))) } }), PLAIN);
   if (!place.known) place.on("plotly_click", event => chosen(data.inputs.indexOf(ranked[event.points[0].pointNumber])));
   place.known = true;

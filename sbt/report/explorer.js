@@ -142,11 +142,11 @@ class Explorer {
     const about = [`stage ${data.stages[data.stage[row]]}`, `iteration ${data.iteration[row]}`, `seed ${data.seed[row]}`, ...modes].join(", ");
     this.part("facts").replaceChildren(...reason,
       make("table", { class: "facts-of-run" }, make("tbody", {}, ...group("Metrics", data.metrics), ...group("Inputs", data.inputs))),
-      make("p", { class: "note" }, about), ...this.command(run));
+      make("p", { class: "note" }, about), ...this.command(row));
   }
-  command(run) {
-    const film = this.data.commands.film;
-    return film ? [make("pre", { tabindex: "0", "aria-label": "command that opens this run" }, film.replaceAll("RUN", String(run)))] : [];
+  command(row) {
+    const { data } = this, { film, replay } = data.commands, command = data.verdict[row] === 2 || !data.traced ? replay : film;
+    return command ? [make("pre", { tabindex: "0", "aria-label": "command that opens this run" }, command.replaceAll("RUN", String(data.index[row])))] : [];
   }
   film(row) {
     const { data } = this, place = this.part("film"), run = data.index[row], raw = data.filmOf.get(run);
@@ -201,10 +201,11 @@ class Explorer {
       select.addEventListener("change", () => this.slice());
     }
     const row = this.nearestSlice(), run = data.index[row];
-    const errors = `The table is interpolated: off by up to ${digits(data.slices.error_p, 2)} in P(critical) and ${withUnit(digits(data.slices.error_mean, 2), data.told.unit)} in the metric.`;
     this.part("slice-title").textContent = row === view.run ? "The metamodel through this run" : `The metamodel through run ${run}, the nearest of ${data.slices.runs.length} runs with slices in this file`;
-    this.part("slice-note").textContent = errors;
-    const k = Number(select.value), input = data.inputs[k], grid = data.slices.grid[k];
+    const k = Number(select.value), input = data.inputs[k], grid = data.slices.grid[k], { error_p: p, error_mean: mean } = data.slices;
+    const off = p < 0.001 ? "by less than 0.001" : p < 0.05 ? `by up to ${digits(p, 1)}`
+      : `at its edges, which may lie up to ${withUnit(digits((grid[grid.length - 1] - grid[0]) / Math.max(grid.length - 1, 1), 1), input.unit)} beside`;
+    this.part("slice-note").textContent = input.whole ? "" : `Both are interpolated: the metric is off by up to ${withUnit(digits(mean, 2), data.told.unit)}, P(critical) ${off}.`;
     const move = drawSlice(this.part("slice"), data, row, k);
     Object.assign(slider, { min: grid[0], max: grid[grid.length - 1], step: input.whole ? 1 : "any" });
     const tell = value => {

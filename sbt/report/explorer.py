@@ -78,6 +78,7 @@ def explorer_data(
         "reason": {str(k): str(shown.reason[k])[:300] for k in np.flatnonzero(~shown.ok)[:2000]},
         "modes": _modes(found), "films": reeled, "lanes": reels.lanes, "film_note": note,
         "films_left_out": len(films) - len(reeled), "commands": dict(commands or {}),
+        "traced": (found.configuration.get("described") or {"traced": True})["traced"],
         "slices": _slices(found, scenario, predict, [film.run for film in films]),
     }  # fmt: skip
 

@@ -203,6 +203,13 @@ class Player {
   }
 }
 
+// The title of a panel, which is as high as about 14 letters are long.
+const inLines = (panel, unit) => {
+  const whole = withUnit(panel, unit ? `(${unit})` : "");
+  if (whole.length < 15) return safe(whole);
+  const words = panel.replace(/ so far$/, ""), rest = withUnit(panel.slice(words.length + 1), unit ? `(${unit})` : "").trim();
+  return [shortened(words, 15), rest].filter(Boolean).map(safe).join("<br>");
+};
 // The range of a panel of curves that shows all of some curves, and their limits.
 const reachOf = (panel, curves) => {
   const values = curves.filter(curve => curve.panel === panel).flatMap(curve => [...curve.values, ...(curve.limits || [])]).filter(Number.isFinite);
@@ -211,12 +218,14 @@ const reachOf = (panel, curves) => {
 };
 // Curves over time, a panel each, on axes for `all` curves; returns a function that moves the line of the moment.
 const drawCurves = async (Plotly, place, film, look, end = film.time[film.time.length - 1], all = null) => {
-  const panels = [...new Set(film.curves.map(curve => curve.panel))];
+  const known = new Set((all || film.curves).filter(curve => curve.values.some(Number.isFinite)).map(curve => curve.panel));
+  const panels = [...new Set(film.curves.map(curve => curve.panel))].filter(panel => known.has(panel));
   const colours = [ACTORS.ego, ACTORS.other];
   const n = panels.length, layout = look({ height: 40 + 96 * n, margin: { l: 52, r: 12, t: 8, b: 34 }, showlegend: false, shapes: [] });
-  const traces = film.curves.map((curve, k) => {
+  const drawn = film.curves.filter(curve => known.has(curve.panel));
+  const traces = drawn.map((curve, k) => {
     const p = panels.indexOf(curve.panel);
-    const mine = film.curves.slice(0, k).filter(other => other.panel === curve.panel).length;
+    const mine = drawn.slice(0, k).filter(other => other.panel === curve.panel).length;
     return { x: film.time, y: curve.values, name: safe(curve.name), mode: "lines", type: "scatter", xaxis: "x", yaxis: `y${p ? p + 1 : ""}`,
       line: { color: panels[p] === "speed" ? colours[mine % 2] : colour("--model"), width: 1.8 },
       hovertemplate: `${safe(curve.name)}: %{y:.3g} ${safe(curve.unit)}<extra></extra>` };
@@ -224,7 +233,7 @@ const drawCurves = async (Plotly, place, film, look, end = film.time[film.time.l
   panels.forEach((panel, p) => {
     const curve = film.curves.find(each => each.panel === panel), top = 1 - p / n;
     layout[`yaxis${p ? p + 1 : ""}`] = { ...layout.yaxis, domain: [top - 1 / n + 0.04, top], zeroline: false, nticks: 4, range: all ? reachOf(panel, all) : undefined,
-      title: { text: safe(withUnit(panel, curve.unit ? `(${curve.unit})` : "")), font: { size: 11 } } };
+      title: { text: inLines(panel, curve.unit), font: { size: 11 } } };
     for (const limit of curve.limits || []) layout.shapes.push({ type: "line", xref: "paper", x0: 0, x1: 1, y0: limit, y1: limit,
       yref: `y${p ? p + 1 : ""}`, line: { color: colour("--critical"), width: 1, dash: "dash" } });
   });

@@ -25,7 +25,7 @@ __all__ = ["Drawing", "draw"]
 _MOST_RUNS_ON_MAP = 800
 _MOST_PANELS = 9
 _FEW_HELD_OUT = 20
-_NO_CHANCE = 1e-6
+_NO_CHANCE, _SLIGHT = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,8 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
         return
     pair = (0,) if space.dimension == 1 else (most_influential_pairs(weights)[0] if space.dimension > 2 else (0, 1))
     plane = probability_plane(predict, found.requirement.critical, space, pair)
+    if float(np.nanmax(plane.probability)) < _NO_CHANCE or float(np.nanmin(plane.probability)) > 1 - _NO_CHANCE:
+        return  # one shade, of which nothing can be read
     figure = new_figure(5.4, 4.4)
     ax = figures.plot_probability(plane, space, figure.subplots())
     caption = "The metamodel's probability that a run is critical."
@@ -150,9 +152,9 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
             caption = caption[:-1] + f", {_MOST_RUNS_ON_MAP:,} of them, evenly spaced over the campaign."
     if space.dimension > 2:
         caption += (
-            f" Each value is the mean over {plane.averaged} Sobol points of the other {space.dimension - 2}"
-            f" input{'s' if space.dimension > 3 else ''} in their ranges (marginal P): a medium shade may mean uncertainty,"
-            " or that the other inputs decide."
+            f" Each value is the mean over {plane.averaged} Sobol points of the other"
+            f" {f'{space.dimension - 2} inputs in their ranges' if space.dimension > 3 else 'input in its range'} (marginal P):"
+            " a medium shade may mean uncertainty, or that the other inputs decide."
         )
     if len(pair) == 2:
         caption += _lines_of(plane.probability, whole=space.dimension == 2)
@@ -168,8 +170,7 @@ def _lines_of(probability: Vector, *, whole: bool) -> str:
         said += f"{';' if solid else ' Dashed:'}{' dashed:' if solid else ''} {' and '.join(f'{level:g}' for level in dashed)}"
     if not said:
         ends = (f"{low:.2g}", f"{high:.2g}")
-        span = f"about {ends[0]}" if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
-        span = f"below {_NO_CHANCE:g}" if high < _NO_CHANCE else f"above {1 - _NO_CHANCE:g}" if low > 1 - _NO_CHANCE else span
+        span = f"about {ends[0]}" if ends[0] == ends[1] else f"at most {ends[1]}" if low < _SLIGHT else f"{ends[0]} to {ends[1]}"
         return f" P is {span} all over: no line is drawn."
     return f"{said}." + (" The gap between the dashed lines is its uncertainty." if whole and len(dashed) == 2 else "")
 
@@ -209,8 +210,8 @@ def _maps_by_choice(
 def _held_out(found: Findings, space: ParameterSpace, predict: Predict) -> Iterator[Drawing]:
     """Yield the figures of the last metamodel on held-out runs."""
     mask = found.held_out
-    if not mask.any():
-        return
+    if int(mask.sum()) < _FEW_HELD_OUT:
+        return  # of a handful no curve can be read; a warning says so
     log_p, log_not = log_probability(predict, found.requirement.critical, space.to_unit(found.history.x[mask]))
     truth, n = found.critical[mask], int(mask.sum())
     if truth.any():
@@ -222,8 +223,6 @@ def _held_out(found: Findings, space: ParameterSpace, predict: Predict) -> Itera
             " dashed: flagging everything."
         )
         yield Drawing("precision_recall", "Finding critical runs", caption, to_svg(figure, "precision_recall"))
-    if int(mask.sum()) < _FEW_HELD_OUT and not truth.any():
-        return  # a single bin, of which nothing can be read
     figure = new_figure(5.4, 4.0)
     curves.plot_reliability(np.exp(log_p), truth, figure.subplots())
     caption = (
@@ -274,7 +273,7 @@ def _counts(found: Findings) -> Iterator[Drawing]:
     caption = "Critical runs found so far, by the stage that requested them."
     if len(found.history.held_out):
         caption += (
-            " Dashed: the number expected of as many random runs, from the share among the held-out ones. A steeper curve is"
-            " the gain of choosing runs."
+            " Dashed: the number expected of as many random runs, from the share among the held-out ones (in brackets its 95 %"
+            " interval). A steeper curve is the gain of choosing runs."
         )
     yield Drawing("progress", "Critical runs over the campaign", caption, to_svg(figure, "progress"))

@@ -22,11 +22,12 @@ __all__ = ["drawing_of_modes", "mode_table"]
 
 _MOST_COLOURS = 8
 _COLOURS = ("#c1272d", "#1f4e79", "#e08e0b", "#2e7d5b", "#7b4fa3", "#0e8fa0", "#8a5a2b", "#d1579a")
+_JOINED = "Critical runs are one mode where the metamodel joins them by a segment with P(critical) > 0.5"
+_ALIKE = " and the nearest road user was on the same side of ego and on the same course"
 _NOTE = (
-    "Critical runs are one mode where the metamodel joins them by a segment with P(critical) > 0.5 and the nearest road user"
-    " was on the same side of ego and on the same course; the deepest mode first. Confirmed: share of repetitions of the"
-    " representative with fresh seeds that were critical again. What makes it safe: the change of inputs to the nearest run, in"
-    " the unit cube, that is not critical. Most likely: the mode's run of largest density."
+    "; the deepest mode first. Confirmed: share of repetitions of the representative with fresh seeds that were critical again."
+    " What makes it safe: the change of inputs to the nearest run, in the unit cube, that is not critical. Most likely: the"
+    " mode's run of largest density."
 )
 
 
@@ -53,7 +54,7 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     which = ("violates",) if several else ()
     columns = ("mode", "representative", metric, *which, "runs", "confirmed", *evidence, *who, *space.names, "what makes it safe",
                *(("avoided by",) if judged else ()), "most likely")  # fmt: skip
-    note = _NOTE + (f" {KNOWN_LIMITS}" if judged else "")
+    note = _JOINED + (_ALIKE if typed else "") + _NOTE + (f" {KNOWN_LIMITS}" if judged else "")
     return Table(columns, tuple(rows), note if rows else "")
 
 
@@ -82,7 +83,7 @@ def _change(mode: FailureMode, space: ParameterSpace) -> str:
         for name, change in ranked
     )
     rest = len(safe.change) - len(ranked)
-    return f"{changes}{f' and {rest} more' if rest > 0 else ''}: {number(safe.metric)} (run {safe.run})"
+    return f"{changes or 'another seed'}{f' and {rest} more' if rest > 0 else ''}: {number(safe.metric)} (run {safe.run})"
 
 
 def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) -> Iterator[tuple[str, str]]:
@@ -103,6 +104,7 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
     ok = history.ok
     ax.scatter(history.x[ok, across], vertical[ok], s=9, color="#c3c9cf", linewidths=0, label="other runs", zorder=1)
     where = {int(index): row for row, index in enumerate(history.index)}
+    arrows = False
     for k, mode in enumerate(modes[:_MOST_COLOURS]):
         rows = [where[run] for run in mode.runs if run in where]
         ax.scatter(
@@ -110,8 +112,8 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
         )
         at, safe = where[mode.representative], mode.nearest_safe
         ax.scatter(history.x[at, across], vertical[at], marker="*", s=150, color=_COLOURS[k], edgecolor="white", zorder=4)
-        if safe is not None and safe.run in where:
-            to = where[safe.run]
+        if safe is not None and safe.change and safe.run in where:
+            to, arrows = where[safe.run], True
             ax.annotate(
                 "", (history.x[to, across], vertical[to]), (history.x[at, across], vertical[at]), zorder=3,
                 arrowprops={"arrowstyle": "->", "color": _COLOURS[k], "lw": 1.2},
@@ -121,7 +123,8 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
     ax.set_ylabel(found.requirement.told_as if up is None else names[up])
     whole_ticks(ax, space.parameters[across], *(() if up is None else (space.parameters[up],)))
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
-    caption = "Critical runs by failure mode; star: representative; arrow: to the nearest run that is not critical."
+    arrow = "; arrow: to the nearest run that is not critical" if arrows else ""
+    caption = f"Critical runs by failure mode; star: representative{arrow}."
     if space.dimension > 2:
         caption += " The two inputs of largest influence are shown; in the others the runs differ too."
     if len(modes) > _MOST_COLOURS:

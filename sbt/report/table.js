@@ -86,8 +86,10 @@ class RunTable {
     this.body.replaceChildren(...shown.map(row => make("tr", { class: row === this.current ? "chosen" : undefined },
       ...this.columns.map((column, k) => k === 0 ? make("td", {}, this.opener(row)) : make("td", {}, column.text(row))))));
     const total = data.total > data.index.length ? ` (of ${data.total} in the store)` : "";
-    this.says.textContent = `${sorted.length} of ${data.index.length} runs${total}, ${sorted.filter(row => data.verdict[row] === 1).length} critical.`
-      + (sorted.length ? ` Rows ${first + 1} to ${first + shown.length}${this.order.column === null ? ", most critical first" : ""}.` : "");
+    const count = verdict => sorted.filter(row => data.verdict[row] === verdict).length, failed = count(2);
+    const ordered = this.order.column === null && failed < sorted.length ? ", most critical first" : "";
+    this.says.textContent = `${sorted.length} of ${data.index.length} runs${total}, ${count(1)} critical${failed ? `, ${failed} failed` : ""}.`
+      + (sorted.length ? ` Rows ${first + 1} to ${first + shown.length}${ordered}.` : "");
     this.before.disabled = first === 0;
     this.after.disabled = first + PAGE >= sorted.length;
   }

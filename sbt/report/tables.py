@@ -14,12 +14,12 @@ from sbt.campaigns.modes import worst_first
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent, written_unit
 from sbt.plugins import OBJECT
-from sbt.problem.arrays import Vector
 from sbt.problem.outcome import doubts
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
+from sbt.report.influence import Influence
 from sbt.report.words import SCORES, distribution_words
 from sbt.store.history import History, Record
 from sbt.store.records import FitRecord, Iteration, Judgement
@@ -74,16 +74,17 @@ class Table:
         return tuple(any(cell.numeric for cell in column) for column in zip(*self.rows, strict=True))
 
 
-def input_table(scenario: LogicalScenario, influence: Vector | None) -> Table:
-    """Return the inputs; with a metamodel also their relative influence on P(critical)."""
+def input_table(scenario: LogicalScenario, influence: Influence | None) -> Table:
+    """Return the inputs; with their influence on P(critical) where that is known."""
     columns = ["input", "range", "unit", "distribution", "description"]
     rows = [_input(parameter) for parameter in scenario.space.parameters]
     if influence is not None:
         columns.insert(4, "influence")
-        rows = [(*row[:4], Cell(f"{value:.2f}", float(value)), *row[4:]) for row, value in zip(rows, influence, strict=True)]
+        shares = influence.total.tolist()
+        rows = [(*row[:4], Cell(f"{share:.2f}", share), *row[4:]) for row, share in zip(rows, shares, strict=True)]
     notes = []
     if influence is not None:
-        notes.append("Influence: total Sobol index of the metamodel's P(critical) over the ranges, relative to the largest.")
+        notes.append("Influence: total Sobol index of the metamodel's P(critical) over the ranges.")
     if scenario.space.constraints:
         notes.append("Constraints: " + "; ".join(text for text, _ in scenario.space.constraints) + ".")
     if scenario.space.correlation is not None:
@@ -129,14 +130,16 @@ def iteration_table(
 ) -> Table:
     """Return how each batch was chosen, what it gave, and the scores of the metamodel then; `coarse`: runs that only teach."""
     critical, by_iteration = requirement.critical_runs(history), {fit.iteration: fit for fit in fits}
-    scored = [key for key in _LIST_SCORES if any(fit.score(key) is not None for fit in fits)]
-    mixes = any(fit.weights for fit in fits)
+    chose = [by_iteration[batch.number] for batch in iterations if batch.number in by_iteration]
+    scored = [key for key in _LIST_SCORES if any(fit.score(key) is not None for fit in chose)]
+    mixes = any(fit.weights for fit in chose)
     rows = []
     for batch in iterations:
         mine, fit = history.iteration == batch.number, by_iteration.get(batch.number)
         weights = None if fit is None else fit.weights
         rows.append((
-            Cell.of(batch.number), Cell(str(batch.stage)), Cell.of(int(mine.sum())),
+            Cell.of(batch.number), Cell(", ".join(dict.fromkeys(history.stage[mine].tolist())) or str(batch.stage)),
+            Cell.of(int(mine.sum())),
             *([] if coarse is None else [Cell.of(int((coarse.iteration == batch.number).sum()))]),
             Cell.of(int((mine & critical).sum())), Cell.of(int((mine & ~history.ok).sum())),
             *(_score(key, None if fit is None else fit.score(key)) for key in scored),

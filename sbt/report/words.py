@@ -139,7 +139,8 @@ def _about_contacts(found: Findings) -> list[str]:
     critical, sentences = int(found.critical.sum()), []
     for doubt, words in _DOUBTS.items():
         n = int((found.critical & found.history.doubtful(doubt)).sum())
-        which = "The critical run has" if critical == 1 else f"{n:,} of the {critical:,} critical runs have"
+        of, has = f"{n:,} of the {critical:,} critical runs", "has" if n == 1 else "have"
+        which = "The critical run has" if critical == 1 else f"{of} {has}"
         sentences += [f"{which} {words}; the table of contacts says more."] if n else []
     passed = int(found.history.doubtful(Doubt.OTHER_LEVEL).sum())
     if passed:
@@ -163,7 +164,7 @@ def warnings_for(found: Findings) -> list[str]:
         *_about_runs(found),
         *_about_contacts(found),
         *_about_scores(found),
-        *map(str, getattr(found.conclusion, "warnings", ())),
+        *(f"{told[:1].upper()}{told[1:].rstrip('.')}." for told in map(str, getattr(found.conclusion, "warnings", ()))),
     ]
 
 
@@ -193,8 +194,8 @@ def _about_runs(found: Findings) -> list[str]:
         n = int(found.held_out.sum())
         most = percent(float(upper(0, n, 0.95)))
         own = isinstance(found.conclusion, FalsificationConclusion)  # which states a bound by more runs
-        bound = f" From the {n:,} random held-out runs alone, up to {most} may be critical (95 %)." if n and not own else ""
-        sentences.append(f"No critical run was found. That is no proof that there is none.{bound}")
+        bound = f" From the {n:,} random held-out runs alone, up to {most} may be critical (95 %)." if n else ""
+        sentences += [] if own else [f"No critical run was found. That is no proof that there is none.{bound}"]
     if len(set(history.versions)) > 1:
         sentences.append("Runs were made with different versions of the software; see the header.")
     return sentences

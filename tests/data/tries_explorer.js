@@ -44,6 +44,7 @@ const picture = () => part("film").querySelector("canvas").toDataURL();
     told.slice = part("slice-says").textContent;
     told.markup = document.querySelectorAll("#explore b").length;
     told.loaded = performance.getEntriesByType("resource").length;
+    told.shares = [...document.querySelectorAll(".js-plotly-plot")].filter(plot => plot._context.showSendToCloud || plot._context.plotlyServerURL).length;
     await new Promise(r => setTimeout(r, 200));
   } catch (error) { told.errors.push(String(error)); }
   const answer = document.createElement("pre"); answer.id = "answer"; answer.textContent = btoa(encodeURIComponent(JSON.stringify(told))); document.body.append(answer);
