@@ -51,6 +51,15 @@ def test_the_report_has_no_serious_fault(browser: Browser, tmp_path: Path) -> No
         page = write_report(store, scenario, predict, None, film=films_of)
     browser.open(f"file://{page}")
     browser.wait(DRAWN)
+    assert browser.ask("[...document.querySelectorAll('main > section')].map(each => each.id)") == [
+        "explore", "figures", "inputs", "critical", "failed", "iterations", "reproduce", "about"
+    ], "what is read after the first paint is in its place"
+    heads = "[...document.querySelectorAll('#inputs tbody td:first-child')].map(cell => cell.textContent)"
+    before = browser.ask(heads)
+    browser.ask("document.querySelector('#inputs th').click(); 0")
+    assert browser.ask(heads) == sorted(before)
+    browser.ask("document.querySelector('#inputs th').click(); 0")
+    assert browser.ask(heads) == sorted(before, reverse=True)
     assert faults(browser) == []
 
 

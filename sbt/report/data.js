@@ -1,11 +1,22 @@
 // The data of the page and small helpers; every text that came from a campaign is written as text, never as markup.
-const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
+const bytesOf = text => {
+  const raw = atob(text), bytes = new Uint8Array(raw.length);
+  for (let k = 0; k < raw.length; k++) bytes[k] = raw.charCodeAt(k);
+  return bytes;
+};
 const floats = text => new Float32Array(bytesOf(text).buffer);
 const wholes = text => new Int32Array(bytesOf(text).buffer);
 const unpacked = async id => {
   const packed = document.getElementById(id).textContent.trim();
   const stream = new Blob([bytesOf(packed)]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).text();
+};
+// Calls once something is painted, or after 2 s: a window that nobody sees paints nothing.
+const afterPaint = then => {
+  let begun = false;
+  const once = () => { if (!begun) { begun = true; then(); } };
+  if (window.PerformanceObserver) new PerformanceObserver(once).observe({ type: "paint", buffered: true });
+  setTimeout(once, 2000);
 };
 // The library is large: it is unpacked after the page is painted.
 const withLibrary = async then => {

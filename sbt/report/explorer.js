@@ -241,4 +241,4 @@ const begin = async () => {
   if (!document.getElementById("explorer-data") || !window.DecompressionStream) return;
   await explore(opened(JSON.parse(await unpacked("explorer-data"))));
 };
-begin();
+afterPaint(begin);

@@ -48,4 +48,4 @@ const compare = async () => {
   new ResizeObserver(() => versus.player.show(versus.player.now)).observe(place);
   if (document.getElementById("library").textContent.trim()) setTimeout(() => withLibrary(() => versus.draw()), 30);
 };
-compare();
+afterPaint(compare);
