@@ -19,6 +19,7 @@ SMALLEST = {
     "overhead.py": "--runs 32",
     "physics.py": "emergency_braking --runs 2 --others 1 --egos IDM",
     "proposals.py": "--runs 30 --repeats 1",
+    "race.py": "--races 20",
     "screening.py": "--rows 50 --inputs 4 --samples 4 --kinds gp",
     "slice_teeth.py": "--scenario following --points 2 --values 4",
     "step_length.py": "--scenario cut_in --points 16 --seeds 2 --reference 0.025",
@@ -49,6 +50,7 @@ SUMO |= {"fuzz.py", "noise.py", "pairs.py", "physics.py", "run_price.py", "throu
 SUMO |= {"report_speed.py"}  # and Chromium
 LONG = {"batch_size.py", "benchmark_page.py", "known_before.py", "snapshots.py"}  # hours, or minutes
 SHARED = {"coarse_problems.py", "disturbing.py", "fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
+SHARED |= {"two_discs.py"}
 
 
 def test_every_script_is_known():

@@ -15,7 +15,8 @@ from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
-from sbt.campaigns.records import CONFIRM
+from sbt.campaigns.rates import LocalRates, local_rates
+from sbt.campaigns.records import CONFIRM, RACE, SearchProposal
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.telling import tell_failures
@@ -23,7 +24,7 @@ from sbt.campaigns.warmed import conditional_on
 from sbt.campaigns.wording import percent, plural
 from sbt.errors import InputError
 from sbt.estimators.binomial import upper
-from sbt.loop.stages import Facts
+from sbt.loop.stages import Facts, Log
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Json, Value
 from sbt.problem.requirement import Requirement
@@ -33,7 +34,8 @@ from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord, Independence, Validation, optional, to_json
 
 __all__ = [
-    "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "search_runs",
+    "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "races",
+    "search_runs",
 ]  # fmt: skip
 
 _TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
@@ -91,7 +93,7 @@ class FalsificationConclusion:
         first_critical_run: index of the first critical run of the search, from 0; None: there is none.
         runs_to_first: how many runs of the search it took, from 1.
         critical_runs: of the search; confirmations are not counted.
-        failure_modes: the deepest first; of a noisy simulator the likeliest to fail again.
+        failure_modes: the deepest first; of a noisy simulator in the order of failure rates (`rates.local_rates`).
         bound: where nothing critical was found, what the space-filling runs say about the critical share of the box.
         closest: where nothing critical was found, the run nearest to the critical interval.
         statement: what follows from the runs, and no more.
@@ -101,6 +103,7 @@ class FalsificationConclusion:
         independence: of the metrics of a combination, given the inputs.
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
         fidelity: what coarse runs did for it, where there are some.
+        raced: repetitions that helped to order the modes and count in no rate; None: there are none.
     """
 
     first_critical_run: int | None
@@ -116,6 +119,7 @@ class FalsificationConclusion:
     independence: Independence | None = optional()
     explained: ExplainedVariance | None = optional()
     fidelity: ScreeningTold | None = optional()
+    raced: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -131,7 +135,7 @@ class FalsificationConclusion:
         if self.simulator_noise is not None:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         said += [*violations_words(self.violates), *independence_words(self.independence)]
-        said += _rates(self.failure_modes)
+        said += _rates(self)
         said += [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
         said += [] if self.fidelity is None else [self.fidelity.sentence()]
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
@@ -149,7 +153,7 @@ class FailureSearch:
 
     def __init__(self, settings: Settings):
         self.settings = settings
-        self._last: tuple[tuple[int, ...], list[Mode]] = ((), [])
+        self._last: tuple[tuple[tuple[int, ...], tuple[int, ...]], list[Mode], LocalRates] | None = None
 
     @cached_property
     def search(self) -> Search:
@@ -167,37 +171,52 @@ class FailureSearch:
         """Return (n,) distance to M_c in the metric's unit, NaN where a run failed."""
         return self.settings.scenario.requirement.margins(history)
 
-    def modes(self, history: History) -> list[Mode]:
-        """Return the failure modes among these runs."""
-        runs = tuple(history.index.tolist())
-        if runs != self._last[0]:
-            self._last = runs, self._modes(history)
-        return self._last[1]
+    def modes(self, history: History, raced: History | None = None) -> list[Mode]:
+        """Return the failure modes among these runs; of a noisy simulator `raced` repetitions help to order them."""
+        return self._learned(history, raced)[0]
 
-    def _modes(self, history: History) -> list[Mode]:
+    def rates(self, history: History, raced: History) -> LocalRates:
+        """Return the failure rates at these runs of a noisy simulator, some of them critical; NaN where there is no metric."""
+        return self._learned(history, raced)[1]
+
+    def _learned(self, history: History, raced: History | None) -> tuple[list[Mode], LocalRates]:
+        runs = tuple(history.index.tolist()), () if raced is None else tuple(raced.index.tolist())
+        if self._last is None or runs != self._last[0]:
+            self._last = runs, *self._learn(history, raced)
+        return self._last[1:]
+
+    def _learn(self, history: History, raced: History | None) -> tuple[list[Mode], LocalRates]:
         scenario = self.settings.scenario
-        ok = np.flatnonzero(history.ok)
+        ok, rates = np.flatnonzero(history.ok), LocalRates(*np.full((2, len(history)), np.nan))
         if not (self.margin(history) <= 0).any():
-            return []
+            return [], rates
         if len(ok) < 2:
             only = int(ok[0])
-            return [Mode((only,), only, only, None)]
+            return [Mode((only,), only, only, None)], rates
         u, y = scenario.space.to_unit(history.x[ok]), scenario.requirement.values(history)[ok]
-        fitted = fit_warped(self.search.for_noise(u, y), u, y, stream(self.settings.seed, "modes", len(history)))
-        return modes_of(fitted, history, scenario, noisy=self.noisy(history))
+        rng = stream(self.settings.seed, "modes", len(history))
+        fitted = fit_warped(self.search.for_noise(u, y), u, y, rng)
+        if not self.noisy(history):
+            return modes_of(fitted, history, scenario), rates
+        again = history.where(np.zeros(len(history), dtype=bool)) if raced is None else raced.where(raced.ok)
+        critical = scenario.requirement.critical_runs(again)
+        found = local_rates(self.search, u, y, history.drawn[ok], scenario.space.to_unit(again.x), critical, rng)
+        rates.mean[ok], rates.std[ok] = found.mean, found.std
+        return modes_of(fitted, history, scenario, rates=rates.mean), rates
 
     def noisy(self, history: History) -> bool:
         """Say whether runs of equal inputs had different metrics."""
         return bool(simulator_noise(history, self.settings.scenario.requirement).noisy)
 
-    def conclusion(self, history: History, fit: FitRecord | None) -> FalsificationConclusion:
+    def conclusion(self, log: Log, fit: FitRecord | None) -> FalsificationConclusion:
         """Return what was found."""
-        searched, scenario = search_runs(history), self.settings.scenario
+        history, race = log.history, races(log)
+        searched, scenario, raced = search_runs(history), self.settings.scenario, history.where(np.isin(history.iteration, race))
         margin = self.margin(searched)
         hits = np.flatnonzero(margin <= 0)
         modes = []
-        for mode in self.modes(searched):
-            again = history.where(confirmations(history, searched.x[mode.representative]))
+        for mode in self.modes(searched, raced):
+            again = history.where(confirmations(history, searched.x[mode.representative], race))
             modes.append(describe(mode, searched, scenario, again, noisy=self.noisy(history)))
         first = int(hits[0]) if len(hits) else None
         bound = None if len(hits) else SearchBound.of(searched)
@@ -207,6 +226,7 @@ class FailureSearch:
             _statement(searched, len(hits), modes, bound), None if fit is None else fit.validation,
             stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
             None if fit is None else fit.independence, explained_variance(self.settings, history),
+            raced=len(raced) or None,
         )  # fmt: skip
 
 
@@ -215,20 +235,30 @@ def search_runs(history: History) -> History:
     return history.where(history.stage != CONFIRM)
 
 
-def confirmations(history: History, x: Vector) -> Mask:
-    """Return (n,) booleans: the run repeated the inputs x (d,) to confirm a failure mode."""
-    return (history.stage == CONFIRM) & (history.x == x).all(axis=1)
+def races(log: Log) -> tuple[int, ...]:
+    """Return the numbers of the batches whose repetitions decided which failure modes come first."""
+    return tuple(batch.number for batch in log.iterations if batch.stage == CONFIRM and batch.read(SearchProposal).method == RACE)
 
 
-def _rates(modes: tuple[FailureMode, ...]) -> list[str]:
-    """Return the failure rates of the first modes in words; nothing where there is one."""
-    rates = [(mode.representative, mode.failure_rate) for mode in modes if mode.failure_rate is not None]
+def confirmations(history: History, x: Vector, race: tuple[int, ...]) -> Mask:
+    """Return (n,) booleans: the run repeated the inputs x (d,) to confirm a failure mode, and decided nothing in a race."""
+    return (history.stage == CONFIRM) & (history.x == x).all(axis=1) & ~np.isin(history.iteration, race)
+
+
+def _rates(found: FalsificationConclusion) -> list[str]:
+    """Return what orders the modes of a noisy simulator, and the failure rates of the first ones; nothing where there is one."""
+    rates = [(mode.representative, mode.failure_rate) for mode in found.failure_modes if mode.failure_rate is not None]
     if len(rates) < 2:  # that of the worst is told
         return []
     told = "; ".join(
         f"run {run} {percent(r.estimate or 0.0)} of {r.runs} ({percent(r.low)} to {percent(r.high)})" for run, r in rates[:_TOLD]
     )
-    return [f"Failure rates with fresh seeds ({percent(rates[0][1].confidence)} interval): {told}."]
+    race = "" if found.raced is None else f" and {plural(found.raced, 'repetition')} that count in no rate below"
+    return [
+        f"Failure modes are told in the order of their failure rates, by the share of critical runs near them{race}, not of how"
+        " deep they are.",
+        f"Failure rates with fresh seeds ({percent(rates[0][1].confidence)} interval): {told}.",
+    ]
 
 
 def _closest(runs: History, margin: Vector, requirement: Requirement) -> ClosestRun | None:

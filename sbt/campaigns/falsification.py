@@ -12,10 +12,11 @@ from scipy.spatial.distance import cdist
 
 from sbt.acquisitions import even, is_greedy, log_scores
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
-from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, confirmations, search_runs
+from sbt.campaigns.confirming import ConfirmStage
+from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, search_runs
 from sbt.campaigns.levels import coarse_runs, screening_told
 from sbt.campaigns.parts import held_out_runs, named_inputs
-from sbt.campaigns.records import CONFIRM, SearchProposal
+from sbt.campaigns.records import SearchProposal
 from sbt.campaigns.repeats import REPEAT, repeats_wanted
 from sbt.campaigns.screening import ScreenStage
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -48,9 +49,6 @@ _SCREENED = "screened"
 """Criterion of the runs that coarse runs chose."""
 PAIR = "pair"
 """Criterion of the runs whose inputs and seed were chosen together."""
-_REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
-_MOST_REPEATS, _REPEATS_IN_ALL = 10, 30  # of a noisy simulator, whose modes have a failure rate
-_MOST_CONFIRMED = 10  # modes, the first ones
 
 
 def recipe(settings: Settings) -> Campaign:
@@ -68,7 +66,7 @@ def recipe(settings: Settings) -> Campaign:
 
     def conclude(log: Log) -> tuple[FalsificationConclusion, FittedMetamodel | None]:
         fitted = learner.fit(log.history)
-        found = failures.conclusion(log.history, None if fitted is None else fitted.record)
+        found = failures.conclusion(log, None if fitted is None else fitted.record)
         return replace(found, fidelity=screening_told(log, settings)), fitted
 
     search: Stage = SearchStage(failures)
@@ -285,37 +283,6 @@ class SearchStage:
             planned.append(PlannedRun(stage, named_inputs(scenario, scenario.pool.x[left[row]])))
             left = np.delete(left, row)
         return planned
-
-
-@dataclass(frozen=True)
-class ConfirmStage:
-    """Repeats each mode's representative with fresh seeds: is the failure one of the scenario, or of a seed?"""
-
-    failure_search: FailureSearch
-    search: Stage
-    name: str = CONFIRM
-
-    def _missing(self, log: Log) -> list[PlannedRun]:
-        if self.failure_search.settings.scenario.pool is not None:
-            return []  # a recorded row cannot be repeated
-        runs, planned = search_runs(log.history), []
-        modes = self.failure_search.modes(runs)[:_MOST_CONFIRMED]
-        repeats = _REPEATS
-        if modes and self.failure_search.noisy(runs):
-            repeats = min(max(_REPEATS_IN_ALL // len(modes), _REPEATS), _MOST_REPEATS)
-        for mode in modes:
-            done = int(confirmations(log.history, runs.x[mode.representative]).sum())
-            planned += [PlannedRun(CONFIRM, runs.inputs(mode.representative))] * (repeats - done)
-        return planned
-
-    def stop(self, log: Log) -> str | None:
-        """Return why the search was over, once the ten deepest modes are repeated."""
-        return None if self._missing(log) else self.search.stop(log)
-
-    def propose(self, log: Log) -> Batch:
-        """Return three runs a mode, up to ten with a noisy simulator, beside the budget."""
-        last = log.last(SearchProposal)
-        return Batch(tuple(self._missing(log)), SearchProposal("repeat", 0 if last is None else last.next_position))
 
 
 def _share_of(share: float, spent: int, size: int) -> int:

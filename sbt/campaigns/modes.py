@@ -31,7 +31,7 @@ _CHUNK = 100  # segments asked for at once
 _UNMEASURED = -2.0
 _FAR = 1e6  # beyond any distance in the unit cube
 _NOT_WITHIN = 1e-9
-_RATE_STEPS = 20  # P(critical) within a twentieth of itself is alike: depth decides
+_RATE_STEPS, _LEAST_RATE = 100, 1e-12  # failure rates within a hundredth of themselves are alike: depth decides
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Mode:
 
     Args:
         rows: of its critical runs in the history.
-        representative: the row deepest in the critical interval; with a noisy simulator the one of the largest P(critical), for
-            depth is luck.
+        representative: the row deepest in the critical interval; with a noisy simulator the one of the largest failure rate
+            (`rates.local_rates`), for depth is luck.
         most_likely: the row of largest p(x).
         safe: the uncritical row nearest to the representative in the unit cube; None: there is none.
     """
@@ -79,7 +79,7 @@ class FailureRate:
         estimate: share of critical ones among those that gave a metric; None: none did.
         low, high: ends of its exact binomial interval; failed runs count as uncritical for the low end, as critical for the high.
         confidence: of the interval.
-        runs: repetitions, all after the representative was chosen.
+        runs: repetitions, all after representatives and order were chosen.
     """
 
     estimate: float | None
@@ -186,17 +186,17 @@ def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = Fal
     return group
 
 
-def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *, noisy: bool = False) -> list[Mode]:
+def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *, rates: Vector | None = None) -> list[Mode]:
     """Return the failure modes, the one with the deepest run first; of a noisy simulator the likeliest to fail again first.
 
-    Repetitions of representatives do not decide the order: the rate of the one that failed most often in them would be stated
+    Repetitions that are told do not decide the order: the rate of the one that failed most often in them would be stated
     too large.
 
     Args:
         fitted: learned from these runs.
         history: runs; only finished ones count.
         scenario: with the campaign's space and requirement.
-        noisy: the simulator is, see `connected` and `Mode`.
+        rates: (n,) failure rates at these runs, where the simulator is noisy, see `connected` and `Mode`; None: it is not.
     """
     critical = scenario.requirement.critical
     y = scenario.requirement.values(history)
@@ -208,10 +208,8 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
     depth, worse = critical.margin(y), severity(history)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
     kind = _kind(history, cube.choices(u))
-    group = connected(fitted, u[chosen], kind[chosen], noisy=noisy)
-    log_rate = np.zeros(len(history))
-    if noisy:
-        log_rate[hits] = fitted.log_probability(u[hits])
+    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None)
+    log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]
     log_p = scenario.space.log_density(history.x[hits])
@@ -233,7 +231,7 @@ def representative_of(log_rate: Vector, depth: Vector, worse: Vector) -> int:
     Alike is relative: where noise decides, the best place may fail with one seed in ten, and others with one in twenty.
 
     Args:
-        log_rate: (n,) log P(critical) of the metamodel; all alike where the simulator is deterministic.
+        log_rate: (n,) logarithms of failure rates; all alike where the simulator is deterministic.
         depth: (n,) margin, smaller is deeper.
         worse: (n,) severity.
     """

@@ -179,11 +179,11 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         return _nothing_found(found, facts)
     modes = found.failure_modes
     worst = f"; {_worst(modes[0], facts)}" if modes else ""
-    often = max(modes, key=lambda mode: mode.confirmed or 0.0, default=None)  # the first of equals
+    often = _most_often(modes)
     if often is not None and often is not modes[0]:
         n, lost = often.confirmation_runs, often.confirmations_lost or 0
         again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
-        worst += f"; run {often.representative} came back most often of all modes, in {again}"
+        worst += f"; run {often.representative} came back more often, in {again}"
     searched = int((facts.history.stage != CONFIRM).sum())
     said = (
         f"The requirement{_of(facts)} is falsified: {found.critical_runs:,} of {plural(searched, 'run')} of the search"
@@ -201,6 +201,17 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "
     more = f"{look}campaign: estimation says how probable failures are, a larger budget looks for more modes"
     return [said, f"{silent}.", f"Next: {more}."]
+
+
+def _most_often(modes: tuple[FailureMode, ...]) -> FailureMode | None:
+    """Return the first mode, or one whose repetitions came back clearly more often: the interval lies above the first's share."""
+
+    def least(mode: FailureMode) -> float:
+        n = mode.confirmation_runs
+        return float(interval(round((mode.confirmed or 0.0) * n), n)[0])
+
+    above = [mode for mode in modes[1:] if least(mode) > (modes[0].confirmed or 0.0)]
+    return max(above, key=lambda mode: mode.confirmed or 0.0) if above else next(iter(modes), None)
 
 
 def _worst(mode: FailureMode, facts: Facts) -> str:

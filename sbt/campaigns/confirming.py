@@ -1,0 +1,89 @@
+"""Repetitions of failure modes beside the budget: a race that orders them where runs are noisy, then those that are told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbt.campaigns.failures import FailureSearch, confirmations, races, search_runs
+from sbt.campaigns.modes import Mode
+from sbt.campaigns.rates import next_repetitions
+from sbt.campaigns.records import CONFIRM, RACE, SearchProposal
+from sbt.loop.stages import Batch, Log, Stage
+from sbt.store.database import PlannedRun
+from sbt.store.history import History
+
+__all__ = ["ROUNDS", "ConfirmStage", "shares"]
+
+_REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
+_MOST_REPEATS, _REPEATS_IN_ALL = 10, 30  # of a noisy simulator, whose modes have a failure rate
+_MOST_CONFIRMED = 10  # modes, the first ones
+_RACING = 0.3  # share of the repetitions that decide the order
+ROUNDS = 3
+"""Batches of repetitions that decide the order."""
+_TOLD = "repeat"  # method of the batch whose repetitions are told
+
+
+@dataclass(frozen=True)
+class ConfirmStage:
+    """Repeats each mode's representative with fresh seeds: is the failure one of the scenario, or of a seed?
+
+    Where the simulator is noisy and there are several modes, some of the repetitions go first to candidates that may have the
+    largest failure rate. They decide representatives and order, and count in no rate that is told.
+    """
+
+    failure_search: FailureSearch
+    search: Stage
+    name: str = CONFIRM
+
+    def stop(self, log: Log) -> str | None:
+        """Return why the search was over, once the first ten modes are repeated."""
+        return None if self._missing(log)[1] else self.search.stop(log)
+
+    def propose(self, log: Log) -> Batch:
+        """Return three runs a mode, of a noisy simulator up to ten, or a round of the race before these, beside the budget."""
+        last = log.last(SearchProposal)
+        method, planned = self._missing(log)
+        return Batch(tuple(planned), SearchProposal(method, 0 if last is None else last.next_position))
+
+    def _missing(self, log: Log) -> tuple[str, list[PlannedRun]]:
+        """Return the runs of the next batch, and what they are for."""
+        search, history = self.failure_search, log.history
+        if search.settings.scenario.pool is not None:
+            return _TOLD, []  # a recorded row cannot be repeated
+        runs, race = search_runs(history), races(log)
+        raced = np.isin(history.iteration, race)
+        modes = search.modes(runs, history.where(raced))[:_MOST_CONFIRMED]
+        wanted = [_REPEATS] * len(modes)
+        if modes and search.noisy(runs):
+            racing, wanted = shares(len(modes))
+            left = racing - int((raced & (history.iteration > runs.iteration.max())).sum())
+            if left > 0:
+                rows = next_repetitions(search.rates(runs, history.where(raced)), _distinct(runs, modes), -(-racing // ROUNDS))
+                return RACE, [PlannedRun(CONFIRM, runs.inputs(row)) for row in rows[:left]]
+        planned = []
+        for mode, n in zip(modes, wanted, strict=True):
+            done = int(confirmations(history, runs.x[mode.representative], race).sum())
+            planned += [PlannedRun(CONFIRM, runs.inputs(mode.representative))] * (n - done)
+        return _TOLD, planned
+
+
+def shares(modes: int) -> tuple[int, list[int]]:
+    """Return how many repetitions order so many modes >= 1 of a noisy simulator, and how many each of them is told by.
+
+    >>> shares(1), shares(3), shares(10)[1][:2]
+    ((0, [10]), (9, [10, 6, 5]), [3, 3])
+    """
+    total = modes * min(max(_REPEATS_IN_ALL // modes, _REPEATS), _MOST_REPEATS)
+    spare = total - _REPEATS * modes
+    racing = min(int(_RACING * total), spare // 2) if modes > 1 else 0
+    first = min(_REPEATS + spare - racing, _MOST_REPEATS)
+    rest = total - racing - first
+    return racing, [first, *(rest // (modes - 1) + (k < rest % (modes - 1)) for k in range(modes - 1))]
+
+
+def _distinct(runs: History, modes: list[Mode]) -> list[list[int]]:
+    """Return the rows of each mode, one of each inputs."""
+    rows = [np.array(mode.rows) for mode in modes]
+    return [mine[np.unique(runs.x[mine], axis=0, return_index=True)[1]].tolist() for mine in rows]
