@@ -138,7 +138,8 @@ def changed(rng: np.random.Generator, data: Any, known: Sequence[str]) -> None:
     elif isinstance(parent, list):
         parent.insert(int(key), any_value(rng, data))
     elif isinstance(value := parent[key], int | float) and not isinstance(value, bool):
-        parent[key] = value * float(rng.choice([-1.0, 0.0, 1e-12, 1e3, 1e9, 1e150]))
+        factor = float(rng.choice([-1.0, 0.0, 1e-12, 1e3, 1e9, 1e150]))
+        parent[key] = value * factor if abs(value) < 1e150 else -value
     else:
         parent[key] = [parent[key], any_value(rng, data)]
 

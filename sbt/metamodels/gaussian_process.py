@@ -125,6 +125,11 @@ class GaussianProcess:
         return replace(self, heavy_noise=True)
 
     @property
+    def with_input_noise(self) -> GaussianProcess:
+        """The same process whose noise depends on the input."""
+        return replace(self, input_noise=True)
+
+    @property
     def _noise_mode(self) -> float | None:
         """Log variance about which the noise is expected; None: there may be none."""
         return _HEAVY_NOISE if self.heavy_noise else _LIKELY_NOISE if self.certainly_noisy else None

@@ -171,21 +171,22 @@ class Prediction:
 
     def _lower_quantile(self, log_q: float, at: _Matrix) -> Vector:
         """Solve log P(Y <= y) = log_q between the smallest and the largest component quantile."""
-        low, high = at.min(axis=0), at.max(axis=0)
-        y: Vector = self.weight @ at
+        found: Vector = self.weight @ at
+        p, y, low, high, rows = self, found, at.min(axis=0), at.max(axis=0), np.arange(len(self))  # of points still to be solved
         for _ in range(_NEWTON_STEPS):
-            log_cdf = self._mix(log_ndtr((y - self.mean) / self.std))
+            log_cdf = p._mix(log_ndtr((y - p.mean) / p.std))
             below = log_cdf < log_q
             low, high = np.where(below, y, low), np.where(below, high, y)
             with np.errstate(over="ignore", invalid="ignore"):
-                newton = y - (log_cdf - log_q) * np.exp(log_cdf - self.log_density(y))
+                newton = y - (log_cdf - log_q) * np.exp(log_cdf - p.log_density(y))
             inside = (newton > low) & (newton < high)
             new = np.where(inside, newton, 0.5 * (low + high))
-            done = np.abs(new - y) <= _ROUNDING * (np.abs(y) + self.std.min(axis=0))
-            y = new
-            if done.all():
+            left = np.abs(new - y) > _ROUNDING * (np.abs(y) + p.std.min(axis=0))
+            found[rows] = new
+            if not left.any():
                 break
-        return y
+            p, y, low, high, rows = p.take(left), new[left], low[left], high[left], rows[left]
+        return found
 
     def _mix(self, log_terms: _Matrix) -> Vector:
         """Return the (n,) logarithm of the weighted sum of exp((k, n) terms)."""
