@@ -221,8 +221,7 @@ def fit_log_probability(
     least = noise[0] if noise else 0.0
     u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
-    log_slope = -0.5 * np.log1p(((y - warp.edge) / warp.scale) ** 2) - np.log(warp.scale)
-    whole = _Form(t, warp.interval(critical), log_slope, noise=least / warp.scale**2)
+    whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=least / warp.scale**2)
     plain = _Form(y, critical, np.zeros(len(y)), noise=least)
     trends = [replace(form, trend=_trend(u, form.values)) for form in (whole, plain)]
     forms = [whole, plain, *(form for form in trends if form.trend is not None)]

@@ -20,6 +20,8 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.stepped import better_stepped
 from sbt.metamodels.torch_tools import check_device
+from sbt.metamodels.warp import Warp
+from sbt.metamodels.warped import WarpedPredictor, warp_of_heavy_tails
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -93,7 +95,7 @@ class Auto:
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
         """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
-        return self._fit(u, y, rng, None)
+        return self._fit(*without_repetitions(*check_rows(u, y)), rng, None)
 
     @property
     def simplest(self) -> GaussianProcess:
@@ -104,12 +106,14 @@ class Auto:
         """Return the same settings for runs whose critical interval is known."""
         return _TargetedAuto(self, critical)
 
-    def _fit(self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None) -> MixturePredictor:
-        u, y = without_repetitions(*check_rows(u, y))
+    def _fit(
+        self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None, warp: Warp | None = None
+    ) -> MixturePredictor:
+        """Fit to y and M_c, both in the unit of the warp where there is one."""
         n = len(y)
         if critical is not None and _FEWEST <= n <= self.gp_rows:
-            return self._fit_at_edge(u, y, rng, Bins.around_edge(y, critical))
-        bins = None if critical is None else Bins.around_edge(y, critical)
+            return self._fit_at_edge(u, y, rng, Bins.around_edge(y, critical, warp))
+        bins = None if critical is None else Bins.around_edge(y, critical, warp)
         models, compared = self._models(n, n, target_aware=bins is not None), min(n, self.compare_rows)
         if n < _FEWEST:
             weights, scores = np.full(len(models), 1.0 / len(models)), None
@@ -173,9 +177,13 @@ class _TargetedAuto:
         """Return the same settings for another interval."""
         return _TargetedAuto(self.settings, critical)
 
-    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor:
-        """Return the mixture fitted to u (n, d) and y (n,); see `Metamodel.fit`."""
-        return self.settings._fit(u, y, rng, self.critical)
+    def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor | WarpedPredictor:
+        """Return the mixture fitted to u (n, d) and y (n,), in a warped unit where its tails are heavy; see `Metamodel.fit`."""
+        u, y = without_repetitions(*check_rows(u, y))
+        warp = warp_of_heavy_tails(self.settings.simplest, u, y, self.critical)
+        if warp is None:
+            return self.settings._fit(u, y, rng, self.critical)
+        return WarpedPredictor(self.settings._fit(u, warp.values(y), rng, warp.interval(self.critical), warp), warp)
 
 
 def _paced(n: int, full: Ensemble, pace: float) -> Ensemble:
@@ -262,7 +270,7 @@ def _explain(
     scores = {name: float(row.mean()) for name, row in zip(names, held, strict=True)}
     scores["mixture"] = float(mixture_score(held, mixture).mean())
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
-    what = "" if bins is None else f" to fall where they did, of the ranges cut at {', '.join(f'{cut:.3g}' for cut in bins.cuts)}"
+    what = "" if bins is None else f" to fall where they did, of the ranges cut at {bins.told}"
     how = f"other rows ({settings.folds} folds)" if shares is None else "nearly all others"
     reason = f"{mixed}: mean log likelihood of {n} rows{what}, each predicted from {how}: {listed}"
     if alone and len(names) > 1:

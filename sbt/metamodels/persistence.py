@@ -24,7 +24,7 @@ from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
 from sbt.metamodels import deep_ensemble as ensemble
 from sbt.metamodels import extra_trees as et
-from sbt.metamodels import gp_algebra, gp_predictor, joint, recalibrated, sparse, stepped
+from sbt.metamodels import gp_algebra, gp_predictor, joint, recalibrated, sparse, stepped, warp, warped
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
 from sbt.problem.combination import CombinedInterval
@@ -56,6 +56,8 @@ _KINDS: dict[str, Any] = {
         sparse.SparsePredictor,
         stepped.Step,
         stepped.SteppedPredictor,
+        warp.Warp,
+        warped.WarpedPredictor,
     )
 }
 

@@ -33,6 +33,7 @@ class Bins:
     Args:
         critical: M_c, in the unit of y.
         near: distance > 0 from an end of M_c that counts as near.
+        warp: in whose unit both are; None: in that of y.
 
     Source:
         The logarithmic score of a categorical outcome, which is proper: Gneiting & Raftery (2007), section 3.
@@ -40,11 +41,18 @@ class Bins:
 
     critical: CriticalInterval
     near: float
+    warp: Warp | None = None
 
     @classmethod
-    def around_edge(cls, y: Vector, critical: CriticalInterval) -> Bins:
+    def around_edge(cls, y: Vector, critical: CriticalInterval, warp: Warp | None = None) -> Bins:
         """Return the ranges for runs y (n,): the quarter of them that is nearest to the edge is near."""
-        return cls(critical, Warp.around_edge(y, critical).scale)
+        return cls(critical, Warp.around_edge(y, critical).scale, warp)
+
+    @property
+    def told(self) -> str:
+        """The cuts in the unit of the metric, in words."""
+        cuts = self.cuts if self.warp is None else self.warp.back(self.cuts)
+        return ", ".join(f"{cut:.3g}" for cut in cuts)
 
     @property
     def cuts(self) -> Vector:

@@ -54,6 +54,14 @@ class Warp:
         """Return the warped y, shape kept."""
         return np.arcsinh((np.asarray(y) - self.edge) / self.scale)
 
+    def back(self, warped: Vector) -> Vector:
+        """Return the y of warped values, shape kept."""
+        return np.asarray(self.edge + self.scale * np.sinh(warped))
+
+    def log_slope(self, y: Vector) -> Vector:
+        """Return (n,) the logarithm of the warp's derivative at y (n,)."""
+        return np.asarray(-0.5 * np.log1p(((y - self.edge) / self.scale) ** 2) - math.log(self.scale))
+
     def learned(self, y: Vector) -> Vector:
         """Return what a metamodel learns: the warped y."""
         return self.values(y)

@@ -20,12 +20,12 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Points, Vector, as_points, as_vector
 from sbt.problem.scenario import LogicalScenario
-from sbt.testbeds import failing, many_inputs, reliability, search, stochastic, thin, traffic
+from sbt.testbeds import failing, heavy, many_inputs, reliability, search, stochastic, thin, traffic
 from sbt.testbeds.problem import Problem, Truth, analytic, noisy
 
 __all__ = ["Problem", "Truth", "analytic", "find", "from_name", "names", "truth", "values"]
 
-_ROOMS = (reliability, traffic, search, failing, many_inputs, stochastic, thin)
+_ROOMS = (reliability, traffic, search, failing, many_inputs, stochastic, thin, heavy)
 _PROBLEMS = {p.name: p for room in _ROOMS for p in room.PROBLEMS}
 _BOX, _COARSE = ":box", ":coarse"
 
@@ -84,4 +84,4 @@ def values(name: str, x: Points, rng: np.random.Generator | None = None) -> Vect
     """
     found = find(name)
     x = as_points(x, len(found.parameters))
-    return noisy(as_vector(found.function(x), len(x)), found.noise, rng)
+    return noisy(as_vector(found.function(x), len(x)), x, found.noise, rng)

@@ -22,6 +22,7 @@ from sbt.seeds import stream
 
 __all__ = [
     "METRIC", "NEGATIVE", "Function", "Input", "Problem", "Truth", "analytic", "lognormal", "noisy", "normal", "parameters_of",
+    "uniform",
 ]  # fmt: skip
 
 METRIC = "y"
@@ -68,7 +69,7 @@ class Problem:
         function: vectorised metric; its docstring has the formula and the source.
         critical: M_c.
         truth: reference values.
-        noise: standard deviation of normal noise on y, drawn from the seed of the run.
+        noise: standard deviation of normal noise on y, drawn from the seed of the run, or a function of x.
         box: (low, high) of each input for searches that do not use the distribution; None: the bounds of the
             parameters, which are the 1e-6 quantiles if an input is unbounded.
         error: standard deviation of a further normal error, drawn from the seed of the run: that of a coarse level of fidelity.
@@ -80,7 +81,7 @@ class Problem:
     function: Function
     critical: CriticalInterval
     truth: Truth
-    noise: float = 0.0
+    noise: float | Function = 0.0
     box: tuple[tuple[float, float], ...] | None = None
     error: float = 0.0
 
@@ -96,7 +97,13 @@ class Problem:
         return replace(self, name=f"{self.name}:box", parameters=parameters, truth=truth, box=None)
 
     def coarse(self) -> Problem:
-        """Return a coarse level of fidelity of a noisy problem: the same noise for the same seed, and an error of 40 % of it."""
+        """Return a coarse level of fidelity of a noisy problem: the same noise for the same seed, and an error of 40 % of it.
+
+        Raises:
+            InputError: the noise is not everywhere equal.
+        """
+        if callable(self.noise):
+            raise InputError(f"a coarse level needs noise that is everywhere equal, but that of {self.name} is not")
         return replace(self, error=_COARSE * self.noise)
 
     def scenario(self) -> LogicalScenario:
@@ -180,14 +187,13 @@ class _Pointwise:
     name: str
     inputs: tuple[str, ...]
     function: Function
-    noise: float
+    noise: float | Function
     error: float = 0.0
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
         x = as_points([[values[name] for name in self.inputs]], len(self.inputs))
-        y = float(as_vector(self.function(x), 1)[0])
-        if self.noise:
-            y += self.noise * float(stream(seed, "testbed", self.name).standard_normal())
+        rng = stream(seed, "testbed", self.name) if self.noise else None
+        y = float(noisy(as_vector(self.function(x), 1), x, self.noise, rng)[0])
         if self.error:
             y += self.error * float(stream(seed, "coarse", self.name).standard_normal())
         return {METRIC: y}
@@ -203,6 +209,14 @@ def lognormal(mean: float, std: float) -> Distribution:
     return Distribution.of(kind="lognormal", mean=mean, std=std)
 
 
-def noisy(y: Vector, noise: float, rng: np.random.Generator | None) -> Vector:
-    """Return y with normal noise; without an rng, y itself."""
-    return y if rng is None or not noise else y + noise * rng.standard_normal(y.shape)
+def uniform(name: str, title: str, d: int, function: Function, share: float, error: float = 0.0) -> Problem:
+    """Return a testbed with d uniform inputs on the unit cube, one region and y <= 0 critical in this share of it."""
+    inputs = parameters_of({f"x{k + 1}": (0.0, 1.0) for k in range(d)})
+    return Problem(name, title, inputs, function, NEGATIVE, Truth(share, error, 1, share, error))
+
+
+def noisy(y: Vector, x: Points, noise: float | Function, rng: np.random.Generator | None) -> Vector:
+    """Return y (n,) at x (n, d) with normal noise; without an rng, y itself."""
+    if rng is None or not noise:
+        return y
+    return y + (noise(x) if callable(noise) else noise) * rng.standard_normal(y.shape)

@@ -34,6 +34,20 @@ def slope(x: Points) -> Vector:
     return 1.3 - 0.9 * (x @ np.array([1.0, 0.8, 0.6, 0.4])) / 2.8 + 0.125 * np.cos(2.0 * np.pi * x[:, 2])
 
 
+def ramp(x: Points) -> Vector:
+    """A ramp, 4 (x1 + x2 + x3) - 1.2, whose noise grows along x1 from 0.2 to 2.2; x4 is idle.
+
+    Source:
+        Constructed.
+    """
+    return 4.0 * x[:, :3].sum(axis=1) - 1.2
+
+
+def growing(x: Points) -> Vector:
+    """Return the noise of the ramp."""
+    return 0.2 + 2.0 * x[:, 0]
+
+
 def _unit(d: int) -> dict[str, tuple[float, float]]:
     return {f"x{k + 1}": (0.0, 1.0) for k in range(d)}
 
@@ -43,4 +57,6 @@ PROBLEMS = (
             Truth(0.0136524465, 0.0, None, 0.0136524465), noise=0.35),
     Problem("slope_noisy", "A rate that grows along four inputs", parameters_of(_unit(4)), slope, NEGATIVE,
             Truth(0.0134660028, 0.0, None, 0.0134660028), noise=0.35),
+    Problem("ramp_uneven_d4", "A ramp whose noise grows along an input", parameters_of(_unit(4)), ramp, NEGATIVE,
+            Truth(0.0112252483, 0.0, None, 0.0112252483), noise=growing),
 )  # fmt: skip

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sbt.problem.arrays import Points, Vector
-from sbt.testbeds.problem import NEGATIVE, Function, Problem, Truth, parameters_of
+from sbt.testbeds.problem import uniform
 
 __all__ = ["PROBLEMS"]
 
@@ -54,18 +54,12 @@ def corner(x: Points) -> Vector:
     return np.minimum(upright, level) - 0.02
 
 
-def _thin(name: str, title: str, d: int, function: Function, share: float, error: float = 0.0) -> Problem:
-    """Return a testbed with uniform inputs on the unit cube."""
-    inputs = parameters_of({f"x{k + 1}": (0.0, 1.0) for k in range(d)})
-    return Problem(name, title, inputs, function, NEGATIVE, Truth(share, error, 1, share, error))
-
-
 _RING = math.pi * ((_RADIUS + _HALF) ** 2 - (_RADIUS - _HALF) ** 2)
 _BALLS = 4.0 / 3.0 * math.pi * ((_SHELL + _SHELL_HALF) ** 3 - (_SHELL - _SHELL_HALF) ** 3)
 
 PROBLEMS = (
-    _thin("ring_d2", "A thin ring", 2, ring, _RING),
-    _thin("shell_d3", "A thin sphere", 3, shell, _BALLS),
-    _thin("banana_d2", "A bent valley", 2, banana, 0.03),
-    _thin("corner_d2", "An L", 2, corner, 0.0585135, 1e-6),
+    uniform("ring_d2", "A thin ring", 2, ring, _RING),
+    uniform("shell_d3", "A thin sphere", 3, shell, _BALLS),
+    uniform("banana_d2", "A bent valley", 2, banana, 0.03),
+    uniform("corner_d2", "An L", 2, corner, 0.0585135, 1e-6),
 )

@@ -1,0 +1,64 @@
+"""Metrics with heavy tails are learned in a warped unit: P(critical) is the same before and after."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sbt import testbeds
+from sbt.metamodels.automatic import Auto
+from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.persistence import load, save
+from sbt.metamodels.warp import Warp
+from sbt.metamodels.warped import WarpedPredictor, warp_of_heavy_tails
+from sbt.problem.requirement import CriticalInterval
+from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import stream
+
+LOW = CriticalInterval(high=0.0)
+PROCESS = GaussianProcess(nu=2.5, input_noise=False)
+
+
+@pytest.mark.parametrize(("critical", "sign"), [(LOW, 1.0), (CriticalInterval(low=0.0), -1.0)])
+def test_a_warped_predictor_keeps_the_probabilities(critical: CriticalInterval, sign: float, tmp_path: Path):
+    rng = stream(3, "warped")
+    u, warp = rng.random((40, 2)), Warp(0.0, 0.5)
+    w = sign * (8.0 * u[:, 0] - 1.0 + u[:, 1])
+    predictor = WarpedPredictor(PROCESS.fit(u, w, rng), warp)
+    at = rng.random((300, 2))
+    inner, p = predictor.predictor(at), predictor(at).probability(critical)
+    np.testing.assert_allclose(p, inner.probability(critical), rtol=1e-9, atol=1e-300)
+    np.testing.assert_allclose(predictor(at).mu, warp.back(inner.mu), rtol=1e-9)
+    np.testing.assert_allclose(warp.values(warp.back(w)), w, rtol=1e-9)
+    low, high = predictor.probability_bounds(at, critical)
+    assert ((low <= p + 1e-9) & (p <= high + 1e-9)).all()
+    drawn = critical.contains(predictor.sample_paths(at[:5], 400, rng)).mean(axis=0)
+    np.testing.assert_allclose(drawn, p[:5], atol=0.12)
+    save(predictor, tmp_path / "m.sbtmodel")
+    np.testing.assert_array_equal(load(tmp_path / "m.sbtmodel")(at).mean, predictor(at).mean)
+
+
+def test_values_over_many_orders_are_learned_as_well_as_a_bowl():
+    """From even runs, and as many near the edge."""
+    name, rng = "steep_bowl_d4", stream(1, "bowl")
+    near = 0.7 + 0.2 * rng.uniform(-1.0, 1.0, (60, 4))
+    u, at = np.vstack([SobolSequence(4, 1).points(0, 60), near]), SobolSequence(4, 2).points(0, 4000)
+    y, truth = testbeds.values(name, u), testbeds.values(name, at) <= 0.0
+    auto = Auto(ensemble_rows=1000)
+    warped, plain = auto.with_target(LOW).fit(u, y, rng), auto._fit(u, y, rng, LOW)
+    wrong = [float(np.abs(predict(at).probability(LOW) - truth).mean()) for predict in (warped, plain)]
+    assert wrong[0] < 1e-3
+    assert wrong[1] > 0.02, "what the metric as it is teaches"
+
+
+def test_other_metrics_are_learned_as_they_are():
+    rng = stream(2, "light")
+    u = rng.random((200, 3))
+    crowded = 0.5 + 1e-4 * rng.standard_normal((180, 3))
+    for y in (u.sum(axis=1) - 0.5, np.exp(u.sum(axis=1)), rng.standard_exponential(200), np.where(u[:, 0] < 0.1, 0.5, 100.0)):
+        assert warp_of_heavy_tails(PROCESS, u, y, LOW) is None
+    beside = np.vstack([u, crowded])
+    assert warp_of_heavy_tails(PROCESS, beside, beside.sum(axis=1) - 1.5, LOW) is None, "runs crowd at the edge of a plain metric"
+    assert warp_of_heavy_tails(PROCESS, u, np.exp(30.0 * u[:, 0]), CriticalInterval(1.0, 2.0)) is None
