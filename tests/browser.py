@@ -100,6 +100,10 @@ class Browser:
         """Go to a page."""
         self._do(self._call("Page.navigate", url=address))
 
+    def beforehand(self, script: str) -> None:
+        """Execute a script in every page that is opened from now on, before its own."""
+        self._do(self._call("Page.addScriptToEvaluateOnNewDocument", source=script))
+
     def ask(self, expression: str) -> Any:
         """Return the value of an expression of JavaScript; a promise is waited for."""
         found = self._do(self._call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import json
 import subprocess
@@ -100,6 +101,8 @@ def test_only_who_has_the_token_and_asks_this_machine_is_answered(served: Served
         assert "token" not in answer.url
     assert served.ask("/c/000000000000")[0] == served.ask("/c/..%2f..%2fetc")[0] == 404
     assert served.ask(f"/api/{key}/report")[0] in (404, 405)
+    assert served.ask("/plotly.js", token="")[0] == 403
+    assert gzip.decompress(served.ask("/plotly.js", **{"Accept-Encoding": "gzip"})[1]) == served.ask("/plotly.js")[1]
 
 
 @pytest.mark.sumo

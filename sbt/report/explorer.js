@@ -234,8 +234,9 @@ const explore = async (data, kept = null) => {
     if (place.clientWidth !== width && explorer.shown) explorer.player.show(explorer.player.now);
     width = place.clientWidth;
   }).observe(place);
-  if (window.Plotly) explorer.draw();
-  else if (document.getElementById("library").textContent.trim()) setTimeout(() => withLibrary(() => explorer.draw()), 30);
+  const library = document.getElementById("library");  // the live view brings its own
+  if (window.Plotly) requestAnimationFrame(() => setTimeout(() => explorer.draw()));  // the run and the table are painted first
+  else if (library && library.textContent.trim()) setTimeout(() => withLibrary(() => explorer.draw()), 30);
 };
 const begin = async () => {
   if (!document.getElementById("explorer-data") || !window.DecompressionStream) return;

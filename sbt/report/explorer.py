@@ -26,7 +26,7 @@ from sbt.report.slices import slices_through
 from sbt.report.thinning import shown_runs
 from sbt.report.words import Findings
 
-__all__ = ["explorer_data", "library", "packed", "render", "scripts", "styles"]
+__all__ = ["explorer_data", "library", "packed", "packed_library", "render", "scripts", "styles"]
 
 _FILMS = 3_000_000
 """Largest size of all films together as text (bytes), before it is packed."""
@@ -147,13 +147,18 @@ def packed(data: Any) -> str:
 
 
 @cache
-def library() -> str:
-    """Return plotly.js as it comes with its Python package, as base64 of its gzip; "" where that is not installed."""
+def packed_library() -> bytes:
+    """Return the gzip of plotly.js as it comes with its Python package; nothing where that is not installed."""
     spec = importlib.util.find_spec("plotly")
     if spec is None or not spec.submodule_search_locations:
-        return ""
+        return b""
     script = Path(spec.submodule_search_locations[0]) / "package_data" / "plotly.min.js"
-    return base64.b64encode(gzip.compress(script.read_bytes(), 6, mtime=0)).decode()
+    return gzip.compress(script.read_bytes(), 6, mtime=0)
+
+
+def library() -> str:
+    """Return plotly.js as base64 of its gzip; "" where it is not installed."""
+    return base64.b64encode(packed_library()).decode()
 
 
 def scripts(*names: str) -> str:

@@ -19,6 +19,7 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from starlette.routing import Route
 
 from sbt.errors import InputError, SbtError
+from sbt.report.explorer import packed_library
 from sbt.serve.campaigns import Campaigns
 from sbt.workflows.live import live_parts
 
@@ -28,7 +29,7 @@ _COOKIE = "sbt-token"
 _LARGE = 10_000
 """Answers larger than so many bytes are packed."""
 _SAFE = {
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline' 'unsafe-eval'; "
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
     "img-src data:; connect-src 'self'; frame-ancestors 'none'; form-action 'none'; base-uri 'none'",
     "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Cache-Control": "no-store",
 }  # fmt: skip
@@ -50,6 +51,7 @@ def application(campaigns: Campaigns, *, token: str, hosts: frozenset[str]) -> S
             Route("/", view.index),
             Route("/c/{key}", view.campaign),
             Route("/c/{key}/report", view.report),
+            Route("/plotly.js", view.library),
             Route("/api/campaigns", view.listed),
             Route("/api/{key}/status", view.status),
             Route("/api/{key}/explorer", view.explorer),
@@ -74,7 +76,8 @@ class _Guard:
             response = RedirectResponse(request.url.path, 303)
             response.set_cookie(_COOKIE, self.token, httponly=True, samesite="strict")
         response = await then(request) if response is None else response
-        response.headers.update(_SAFE)
+        for name, value in _SAFE.items():
+            response.headers.setdefault(name, value)
         return response
 
     def _refusal(self, request: Request) -> Response | None:
@@ -113,6 +116,16 @@ class _View:
         except InputError as error:
             return Response(str(error), 404)
         return HTMLResponse(await run_in_threadpool(path.read_bytes))
+
+    async def library(self, request: Request) -> Response:
+        content, how = await run_in_threadpool(packed_library), {"Cache-Control": "private, max-age=3600"}
+        if not content:
+            return Response("plotly is not installed", 404)
+        if "gzip" in request.headers.get("accept-encoding", ""):
+            how["Content-Encoding"] = "gzip"
+        else:
+            content = gzip.decompress(content)
+        return Response(content, media_type="text/javascript", headers=how)
 
     async def listed(self, request: Request) -> Response:
         return await _answered(request, self.campaigns.listed)

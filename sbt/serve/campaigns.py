@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -87,7 +88,7 @@ class Campaigns:
         self.folders, self._trusted = tuple(folders), trusted
         self._watched: dict[str, _Watched] = {}
         self._searched, self._lock = -_FOUND_AGAIN, threading.Lock()
-        self._filming = threading.Semaphore(2)
+        self._filming, self._ready = threading.Semaphore(2), False
         self._resumed: list[subprocess.Popen[bytes]] = []
 
     def close(self) -> None:
@@ -116,8 +117,11 @@ class Campaigns:
 
     def listed(self) -> list[Json]:
         """Return the campaigns, running ones first, then the newest."""
-        rows = [self.status(key) for key in self._known()]
-        return sorted(rows, key=lambda row: (row["state"] != "running", -row["changed"]))
+        rows = sorted((self.status(key) for key in self._known()), key=lambda row: (row["state"] != "running", -row["changed"]))
+        if rows and not self._ready:
+            self._ready = True  # what a first look imports is there when one is asked for
+            threading.Thread(target=_look, args=(self[rows[0]["key"]].folder,), daemon=True).start()
+        return rows
 
     def status(self, key: str) -> Json:
         """Return how far a campaign is, as `status --json` prints it, with `key`, `name` and `changed`; or its `error`."""
@@ -216,6 +220,11 @@ class Campaigns:
     def _environment(self) -> dict[str, str]:
         own = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
         return {**os.environ, **own, **({"SBT_TRUST": "1"} if self._trusted else {})}
+
+
+def _look(folder: Path) -> None:
+    with suppress(SbtError, OSError):
+        first_look(folder)
 
 
 def _changed(folder: Path) -> float:

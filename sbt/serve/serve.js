@@ -45,6 +45,14 @@ const showList = campaigns => {
 
 const blank = at("explore") && at("explore").cloneNode(true);
 let shown = -1, loading = false;
+// The library is fetched with the page, and executed once runs are painted.
+const draws = () => {
+  const given = document.querySelector("link[rel=preload]");
+  if (!given) return;
+  document.head.append(element("script", { src: given.href }));
+  document.head.lastChild.addEventListener("load", () => { if (window.explorer) window.explorer.draw(); });
+  given.remove();
+};
 const showStatus = async status => {
   const running = status.state === "running", failed = failedOf(status.runs);
   at("name").textContent = document.title = status.name;
@@ -74,6 +82,7 @@ const show = async data => {
   const fresh = opened(data);
   if (films.size) { fresh.filmOf = films; fresh.lanes = lanes; }  // those that were made on demand
   await explore(fresh, before && { x: before.x, y: before.y, run });
+  requestAnimationFrame(() => setTimeout(draws));
   at("explore").querySelector("[data-part=films]").previousElementSibling.hidden = !data.films.length;
 };
 const load = async done => {
@@ -85,7 +94,7 @@ const load = async done => {
       await show(await asked(`/api/${KEY}/explorer?first=1`));
       at("said").textContent = `These are ${whole(window.explorer.data.index.length)} of ${whole(done)} runs, evenly spaced; the others are being read.`;
       shown = 0;
-      await new Promise(then => setTimeout(then, 300));
+      for (let k = 0; k < 50 && !window.explorer.listening; k++) await new Promise(then => setTimeout(then, 100));  // drawn first
     }
     await show(await asked(`/api/${KEY}/explorer`));
     at("said").textContent = "";

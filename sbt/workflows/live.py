@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sbt.problem.plain import Json
-from sbt.report.explorer import explorer_data, library, scripts, styles
+from sbt.report.explorer import explorer_data, packed_library, scripts, styles
 from sbt.report.projection import influence_from_runs
 from sbt.report.reel import Reels
 from sbt.report.words import Findings, conclusion_sentences
@@ -84,12 +84,12 @@ def first_look(folder: Path) -> Json:
 
 
 def live_parts() -> Json:
-    """Return what a page with the explorer is made of, beside its data: our own text, and the library as base64."""
+    """Return what a page with the explorer is made of, beside data and library: our own text, and whether that is there."""
     import markupsafe
 
     note = "How much of the rank of the metric each input explains alone in the runs, relative to the largest."
     own = {name: markupsafe.Markup(text) for name, text in (("styles", styles()), ("scripts", scripts()))}
-    return {"explorer": {"library": library(), "note": note, **own}}
+    return {"explorer": {"library": bool(packed_library()), "note": note, **own}}
 
 
 def film_of(folder: Path, run: int) -> Json:
