@@ -20,7 +20,7 @@ from sbt.metamodels import gaussian_process as gp
 from sbt.metamodels.scores import scores
 
 KEYS = ("log_likelihood", "average_precision", "log_likelihood_critical")
-_fit_posterior = gp._fit_posterior
+_fit_posterior = gp.fit_posterior
 
 
 def replay(u, y, critical, sizes, seed, *, warm):
@@ -30,10 +30,10 @@ def replay(u, y, critical, sizes, seed, *, warm):
     for n in sizes:
         train, last = order[:n], previous if warm else None
 
-        def fit(nu, u, z, spread, start, device, last=last):
-            return _fit_posterior(nu, u, z, spread, last if start is None else start, device)
+        def fit(objective, start=None, last=last):
+            return _fit_posterior(objective, last if start is None else start)
 
-        with patch.object(gp, "_fit_posterior", fit):
+        with patch.object(gp, "fit_posterior", fit):
             begun = time.process_time()
             predictor = gp.GaussianProcess().fit(u[train], y[train], np.random.default_rng(seed))
             seconds = time.process_time() - begun

@@ -10,12 +10,14 @@ import gpytorch
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import approx_fprime
 
 from sbt.errors import InputError
 from sbt.metamodels.base import build, split_validation, standardise
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.gp_algebra import Hyperparameters
+from sbt.metamodels.gp_fit import Objective
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.requirement import CriticalInterval
@@ -171,42 +173,38 @@ def test_kernel_is_gpytorchs(nu):
     np.testing.assert_allclose(found, 2.0 * expected, rtol=1e-6)
 
 
-def test_gradient_is_that_of_the_objective():
-    from scipy.optimize import approx_fprime
-
-    from sbt.metamodels.gaussian_process import _Model
-
-    u, y = rows(30, noise=0.1)
-    z, spread = standardise(y)[0], np.linspace(0.5, 2.0, 30)
-    for priors in (True, False):
-        model = _Model.build(1.5, 3, torch.device("cpu"), priors=priors)
-        model.assign(Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
-        parameters = model.parameters()
-
-        def value(vector, model=model, parameters=parameters):
-            torch.nn.utils.vector_to_parameters(torch.from_numpy(vector), parameters)
-            return model.backward(torch.from_numpy(u), z, spread)
-
-        at = torch.nn.utils.parameters_to_vector(parameters).detach().numpy().copy()
-        numeric = approx_fprime(at, value, 1e-6)
-        value(at)
-        exact = np.concatenate([p.grad.numpy().ravel() for p in parameters])
-        np.testing.assert_allclose(exact, numeric, atol=1e-5)
+def objective(nu: float, *, priors: bool, noise_mode: float | None = None) -> Objective:
+    u, y = rows(150, noise=0.1)
+    spread = np.linspace(0.5, 2.0, 150)
+    return Objective(nu, u, standardise(y)[0], spread, torch.device("cpu"), priors=priors, noise_mode=noise_mode)
 
 
-def test_likelihood_is_gpytorchs():
-    from sbt.metamodels.gaussian_process import _Model
+@pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
+def test_gradient_is_that_of_the_objective(nu):
+    for priors, mode in ((True, None), (True, -0.7), (False, None)):
+        value = objective(nu, priors=priors, noise_mode=mode)
+        at = value.vector(Hyperparameters(nu, np.array([0.3, 0.7, 2.0]), 1.0 if priors else 1.3, 0.05))
+        assert value.hyperparameters(at).noise == pytest.approx(0.05)
+        np.testing.assert_allclose(value(at)[1], approx_fprime(at, lambda v, f=value: f(v)[0], 1e-6), atol=1e-5)
 
-    u, y = rows(30, noise=0.1)
-    z = standardise(y)[0]
-    model = _Model.build(1.5, 3, torch.device("cpu"), priors=False)
-    model.assign(Hyperparameters(1.5, np.array([0.3, 0.7, 2.0]), 1.3, 0.05))
-    value = model.backward(torch.from_numpy(u), z, np.ones(30))
-    covariance = model.kernel(torch.from_numpy(u)).to_dense().detach() + 0.05 * torch.eye(30)
+
+@pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
+def test_likelihood_and_priors_are_those_of_gpytorch_and_torch(nu):
+    likelihood = objective(nu, priors=False)
+    at = likelihood.vector(Hyperparameters(nu, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
+    kernel = gpytorch.kernels.MaternKernel(nu, ard_num_dims=3).double()
+    kernel.lengthscale = torch.tensor([0.3, 0.7, 2.0])
+    noise, z = torch.from_numpy(0.05 * likelihood.spread), torch.from_numpy(likelihood.z)
+    covariance = kernel(torch.from_numpy(likelihood.u)).to_dense().detach() + torch.diag(noise)
     inverse = torch.linalg.inv(covariance)
-    centre = (inverse.sum(0) @ torch.from_numpy(z)) / inverse.sum()
-    law = torch.distributions.MultivariateNormal(centre.expand(30), covariance)
-    assert value == pytest.approx(-law.log_prob(torch.from_numpy(z)).item() / 30)
+    law = torch.distributions.MultivariateNormal((inverse.sum(0) @ z / inverse.sum()).expand(150), covariance)
+    assert likelihood(at)[0] == pytest.approx(-law.log_prob(z).item() / 150, rel=1e-6)
+    posterior = objective(nu, priors=True, noise_mode=-5.0)
+    of_length = torch.distributions.LogNormal(np.sqrt(2.0) + 0.5 * np.log(3.0), np.sqrt(3.0))
+    of_noise = torch.distributions.Normal(-5.0, 1.0).log_prob(torch.tensor(0.05).log())
+    log_prior = of_length.log_prob(torch.tensor([0.3, 0.7, 2.0])).sum() + of_noise
+    found = posterior(posterior.vector(posterior.hyperparameters(np.append(np.log([0.3, 0.7, 2.0]), np.log(0.05 - 1e-4)))))[0]
+    assert found == pytest.approx(likelihood(at)[0] - log_prior.item() / 150, rel=1e-6)
 
 
 def test_process_interpolates_a_smooth_function():

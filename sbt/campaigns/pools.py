@@ -113,9 +113,12 @@ def fit_proposal(
         shares: of the draws, as `SHARES`.
         rng: the only source of randomness.
     """
-    start = Mixture(frame.wide, choices=frame.choices)
-    mixture = start if log_probability is None or hits is None else _fitted(log_probability, start, hits, rng)
-    return Proposal(mixture, log_probability, _pooled(space, frame, mixture, log_probability, shares, _PILOT, rng).plan)
+    mixture, drawn = Mixture(frame.wide, choices=frame.choices), None
+    if log_probability is not None and hits is not None:
+        mixture, drawn = _fitted(log_probability, mixture, hits, rng)
+    if drawn is None:
+        drawn = _drawn(mixture, log_probability, _PILOT, rng)
+    return Proposal(mixture, log_probability, _pooled(space, frame, mixture, drawn, shares, rng).plan)
 
 
 def draw_pool(
@@ -124,23 +127,40 @@ def draw_pool(
 ) -> Pool:  # fmt: skip
     """Return a fresh pool and how a batch would be drawn from it, so many draws; the metamodel `learned` from so many runs."""
     n = int(np.clip(_POOL_COST / max(learned, 1) ** 2, min(_POOL_EACH * draws, _POOL), _POOL))
-    return _pooled(space, frame, proposal.mixture, proposal.log_probability, shares, n, rng, proposal.pilot.form)
+    drawn = _drawn(proposal.mixture, proposal.log_probability, n, rng)
+    return _pooled(space, frame, proposal.mixture, drawn, shares, rng, proposal.pilot.form)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Points of a mixture: coordinates v (n, m), the component each was drawn from, log density, what the metamodel says."""
+
+    v: Points
+    stratum: Vector
+    log_h: Vector
+    whole: Event
+    parts: tuple[Event, ...]
+
+
+def _drawn(mixture: Mixture, log_probability: LogProbability | None, n: int, rng: np.random.Generator) -> _Drawn:
+    """Return n points of a mixture."""
+    v, stratum = mixture.sample(n, rng)
+    unsure = np.full(n, np.log(0.5))
+    whole, parts = (Event((unsure, unsure)), ()) if log_probability is None else events(log_probability, v)
+    return _Drawn(v, stratum, mixture.log_density(v), whole, parts)
 
 
 def _pooled(
-    space: ParameterSpace, frame: Frame, mixture: Mixture, log_probability: LogProbability | None, shares: tuple[float, ...],
-    n: int, rng: np.random.Generator, form: str | None = None,
+    space: ParameterSpace, frame: Frame, mixture: Mixture, drawn: _Drawn, shares: tuple[float, ...], rng: np.random.Generator,
+    form: str | None = None,
 ) -> Pool:  # fmt: skip
-    """Return a pool of n points."""
-    v, stratum = mixture.sample(n, rng)
+    """Return the pool of the points that were drawn."""
+    v, stratum, log_h, whole, parts = drawn.v, drawn.stratum, drawn.log_h, drawn.whole, drawn.parts
     z = frame.lift(v, rng)
     x = space.from_normal(z)
-    log_h = mixture.log_density(v)
     log_w = log_normal(v) - log_h
     if space.constraints:
         log_w = np.where(space.feasible(x), log_w - math.log(space.feasible_mass), -np.inf)
-    unsure = np.full(len(v), np.log(0.5))
-    whole, parts = (Event((unsure, unsure)), ()) if log_probability is None else events(log_probability, v)
     plan = plan_batch(
         *whole.safe, log_w, log_wide(v, frame.wide, frame.choices) - log_h, stratum, shares, form,
         others=tuple(event for event in (whole.critical, *(part.safe for part in parts)) if event is not None),
@@ -148,8 +168,10 @@ def _pooled(
     return Pool(mixture, z, x, plan, whole, parts, stratum)
 
 
-def _fitted(log_probability: LogProbability, start: Mixture, hits: Points, rng: np.random.Generator) -> Mixture:
-    """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi)), and of what else is estimated.
+def _fitted(
+    log_probability: LogProbability, start: Mixture, hits: Points, rng: np.random.Generator
+) -> tuple[Mixture, _Drawn | None]:
+    """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi)), and of what else is estimated; and points of h, if any.
 
     With many runs a sketch of the metamodel guides the particles; the mixture is then fitted again to points of its own, which
     the metamodel itself weights.
@@ -157,29 +179,28 @@ def _fitted(log_probability: LogProbability, start: Mixture, hits: Points, rng: 
     rough = sketch_of(log_probability, SKETCH)
 
     def target(v: Points, k: int) -> Vector:
-        return _targets(rough, v)[k]
+        return _targets(v, *events(rough, v))[k]
 
     near = Near(start, hits)
-    count = len(_targets(log_probability, hits[:1]))
+    count = len(_targets(hits[:1], *events(log_probability, hits[:1])))
     clouds = tuple(particles(partial(target, k=k), near, _PARTICLES, rng) for k in range(count))
     mixture = fit_mixture(clouds, start.wide, rng, choices=start.choices)
     for _ in range(_REFITS):  # from particles that a few ancestors share to points that are independent
-        v, _ = mixture.sample(_REFIT_POINTS, rng)
-        log_h, targets = mixture.log_density(v), _targets(log_probability, v)
-        if min(effective_size(target - log_h) for target in targets) >= _ENOUGH * len(v):
-            break
-        clouds = tuple(v[reweighted(target, log_h, _PARTICLES, rng)] for target in targets)
+        drawn = _drawn(mixture, log_probability, _REFIT_POINTS, rng)
+        targets = _targets(drawn.v, drawn.whole, drawn.parts)
+        if min(effective_size(target - drawn.log_h) for target in targets) >= _ENOUGH * _REFIT_POINTS:
+            return mixture, drawn
+        clouds = tuple(drawn.v[reweighted(target, drawn.log_h, _PARTICLES, rng)] for target in targets)
         mixture = fit_mixture(clouds, start.wide, rng, choices=start.choices)
-    return mixture
+    return mixture, None
 
 
-def _targets(log_probability: LogProbability, v: Points) -> list[Vector]:
+def _targets(v: Points, whole: Event, parts: tuple[Event, ...]) -> list[Vector]:
     """Return the log densities that points of a pool should follow, not normalised, at coordinates v (n, m).
 
     Those of the event's mass and boundary; where runs failed, between the mass and the boundary of critical or failed ones;
     the mass of each requirement of a combination.
     """
-    whole, parts = events(log_probability, v)
     log_p, (log_pi, log_not) = log_normal(v), whole.safe
     worst = [] if whole.critical is None else [log_p + 0.5 * whole.critical[0]]
     return [log_p + log_pi, log_p + 0.5 * (log_pi + log_not), *worst, *(log_p + part.safe[0] for part in parts)]

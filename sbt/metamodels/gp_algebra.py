@@ -18,8 +18,8 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector
 
 __all__ = [
-    "NOISE_FLOOR", "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "inverse_diagonal", "inverse_lower",
-    "like", "native", "placed", "solve", "solve_right", "squared_columns", "triangular",
+    "NOISE_FLOOR", "Hyperparameters", "Matrix", "Solved", "cholesky", "diagonal", "host", "inverse_diagonal", "inverse_factor",
+    "inverse_lower", "like", "placed", "product", "solve", "solve_right", "squared_columns", "triangular",
 ]  # fmt: skip
 
 Matrix = Any
@@ -38,12 +38,16 @@ class Hyperparameters:
     outputscale: float
     noise: float
 
+    @property
+    def scaling(self) -> Vector:
+        """(d,) factors on coordinates, with which the kernel depends on their distance alone."""
+        return np.asarray(math.sqrt(2.0 * self.nu) / self.lengthscale)
+
     def covariance(self, a: Matrix, b: Matrix) -> Matrix:
         """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
-        scale = like(math.sqrt(2.0 * self.nu) / self.lengthscale, a)
+        scale = like(self.scaling, a)
         if isinstance(a, torch.Tensor):
-            r: Matrix = torch.cdist(a * scale, b * scale, compute_mode="donot_use_mm_for_euclid_dist")
-            return self.outputscale * _matern(r, self.nu)
+            return self.outputscale * _matern(_distances(a * scale, b * scale), self.nu)
         found, rows = cdist(a * scale, b * scale), max(_CACHED // max(len(b), 1), 1)
         for start in range(0, len(found), rows):
             part = found[start : start + rows]
@@ -51,6 +55,42 @@ class Hyperparameters:
             if self.outputscale != 1.0:
                 part *= self.outputscale
         return found
+
+    def covariance_and_slope(self, a: Matrix) -> tuple[Matrix, Matrix]:
+        """Return the lower triangle of the (n, n) covariance at a (n, d), and f (n, n).
+
+        The covariance of two points a and b has the derivative f (a_k - b_k)^2 by the logarithm of length scale k, of
+        coordinates that are multiplied by `scaling`.
+        """
+        n, at = len(a), a * like(self.scaling, a)
+        if isinstance(a, torch.Tensor):
+            return tuple(part.tril_() for part in self._with_slope(_distances(at, at)))
+        both, rows = np.zeros((2, n, n)), max(_CACHED // max(n, 1), 1)
+        for start in range(0, n, rows):
+            part = both[:, start : start + rows, start:]
+            part[:] = self._with_slope(cdist(at[start : start + rows], at[start:]))
+            part[..., :rows] = np.triu(part[..., :rows])
+        return both[0].T, both[1].T
+
+    def _with_slope(self, r: Matrix) -> tuple[Matrix, Matrix]:
+        """Return the covariance at distances r, and its derivative by r, divided by -r; writes on `r`."""
+        decay = self.outputscale * (torch if isinstance(r, torch.Tensor) else np).exp(-r)
+        if self.nu == 0.5:
+            r[r == 0.0] = math.inf  # of equal points nothing depends on the length
+            return decay, decay / r
+        r += 1.0
+        if self.nu == 1.5:
+            return decay * r, decay
+        decay /= 3.0
+        slope = decay * r
+        r += 1.0
+        r *= slope
+        r += decay
+        return r, slope
+
+
+def _distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def _matern(r: Matrix, nu: float) -> Matrix:
@@ -96,23 +136,22 @@ def cholesky(covariance: Matrix, noise: Vector) -> Matrix:
 class Solved:
     """What the gradient and the leave-one-out residuals need of a factored covariance."""
 
-    inverse: Matrix  # (n, n)
+    inverse: Matrix  # (n, n), its lower triangle at least
     alpha: Matrix  # (n,) inverse (z - its generalised least-squares mean)
     log_likelihood: float
 
 
 def solve(factor: Matrix, z: Vector) -> Solved:
-    """Return the inverse of the covariance whose factor this is, and the likelihood of z (n,)."""
+    """Return the inverse of the covariance whose factor this is, and the likelihood of z (n,); writes on `factor`."""
+    log_det, right = 2.0 * float(np.log(host(diagonal(factor))).sum()), like(z, factor)
     if isinstance(factor, torch.Tensor):
         inverse: Matrix = torch.cholesky_inverse(factor)
+        row_sums, alpha = inverse.sum(axis=1), inverse @ right
     else:
-        lower = np.tril(lapack.dpotri(factor, lower=1)[0])
-        inverse = lower + np.tril(lower, -1).T
-    right = like(z, factor)
-    row_sums = inverse.sum(axis=1)
+        inverse = lapack.dpotri(factor, lower=1, overwrite_c=1)[0]
+        row_sums, alpha = (blas.dsymv(1.0, inverse, v, lower=1) for v in (np.ones(len(z)), right))
     centre = float(row_sums @ right / row_sums.sum())
-    alpha = inverse @ right - centre * row_sums
-    log_det = 2.0 * float(np.log(host(diagonal(factor))).sum())
+    alpha = alpha - centre * row_sums
     fit = float((right - centre) @ alpha)
     return Solved(inverse, alpha, -0.5 * (fit + log_det + len(z) * math.log(2.0 * math.pi)))
 
@@ -121,7 +160,7 @@ def inverse_diagonal(factor: Matrix) -> Vector:
     """Return the (n,) diagonal of the inverse of the covariance whose factor this is."""
     if isinstance(factor, torch.Tensor):
         return host(torch.cholesky_inverse(factor).diagonal())
-    return np.asarray(np.diag(inverse_lower(factor)))
+    return squared_columns(inverse_factor(factor))
 
 
 def inverse_lower(factor: Points) -> Points:
@@ -134,6 +173,16 @@ def solve_right(factor: Matrix, right: Points) -> Points:
     if isinstance(factor, torch.Tensor):
         return host(torch.cholesky_solve(like(right, factor), factor))
     return np.asarray(cho_solve((factor, True), right))
+
+
+def inverse_factor(factor: Points) -> Points:
+    """Return the inverse of a lower factor (n, n)."""
+    return np.asarray(lapack.dtrtri(factor, lower=1)[0])
+
+
+def product(lower: Points, right: Points) -> Points:
+    """Return a lower triangular matrix (n, n) times `right` (n, m); may write on `right`."""
+    return np.asarray(blas.dtrmm(1.0, lower, right, lower=1, overwrite_b=1))
 
 
 def triangular(factor: Matrix, right: Matrix) -> Matrix:
@@ -163,11 +212,6 @@ def placed(array: Points, device: torch.device) -> Matrix:
 def like(array: Points, matrix: Matrix) -> Matrix:
     """Return an array as a matrix where `matrix` is."""
     return placed(array, matrix.device) if isinstance(matrix, torch.Tensor) else array
-
-
-def native(tensor: torch.Tensor) -> Matrix:
-    """Return a tensor as a matrix: an array that shares its memory on the CPU."""
-    return tensor.numpy() if tensor.device.type == "cpu" else tensor
 
 
 def host(matrix: Matrix) -> Points:

@@ -20,9 +20,11 @@ from sbt.metamodels.gp_algebra import (
     cholesky,
     host,
     inverse_diagonal,
+    inverse_factor,
     inverse_lower,
     like,
     placed,
+    product,
     solve_right,
     squared_columns,
     triangular,
@@ -36,6 +38,7 @@ __all__ = ["GaussianProcessPredictor", "NoiseSpread", "relative_variance"]
 
 _GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, are spread evenly: rows that are chosen by them hit no period
 _CHUNK = 512  # points predicted at once: 2 MB a 500 rows
+_INVERTED = 3000  # rows up to which the factor is inverted: 72 MB
 _QUICK = 128  # points bounded at once: intermediate arrays stay in the cache
 _ROUNDED = {np.float32: 1e-6, np.float64: 2e-15}  # of a correlation: at most a dozen roundings
 _ROUGH = 1e-3  # error of the mean, relative to the std of y, up to which single precision will do
@@ -123,7 +126,8 @@ class GaussianProcessPredictor:
             Rasmussen & Williams (2006), eqs. (5.10)-(5.12).
         """
         with single_threaded():
-            variance = 1.0 / inverse_diagonal(self._placed[1])
+            root = self._inverse
+            variance = 1.0 / (inverse_diagonal(self._placed[1]) if root is None else squared_columns(root))
         relative = self.spread(self.u) if self.spread is not None else np.ones(len(self.u))
         at = self._learned_as(u, y)
         own, k = at >= 0, len(self.widths)
@@ -165,7 +169,7 @@ class GaussianProcessPredictor:
         scale, noise = self.hyper.outputscale, self.hyper.noise
         most = 1.0 if self.spread is None else self.spread.largest
         with single_threaded():
-            b = u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
+            b = u * self.hyper.scaling
             scaled = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)])
             shape = (min(_QUICK, len(u)), len(self.u))
             room = np.empty(shape), np.empty(shape, self._precision), np.empty(shape, self._precision)
@@ -233,7 +237,7 @@ class GaussianProcessPredictor:
     @cached_property
     def _prepared(self) -> tuple[Points, Vector]:
         """Return what squared distances of points and rows are made from, (d + 2, n), and (n,) weights."""
-        a = self.u * (math.sqrt(2.0 * self.hyper.nu) / self.hyper.lengthscale)
+        a = self.u * self.hyper.scaling
         across = np.column_stack([-2.0 * a, (a**2).sum(axis=1) + self._cancelled, np.ones(len(a))]).T
         return np.ascontiguousarray(across), self.hyper.outputscale * self.alpha
 
@@ -243,12 +247,12 @@ class GaussianProcessPredictor:
         Source:
             Rasmussen & Williams (2006), eq. (2.24) and appendix A.2.
         """
-        rows, factor, alpha = self._placed
+        rows, _, alpha = self._placed
         with single_threaded():
             at = like(u, rows)
             cross = self.hyper.covariance(rows, at)  # (rows, m)
             mean = self.centre + host(alpha @ cross)
-            half = triangular(factor, cross)
+            half = self._half(cross)
             latent = self.hyper.covariance(at, at) - half.T @ half
             root = host(cholesky(latent, np.full(len(u), 1e-8 * self.hyper.outputscale)))
             return self.shift + self.scale * (mean + rng.standard_normal((n, len(u))) @ root.T)
@@ -272,11 +276,21 @@ class GaussianProcessPredictor:
 
     def _moments(self, u: Points) -> tuple[Vector, Vector]:
         """Return (m,) mean and (m,) variance without noise, standardised."""
-        rows, factor, alpha = self._placed
+        rows, _, alpha = self._placed
         cross = self.hyper.covariance(like(u, rows), rows).T  # (n, m), column by column as BLAS wants it: nothing is copied
         mean = self.centre + host(alpha @ cross)
-        variance = self.hyper.outputscale - squared_columns(triangular(factor, cross))
+        variance = self.hyper.outputscale - squared_columns(self._half(cross))
         return mean, np.maximum(variance, 1e-10 * self.hyper.outputscale)
+
+    def _half(self, cross: Matrix) -> Matrix:
+        """Return the inverse of the factor times `cross` (n, m); may write on `cross`."""
+        return triangular(self._placed[1], cross) if self._inverse is None else product(self._inverse, cross)
+
+    @cached_property
+    def _inverse(self) -> Points | None:
+        """The inverse of the factor on the CPU, with which a product is quicker than a solve; None for many rows: memory."""
+        placed_there = isinstance(self._placed[1], np.ndarray) and len(self.u) <= _INVERTED
+        return inverse_factor(self.factor) if placed_there else None
 
     @cached_property
     def _placed(self) -> tuple[Matrix, Matrix, Matrix]:

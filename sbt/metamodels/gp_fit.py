@@ -1,0 +1,167 @@
+"""Hyperparameters of a Gaussian process: of largest posterior density by L-BFGS, or the paper's by Adam with early stopping.
+
+Likelihood, priors and their gradient are written out: one Cholesky factor serves them all, and neither automatic
+differentiation, which takes as long as the mathematics, nor conjugate gradients are needed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from sbt.metamodels.gp_algebra import NOISE_FLOOR, Hyperparameters, cholesky, diagonal, host, like, placed, solve
+from sbt.problem.arrays import Points, Vector
+
+__all__ = ["HEAVY_NOISE", "LIKELY_NOISE", "Objective", "fit_early_stopped", "fit_posterior"]
+
+LIKELY_NOISE, HEAVY_NOISE = -5.0, -0.7
+"""Log variances: the mode of a noisy metric, and about half of y's, the mode where a simulator is known to be noisy."""
+_NO_NOISE = math.log(NOISE_FLOOR)  # of a deterministic metric
+_BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
+_LEAST_NOISE = 1e-4  # where there are no priors or certainly noise
+_FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
+_HEAVY_LENGTH, _HEAVY_START = 0.6, 0.5  # the same where noise is heavy: from short ones the fit takes noise for structure
+_ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
+_IMPROVEMENT = 0.01  # of the mean validation log likelihood that resets the patience
+_PRIOR_SPREAD = math.sqrt(3.0)  # of the log length scales
+_LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """Minus the log likelihood, and log priors, of n rows as a function of the vector of log hyperparameters, per row.
+
+    The vector has the d log length scales, the log output scale where there are no priors (with them it is fixed at 1, the
+    variance of standardised y), and the log of what the noise variance has above its floor.
+
+    Args:
+        nu: smoothness of the kernel.
+        u: (n, d) rows.
+        z: (n,) standardised y.
+        spread: (n,) noise variance relative to the common one.
+        device: where it is computed.
+        priors: the posterior density counts; otherwise the likelihood alone.
+        noise_mode: log variance about which the noise is expected; None: there may be none.
+
+    Source:
+        Rasmussen & Williams (2006), algorithm 2.1, eqs. (4.17), (5.9); priors: Hvarfner et al. (2024), as in BoTorch
+        since 0.12.
+    """
+
+    nu: float
+    u: Points
+    z: Vector
+    spread: Vector
+    device: torch.device
+    priors: bool = True
+    noise_mode: float | None = None
+
+    @property
+    def floor(self) -> float:
+        """Least noise variance."""
+        return NOISE_FLOOR if self.priors and self.noise_mode is None else _LEAST_NOISE
+
+    @cached_property
+    def _rows(self) -> Points:
+        return placed(self.u, self.device)
+
+    def vector(self, hyper: Hyperparameters) -> Vector:
+        """Return the vector of hyperparameters."""
+        scale = [] if self.priors else [math.log(hyper.outputscale)]
+        noise = max(hyper.noise, 1.001 * self.floor) - self.floor
+        return np.concatenate([np.log(hyper.lengthscale), scale, [math.log(noise)]])
+
+    def hyperparameters(self, vector: Vector) -> Hyperparameters:
+        """Return the hyperparameters of a vector."""
+        d = self.u.shape[1]
+        scale = 1.0 if self.priors else math.exp(vector[d])
+        return Hyperparameters(self.nu, np.exp(vector[:d]), scale, self.floor + math.exp(vector[-1]))
+
+    def __call__(self, vector: Vector) -> tuple[float, Vector]:
+        """Return the objective at a vector, and its gradient; the mean is profiled out, so it adds nothing to the gradient."""
+        hyper, n, d = self.hyperparameters(vector), len(self.z), self.u.shape[1]
+        covariance, factors = hyper.covariance_and_slope(self._rows)
+        solved = solve(cholesky(covariance, hyper.noise * self.spread), self.z)
+        slope = solved.inverse  # from here on, twice n times that by the covariance
+        slope -= (solved.alpha[:, None] * solved.alpha).T  # symmetric; its memory is laid out as the inverse's
+        by_noise = 0.5 / n * float(host(diagonal(slope)) @ self.spread)
+        slope *= factors
+        at = self._rows * like(hyper.scaling, self._rows)
+        at = at - at.mean(axis=0)  # differences of small numbers are exact
+        sums = slope.sum(axis=0) + slope.sum(axis=1)
+        by_length = host(sums @ (at * at) - 2.0 * (at * (slope @ at)).sum(axis=0)) / n
+        by_scale = 0.5 / n * (n - float(host(solved.alpha) @ self.z)) - by_noise * hyper.noise  # alpha sums to 0
+        gradient = np.concatenate([by_length, [] if self.priors else [by_scale], [by_noise * (hyper.noise - self.floor)]])
+        value = -solved.log_likelihood / n
+        if not self.priors:
+            return value, gradient
+        away = (vector[:d] - math.sqrt(2.0) - 0.5 * math.log(d)) / _PRIOR_SPREAD
+        log_prior = -vector[:d] - 0.5 * away**2 - math.log(_PRIOR_SPREAD) - _LOG_ROOT
+        gradient[:d] += (1.0 + away / _PRIOR_SPREAD) / n
+        of_noise, by_log_noise = _log_prior_of_noise(math.log(hyper.noise), self.noise_mode)
+        gradient[-1] -= by_log_noise * (1.0 - self.floor / hyper.noise) / n
+        return value - (float(log_prior.sum()) + of_noise) / n, gradient
+
+
+def _log_prior_of_noise(log_noise: float, mode: float | None) -> tuple[float, float]:
+    """Return the log prior density of the log noise variance, and its derivative.
+
+    Half is that of noisy metrics, half is flat down to jitter. With a mode there is noise for certain, about there.
+
+    The first alone costs a deterministic metric 80 nats: 100 smooth runs were then learned with noise of 2 % of the
+    standard deviation of y, too much for a critical interval that is narrower.
+    """
+    away = log_noise - (LIKELY_NOISE if mode is None else mode)
+    noisy = -0.5 * away**2 - _LOG_ROOT
+    if mode is not None:
+        return noisy, -away
+    flat = -np.logaddexp(0.0, 2.0 * away) - math.log(LIKELY_NOISE - _NO_NOISE)
+    share = expit(noisy - flat)
+    return float(np.logaddexp(noisy, flat)) - math.log(2.0), float(-share * away - (1.0 - share) * 2.0 * expit(2.0 * away))
+
+
+def fit_posterior(objective: Objective, start: Hyperparameters | None = None) -> Hyperparameters:
+    """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
+    if start is None:
+        d, heavy = objective.u.shape[1], objective.noise_mode == HEAVY_NOISE
+        length, noise = (_HEAVY_LENGTH, _HEAVY_START) if heavy else (_FIRST_LENGTH, _FIRST_NOISE)
+        start = Hyperparameters(objective.nu, np.full(d, length * math.sqrt(d)), 1.0, noise)
+    first = objective.vector(start)
+    found = minimize(
+        objective, first, jac=True, method="L-BFGS-B", bounds=[_BOUNDS] * (len(first) - 1) + [(_NO_NOISE - 1.0, _BOUNDS[1])],
+        options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE},
+    )  # fmt: skip
+    return objective.hyperparameters(found.x)
+
+
+def fit_early_stopped(
+    objective: Objective, score: Callable[[Hyperparameters], float], *, learning_rate: float, patience: int, max_epochs: int
+) -> Hyperparameters:
+    """Return the hyperparameters of the largest score, a mean validation log likelihood, on Adam's way: the paper's rule.
+
+    Source:
+        Kingma & Ba (2015), algorithm 1.
+    """
+    half = math.log(2.0)  # where GPyTorch, which the paper used, starts: softplus(0)
+    vector = objective.vector(Hyperparameters(objective.nu, np.full(objective.u.shape[1], half), half, half))
+    mean, square = np.zeros(len(vector)), np.zeros(len(vector))
+    best, best_score, since = objective.hyperparameters(vector), -math.inf, 0
+    for epoch in range(1, max_epochs + 1):
+        slope = objective(vector)[1]
+        mean, square = 0.9 * mean + 0.1 * slope, 0.999 * square + 0.001 * slope**2
+        step = mean / (1.0 - 0.9**epoch) / (np.sqrt(square / (1.0 - 0.999**epoch)) + 1e-8)
+        vector = np.clip(vector - learning_rate * step, *_BOUNDS)
+        hyper = objective.hyperparameters(vector)
+        value, since = score(hyper), since + 1
+        if value > best_score + _IMPROVEMENT:
+            best, best_score, since = hyper, value, 0
+        if since >= patience:
+            break
+    return best
