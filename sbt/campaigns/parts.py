@@ -127,7 +127,7 @@ class BatchStage:
         found = (evenly if first or n == 0 else self.choose)(s, fitted, log, n)
         stage = "initial" if first else self.name
         x = without_repetition(s.scenario, log.planned, found.x) if self.repeats else found.x
-        chosen = PlannedPoints(stage, x, s.scenario.space.named)
+        chosen = PlannedPoints(stage, x, s.scenario.space.names, s.scenario.space.choices)
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)
         return Batch((*chosen, *again, *random) if again or random else chosen, proposal, fitted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from sbt.loop.stages import Batch, Log, Progress, Stage
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.requirement import Requirement
 from sbt.seeds import run_seeds
-from sbt.store.database import Store
+from sbt.store.database import PlannedPoints, Store
 from sbt.store.history import History
 
 __all__ = ["Counter", "Driver"]
@@ -73,12 +73,15 @@ class Driver:
     _first: float | None = None
     _last: float = 0.0
 
-    def plan(self, stage: Stage, batch: Batch, log: Log) -> float:
-        """Write a batch, and what its metamodel is worth; return the seconds of its fit."""
-        spent, start = self.keep(batch.fitted, log), self.store.end
-        seeds = run_seeds(self.seed, range(start, start + len(batch.runs)))
+    def plan(self, stage: Stage, batch: Batch, log: Log) -> Iterator[Job]:
+        """Write a batch, and what its metamodel is worth; return its runs, in the order of their indices."""
+        spent, end = self.keep(batch.fitted, log), self.store.end
+        seeds = run_seeds(self.seed, range(end, end + len(batch.runs)))
         self.store.plan(log.iteration, stage.name, batch.runs, seeds, batch.proposal)
-        return spent
+        self.seconds["propose"] -= spent
+        if isinstance(batch.runs, PlannedPoints):  # a million of them need not be read from where they have just been written
+            return batch.runs.jobs(end, seeds)
+        return iter(self.store.unfinished(since=end))
 
     def keep(self, fitted: FittedMetamodel | None, log: Log) -> float:
         """Write what the log keeps of a metamodel; return the seconds of its fit."""

@@ -13,8 +13,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 
 from sbt.errors import InputError
 from sbt.execution.protocol import Executor, groups_of, is_apart
@@ -126,15 +127,16 @@ class _StageLoop:
     driver: Driver
     executor: Executor
     _queue: deque[Job] = field(default_factory=deque)
+    _planned: deque[Iterator[Job]] = field(default_factory=deque)
     _thought: _Thought | None = None
     _reason: str | None = None
 
     def run(self) -> str:
         """Run the stage to its end; return why it was over."""
-        ahead, store = ahead_of(self.stage), self.driver.store
+        ahead = ahead_of(self.stage)
         while True:
             if not self._queue:
-                self._queue.extend(store.unfinished(_AT_ONCE))
+                self._queue.extend(self._coming())
             self._advance(ahead)
             if self._queue:
                 self._simulate(ahead)
@@ -142,6 +144,14 @@ class _StageLoop:
                 self._thought.wait()
             elif self._reason is not None:
                 return self._reason
+
+    def _coming(self) -> list[Job]:
+        """Return the next runs that were planned and not queued yet, or those that an interrupted campaign left."""
+        while self._planned:
+            if jobs := list(islice(self._planned[0], _AT_ONCE)):
+                return jobs
+            self._planned.popleft()
+        return self.driver.store.unfinished(_AT_ONCE)
 
     def _simulate(self, ahead: int) -> None:
         """Run what is queued, and what joins the queue meanwhile."""
@@ -177,9 +187,9 @@ class _StageLoop:
         if isinstance(chosen, str):
             self._reason = chosen
             return
-        end = driver.store.end
-        driver.seconds["propose"] += thought.seconds - driver.plan(self.stage, chosen, thought.log)
-        self._queue.extend(driver.store.unfinished(_AT_ONCE, since=end))
+        driver.seconds["propose"] += thought.seconds
+        self._planned.append(driver.plan(self.stage, chosen, thought.log))
+        self._queue.extend(islice(self._planned[-1], _AT_ONCE))
 
 
 class _Thought:

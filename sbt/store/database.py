@@ -240,7 +240,7 @@ class Store:
         """
         start = self.end
         places = range(start, start + len(runs)) if indices is None else indices
-        rows = plan_rows(iteration, zip(places, runs, seeds, strict=True), self._known.names, self._warm_ups)
+        rows = plan_rows(iteration, places, runs, seeds, self._known.names, self._warm_ups)
         text = dump(proposal if isinstance(proposal, dict) else to_json(proposal))
         with self._transaction():
             self._db.executemany(

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Points
+from sbt.problem.outcome import Job
 from sbt.problem.plain import Value, Values
 from sbt.store.history import PLANNED
 from sbt.store.layout import checksum_of
 
 __all__ = ["PlannedPoints", "PlannedRun", "dump", "dump_inputs", "dump_metrics", "plan_rows", "storable", "storable_reason"]
 
+_ROWS = 10_000
+"""Rows of a design that become Python numbers at once."""
 _MOST = 10_000
 """Characters of a message that a store keeps: one with a whole dump in it says no more."""
 
@@ -51,13 +54,15 @@ class PlannedPoints(Sequence[PlannedRun]):
 
     Args:
         stage: what asks for them.
-        x: (n, d) inputs in their units.
-        named: (d,) -> values by name.
+        x: (n, d) inputs in their units, a choice as its position.
+        names: (d,) of the inputs.
+        choices: of the inputs that have some, by name.
     """
 
     stage: str
     x: Points
-    named: Callable[[Vector], Mapping[str, Value]]
+    names: tuple[str, ...]
+    choices: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of runs."""
@@ -70,12 +75,25 @@ class PlannedPoints(Sequence[PlannedRun]):
     def __getitem__(self, k: int | slice) -> PlannedRun | PlannedPoints:
         """Return one run, or the runs of a slice."""
         if isinstance(k, slice):
-            return PlannedPoints(self.stage, self.x[k], self.named)
-        return PlannedRun(self.stage, self.named(self.x[k]))
+            return replace(self, x=self.x[k])
+        return next(iter(replace(self, x=self.x[[k]])))
 
     def __iter__(self) -> Iterator[PlannedRun]:
         """Yield the runs."""
-        return (PlannedRun(self.stage, self.named(row)) for row in self.x)
+        return (PlannedRun(self.stage, inputs) for inputs in self.inputs())
+
+    def inputs(self) -> Iterator[dict[str, Value]]:
+        """Yield the inputs of each run by name, choices as text."""
+        for start in range(0, len(self.x), _ROWS):
+            for row in self.x[start : start + _ROWS].tolist():
+                inputs: dict[str, Value] = dict(zip(self.names, row, strict=True))
+                for name, choices in self.choices.items():
+                    inputs[name] = choices[int(inputs[name])]
+                yield inputs
+
+    def jobs(self, first: int, seeds: Iterable[int]) -> Iterator[Job]:
+        """Yield the runs as jobs of these seeds, the first one with this index: what a store gives back of them."""
+        return (Job(first + k, inputs, seed) for k, (inputs, seed) in enumerate(zip(self.inputs(), seeds, strict=True)))
 
 
 def storable(text: str) -> str:
@@ -97,17 +115,30 @@ def storable_reason(text: str) -> str:
 
 
 def plan_rows(
-    iteration: int, runs: Iterable[tuple[int, PlannedRun, int]], names: Sequence[str], warm_ups: int
+    iteration: int, indices: Sequence[int], runs: Sequence[PlannedRun], seeds: Sequence[int], names: Sequence[str], warm_ups: int
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of planned runs with their index and drawn seed, for a store with these inputs and warm-ups."""
-    for index, run, drawn in runs:
-        values = run.inputs
+    """Yield the rows of planned runs with their indices and drawn seeds, for a store with these inputs and warm-ups."""
+    plain: Iterator[_Plain]
+    if isinstance(runs, PlannedPoints):
+        plain = ((runs.stage, inputs, seed, 0, 0, None, None) for inputs, seed in zip(runs.inputs(), seeds, strict=True))
+    else:
+        plain = (_plain(run, seed) for run, seed in zip(runs, seeds, strict=True))
+    for index, (stage, values, seed, chosen, level, warm_up, log_q) in zip(indices, plain, strict=True):
+        shared = int(seed) % warm_ups if warm_ups and warm_up is None else warm_up
         inputs = dump_inputs([values[name] for name in names])
-        chosen, seed = run.seed is not None and not run.blind, drawn if run.seed is None else run.seed
-        log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
-        warm_up = int(seed) % warm_ups if warm_ups and run.warm_up is None else run.warm_up
-        row = (int(index), run.stage, int(iteration), inputs, int(seed), int(chosen), run.level, warm_up, log_q)
+        row = (int(index), stage, int(iteration), inputs, int(seed), chosen, level, shared, log_q)
         yield (*row, checksum_of(*row), PLANNED)
+
+
+_Plain = tuple[str, Values, int, int, int, int | None, float | None]
+"""Stage, inputs, seed, whether that was chosen, level, warm-up, log density."""
+
+
+def _plain(run: PlannedRun, drawn: int) -> _Plain:
+    """Return what a store keeps of a run; `drawn` is its seed where none was chosen."""
+    chosen, seed = run.seed is not None and not run.blind, drawn if run.seed is None else run.seed
+    log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
+    return run.stage, run.inputs, seed, int(chosen), run.level, run.warm_up, log_q
 
 
 def dump_inputs(values: Sequence[Value]) -> str:
@@ -116,7 +147,7 @@ def dump_inputs(values: Sequence[Value]) -> str:
     >>> dump_inputs([0.1, 2.0, "left"])
     '[0.1,2.0,"left"]'
     """
-    if not all(type(value) is float and math.isfinite(value) for value in values):
+    if set(map(type, values)) != {float} or not math.isfinite(sum(values)):  # type: ignore[arg-type]
         return dump(values)
     return f"[{','.join(map(repr, values))}]"  # as JSON writes them, in a third of the time
 
