@@ -19,6 +19,7 @@ def check_row(folder: Path, what: str, stored: int, *parts: Any) -> None:
 
 def check_rows(folder: Path, what: str, rows: Sequence[tuple[Any, ...]], stored: Sequence[int]) -> None:
     """Refuse rows, of which the first field says which run they are of, that are not what was written."""
-    for row, written_then, now in zip(rows, stored, checksums_of(rows), strict=True):
-        if written_then != now:
-            raise damaged(folder, f"{what} {row[0]} has a wrong checksum")
+    now = checksums_of(rows)
+    if now != list(stored):
+        wrong = next(row for row, then, found in zip(rows, stored, now, strict=True) if then != found)
+        raise damaged(folder, f"{what} {wrong[0]} has a wrong checksum")

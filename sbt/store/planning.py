@@ -82,14 +82,18 @@ class PlannedPoints(Sequence[PlannedRun]):
         """Yield the runs."""
         return (PlannedRun(self.stage, inputs) for inputs in self.inputs())
 
-    def inputs(self) -> Iterator[dict[str, Value]]:
-        """Yield the inputs of each run by name, choices as text."""
+    def values(self) -> Iterator[list[Value]]:
+        """Yield the inputs of each run, choices as text."""
+        chosen = [(self.names.index(name), choices) for name, choices in self.choices.items()]
         for start in range(0, len(self.x), _ROWS):
             for row in self.x[start : start + _ROWS].tolist():
-                inputs: dict[str, Value] = dict(zip(self.names, row, strict=True))
-                for name, choices in self.choices.items():
-                    inputs[name] = choices[int(inputs[name])]
-                yield inputs
+                for k, choices in chosen:
+                    row[k] = choices[int(row[k])]
+                yield row
+
+    def inputs(self) -> Iterator[dict[str, Value]]:
+        """Yield the inputs of each run by name, choices as text."""
+        return (dict(zip(self.names, row, strict=True)) for row in self.values())
 
     def jobs(self, first: int, seeds: Iterable[int]) -> Iterator[Job]:
         """Yield the runs as jobs of these seeds, the first one with this index: what a store gives back of them."""
@@ -119,26 +123,25 @@ def plan_rows(
 ) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of planned runs with their indices and drawn seeds, for a store with these inputs and warm-ups."""
     plain: Iterator[_Plain]
-    if isinstance(runs, PlannedPoints):
-        plain = ((runs.stage, inputs, seed, 0, 0, None, None) for inputs, seed in zip(runs.inputs(), seeds, strict=True))
+    if isinstance(runs, PlannedPoints) and runs.names == tuple(names):
+        plain = ((runs.stage, row, seed, 0, 0, None, None) for row, seed in zip(runs.values(), seeds, strict=True))
     else:
-        plain = (_plain(run, seed) for run, seed in zip(runs, seeds, strict=True))
+        plain = (_plain(run, names, seed) for run, seed in zip(runs, seeds, strict=True))
     for index, (stage, values, seed, chosen, level, warm_up, log_q) in zip(indices, plain, strict=True):
         shared = int(seed) % warm_ups if warm_ups and warm_up is None else warm_up
-        inputs = dump_inputs([values[name] for name in names])
-        row = (int(index), stage, int(iteration), inputs, int(seed), chosen, level, shared, log_q)
+        row = (int(index), stage, int(iteration), dump_inputs(values), int(seed), chosen, level, shared, log_q)
         yield (*row, checksum_of(*row), PLANNED)
 
 
-_Plain = tuple[str, Values, int, int, int, int | None, float | None]
+_Plain = tuple[str, list[Value], int, int, int, int | None, float | None]
 """Stage, inputs, seed, whether that was chosen, level, warm-up, log density."""
 
 
-def _plain(run: PlannedRun, drawn: int) -> _Plain:
+def _plain(run: PlannedRun, names: Sequence[str], drawn: int) -> _Plain:
     """Return what a store keeps of a run; `drawn` is its seed where none was chosen."""
     chosen, seed = run.seed is not None and not run.blind, drawn if run.seed is None else run.seed
     log_q = None if run.log_q is None else float(run.log_q) + 0.0  # SQLite keeps no negative zero
-    return run.stage, run.inputs, seed, int(chosen), run.level, run.warm_up, log_q
+    return run.stage, [run.inputs[name] for name in names], seed, int(chosen), run.level, run.warm_up, log_q
 
 
 def dump_inputs(values: Sequence[Value]) -> str:
