@@ -18,6 +18,7 @@ from sbt.campaigns.exploration import largest_batch
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place
+from sbt.campaigns.regions import CriticalRegion, critical_regions
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_boundary
@@ -57,6 +58,7 @@ class BoundaryConclusion:
         held_out_fractions: of a combination, the share of the held-out runs that violates each requirement.
         independence: of the metrics of a combination, given the inputs.
         place: where the boundary lies; None: the metamodel sees none.
+        regions: separate critical regions, the largest first; None: the metamodel sees none.
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
         doubt: what inputs and drawn traffic decide of whether a run is critical; None: it is not known.
         every_combination: what is known because every combination of the inputs was run; None: some were not.
@@ -78,6 +80,7 @@ class BoundaryConclusion:
     explained: ExplainedVariance | None = optional()
     doubt: TrafficDoubt | None = optional()
     every_combination: EveryCombination | None = optional()
+    regions: tuple[CriticalRegion, ...] | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -135,12 +138,14 @@ def recipe(settings: Settings) -> Campaign:
             shares = learner.fine_shares(fitted)
         every = every_combination(settings.scenario, log.history)
         shares = shares if every is None else (every.share, 0.0, 0.0)
-        place = boundary_place(partial(_log_odds, fitted, settings), settings.scenario, settings.seed)
+        log_odds = partial(_log_odds, fitted, settings)
+        place = boundary_place(log_odds, settings.scenario, settings.seed)
+        regions = None if place is None else critical_regions(log_odds, settings.scenario, settings.seed)
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history), traffic_doubt(settings, log.history),
-            every,
+            every, regions or None,
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

@@ -20,6 +20,7 @@ from sbt.campaigns.lost import (
     why_they_fail,
 )  # fmt: skip
 from sbt.campaigns.records import CONFIRM
+from sbt.campaigns.regions import regions_words
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST
@@ -85,7 +86,9 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     else:
         sure = "no held-out run tested it"
     if found.place is not None:
-        where = found.place.words(facts.units)
+        section = found.place.words(facts.units)
+        regions = () if found.place.vague or found.regions is None else found.regions  # roughness would be counted
+        where = regions_words(regions, found.place.inputs, facts.units) or section
         lead = f"{_of(facts, 'In').strip() or 'Here'}, a run is critical ({_condition(facts)}) where {where}"
         if found.place.vague:
             lead = (
@@ -105,6 +108,8 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
         f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
     ]
+    if found.place is not None and where != section and not _none_critical(facts):
+        said.append(f"On lines across the boundary, a run is critical where {section}.")
     return [*said, *_reconciled(found, measured_share), *_too_sure(found)]
 
 
