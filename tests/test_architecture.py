@@ -44,7 +44,7 @@ LATE = {
 }
 """Imports inside functions that may look up: only when they are needed."""
 BELONGS = {
-    "libsumo": {"sumo"}, "traci": {"sumo"}, "torch": {"metamodels"}, "gpytorch": set(), "sklearn": {"metamodels"},
+    "libsumo": {"sumo"}, "traci": {"sumo"}, "torch": {"metamodels"}, "gpytorch": {"metamodels"}, "sklearn": {"metamodels"},
     "joblib": {"execution"}, "distributed": {"execution"}, "sqlite3": {"store", "cli"}, "typer": {"cli"},
     "pydantic": {"config", "store"},  # reads configurations, and records of the log
 }  # fmt: skip

@@ -20,7 +20,7 @@ import sbt
 
 __all__ = ["Check", "examine"]
 
-_PACKAGES = ("libsumo", "torch", "scikit-learn", "numpy", "scipy", "pandas", "joblib")
+_PACKAGES = ("libsumo", "torch", "gpytorch", "scikit-learn", "numpy", "scipy", "pandas", "joblib")
 _MODULES = {"scikit-learn": "sklearn"}
 _FREE_GB = 1.0
 _COMMITS = 50

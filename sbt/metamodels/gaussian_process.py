@@ -26,7 +26,8 @@ from sbt.metamodels.gp_algebra import (
     solve,
     solve_right,
 )
-from sbt.metamodels.gp_fit import HEAVY_NOISE, LIKELY_NOISE, Objective, fit_early_stopped, fit_posterior
+from sbt.metamodels.gp_fit import HEAVY_NOISE, LIKELY_NOISE, Objective, fit_posterior
+from sbt.metamodels.gp_paper import fit_early_stopped
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative_variance
 from sbt.metamodels.tails import student_widths
 from sbt.metamodels.torch_tools import check_device, device_of, single_threaded
@@ -139,8 +140,8 @@ class GaussianProcess:
                 return float(fitted(u[validation]).log_density(z[validation]).mean())
 
             hyper = fit_early_stopped(
-                Objective(self.nu, u[training], z[training], ones, device, priors=False), score,
-                learning_rate=self.learning_rate, patience=self.patience, max_epochs=self.max_epochs,
+                self.nu, u[training], z[training], score, learning_rate=self.learning_rate, patience=self.patience,
+                max_epochs=self.max_epochs, device=device,
             )  # fmt: skip
             return _condition(self, hyper, u[training], z[training], ones, None, shift, scale)
         rows = rng.permutation(len(z))[: self.fit_rows]

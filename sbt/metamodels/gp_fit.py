@@ -1,4 +1,4 @@
-"""Hyperparameters of a Gaussian process: of largest posterior density by L-BFGS, or the paper's by Adam with early stopping.
+"""Hyperparameters of a Gaussian process: of largest posterior density, by L-BFGS.
 
 Likelihood, priors and their gradient are written out: one Cholesky factor serves them all, and neither automatic
 differentiation, which takes as long as the mathematics, nor conjugate gradients are needed.
@@ -7,7 +7,6 @@ differentiation, which takes as long as the mathematics, nor conjugate gradients
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,27 +18,26 @@ from scipy.special import expit
 from sbt.metamodels.gp_algebra import NOISE_FLOOR, Hyperparameters, cholesky, diagonal, host, like, placed, solve
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["HEAVY_NOISE", "LIKELY_NOISE", "Objective", "fit_early_stopped", "fit_posterior"]
+__all__ = ["HEAVY_NOISE", "LIKELY_NOISE", "Objective", "fit_posterior"]
 
 LIKELY_NOISE, HEAVY_NOISE = -5.0, -0.7
 """Log variances: the mode of a noisy metric, and about half of y's, the mode where a simulator is known to be noisy."""
 _NO_NOISE = math.log(NOISE_FLOOR)  # of a deterministic metric
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
-_LEAST_NOISE = 1e-4  # where there are no priors or certainly noise
+_LEAST_NOISE = 1e-4  # where there is certainly noise
 _FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
 _HEAVY_LENGTH, _HEAVY_START = 0.6, 0.5  # the same where noise is heavy: from short ones the fit takes noise for structure
 _ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
-_IMPROVEMENT = 0.01  # of the mean validation log likelihood that resets the patience
 _PRIOR_SPREAD = math.sqrt(3.0)  # of the log length scales
 _LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Minus the log likelihood, and log priors, of n rows as a function of the vector of log hyperparameters, per row.
+    """Minus the log posterior density of n rows as a function of the vector of log hyperparameters, per row.
 
-    The vector has the d log length scales, the log output scale where there are no priors (with them it is fixed at 1, the
-    variance of standardised y), and the log of what the noise variance has above its floor.
+    The vector has the d log length scales and the log of what the noise variance has above its floor; the output scale is
+    that of standardised y, 1.
 
     Args:
         nu: smoothness of the kernel.
@@ -47,7 +45,6 @@ class Objective:
         z: (n,) standardised y.
         spread: (n,) noise variance relative to the common one.
         device: where it is computed.
-        priors: the posterior density counts; otherwise the likelihood alone.
         noise_mode: log variance about which the noise is expected; None: there may be none.
 
     Source:
@@ -60,13 +57,12 @@ class Objective:
     z: Vector
     spread: Vector
     device: torch.device
-    priors: bool = True
     noise_mode: float | None = None
 
     @property
     def floor(self) -> float:
         """Least noise variance."""
-        return NOISE_FLOOR if self.priors and self.noise_mode is None else _LEAST_NOISE
+        return NOISE_FLOOR if self.noise_mode is None else _LEAST_NOISE
 
     @cached_property
     def _rows(self) -> Points:
@@ -74,15 +70,12 @@ class Objective:
 
     def vector(self, hyper: Hyperparameters) -> Vector:
         """Return the vector of hyperparameters."""
-        scale = [] if self.priors else [math.log(hyper.outputscale)]
         noise = max(hyper.noise, 1.001 * self.floor) - self.floor
-        return np.concatenate([np.log(hyper.lengthscale), scale, [math.log(noise)]])
+        return np.append(np.log(hyper.lengthscale), math.log(noise))
 
     def hyperparameters(self, vector: Vector) -> Hyperparameters:
         """Return the hyperparameters of a vector."""
-        d = self.u.shape[1]
-        scale = 1.0 if self.priors else math.exp(vector[d])
-        return Hyperparameters(self.nu, np.exp(vector[:d]), scale, self.floor + math.exp(vector[-1]))
+        return Hyperparameters(self.nu, np.exp(vector[:-1]), 1.0, self.floor + math.exp(vector[-1]))
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
         """Return the objective at a vector, and its gradient; the mean is profiled out, so it adds nothing to the gradient."""
@@ -97,17 +90,13 @@ class Objective:
         at = at - at.mean(axis=0)  # differences of small numbers are exact
         sums = slope.sum(axis=0) + slope.sum(axis=1)
         by_length = host(sums @ (at * at) - 2.0 * (at * (slope @ at)).sum(axis=0)) / n
-        by_scale = 0.5 / n * (n - float(host(solved.alpha) @ self.z)) - by_noise * hyper.noise  # alpha sums to 0
-        gradient = np.concatenate([by_length, [] if self.priors else [by_scale], [by_noise * (hyper.noise - self.floor)]])
-        value = -solved.log_likelihood / n
-        if not self.priors:
-            return value, gradient
+        gradient = np.append(by_length, by_noise * (hyper.noise - self.floor))
         away = (vector[:d] - math.sqrt(2.0) - 0.5 * math.log(d)) / _PRIOR_SPREAD
         log_prior = -vector[:d] - 0.5 * away**2 - math.log(_PRIOR_SPREAD) - _LOG_ROOT
         gradient[:d] += (1.0 + away / _PRIOR_SPREAD) / n
         of_noise, by_log_noise = _log_prior_of_noise(math.log(hyper.noise), self.noise_mode)
         gradient[-1] -= by_log_noise * (1.0 - self.floor / hyper.noise) / n
-        return value - (float(log_prior.sum()) + of_noise) / n, gradient
+        return -(solved.log_likelihood + float(log_prior.sum()) + of_noise) / n, gradient
 
 
 def _log_prior_of_noise(log_noise: float, mode: float | None) -> tuple[float, float]:
@@ -139,29 +128,3 @@ def fit_posterior(objective: Objective, start: Hyperparameters | None = None) ->
         options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE},
     )  # fmt: skip
     return objective.hyperparameters(found.x)
-
-
-def fit_early_stopped(
-    objective: Objective, score: Callable[[Hyperparameters], float], *, learning_rate: float, patience: int, max_epochs: int
-) -> Hyperparameters:
-    """Return the hyperparameters of the largest score, a mean validation log likelihood, on Adam's way: the paper's rule.
-
-    Source:
-        Kingma & Ba (2015), algorithm 1.
-    """
-    half = math.log(2.0)  # where GPyTorch, which the paper used, starts: softplus(0)
-    vector = objective.vector(Hyperparameters(objective.nu, np.full(objective.u.shape[1], half), half, half))
-    mean, square = np.zeros(len(vector)), np.zeros(len(vector))
-    best, best_score, since = objective.hyperparameters(vector), -math.inf, 0
-    for epoch in range(1, max_epochs + 1):
-        slope = objective(vector)[1]
-        mean, square = 0.9 * mean + 0.1 * slope, 0.999 * square + 0.001 * slope**2
-        step = mean / (1.0 - 0.9**epoch) / (np.sqrt(square / (1.0 - 0.999**epoch)) + 1e-8)
-        vector = np.clip(vector - learning_rate * step, *_BOUNDS)
-        hyper = objective.hyperparameters(vector)
-        value, since = score(hyper), since + 1
-        if value > best_score + _IMPROVEMENT:
-            best, best_score, since = hyper, value, 0
-        if since >= patience:
-            break
-    return best
