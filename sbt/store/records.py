@@ -185,10 +185,14 @@ class Iteration:
     number: int
     stage: str
     proposal: JsonMapping
+    _records: dict[type, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def read(self, kind: type[T]) -> T:
-        """Return how it was chosen as the stage's own record."""
-        return from_json(kind, self.proposal)
+        """Return how it was chosen as the stage's own record; made once, as stages read all batches before each one."""
+        found: T | None = self._records.get(kind)
+        if found is None:
+            found = self._records[kind] = from_json(kind, self.proposal)
+        return found
 
 
 @dataclass(frozen=True)
