@@ -25,7 +25,7 @@ from sbt.cli import app
 from sbt.errors import StoreError
 from sbt.problem.outcome import Outcome, Status
 from sbt.problem.requirement import Requirement
-from sbt.store.database import DATABASE, PlannedRun, Store
+from sbt.store.database import DATABASE, PlannedPoints, PlannedRun, Store
 from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord, Iteration, Validation
 
@@ -70,6 +70,19 @@ def test_rows_come_back_to_the_last_bit(tmp_path: Path):
     assert history.records[1].reason == "too long: 60 s ünd 'quotes'"
     assert [r.log_q for r in history.records] == [None, -0.5, -0.5]
     assert history.records[0].collisions == "ego>co@1.2"
+
+
+def test_a_design_gives_the_jobs_and_rows_that_a_store_gives_of_its_runs(tmp_path: Path):
+    x = np.column_stack([np.random.default_rng(0).normal(size=6), [2.0, 0.0, 1.0, 1.0, -0.0, 2.0]])
+    points = PlannedPoints("initial", x, ("a", "b"), {"b": ("left", "middle", "right")})
+    kept = {**CONFIGURATION, "described": {"inputs": [{"name": "b", "choices": ["left", "middle", "right"]}]}}
+    found = []
+    for k, runs in enumerate((points, list(points), [points[k] for k in range(-6, 0)], [*points[:2], *points[2:]])):
+        with Store.open(tmp_path / str(k), kept) as store:
+            store.plan(0, "initial", runs, range(6), {})
+            found.append((store.unfinished(), store._select("SELECT * FROM runs")))
+    assert all(each == found[0] for each in found)
+    assert list(points.jobs(0, range(6))) == found[0][0]
 
 
 def test_a_frame_has_one_column_an_input_and_a_metric(tmp_path: Path):
