@@ -40,14 +40,14 @@ SMALLEST = {
     "fuzz.py": "--configurations 2 --scenarios 1",
     "large.py": "--runs 200 --batch 100",
     "pairs.py": "crossing_pedestrian --seeds 1 --runs 30",
-    "report_speed.py": "--runs 20 --scenario cut_in --clicks 2 --opened 1",
+    "report_speed.py": "--runs 20 --scenario cut_in --clicks 2 --opened 1", "serve_speed.py": "--runs 20 --opened 1",
     "run_price.py": "--runs 2 --repeats 1 --only crossing_pedestrian",
     "fidelity.py": "problems --budget 40 --seeds 1 --only useless --probabilities 0.38",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py"}
 SUMO |= {"fuzz.py", "noise.py", "pairs.py", "physics.py", "run_price.py", "throughput.py", "transfer.py", "watcher.py"}
-SUMO |= {"report_speed.py"}  # and Chromium
+SUMO |= {"report_speed.py"}  # and Chromium, as serve_speed.py
 LONG = {"batch_size.py", "benchmark_page.py", "known_before.py", "snapshots.py"}  # hours, or minutes
 SHARED = {"coarse_problems.py", "disturbing.py", "fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
 SHARED |= {"two_discs.py"}
@@ -60,7 +60,7 @@ def test_every_script_is_known():
 @pytest.mark.slow
 @pytest.mark.parametrize("script", [pytest.param(s, marks=[pytest.mark.sumo] if s in SUMO else []) for s in SMALLEST])
 def test_it_runs(script, tmp_path, campaign):
-    if script == "report_speed.py" and PROGRAM is None:
+    if script in ("report_speed.py", "serve_speed.py") and PROGRAM is None:
         pytest.skip("Chromium is not installed")
     if script == "warm_start.py":
         campaign(campaign="coverage", budget=100, store=str(tmp_path / "store"))

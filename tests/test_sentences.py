@@ -1,7 +1,9 @@
 """The sentences: the answer with its interval, what it does not tell, what to do next; the same wherever they are read."""
 
+import dataclasses
 import html
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +16,13 @@ from sbt.campaigns.place import BoundaryPlace, Cut, Stretch, boundary_place
 from sbt.campaigns.telling import tell_boundary
 from sbt.campaigns.wording import measured, requirement_words, written_unit
 from sbt.cli import app
-from sbt.loop.stages import Facts
+from sbt.loop.stages import Facts, sentences_of
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.store.history import History
+from sbt.workflows.exporting import limits_of
 
 WEDGE = sbt.Scenario(
     "wedge",
@@ -47,6 +50,9 @@ def test_the_place_of_a_boundary_is_where_it_is_and_names_what_matters():
         assert stretch.low == 0.0
         assert stretch.high == pytest.approx(4.0 + 0.3 * cut.at, abs=0.01)
         assert cut.unsure == pytest.approx(np.log(19) / 20, abs=0.03)
+    succeeds = boundary_place(log_odds, scenario, 1, lambda u: np.where(u[:, 2] < 0.5, -0.1, -3.0))  # runs fail where b > 0
+    assert max(cut.at for cut in succeeds.cuts) <= 0.0 < max(cut.at for cut in found.cuts)
+    assert boundary_place(log_odds, scenario, 1, lambda u: np.full(len(u), -3.0)) is None
     for side in (-np.inf, 50.0):
         assert boundary_place(lambda u, p=side: np.full(len(u), p), scenario, seed=1) is None
 
@@ -101,3 +107,16 @@ def test_few_combinations_are_advised_to_be_run():
     facts = Facts(History.of(("a",)), Requirement("y", high=0.0), "m", "s", {}, 40)
     told = tell_boundary(BoundaryConclusion(0.3, 0.0, 0.0, None), CriticalShare(None, 0.0, 1.0), facts)
     assert told[2].startswith("Next: budget: 40 runs all 40 combinations of the inputs")
+
+
+def test_a_metric_without_a_unit_is_explained():
+    conclusion = SimpleNamespace(sentences=lambda facts: ["8 % is critical (criterion \N{LESS-THAN OR EQUAL TO} -10)."])
+    facts = Facts(History.of(("a",)), Requirement("criterion", high=-10.0), meanings={"criterion": "smallest distance (m)"})
+    assert sentences_of(conclusion, facts)[1:] == ["criterion: smallest distance (m)."]
+    assert sentences_of(conclusion, dataclasses.replace(facts, units={"criterion": "m"}))[1:] == []
+
+
+def test_an_exported_boundary_says_what_it_rests_on(campaign, tmp_path):
+    campaign(campaign="coverage", budget=20, store=str(tmp_path / "s"))
+    assert limits_of(tmp_path / "s", "csv") == []
+    assert "were not chosen to find the boundary" in limits_of(tmp_path / "s", "boundary")[0]

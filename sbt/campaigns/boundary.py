@@ -17,7 +17,7 @@ from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
-from sbt.campaigns.place import BoundaryPlace, boundary_place
+from sbt.campaigns.place import BoundaryPlace, boundary_place, succeeding
 from sbt.campaigns.regions import CriticalRegion, critical_regions
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -139,7 +139,7 @@ def recipe(settings: Settings) -> Campaign:
         every = every_combination(settings.scenario, log.history)
         shares = shares if every is None else (every.share, 0.0, 0.0)
         log_odds = partial(_log_odds, fitted, settings)
-        place = boundary_place(log_odds, settings.scenario, settings.seed)
+        place = boundary_place(log_odds, settings.scenario, settings.seed, fitted.log_success)
         regions = None if place is None else critical_regions(log_odds, settings.scenario, settings.seed)
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
@@ -170,6 +170,8 @@ def _rule(settings: Settings) -> ChoiceRule:
 def boundary_points(settings: Settings, history: History, most: int = 500) -> Points:
     """Return up to `most` points (m, d) in the inputs' units where P(critical), learned from all runs, crosses 0.5.
 
+    Those where a run rather fails are left out.
+
     Raises:
         InputError: there is no metamodel, or fewer than two runs to learn from.
     """
@@ -185,6 +187,7 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
         crossings(lambda v: predictor(space.metamodel_inputs(v)).probability(critical), alike[group == g], most)
         for g in range(group.max() + 1)
     ])  # fmt: skip
+    found = found[succeeding(settings.learner.success(history), found)]
     x = space.from_unit(found[np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(np.intp))])
     return x[space.feasible(x)]
 

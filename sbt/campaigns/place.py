@@ -9,14 +9,14 @@ import numpy as np
 from scipy.special import expit
 
 from sbt.campaigns.wording import measured, number
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
 
-__all__ = ["BoundaryPlace", "Cut", "Stretch", "boundary_place"]
+__all__ = ["BoundaryPlace", "Cut", "Stretch", "boundary_place", "succeeding"]
 
 _MOST_FIXED = 4  # inputs beside the two that a sentence names
 
@@ -26,6 +26,7 @@ Probability = Callable[[Points], Vector]
 _LOOK_FROM = 2048
 _CROSSINGS = 64
 _STEP = 0.002  # of the unit cube, to both sides, for the direction of the steepest change
+_EVEN = float(np.log(0.5))  # log P(a run gives a metric) below which it rather fails
 _CELLS = 400  # of a line on which edges are looked for
 _CUTS = (0.1, 0.5, 0.9)  # quantiles of the second input along the boundary
 _MOST = 1e6  # log odds beyond which nothing is told apart
@@ -110,8 +111,10 @@ class BoundaryPlace:
         return said
 
 
-def boundary_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int) -> BoundaryPlace | None:
-    """Return where the boundary lies; None where the metamodel sees none, or no input is continuous."""
+def boundary_place(
+    log_odds: LogOdds, scenario: LogicalScenario, seed: int, log_success: LogOdds | None = None
+) -> BoundaryPlace | None:
+    """Return where the boundary lies; None where the metamodel sees none among runs that succeed, or no input is continuous."""
     space = scenario.space
 
     def probability(v: Points) -> Vector:
@@ -123,6 +126,7 @@ def boundary_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int) -> B
         return None
     edge = space.cube.snapped(crossings(probability, space.cube.snapped(u), _CROSSINGS))
     edge = edge[space.feasible(space.from_unit(edge))] if len(edge) else edge
+    edge = edge[succeeding(log_success, edge)]
     if len(edge) == 0:
         return None
     weight = _weights(log_odds, edge, continuous)
@@ -139,6 +143,13 @@ def boundary_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int) -> B
     fixed = {name: row[name] for name in space.names if name not in names}
     shares = {space.names[k]: float(w) for k, w in zip(continuous, weight, strict=True)}
     return BoundaryPlace(tuple(names), low, high, tuple(cuts), fixed, shares) if cuts else None
+
+
+def succeeding(log_success: LogOdds | None, u: Points) -> Mask:
+    """Return (n,) where at points of the unit cube a run rather gives a metric; everywhere where none failed."""
+    if log_success is None or len(u) == 0:
+        return np.ones(len(u), dtype=bool)
+    return np.asarray(log_success(u) >= _EVEN)
 
 
 def _weights(log_odds: LogOdds, edge: Points, continuous: list[int]) -> Vector:

@@ -201,10 +201,13 @@ def export(
 ) -> None:
     """Write the runs of a campaign as a table."""
     with clean_stdout():
-        from sbt.workflows.exporting import export_store
+        from sbt.workflows.exporting import export_store, limits_of
 
-        path = export_store(with_store(folder, trust=trust), form)
+        store = with_store(folder, trust=trust)
+        path, limits = export_store(store, form), limits_of(store, form)
     print(path)
+    for limit in limits:
+        print(f"note: {limit}", file=sys.stderr)
     next_command("sumo-sbt", "report", str(folder))
 
 

@@ -18,6 +18,7 @@ from sbt.store.records import FitRecord, Iteration
 
 __all__ = [
     "Batch", "Campaign", "Conclusion", "Facts", "Log", "LooksAhead", "Progress", "Shard", "Stage", "few_combinations", "proposed",
+    "sentences_of",
 ]  # fmt: skip
 
 _FEW = 4096
@@ -97,6 +98,7 @@ class Facts:
         scenario: its name.
         units: of inputs and metrics, by name.
         combinations: of the inputs, where all are whole numbers or choices and there are at most 4,096; None: otherwise.
+        meanings: of metrics, by name.
     """
 
     history: History
@@ -105,13 +107,22 @@ class Facts:
     scenario: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
     combinations: int | None = None
+    meanings: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, history: History, scenario: LogicalScenario) -> Facts:
         """Return the facts of a campaign with this scenario."""
         return cls(
-            history, scenario.requirement, scenario.unit, scenario.name, scenario.units, few_combinations(scenario)
+            history, scenario.requirement, scenario.unit, scenario.name, scenario.units, few_combinations(scenario),
+            {m.name: m.description for m in scenario.metrics if m.description},
         )
+
+
+def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
+    """Return the sentences of a conclusion, and what a metric of the requirement is that has no unit, where that is known."""
+    said = conclusion.sentences(facts)
+    bare = [part.metric for part in facts.requirement.parts if not facts.units.get(part.metric)]
+    return said and [*said, *(f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings)]
 
 
 def few_combinations(scenario: LogicalScenario) -> int | None:

@@ -167,14 +167,14 @@ def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
     planned = [int((history.stage == stage).sum()) for stage in stages]
     names = [f"{stage}: {n[-1]:,} of {all_:,}" for stage, n, all_ in zip(stages, found, planned, strict=True)]
     bands = ax.stackplot(
-        history.index[at] + 1, *found, labels=[label(n) for n in names], edgecolor="white", linewidth=0.3, step="post"
+        at + 1, *found, labels=[label(n) for n in names], edgecolor="white", linewidth=0.3, step="post"
     )
     for k, band in enumerate(bands):
         band.set(facecolor=shades[k % 6], hatch=hatches[k % 6])
     held = history.held_out
     if len(held):
         hits = requirement.critical_runs(held)
-        rate, ends = float(hits.mean()), np.array([0, history.index[-1] + 1])
+        rate, ends = float(hits.mean()), np.array([0, len(history)])
         least, most = (float(share) * ends[1] for share in interval(int(hits.sum()), len(held)))
         ax.plot(
             ends,
@@ -185,7 +185,7 @@ def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
             label=f"all runs at random: {rate * ends[1]:,.0f} ({least:,.0f} to {most:,.0f})",
         )
     ax.locator_params(axis="y", integer=True)
-    ax.set(xlabel="number of runs", ylabel="critical runs so far", xlim=(0, history.index[-1] + 1))
+    ax.set(xlabel="number of runs", ylabel="critical runs so far", xlim=(0, len(history)))
     ax.set_ylim(bottom=0, top=None if critical.any() else 1)
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2 if len(names) < 4 else 3, fontsize="small")
     return ax

@@ -135,7 +135,7 @@ class Explorer {
   }
   facts(row) {
     const { data } = this, run = data.index[row];
-    const line = column => make("tr", {}, make("th", { scope: "row" }, column.name), make("td", {}, withUnit(valueText(column, row), column.unit)));
+    const line = column => make("tr", {}, make("th", { scope: "row", title: column.description || column.name }, column.name), make("td", {}, withUnit(valueText(column, row), column.unit)));
     const group = (name, columns) => columns.length ? [make("tr", {}, make("th", { colspan: "2", class: "group" }, name)), ...columns.map(line)] : [];
     const reason = data.reason[row] ? [make("p", { class: "note" }, `Failed: ${data.reason[row]}`)] : [];
     const modes = data.modes.map((mode, k) => mode.runs.includes(run) ? `failure mode ${k + 1}` : "").filter(Boolean);

@@ -66,7 +66,10 @@ def explorer_data(
     return {
         "title": scenario.name, "told": requirement.told_as, "total": len(history), "critical_total": int(np.sum(critical)),
         "inputs": [_input(p, k, influence) for k, p in enumerate(scenario.space.parameters)],
-        "metrics": [{"name": m, "unit": found.units.get(m, ""), "critical": limits.get(m)} for m in history.metrics],
+        "metrics": [
+            {"name": m, "unit": found.units.get(m, ""), "critical": limits.get(m), "description": found.meanings.get(m, "")}
+            for m in history.metrics
+        ],
         "weights": [float(f"{w:.4g}") for w in np.asarray(weights).tolist()],
         "order": np.argsort(-np.asarray(weights), kind="stable").tolist(),
         "index": _whole(shown.index), "verdict": verdict.tolist(), "margin": _floats(margin),

@@ -142,7 +142,7 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
         return  # one shade, of which nothing can be read
     figure = new_figure(5.4, 4.4)
     ax = figures.plot_probability(plane, space, figure.subplots())
-    caption = "The metamodel's probability that a run is critical."
+    caption = f"The metamodel's probability that a run is critical{_where_runs_fail(found)}."
     learned = found.history.where(found.history.stage != VALIDATION)
     if space.dimension == 2 and len(learned):
         shown = np.unique(np.linspace(0, len(learned) - 1, _MOST_RUNS_ON_MAP).round())
@@ -159,6 +159,14 @@ def _map(found: Findings, space: ParameterSpace, predict: Predict, weights: Vect
     if len(pair) == 2:
         caption += _lines_of(plane.probability, whole=space.dimension == 2)
     yield Drawing("probability", "Where critical runs are expected", caption, to_svg(figure, "probability"))
+
+
+def _meaning(found: Findings, metric: str) -> str:
+    return f", {meaning}" if (meaning := found.meanings.get(metric)) else ""
+
+
+def _where_runs_fail(found: Findings) -> str:
+    return "" if found.history.ok.all() else ", if it gives a metric: of places where runs fail it says nothing"
 
 
 def _lines_of(probability: Vector, *, whole: bool) -> str:
@@ -198,7 +206,7 @@ def _maps_by_choice(
         ax.set_title(figures.escaped(f"{name} = {choice}"), fontsize="medium")
     for ax in grid[len(choices) :]:
         ax.set_visible(False)
-    caption = f"The metamodel's probability that a run is critical, for each choice of {name}."
+    caption = f"The metamodel's probability that a run is critical, for each choice of {name}{_where_runs_fail(found)}."
     if space.dimension == 3:
         caption += " Markers: the runs it could learn from."
     else:
@@ -260,7 +268,7 @@ def _counts(found: Findings) -> Iterator[Drawing]:
         figure = new_figure(5.4, 3.7)
         curves.plot_metric_histogram(found.history, part, figure.subplots(), unit=unit)
         caption = (
-            f"The safety metric; shaded where critical ({requirement_words(part, unit)})."
+            f"The safety metric{_meaning(found, part.metric)}; shaded where critical ({requirement_words(part, unit)})."
             f"{' Held-out runs are random, the others were chosen.' if found.held_out.any() else ''}"
             " The outermost bins hold what lies beyond."
         )
@@ -271,6 +279,7 @@ def _counts(found: Findings) -> Iterator[Drawing]:
     figure = new_figure(5.4, 3.7)
     curves.plot_progress(found.history, found.requirement, figure.subplots())
     caption = "Critical runs found so far, by the stage that requested them."
+    caption += " Coarse runs are not among them, nor counted." if found.configuration.get("fidelity") else ""
     if len(found.history.held_out):
         caption += (
             " Dashed: the number expected of as many random runs, from the share among the held-out ones (in brackets its 95 %"

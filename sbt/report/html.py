@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sbt.campaigns.asking import Sensitivity
+from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.wording import NOTHING, number
 from sbt.files import write_atomically
 from sbt.loop.stages import Conclusion
@@ -137,7 +138,7 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
     return [
         ("campaign", str(configuration.get("campaign", NOTHING)).removeprefix(OBJECT)),
         ("scenario", str(configuration.get("scenario", scenario.name)).removeprefix(OBJECT)),
-        ("critical if", requirement_words(found.requirement, found.unit, found.units) + _meaning(found, scenario)),
+        ("critical if", requirement_words(found.requirement, found.unit, found.units) + _meaning(found)),
         ("runs", runs + (f", {planned:,} planned" if planned else "")),
         ("ended", str(found.ended.get("stopped") or NOTHING)),
         ("seed", str(configuration.get("seed", NOTHING))),
@@ -147,17 +148,19 @@ def _facts(found: Findings, scenario: LogicalScenario, store: Store) -> list[tup
     ]
 
 
-def _meaning(found: Findings, scenario: LogicalScenario) -> str:
+def _meaning(found: Findings) -> str:
     """Return what the metrics of the requirement are, where that is known."""
-    asked = {part.metric for part in found.requirement.parts}
-    told = [f"{m.name}: {m.description}" for m in scenario.metrics if m.name in asked and m.description]
+    asked = [part.metric for part in found.requirement.parts]
+    told = [f"{metric}: {found.meanings[metric]}" for metric in asked if metric in found.meanings]
     return f" ({'; '.join(told)})" if told else ""
 
 
 def _time(found: Findings) -> str:
     simulated = f"{_duration(float(found.history.seconds.sum()))} of simulation, summed over workers"
     spent = found.ended.get("seconds") or {}
-    other = [f"{name} {_duration(spent[name])}" for name in ("fit", "propose") if spent.get(name)]
+    within = isinstance(found.conclusion, EstimationConclusion)  # whose metamodels are fitted while it proposes
+    names = {"fit": "fit", "propose": "fit and propose" if within else "propose"}
+    other = [f"{said} {_duration(spent[name])}" for name, said in names.items() if spent.get(name)]
     work, idle = (float(spent.get(name) or 0.0) for name in ("work", "idle"))
     used = [f"workers busy {100 * work / (work + idle):.0f} %"] if work else []
     return ", ".join([simulated, *other, *used])

@@ -41,7 +41,7 @@ class RunTable {
       make("div", { class: "film-bar" }, this.before, this.after));
   }
   heading(column, k) {
-    const button = make("button", { type: "button", onclick: () => this.sort(k), title: column.name }, shortened(titled(column), 28));
+    const button = make("button", { type: "button", onclick: () => this.sort(k), title: [column.name, column.description].filter(Boolean).join(": ") }, shortened(titled(column), 28));
     return make("th", { scope: "col" }, button);
   }
   filter(column, k) {

@@ -12,7 +12,7 @@ from sbt.campaigns.lost import nothing_known
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.wording import number, percent, requirement_words, written_unit
 from sbt.estimators.binomial import upper
-from sbt.loop.stages import Conclusion, Facts, few_combinations
+from sbt.loop.stages import Conclusion, Facts, few_combinations, sentences_of
 from sbt.problem.outcome import Doubt
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
@@ -65,6 +65,7 @@ class Findings:
         units: of inputs and metrics, by name.
         scenario: its name.
         combinations: of the inputs, where they are few.
+        meanings: of metrics, by name.
     """
 
     history: History
@@ -79,6 +80,7 @@ class Findings:
     units: Mapping[str, str] = field(default_factory=dict)
     scenario: str = ""
     combinations: int | None = None
+    meanings: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -92,6 +94,7 @@ class Findings:
             conclusion, store.conclusion or {},
             validation, store.counts.get(PLANNED, 0), scenario.direction,
             scenario.units, scenario.name, few_combinations(scenario),
+            {m.name: m.description for m in scenario.metrics if m.description},
         )  # fmt: skip
 
     @property
@@ -107,7 +110,7 @@ class Findings:
     @property
     def facts(self) -> Facts:
         """What the conclusion's own sentences may refer to."""
-        return Facts(self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations)
+        return Facts(self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations, self.meanings)
 
 
 def distribution_words(parameter: Parameter) -> str:
@@ -127,7 +130,7 @@ def distribution_words(parameter: Parameter) -> str:
 def conclusion_sentences(found: Findings) -> list[str]:
     """Return what the campaign found, the most important first: the sentences of `run --json`, or what is known before them."""
     if found.conclusion is not None:
-        return found.conclusion.sentences(found.facts) or nothing_known(found.facts)
+        return sentences_of(found.conclusion, found.facts) or nothing_known(found.facts)
     ok, critical = int(found.history.ok.sum()), int(found.critical.sum())
     if not ok:
         return ["No run has given a metric yet."]
@@ -164,7 +167,7 @@ def warnings_for(found: Findings) -> list[str]:
         *_about_runs(found),
         *_about_contacts(found),
         *_about_scores(found),
-        *(f"{told[:1].upper()}{told[1:].rstrip('.')}." for told in map(str, getattr(found.conclusion, "warnings", ()))),
+        *(f"{said[:1].upper()}{said[1:].rstrip('.')}." for said in map(str, getattr(found.conclusion, "warnings", ()))),
     ]
 
 

@@ -13,12 +13,13 @@ from sbt.files import as_cell, write_atomically
 from sbt.plugins import Objects
 from sbt.store.database import Store
 from sbt.store.history import named_columns
+from sbt.workflows.status import read_status
 from sbt.workflows.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["FORMS", "export_store"]
+__all__ = ["FORMS", "export_store", "limits_of"]
 
 
 def export_store(folder: Path, form: str = "csv", *, objects: Objects | None = None) -> Path:
@@ -56,6 +57,16 @@ def _as_csv(store: Store, study: Study) -> Path:
     """Write one row a run."""
     frame = _cells(_frame(store, study))
     return write_atomically(store.folder / "exports" / "runs.csv", lambda part: frame.to_csv(part, index=False))
+
+
+def limits_of(folder: Path, form: str) -> list[str]:
+    """Return in sentences what a reader of an exported file must know: that runs are missing, or were not chosen for it."""
+    found = read_status(folder)
+    kind, runs = found["campaign"], found["done"]
+    said = [] if found["state"] == "finished" else [f"the campaign has not concluded: these are {runs:,} runs so far"]
+    if form == "boundary" and kind != "boundary":
+        said.append(f"the runs of this campaign ({kind}) were not chosen to find the boundary, which may lie elsewhere")
+    return said
 
 
 def _cells(frame: pd.DataFrame) -> pd.DataFrame:

@@ -17,7 +17,7 @@ from sbt.campaigns.preventable import with_judgements
 from sbt.campaigns.wording import plural
 from sbt.errors import InputError, StoreError
 from sbt.loop.learner import FittedMetamodel
-from sbt.loop.stages import Conclusion, Facts
+from sbt.loop.stages import Conclusion, Facts, sentences_of
 from sbt.plugins import OBJECT, Objects
 from sbt.problem.plain import Json
 from sbt.problem.scenario import LogicalScenario
@@ -268,7 +268,7 @@ class Result(Generic[C]):
         """Return what the campaign found in plain words."""
         if not self.finished:
             return [f"The campaign has not concluded: {len(self.history):,} runs are done."]
-        said = self.conclusion.sentences(Facts.of(self.history, self.scenario))
+        said = sentences_of(self.conclusion, Facts.of(self.history, self.scenario))
         return [*said, *map(str, getattr(self.conclusion, "warnings", ())), *self._failures()]
 
     def _failures(self) -> list[str]:

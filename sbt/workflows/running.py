@@ -17,7 +17,7 @@ from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.running import Finished, check_shard, run_shard, run_stages
-from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard
+from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard, sentences_of
 from sbt.plugins import OBJECT, Objects, forget_files
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
@@ -179,7 +179,7 @@ def summarise(store: Store, study: Study, finished: Finished) -> Summary:
         {k: round(v, 4) for k, v in finished.seconds.items()}, finished.conclusion,
         int(np.count_nonzero(critical & history.unconfirmed)), int(np.count_nonzero(critical & history.doubtful(Doubt.STRUCK))),
         int(np.count_nonzero(history.doubtful(Doubt.OTHER_LEVEL))),
-        tuple(finished.conclusion.sentences(Facts.of(history, scenario))),
+        tuple(sentences_of(finished.conclusion, Facts.of(history, scenario))),
         scenario.requirement.told_as, scenario.units,
     )  # fmt: skip
 
