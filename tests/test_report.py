@@ -171,7 +171,7 @@ def test_commands_give_the_inputs_to_the_last_digit(wedge):
 
 
 def test_hostile_text_stays_text(tmp_path):
-    evil = "<script>alert(1)</script>\n</style><img src=http://x.invalid/a onerror=alert(2)> ${x} {{ 7*7 }}"
+    evil = "<script>alert(1)</script></noscript>\n</style><img src=http://x.invalid/a onerror=alert(2)> ${x} {{ 7*7 }}"
     space = ParameterSpace((Parameter("a", 0, 1, "$<b>&\\frac"), Parameter("b", 0, 1, "--><script>", description=evil)))
     scenario = LogicalScenario(
         "evil", space, Requirement("m", CRITICAL.low, CRITICAL.high), description=evil, evaluate=lambda v, s: {},
@@ -184,6 +184,7 @@ def test_hostile_text_stays_text(tmp_path):
         page = page_of(store, scenario)
     assert page.tags.count("script") == 4
     assert "img" not in page.tags
+    assert page.text.count("</noscript>") == page.tags.count("noscript") == 2
     assert "{{ 7*7 }}" in page.text
     assert "simulate &#39;my; rm -rf &lt;x&gt;.yaml&#39;" in page.text
 

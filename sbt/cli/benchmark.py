@@ -47,6 +47,8 @@ def benchmark(
     if as_json:
         print_json(result)
     else:
+        if reference_only:
+            print("\n".join(f"reference runs: {folder}" for folder in result["references"]))
         print(f"{result['done']} of {result['cells']} cells done, {len(result['failed'])} failed")
         print(f"table: {result['table']}, {len(result['figures'])} figures" if result["table"] else f"store: {result['store']}")
         if result["done"] < result["cells"] and not figures_only:
