@@ -15,8 +15,8 @@ from sbt.loop.stages import Facts
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
-from sbt.store.history import History
 from sbt.testbeds import analytic, find, truth, values
+from tests.sided_runs import sided_runs
 
 COUNTED = {
     "himmelblau_partx": 3, "ring_d2": 1, "shell_d3": 1, "banana_d2": 1, "corner_d2": 1, "wavy_level_d3": 1, "hartmann6_1e-3": 2,
@@ -75,7 +75,7 @@ def test_a_boundary_names_its_regions(tmp_path):
 
 def test_regions_are_counted_where_the_edges_are_known():
     regions = tuple(CriticalRegion(share, {"a": Stretch(low, low + 0.1)}) for share, low in ((0.2, 0), (0.1, 0.5), (0.001, 0.9)))
-    facts = Facts(History.of(("a",)), Requirement("y", high=0.0), "m", "s")
+    facts = Facts(sided_runs(5, 5), Requirement("y", high=0.0), "m", "s")
     for unsure, told in ((0.01, 2), (0.5, 0)):
         place = BoundaryPlace(("a",), 0.0, 1.0, (Cut(None, (Stretch(0.0, 0.3),), unsure),), {}, {"a": 1.0})
         found = BoundaryConclusion(0.3, 0.0, 0.0, None, place=place, regions=regions)

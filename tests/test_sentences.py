@@ -23,6 +23,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.store.history import History
 from sbt.workflows.exporting import limits_of
+from tests.sided_runs import sided_runs
 
 WEDGE = sbt.Scenario(
     "wedge",
@@ -91,11 +92,14 @@ def test_units_are_printed_as_people_write_them():
 
 def test_a_boundary_that_is_less_certain_than_it_is_wide_is_no_answer():
     """The first sentence says so, and that held-out runs deny the share; a sharp one is told as before."""
-    history = History.of(("a",))
-    facts = Facts(history, Requirement("y", high=0.0), "m", "s")
     share = CriticalShare(0.5, 0.4, 0.6, counted=100)
-    vague = "Where runs of s are critical (y \N{LESS-THAN OR EQUAL TO} 0 m) is not known sharply yet"
-    for unsure, begins in ((0.01, "In s, a run is critical"), (0.5, vague)):
+    vague = "Where runs of s are critical (y \N{LESS-THAN OR EQUAL TO} 0 m) is not known sharply yet: "
+    for unsure, critical, begins in (
+        (0.01, 5, "In s, a run is critical"),
+        (0.5, 5, f"{vague}edges are less certain"),
+        (0.01, 1, f"{vague}only 1 critical run tells"),
+    ):
+        facts = Facts(sided_runs(critical, 20), Requirement("y", high=0.0), "m", "s")
         place = BoundaryPlace(("a",), 0.0, 1.0, (Cut(None, (Stretch(0.0, 0.3),), unsure),), {}, {"a": 1.0})
         first = tell_boundary(BoundaryConclusion(0.3, 0.0, 0.0, None, place=place), share, facts)[0]
         assert first.startswith(begins)

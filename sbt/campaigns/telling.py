@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
+_FEW = 5  # runs of a side, below which edges are told with reserve, however sure the metamodel is
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
 _WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"
@@ -87,13 +88,16 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         sure = "no held-out run tested it"
     if found.place is not None:
         section = found.place.words(facts.units)
-        regions = () if found.place.vague or found.regions is None else found.regions  # roughness would be counted
+        few = _few_of_a_side(facts)
+        unsharp = bool(few) or found.place.vague
+        regions = () if unsharp or found.regions is None else found.regions  # roughness would be counted
         where = regions_words(regions, found.place.inputs, facts.units) or section
         lead = f"{_of(facts, 'In').strip() or 'Here'}, a run is critical ({_condition(facts)}) where {where}"
-        if found.place.vague:
+        if unsharp:
+            why = few or "edges are less certain than the critical part is wide"
             lead = (
-                f"Where runs{_of(facts)} are critical ({_condition(facts)}) is not known sharply yet: edges are less certain than"
-                f" the critical part is wide. The metamodel's best guess is that a run is critical where {where}"
+                f"Where runs{_of(facts)} are critical ({_condition(facts)}) is not known sharply yet: {why}. The metamodel's best"
+                f" guess is that a run is critical where {where}"
             )
     else:
         lead = f"{percent(found.critical_fraction)} of the parameter space{_of(facts)} is critical ({_condition(facts)})"
@@ -117,6 +121,14 @@ def _denied(found: BoundaryConclusion, runs: CriticalShare) -> bool:
     """Return whether held-out runs deny the share of the metamodel, or its certainty."""
     share = found.critical_fraction or 0.0
     return bool(_too_sure(found)) or (runs.critical_fraction is not None and not runs.low <= share <= runs.high)
+
+
+def _few_of_a_side(facts: Facts) -> str:
+    """Return in words that the boundary rests on few runs of one of its sides; empty where it does not."""
+    critical = facts.requirement.critical_runs(facts.history.training)
+    sides = {"critical": int(critical.sum()), "uncritical": int((~critical).sum())}
+    side = min(sides, key=lambda name: sides[name])
+    return f"only {plural(sides[side], f'{side} run')} tell{'s' * (sides[side] == 1)} of it" if sides[side] < _FEW else ""
 
 
 def _all_critical(facts: Facts) -> bool:
