@@ -155,7 +155,8 @@ class Explorer {
     if (!raw) {
       this.part("curves").replaceChildren();
       place.replaceChildren(make("p", { class: "note" }, data.verdict[row] === 2 ? "A failed run has no film."
-        : data.films.length ? "This run's film is not in this file; the command makes it." : data.film_note || "There are no films in this file."));
+        : data.films.length ? "This run's film is not in this file; the command makes it." : data.film_note
+        || (data.traced ? "There are no films in this file." : "The scenario gives its metrics directly: there is no trace to show.")));
       return;
     }
     this.shown = developed(raw);

@@ -31,7 +31,7 @@ const watch = async (path, show) => {
 };
 
 const showList = campaigns => {
-  at("says").textContent = campaigns.length ? `${campaigns.length} campaigns, running ones first.` : "There are no campaigns in these folders yet; they appear here by themselves.";
+  at("says").textContent = campaigns.length ? campaigns.length > 1 ? `${campaigns.length} campaigns, running ones first.` : "1 campaign." : "There are no campaigns in these folders yet; they appear here by themselves.";
   at("campaigns").replaceChildren(...campaigns.map(campaign => element("tr", {},
     element("td", {}, element("a", { href: `/c/${campaign.key}` }, campaign.name), ...(campaign.campaign ? [element("div", { class: "note" }, `${campaign.campaign} of ${campaign.scenario}`)] : [])),
     element("td", { "data-state": campaign.state }, campaign.state, ...(campaign.error ? [element("div", { class: "note" }, campaign.error)] : [])),
@@ -111,7 +111,7 @@ if (typeof Explorer !== "undefined") {
   Explorer.prototype.film = function (row) {
     filmOfPage.call(this, row);
     const run = this.data.index[row];
-    if (this.data.filmOf.has(run) || this.data.verdict[row] === 2) return;
+    if (this.data.filmOf.has(run) || this.data.verdict[row] === 2 || !this.data.traced) return;
     const button = make("button", { type: "button", onclick: async () => {
       button.disabled = true;
       button.textContent = "Executing the run again …";
