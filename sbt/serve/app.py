@@ -19,9 +19,8 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from starlette.routing import Route
 
 from sbt.errors import InputError, SbtError
-from sbt.report.explorer import packed_library
 from sbt.serve.campaigns import Campaigns
-from sbt.workflows.live import live_parts
+from sbt.workflows.live import live_parts, packed_library
 
 __all__ = ["application"]
 

@@ -16,7 +16,7 @@ from sbt.store.history import PLANNED
 from sbt.workflows.filming import film_runs
 from sbt.workflows.study import RESOLVED, Study
 
-__all__ = ["LiveCampaign", "check_resumable", "film_of", "first_look", "live_parts"]
+__all__ = ["LiveCampaign", "check_resumable", "film_of", "first_look", "live_parts", "packed_library"]
 
 _FIRST = 2000
 """Runs of a first look at a large store."""
