@@ -105,11 +105,8 @@ class Known:
             return None
         interval, earlier = self.settings.scenario.requirement.critical, () if transfer is None else transfer.trends
         noise = [_SURE_NOISE * std**2 for std in self.noise]
-        metamodel = metamodel_of(self.settings)
-        if any(self.noise):  # where it is larger than elsewhere, more runs are critical than one noise for all lets expect
-            metamodel = getattr(metamodel, "with_input_noise", metamodel)
         given = fit_log_probability(
-            metamodel, self.coordinates, interval, self.z, self.y, rng, noise, earlier=earlier
+            metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng, noise, earlier=earlier
         )  # fmt: skip
         ok = np.arange(len(self.z) + len(self.failed)) < len(self.z)
         return with_failed_runs(given, self.coordinates, np.vstack([self.z, self.failed]), ok, rng)

@@ -7,6 +7,7 @@ without trend limits its confidence where it only extrapolates.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sbt.estimators.transfer import Trend, trended
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sketched, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sketched, with_target, without_repetitions
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
@@ -39,6 +40,7 @@ _LEAST_R2 = 0.5  # leave-one-out R2 from which on a trend is taken: it explains 
 _FEWEST_SCORED = 16  # runs from which on forms are compared
 _HELD_OUT, _MOST_SCORED = 3, 150  # one run in so many scores the forms, of at most so many
 _SURE = 1.0  # gain in mean log density (nats a run) of a trend from which on it is trusted alone
+_UNEVEN = 2.0  # standard errors by which noise that depends on the input has to predict left-out runs better
 _RIDGES = (1e-6, 1e-4, 1e-2, 1.0)  # penalties relative to the number of rows
 
 
@@ -221,6 +223,7 @@ def fit_log_probability(
     least = noise[0] if noise else 0.0
     u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
+    metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel
     whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=least / warp.scale**2)
     plain = _Form(y, critical, np.zeros(len(y)), noise=least)
     trends = [replace(form, trend=_trend(u, form.values)) for form in (whole, plain)]
@@ -236,6 +239,24 @@ def fit_log_probability(
         sure = forms[best].trend is None or gain[best] > _SURE
         chosen = [forms[best]] if sure else [whole, forms[best]]
     return _Largest(coordinates, tuple(form.fit(metamodel, u, every, rng) for form in chosen))
+
+
+def _for_uneven_noise(metamodel: Metamodel, u: Points, t: Vector, rng: np.random.Generator) -> Metamodel:
+    """Return the metamodel, with noise that depends on the input where that surely predicts left-out values t (n,) better.
+
+    Where noise is larger than elsewhere, more runs are critical than one noise for all lets expect.
+    """
+    uneven: Metamodel | None = getattr(metamodel, "with_input_noise", None)
+    if uneven is None:
+        return metamodel
+    rows = rng.permutation(len(t))[:_MOST_SCORED]
+    u, t = without_repetitions(u[rows], t[rows])
+    scores = []
+    for each in (metamodel, uneven):
+        predictor: Any = each.fit(u, t, rng)
+        scores.append(predictor.leave_one_out(u, t).log_density(t))
+    gain = scores[1] - scores[0]
+    return uneven if gain.mean() > _UNEVEN * gain.std() / math.sqrt(len(t)) else metamodel
 
 
 def _gains(metamodel: Metamodel, forms: list[_Form], u: Points, weight: Vector, rng: np.random.Generator) -> Vector:

@@ -1,0 +1,26 @@
+"""Noise that depends on the inputs: an estimation learns it where that surely predicts runs better."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sbt.estimators.surrogate import fit_log_probability
+from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.problem.requirement import CriticalInterval
+from sbt.seeds import stream
+
+PROCESS = GaussianProcess(nu=2.5, input_noise=False)
+
+
+@pytest.mark.parametrize(("uneven", "times"), [(True, 20.0), (False, 3.0)])
+def test_noise_is_learned_as_uneven_where_it_is(uneven: bool, times: float):
+    """Fails with 7 % of the seeds where x1 > 0.5 if the noise is larger there, else with 7 % everywhere."""
+    rng = stream(1, "uneven")
+    x = rng.random((250, 2))
+    noise = np.where(x[:, 0] > 0.5, 1.0, 0.05) if uneven else np.ones(250)
+    y = 1.5 + 0.3 * np.sin(4.0 * x[:, 1]) + noise * rng.standard_normal(250)
+    belief = fit_log_probability(PROCESS, lambda z: z, CriticalInterval(high=0.0), x, y, stream(2, "fit"), [0.01])
+    left, right = (np.exp(belief(np.column_stack([np.full(50, a), np.linspace(0, 1, 50)]))[0]).mean() for a in (0.25, 0.75))
+    assert right == pytest.approx(0.07, abs=0.05)
+    assert (right > times * left) == uneven
