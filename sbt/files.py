@@ -73,10 +73,15 @@ def move_atomically(path: Path, target: Path) -> None:
 def as_cell(value: Any) -> Any:
     """Return what a cell of a table for people holds: a text that a spreadsheet would take for a formula begins with a quote.
 
+    Carriage returns become ends of lines: writers of CSV leave them unquoted, and a reader begins a row at each.
+
     >>> as_cell("=1+1"), as_cell("-3.5"), as_cell("car"), as_cell(-3.5)
     ("'=1+1", '-3.5', 'car', -3.5)
     """
-    if not isinstance(value, str) or not value.startswith(("=", "+", "-", "@", "\t", "\r", "\n")):
+    if not isinstance(value, str):
+        return value
+    value = value.replace("\r\n", "\n").replace("\r", "\n")
+    if not value.startswith(("=", "+", "-", "@", "\t", "\n")):
         return value
     try:
         float(value)

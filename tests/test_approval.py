@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
+import py_compile
 import shutil
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sbt
+from sbt import plugins
 from sbt.cli import app
 from sbt.plugins import approval
 from sbt.plugins.approval import UntrustedError
@@ -165,3 +169,56 @@ def test_own_files_that_are_moved_or_bundled_give_the_same_runs(tmp_path: Path, 
     for store in (tmp_path / "moved" / "s", tmp_path / "other" / "mail"):
         code, said = tried("replay", store, 2, "--json")
         assert (code, json.loads(said)["identical"]) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("said", "file", "inside"),
+    [
+        ("from PKG import mod", "mod.py", ""),
+        ("from PKG.sub import mod", "sub/mod.py", ""),
+        ("import PKG.sub.mod", "sub/__init__.py", ""),
+        ("from PKG import *", "mod.py", ""),
+        ("from PKG import *", "sub/mod.py", "from .sub import mod"),
+        ("import PKG.sub.mod", "mod.py", "from .. import mod"),
+        ("import PKG.sub.mod", "mod.py", "from PKG.mod import X"),
+    ],
+)
+def test_every_module_that_an_import_can_run_is_approved_and_bundled(tmp_path: Path, said: str, file: str, inside: str):
+    package = tmp_path / "pkg"
+    (package / "sub").mkdir(parents=True)
+    where = "sub/mod.py" if said.endswith("sub.mod") else "__init__.py"
+    for name in ("__init__.py", "mod.py", "sub/__init__.py", "sub/mod.py"):
+        (package / name).write_text(f"{inside.replace('PKG', 'pkg') if name == where else ''}\nX = 1\n")
+    main = tmp_path / "main.py"
+    main.write_text(said.replace("PKG", "pkg"))
+    before = approval.digest_of(main)
+    assert package / file in approval.modules_of(main)
+    (package / file).write_text("X = 2\n")
+    assert approval.digest_of(main) != before
+
+
+def test_byte_code_beside_approved_source_never_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stranger: Any):
+    monkeypatch.setattr("sys.path", [str(tmp_path), *sys.path])
+    evil, helper, alone = (f"{name}_{os.urandom(4).hex()}" for name in ("main", "helper", "alone"))
+    (tmp_path / "evil.py").write_text("WHAT = 'byte code'\n")
+    (tmp_path / f"{evil}.py").write_text(f"""
+from {helper} import WHAT
+try:
+    import {alone}
+except ImportError:
+    ALONE = None
+def later():
+    import {helper}_later
+    return {helper}_later.WHAT
+""")
+    mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
+    for name in (helper, f"{helper}_later"):
+        (tmp_path / f"{name}.py").write_text("WHAT = 'source'\n")
+        cached = importlib.util.cache_from_source(str(tmp_path / f"{name}.py"))
+        py_compile.compile(str(tmp_path / "evil.py"), cached, invalidation_mode=mode)
+    py_compile.compile(str(tmp_path / "evil.py"), str(tmp_path / f"{alone}.pyc"))
+    cached = importlib.util.cache_from_source(str(tmp_path / f"{evil}.py"))
+    py_compile.compile(str(tmp_path / "evil.py"), cached, invalidation_mode=mode)
+    importlib.util.find_spec(f"{helper}_later")  # the folder has been looked at before
+    what = [plugins.load("metrics", f"{evil}.py:{name}", tmp_path) for name in ("WHAT", "ALONE", "later")]
+    assert (what[0], what[1], what[2]()) == ("source", None, "source")

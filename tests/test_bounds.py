@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import gzip
+import io
 import json
 import os
 import shutil
@@ -183,3 +185,7 @@ def test_no_cell_of_a_table_is_a_formula():
     assert cells["'@m"].tolist() == ["'+a", "'\tb"]
     assert cells["x"].tolist() == [-1.5, 2.0]
     assert [as_cell(value) for value in (None, 3, "a=b", "-")] == [None, 3, "a=b", "'-"]
+    file = io.StringIO()
+    _cells(pd.DataFrame({"reason": ["a\r=1+1", "b\r\n=2", "\r=3"]})).to_csv(file, index=False)
+    assert list(csv.reader(io.StringIO(file.getvalue()))) == [["reason"], ["a\n=1+1"], ["b\n=2"], ["'\n=3"]]
+    assert "\r" not in file.getvalue(), "a reader begins a row at an unquoted carriage return"

@@ -462,6 +462,15 @@ def test_a_full_disk_is_an_error_for_results_and_none_for_progress():
         assert progress.gone
 
 
+@pytest.mark.parametrize("ending", [[], ["--json"]])
+def test_a_full_disk_behind_stdout_is_said_in_words(ending: list[str]):
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([*SBT, "list", *ending], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr.strip()) == (1, "the output must be written, but it cannot be: No space left on device")
+
+
 def test_check_tells_what_code_raises(rude: Path):
     text = rude.read_text().replace("    try:\n", "    import sys\n    sys.exit('no')\n    try:\n", 1)
     rude.write_text(text)

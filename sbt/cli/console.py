@@ -23,7 +23,7 @@ import typer
 from sbt import interruption
 from sbt.cli.progress import ProgressDisplay
 from sbt.errors import InputError, SbtError
-from sbt.execution.streams import SteadyStream, open_missing
+from sbt.execution.streams import SteadyStream, UnwrittenError, open_missing
 
 __all__ = [
     "Exit", "ProgressDisplay", "clean_stdout", "fail", "next_command", "print_json", "process", "resumable", "verb",
@@ -81,6 +81,8 @@ def _verdict(error: BaseException) -> tuple[str, Exit]:
         return str(error), Exit.INPUT
     if isinstance(error, SbtError):
         return str(error), Exit.INTERNAL
+    if isinstance(error, UnwrittenError):
+        return f"the output must be written, but it cannot be: {error.strerror}", Exit.INTERNAL
     if isinstance(error, OSError) and error.filename is not None:  # the disk, not the code
         return f"a file must be readable and writable, but {error.filename} is not: {error.strerror}", Exit.INTERNAL
     what = f"{type(error).__name__}: {error}".removesuffix(": ")

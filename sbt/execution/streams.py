@@ -7,10 +7,14 @@ import os
 import sys
 from typing import Any, TextIO
 
-__all__ = ["SteadyStream", "open_missing"]
+__all__ = ["SteadyStream", "UnwrittenError", "open_missing"]
 
 _GONE = (errno.EPIPE, errno.EBADF, errno.EIO, errno.ENXIO)
 """Errors of a stream whose reader has left: a closed pipe, descriptor or terminal."""
+
+
+class UnwrittenError(OSError):
+    """A stream has a reader, but cannot be written to: the disk is full."""
 
 
 class SteadyStream:
@@ -52,7 +56,7 @@ class SteadyStream:
         """From now on write to nowhere, also what is not Python's (SUMO, child processes)."""
         closed = self._stream.closed
         if isinstance(error, OSError) and not (self._any or error.errno in _GONE):
-            raise error
+            raise UnwrittenError(error.errno, error.strerror) from error
         if isinstance(error, ValueError) and not closed:
             raise error
         self.gone = True

@@ -20,6 +20,7 @@ from typing import Any, TypeVar, cast
 from sbt import interruption
 from sbt.errors import InputError, PluginError, did_you_mean
 from sbt.plugins.approval import check_approved, modules_of, named_by
+from sbt.plugins.source import FromSource, import_from_source
 
 __all__ = [
     "KINDS", "OBJECT", "Objects", "Scope", "forget_changed", "forget_files", "kept", "load", "names", "newer", "noted",
@@ -167,11 +168,12 @@ def _module(path: str) -> Any:
     """Import one file under a name of its own, once a process while it stays as it is."""
     noted(Path(path))
     name = f"sbt_user_{abs(hash(path)):x}_{Path(path).stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(name, path, loader=FromSource(name, path))
     if spec is None or spec.loader is None or not Path(path).is_file():
         raise PluginError(f"a plug-in file must exist, but got '{path}'")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    import_from_source(Path(path).parent)
     try:
         _guarded(
             partial(spec.loader.exec_module, module),

@@ -10,19 +10,22 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 from sbt.errors import PluginError
+from sbt.plugins.source import is_installed
 
 __all__ = ["TRUST", "UntrustedError", "check_approved", "digest_of", "is_trusted", "modules_of", "named_by", "trust_store"]
 
 TRUST = "SBT_TRUST"
 """Variable of the environment: 1 approves all code, folders (as in PATH) that which lies in them."""
 
+_SUFFIXES = (".py", *EXTENSION_SUFFIXES)
 _STORE: ContextVar[Path | None] = ContextVar("store", default=None)
 _trusted: set[Path] = set()
 """Stores whose code the user has approved in this process."""
@@ -81,29 +84,50 @@ def digest_of(path: Path) -> str:
 
 
 def modules_of(path: Path) -> dict[Path, bytes]:
-    """Return a file of Python, and the modules beside it that it imports, and those import."""
+    """Return a file of Python, and the modules beside it that it imports, and those import; without what is installed."""
     found: dict[Path, bytes] = {}
     waiting = [path]
     while waiting:
         file = waiting.pop()
-        if file not in found:
+        if file not in found and (file == path or not is_installed(file)):
             found[file] = file.read_bytes()
-            waiting += _imported(found[file], file.parent)
+            waiting += _imported(found[file], file.parent, path.parent)
     return found
 
 
-def _imported(data: bytes, folder: Path) -> Iterator[Path]:
-    """Yield the modules in a folder that code imports; nothing where it is no Python, which is told when it is imported."""
+def _imported(data: bytes, folder: Path, root: Path) -> Iterator[Path]:
+    """Yield the modules in a folder, or in that of the scenario's file, which code imports; packages with what is above them.
+
+    Nothing where it is no Python, which is told when it is imported.
+    """
     try:
         nodes = list(ast.walk(ast.parse(data)))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return
     for node in nodes:
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
-            for module in modules:
-                base = folder.joinpath(*module.split("."))
-                yield from (file for file in (base.with_name(f"{base.name}.py"), base / "__init__.py") if file.is_file())
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield from _named(alias.name, (folder, root))
+        elif isinstance(node, ast.ImportFrom):
+            above = (folder, *folder.parents)[: node.level][-1:]
+            bases = [base for base in above or (folder, root) if base == root or root in base.parents]
+            module = node.module or ""
+            for alias in node.names:
+                yield from _named(".".join(filter(None, (module, alias.name))), bases)
+
+
+def _named(name: str, bases: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files of a dotted name of a module in folders, and of the packages that it lies in; `*`: of all in a package."""
+    for base in dict.fromkeys(bases):
+        place = base
+        for part in name.split("."):
+            if part == "*":
+                yield from (file for file in sorted(place.glob("*")) if file.is_file() and file.name.endswith(_SUFFIXES))
+                yield from (file for file in sorted(place.glob("*/__init__.*")) if file.name.endswith(_SUFFIXES))
+                break
+            place = place / part
+            files = (where.with_name(where.name + suffix) for where in (place, place / "__init__") for suffix in _SUFFIXES)
+            yield from (file for file in files if file.is_file())
 
 
 def _lies_in_trusted(path: Path) -> bool:

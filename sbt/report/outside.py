@@ -10,6 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from sbt.files import as_cell
 from sbt.metrics.geometry import corners, select_instants
 from sbt.problem.trace import Trace
 from sbt.report.scene import is_person
@@ -50,7 +51,7 @@ def write_csv(file: Path, trace: Trace) -> None:
     with file.open("w", newline="") as out:
         writer = csv.DictWriter(out, list(rows[0]))
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({key: as_cell(value) for key, value in row.items()} for row in rows)
 
 
 def write_fcd(file: Path, trace: Trace) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import sysconfig
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +14,7 @@ from sbt.config.source import read_yaml, yaml_reader
 from sbt.errors import InputError
 from sbt.files import scratch_in, write_atomically
 from sbt.plugins import read_files
+from sbt.plugins.source import is_installed
 from sbt.problem.plain import Json, JsonMapping
 from sbt.store.connection import copy_database
 from sbt.store.database import DATABASE
@@ -84,7 +84,7 @@ def write_bundle(store: Path, folder: Path, target: Path) -> list[Path]:
     Raises:
         InputError: a file names another one absolutely, or the zip cannot be written.
     """
-    files = [path for path in read_files() if not _is_installed(path)]
+    files = [path for path in read_files() if not is_installed(path)]
     root = Path(os.path.commonpath([folder.resolve(), *(path.parent for path in files)]))
     absolute = [path for path in files if path.suffix != ".py" and f"{root}{os.sep}".encode() in path.read_bytes()]
     if absolute:
@@ -111,9 +111,3 @@ def write_bundle(store: Path, folder: Path, target: Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"a bundle must be written into a folder that may be written, but {target}: {error.strerror}") from None
     return files
-
-
-def _is_installed(path: Path) -> bool:
-    """Return whether a file came with Python, this package or another one."""
-    places = (Path(__file__).parents[1], *(Path(sysconfig.get_path(kind)) for kind in ("stdlib", "purelib", "platlib")))
-    return any(place.resolve() in path.parents for place in places)
