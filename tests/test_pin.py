@@ -106,3 +106,16 @@ def test_runs_are_named_by_index_or_mode_and_must_be_there(tmp_path: Path):
     for run, message in (("mode:99", "needs a failure mode"), ("-1", "RUN must be"), ("500", "finished one")):
         with pytest.raises(InputError, match=message):
             pin_runs(tmp_path / "s", [run], tmp_path / "t")
+
+
+def test_a_run_without_a_trace_is_pinned_where_a_run_approved_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    (tmp_path / "own.py").write_text(
+        "import sbt\n"
+        "A = sbt.Scenario('own', inputs=[sbt.Parameter('u', 0, 1)], requirement=sbt.Requirement('y', high=0.5),\n"
+        "                 evaluate=lambda values, seed: {'y': values['u']})\n"
+    )
+    (tmp_path / "c.yaml").write_text("campaign: coverage\nscenario: own.py:A\nbudget: 4\nstore: s\nexecutor: {kind: serial}\n")
+    assert CliRunner().invoke(app, ["run", str(tmp_path / "c.yaml"), "--store", str(tmp_path / "s")]).exit_code == 0
+    pinned = CliRunner().invoke(app, ["pin", str(tmp_path / "s"), "0", "--into", str(tmp_path / "tests")])
+    assert pinned.exit_code == 0, pinned.output

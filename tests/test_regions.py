@@ -15,6 +15,7 @@ from sbt.loop.stages import Facts
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
+from sbt.seeds import stream
 from sbt.testbeds import analytic, find, truth, values
 from tests.sided_runs import sided_runs
 
@@ -33,7 +34,10 @@ def test_regions_of_known_problems_are_counted(name: str):
     def log_odds(u: Points) -> Vector:
         return np.where(problem.critical.contains(values(name, scenario.space.from_unit(u))), 1.0, -1.0)
 
-    found = critical_regions(log_odds, scenario, seed=0)
+    even = scenario.space.cube.snapped(stream(7, name).random((40_000, scenario.space.dimension)))
+    met = even[log_odds(even) > 0.0]
+    found = critical_regions(log_odds, scenario, 0, met)
+    assert critical_regions(log_odds, scenario, 0, met[:0]) == (), "no run says that it is one"
     shares = [region.share for region in found]
     assert len(found) == COUNTED[name]
     assert shares == sorted(shares, reverse=True)
@@ -50,9 +54,10 @@ def test_what_only_a_choice_or_a_whole_number_divides_is_one_region():
         first, last = (u[:, 2] < choice) & (u[:, 0] < 0.4), (u[:, 2] > 2 * choice) & (u[:, 0] > 0.6)
         return np.where(first | last, 1.0, -1.0)
 
-    assert [round(r.share, 1) for r in critical_regions(lambda u: 0.5 - u[:, 0], scenario, seed=0)] == [0.5]
-    assert [round(r.share, 2) for r in critical_regions(apart, scenario, seed=0)] == [0.13, 0.13]
-    assert critical_regions(lambda u: -u[:, 0], scenario, seed=0) == ()
+    met = scenario.space.cube.snapped(stream(8, "met").random((300, 3)))
+    assert [round(r.share, 1) for r in critical_regions(lambda u: 0.5 - u[:, 0], scenario, 0, met[met[:, 0] < 0.5])] == [0.5]
+    assert [round(r.share, 2) for r in critical_regions(apart, scenario, 0, met[apart(met) > 0.0])] == [0.13, 0.13]
+    assert critical_regions(lambda u: -u[:, 0], scenario, 0, met) == ()
 
 
 def test_a_boundary_names_its_regions(tmp_path):

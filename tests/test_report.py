@@ -280,8 +280,8 @@ def test_says_where_runs_lie_beyond_the_critical_interval(tmp_path):
         ),
         (BoundaryConclusion(0.163, 0.01, 0.1, None), "takes 16.3 % of the parameter space"),
         (
-            BoundaryConclusion(0.163, 0.01, 0.1, None, held_out_fraction=CriticalShare(0.2, 0.1, 0.3, 0.95, 50)),
-            "the 50 held-out runs alone say 20 % (95 % interval 10 % to 30 %). They agree",
+            BoundaryConclusion(0.163, 0.01, 0.1, None, held_out_fraction=CriticalShare(0.2, 0.1, 0.3, 0.95, 150)),
+            "the 150 held-out runs alone say 20 % (95 % interval 10 % to 30 %). They agree",
         ),
         (
             FalsificationConclusion(11, 12, 5, (), None, None, "What follows."),

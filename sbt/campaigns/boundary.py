@@ -141,7 +141,8 @@ def recipe(settings: Settings) -> Campaign:
         log_odds = partial(_log_odds, fitted, settings)
         place = boundary_place(log_odds, settings.scenario, settings.seed, fitted.log_success)
         there = log_odds if fitted.log_success is None else partial(_log_odds_there, log_odds, fitted.log_success)
-        regions = None if place is None else critical_regions(there, settings.scenario, settings.seed)
+        met = _met(log.history, settings)
+        regions = None if place is None else critical_regions(there, settings.scenario, settings.seed, met)
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
@@ -152,6 +153,12 @@ def recipe(settings: Settings) -> Campaign:
     most = largest_batch if settings.acquisition is None else None
     stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even, most=most)
     return Campaign((stage,), conclude)
+
+
+def _met(history: History, settings: Settings) -> Points:
+    """Return (k, d) critical runs, in the unit cube."""
+    scenario = settings.scenario
+    return scenario.space.cube.snapped(scenario.space.to_unit(history.x[scenario.requirement.critical_runs(history)]))
 
 
 def _log_odds(fitted: FittedMetamodel, settings: Settings, u: Points) -> Vector:

@@ -36,7 +36,7 @@ __all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "conclude_sum",
 _HIGH_DIMENSION = 20  # inputs from which on the metamodels learn less than the chains of subset simulation find
 _CONFIDENCE = 0.95
 _HEAVY = 0.25  # share of the weight that one draw may carry before the reader is warned
-_NOTHING = "nothing critical was met: the probability is only bounded from above, by the draws from the inputs' distribution"
+_NOTHING = "no draw that counts was critical: the probability is only bounded from above, by draws from the inputs' distribution"
 
 
 @dataclass(frozen=True)

@@ -84,10 +84,12 @@ class BoundaryPlace:
         """Return where critical meets uncritical, in words."""
         first, unit = self.inputs[0], units.get(self.inputs[0], "")
         second = self.inputs[1] if len(self.inputs) > 1 else ""
+        at = ["" if cut.at is None else measured("", cut.at, units.get(second, "")).strip() for cut in self.cuts]
         parts = []
         for k, cut in enumerate(self.cuts):
-            at = "" if cut.at is None else f" at {measured('' if k else second, cut.at, units.get(second, '')).strip()}"
-            parts.append(f"{' and '.join(self._stretches(cut, unit))}{at}")
+            if at[k] not in at[:k]:
+                where = f" at {second} {at[k]}" if at[k] and not k else f" at {at[k]}" if at[k] else ""
+                parts.append(f"{' and '.join(dict.fromkeys(self._stretches(cut, unit)))}{where}")
         unsure = measured("", max(cut.unsure for cut in self.cuts), unit, 2).strip()
         said = f"{first} is {', '.join(parts)} (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)"
         if self.fixed:

@@ -41,16 +41,18 @@ class CriticalRegion:
     extent: Mapping[str, Stretch]
 
 
-def critical_regions(log_odds: LogOdds, scenario: LogicalScenario, seed: int) -> tuple[CriticalRegion, ...]:
+def critical_regions(log_odds: LogOdds, scenario: LogicalScenario, seed: int, met: Points) -> tuple[CriticalRegion, ...]:
     """Return the critical regions, the largest first; none where the metamodel sees none of two thousand points critical.
 
     Two points are in one region where P(critical) > 0.5 on a chain of segments between critical points; another choice is
-    a step. Regions of fewer than three points of the 8,192 that are looked at are left out.
+    a step. Regions of fewer than three points of the 8,192 that are looked at are left out, and those that no critical run is
+    joined to.
 
     Args:
         log_odds: of critical, at points of the unit cube.
         scenario: with its space.
         seed: of the points.
+        met: (k, d) critical runs, in the unit cube.
     """
     space = scenario.space
     u = SobolSequence(space.dimension, seed).admissible(lambda v: space.feasible(space.from_unit(v)), _POINTS, _LEAST)
@@ -77,6 +79,8 @@ def critical_regions(log_odds: LogOdds, scenario: LogicalScenario, seed: int) ->
     for part in np.argsort(-count, kind="stable"):
         if count[part] < _COUNTED:
             break
+        if not _joined_to(critical[label == part], met, space.cube.embedded, joined):
+            continue
         x = space.from_unit(critical[label == part])
         ends = np.quantile(x, _INNER, axis=0)
         ranges = zip(space.parameters, *ends.tolist(), strict=True)
@@ -121,6 +125,16 @@ def _parts(points: Points, distance: Points, joined: Callable[[Points, Points], 
     more = np.concatenate([np.empty((0, 2), dtype=np.intp), *further])
     more = more[joined(points[more[:, 0]], points[more[:, 1]])] if len(more) else more
     return _components(np.concatenate([pairs, more]), n)
+
+
+def _joined_to(part: Points, met: Points, embedded: Callable[[Points], Points], joined: Callable[[Points, Points], Mask]) -> bool:
+    """Return whether one of some runs (k, d) is joined to a part (n, d); the nearest pairs are tried."""
+    if len(met) == 0:
+        return False
+    distance = cdist(embedded(met), embedded(part))
+    nearest = distance.argmin(axis=1)
+    runs = np.argsort(distance.min(axis=1), kind="stable")[:_BETWEEN]
+    return bool(joined(met[runs], part[nearest[runs]]).any())
 
 
 def _components(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:

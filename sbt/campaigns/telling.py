@@ -21,6 +21,7 @@ from sbt.campaigns.lost import (
 )  # fmt: skip
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
+from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST
@@ -36,7 +37,8 @@ if TYPE_CHECKING:
 __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
-_FEW = 5  # runs of a side, below which edges are told with reserve, however sure the metamodel is
+_HARDLY = 100  # held-out runs, below which their interval is too wide to confirm a share
+_FAR = 30.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
 _WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"
@@ -86,9 +88,9 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         )
     else:
         sure = "no held-out run tested it"
+    few = few_of_a_side(facts)
     if found.place is not None:
         section = found.place.words(facts.units)
-        few = _few_of_a_side(facts)
         unsharp = bool(few) or found.place.vague
         regions = () if unsharp or found.regions is None else found.regions  # roughness would be counted
         where = regions_words(regions, found.place.inputs, facts.units) or section
@@ -101,10 +103,11 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
             )
     else:
         lead = f"{percent(found.critical_fraction)} of the parameter space{_of(facts)} is critical ({_condition(facts)})"
-    if _none_critical(facts):
+        lead += f" by the metamodel, but {few}" if few else ""
+    if none_critical(facts):
         lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
     rests = f"the metamodel learned that from {plural(learned, 'run')}"
-    missing = "an uncritical" if _all_critical(facts) else "a critical"
+    missing = "an uncritical" if all_critical(facts) else "a critical"
     denied = " The held-out runs deny its figures (below): do not rely on it yet." if _denied(found, measured_share) else ""
     said = [
         f"{lead}; {rests}, and {sure}.{denied}",
@@ -112,7 +115,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
         f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
     ]
-    if found.place is not None and where != section and not _none_critical(facts):
+    if found.place is not None and where != section and not none_critical(facts):
         said.append(f"On lines across the boundary, a run is critical where {section}.")
     return [*said, *_reconciled(found, measured_share), *_too_sure(found)]
 
@@ -123,27 +126,8 @@ def _denied(found: BoundaryConclusion, runs: CriticalShare) -> bool:
     return bool(_too_sure(found)) or (runs.critical_fraction is not None and not runs.low <= share <= runs.high)
 
 
-def _few_of_a_side(facts: Facts) -> str:
-    """Return in words that the boundary rests on few runs of one of its sides; empty where it does not."""
-    critical = facts.requirement.critical_runs(facts.history.training)
-    sides = {"critical": int(critical.sum()), "uncritical": int((~critical).sum())}
-    side = min(sides, key=lambda name: sides[name])
-    return f"only {plural(sides[side], f'{side} run')} tell{'s' * (sides[side] == 1)} of it" if sides[side] < _FEW else ""
-
-
-def _all_critical(facts: Facts) -> bool:
-    """Return whether every run that gave a metric was critical."""
-    ok = facts.history.ok
-    return bool(ok.any() and facts.requirement.critical_runs(facts.history)[ok].all())
-
-
-def _none_critical(facts: Facts) -> bool:
-    """Return whether there are runs with a metric, and none of them was critical."""
-    return bool(facts.history.ok.any() and not facts.requirement.critical_runs(facts.history).any())
-
-
 def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:
-    if _all_critical(facts):
+    if all_critical(facts):
         return _WIDEN
     if not tested:
         return "test it: validation.reference: 300 scores the metamodel on 300 more runs drawn at random"
@@ -172,6 +156,8 @@ def _reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
     alone = f"the {plural(runs.counted, 'held-out run')} alone say {percent(runs.critical_fraction)} ({_ends(runs)})"
     if not runs.low <= share <= runs.high:
         return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
+    if runs.counted < _HARDLY:
+        return [f"{said}; {alone}. So few runs hardly test it: it lies within their interval."]
     sharper = "; the metamodel's figure, which rests on all runs, is the sharper one" if share and runs.counted < _MANY else ""
     return [f"{said}; {alone}. They agree: it lies within that interval{sharper}."]
 
@@ -289,11 +275,14 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     subject = f"a critical run{_of(facts)} ({_condition(facts)}) under the inputs' distribution"
     if found.exact_bound is not None:
         most = f"with {confidence} confidence the probability of {subject} is at most {number(found.exact_bound, 3)}"
-        said = f"No critical run was drawn: {most}"
+        known = met(facts)
+        said = f"{known}, but none by the draws that count: {most}" if known else f"No critical run was drawn: {most}"
         exact = facts.history.ok.all() and 0.0 < found.exact_bound < 1.0
         draws = plural(unmet_draws(found.exact_bound, found.confidence), "draw") if exact else "draws"
         rests = f", by {draws} from the inputs' distribution among {plural(n, 'run')}"
         silent = "This does not tell that there is none: a smaller probability cannot be told from zero by so many draws"
+        if known:
+            silent = "This does not tell how probable they are: the critical runs were chosen by results, or only taught"
     elif found.probability is None:
         said = f"The probability of {subject} is not known yet: no draw counts"
         silent = "The critical runs so far were chosen by results, so their share is no estimate"
@@ -330,6 +319,8 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         kept = decides_bound(lost if worst is None else worst, found.exact_bound)
         if kept is not None:
             return kept
+        if met(facts):
+            return f"a larger budget than {n:,} runs, so that draws that count meet what has been met; look at the critical runs"
         return "campaign: falsification searches for the first critical run; ten times as many runs lower the bound tenfold"
     if found.probability is None:
         return f"a larger budget than {n:,} runs, so that after searching and learning some draws count"
@@ -340,19 +331,13 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         )
     if found.combinations is not None and found.low == found.high:
         return "if equal inputs may end differently, acquisition: {kind: monte_carlo} gives an interval that holds then too"
-    if _all_critical(facts):
+    if all_critical(facts):
         return _WIDEN
     if found.gate is not None and found.gate.verdict == "undecided":
         return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
     wide, counted = _too_wide(found), found.counted or n
     if wide > 1.0 and counted:
-        more, made = counted * (wide**2 - 1.0), n or counted
-        if more < _TOO_FAR:
-            return (
-                f"about {_round(more):,} more runs (budget: {_round(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
-                " fewer where the metamodel goes on to learn"
-            )
-        return "more runs than can be asked for here narrow it; change the metamodel, or the requirement to a milder one"
+        return _runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
     unseen = 3.0 / max(found.probability, 1e-300)
     if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
         return (
@@ -360,6 +345,16 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
             " distribution (acquisition: {kind: monte_carlo})"
         )
     return f"it is as narrow as asked{'; look at the critical runs in the report' if found.hits else ''}"
+
+
+def _runs_for_precision(more: float, made: int, *, known: bool) -> str:
+    """Return how many more runs, beside those that were made, give the estimate its precision; `known`: it is not 0."""
+    if not known or more > _FAR * made:
+        return f"a larger budget: ten times {made:,} runs tell how many it takes, since too few critical draws count now"
+    return (
+        f"about {_round(more):,} more runs (budget: {_round(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
+        " fewer where a metamodel goes on to learn"
+    )
 
 
 def _too_wide(found: EstimationConclusion) -> float:

@@ -237,11 +237,11 @@ class Replay:
         return str(self.outcome.status) == self.record.status and dict(self.outcome.metrics) == dict(self.record.metrics)
 
 
-def replay_run(folder: Path, index: int, *, objects: Objects | None = None) -> Replay:
+def replay_run(folder: Path, index: int, *, objects: Objects | None = None, execute: bool = False) -> Replay:
     """Execute a stored run again, as the campaign did.
 
-    Where a file of Python gives metrics without a trace, there is nothing to show: its code runs only where the user asks
-    for that by trusting the store.
+    Where a file of Python gives metrics without a trace, there is nothing to show: its code runs only where that is asked for,
+    by `execute` or by trusting the store.
 
     Raises:
         InputError: the store has no finished run of this index, or its code is needed and not approved.
@@ -253,7 +253,7 @@ def replay_run(folder: Path, index: int, *, objects: Objects | None = None) -> R
         have = f"{history.index[0]} to {history.index[-1]}" if len(history) else "none yet"
         raise InputError(f"a run must be a finished one of {folder} ({have}), but got {index}")
     record = history.record(int(rows[0]))
-    if study.own_code and not study.kept["described"]["traced"] and not is_trusted(folder):
+    if study.own_code and not study.kept["described"]["traced"] and not (execute or is_trusted(folder)):
         stored = Outcome(index, Status(record.status), record.metrics, record.reason, record.seconds)
         return Replay(record, stored, None, study.scenario, executed=False)
     with study.loaded.scope.naming():
