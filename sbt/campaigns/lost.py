@@ -28,7 +28,7 @@ def nothing_known(facts: Facts) -> list[str]:
 
 def why_they_fail() -> str:
     """Return the advice for runs that fail."""
-    return "look at why they failed (the table of failed runs; replay of one), mend it, and run the campaign in a new store"
+    return "look at why they failed (table of failed runs in the report, export), mend it, and run the campaign in a new store"
 
 
 def lost_runs(lost: int, n: int) -> str:

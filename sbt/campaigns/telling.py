@@ -38,7 +38,7 @@ __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
 _HARDLY = 100  # held-out runs, below which their interval is too wide to confirm a share
-_FAR = 30.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
+_FAR = 100.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
 _WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"

@@ -116,7 +116,7 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
         raise fail(f"{result['critical']} critical runs", Exit.CRITICAL)
     if 2 * result["failed"] > result["runs"]:
         reason = f"at most half of the runs may fail, but {result['failed']} of {result['runs']} did"
-        raise fail(f"{reason}; `sumo-sbt status` and `export` show why", Exit.FAILED_RUNS)
+        raise fail(f"{reason}; the report and `sumo-sbt export` show why", Exit.FAILED_RUNS)
 
 
 def status(

@@ -228,13 +228,12 @@ def _look(folder: Path) -> None:
 
 
 def _changed(folder: Path) -> float:
-    """Return when a store was written last (s, of the epoch)."""
+    """Return when a store was written last (s, of the epoch); who reads it leaves an empty file beside it."""
     times = [0.0]
     for name in ("campaign.sqlite", "campaign.sqlite-wal"):
-        try:
-            times.append((folder / name).stat().st_mtime)
-        except OSError:
-            continue
+        with suppress(OSError):
+            found = (folder / name).stat()
+            times += [found.st_mtime] if found.st_size else []
     return max(times)
 
 
