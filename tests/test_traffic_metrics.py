@@ -17,7 +17,7 @@ from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import FAR, HORIZON, collision, drac_max, ttc_min
 from sbt.metrics.pairwise import in_traffic, worst_signal
 from sbt.metrics.paths import ttc_on_paths
-from sbt.metrics.planar import distance_min, post_encroachment_time, time_behind, ttc_2d
+from sbt.metrics.planar import distance_min, pet, post_encroachment_time, severity, time_behind, ttc_2d, ttc_2d_min
 from sbt.metrics.stl import stl
 from sbt.metrics.traffic import any_collision, any_impact_speed, nearest_distance, others_braking_max, pet_ego_first, ttc_path_min
 from sbt.problem.outcome import Job, Status
@@ -215,3 +215,35 @@ def test_what_is_computed_for_all_others_at_once_is_what_each_alone_gives():
         assert any_collision()(trace) == max(collision()(one) for one in alone)
         conflicts += np.array([0.0 < times.min() < 5.0, 0.0 < min(behind) < 5.0, times.min() == 5.0, min(behind) == 5.0])
     assert (conflicts >= 1).all(), "nothing was there to be missed"
+
+
+def coming_and_going(rng: np.random.Generator) -> Trace:
+    """The same, where the others are there for some time only."""
+    trace = wandering(rng)
+    states = {name: getattr(trace, name).copy() for name in ("x", "y", "heading", "speed", "acceleration")}
+    for k in range(1, len(trace.actors)):
+        enters, leaves = np.sort(rng.integers(0, len(trace.time) + 1, 2))
+        for values in states.values():
+            values[:enters, k] = values[leaves:, k] = np.nan
+    return dataclasses.replace(trace, **states)
+
+
+def test_a_metric_of_a_trace_in_which_the_other_comes_and_goes_is_that_of_the_time_in_which_both_are_there():
+    """Nobody who touches the ego is passed over because it was not there before, or is not later."""
+    rng = np.random.default_rng(3)
+    metrics = (collision(), any_collision(), any_impact_speed(), distance_min(), nearest_distance(), severity(), ttc_2d_min())
+    touched = 0
+    for _ in range(60):
+        trace = coming_and_going(rng)
+        for name in trace.actors[1:]:
+            one = trace.select(slice(None), {"ego": "ego", name: "co"})
+            if one.present[:, 1].sum() > 1:
+                for metric in (*metrics, ttc_path_min()):
+                    assert metric(one) == in_traffic(metric, "ego")(one), metric.name
+                for metric in (pet(), pet_ego_first()):  # who comes when the ego has gone counts too
+                    both = [metric(part) for _, part in joint_intervals(one, "ego", "co")]
+                    assert in_traffic(metric, "ego")(one) == metric(one) <= min(both) + 1e-9, metric.name
+                touched += collision()(one) > 0
+        alone = [trace.select(slice(None), {"ego": "ego", name: "co"}) for name in trace.actors[1:]]
+        assert pet_ego_first()(trace) == min(pet_ego_first()(one) for one in alone)
+    assert touched >= 5, "nothing was there to be missed"

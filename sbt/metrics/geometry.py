@@ -1,5 +1,7 @@
 """Oriented rectangles: contact while moving, and distance; vectorised over time.
 
+Where one of two is not there, its states are NaN: nothing touches it, and distances are NaN.
+
 The shape of a long vehicle is several rectangles (`ActorTrace.parts`): `contact_index`, `time_to_contact` and
 `rectangle_distance` compare all of them, the other functions single rectangles.
 """
@@ -34,13 +36,13 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Rectangles:
-    """Any n rectangles: (n,) centres and headings, and (n, 1) lengths and widths."""
+    """Any n rectangles: (n,) centres, headings, lengths and widths."""
 
     x: Vector
     y: Vector
     heading: Vector
-    length: np.ndarray
-    width: np.ndarray
+    length: Vector
+    width: Vector
 
 
 def rectangles(actor: ActorTrace) -> tuple[ActorTrace, ...]:
@@ -59,8 +61,8 @@ def overlap_depth(a: ActorTrace, b: ActorTrace) -> Vector:
     The least overlap on the four axes; where they are apart, minus a lower bound of their distance.
     """
     cos, sin = _axes(a, b)
-    apart: Vector = np.abs((b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin)
-    return (_reach(a, cos, sin) + _reach(b, cos, sin) - apart).min(axis=1)
+    apart: Vector = np.abs((b.x - a.x) * cos + (b.y - a.y) * sin)
+    return (_reaches(a, b, cos, sin) - apart).min(axis=0)
 
 
 def corners(actor: ActorTrace) -> np.ndarray:
@@ -74,17 +76,19 @@ def corners(actor: ActorTrace) -> np.ndarray:
 
 
 def _axes(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (t, 4) directions of the separating axes: along and across each rectangle."""
-    angle = np.empty((len(a.heading), 4))
-    angle[:, 0], angle[:, 2] = a.heading, b.heading
-    angle[:, 1::2] = angle[:, ::2] + np.pi / 2
+    """Return the (4, t) directions of the separating axes: along and across each rectangle."""
+    angle = np.empty((4, len(a.heading)))
+    angle[0], angle[2] = a.heading, b.heading
+    angle[1::2] = angle[::2] + np.pi / 2
     return np.cos(angle), np.sin(angle)
 
 
-def _reach(actor: ActorTrace | Rectangles, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
-    """Return the (t, 4) half extent of a rectangle along each axis."""
-    c, s = np.cos(actor.heading)[:, None], np.sin(actor.heading)[:, None]
-    return 0.5 * (actor.length * np.abs(c * cos + s * sin) + actor.width * np.abs(-s * cos + c * sin))
+def _reaches(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+    """Return the (4, t) sums of the half extents of two rectangles along their four axes."""
+    ahead = np.abs(cos[::2, None] * cos + sin[::2, None] * sin)  # (2, 4, t): of each rectangle to every axis
+    aside = np.abs(cos[::2, None] * sin - sin[::2, None] * cos)
+    half = [0.5 * (each.length * ahead[k] + each.width * aside[k]) for k, each in enumerate((a, b))]
+    return half[0] + half[1]
 
 
 def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
@@ -92,13 +96,17 @@ def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
 
     Between instants the centres move on straight lines, and the headings are those at the end of the step. The
     relative motion is tested on the separating axes, so that no contact is missed, whatever the step. The first
-    instant has no step before it; its value is 0 if the rectangles overlap.
+    instant at which both are there has no step before it; its value is 0 if the rectangles overlap.
 
     Source:
         Separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
     """
     dx, dy = b.x - a.x, b.y - a.y
-    return contact_share(a, b, np.concatenate([dx[:1], dx[:-1]]), np.concatenate([dy[:1], dy[:-1]]))
+    before_x, before_y = np.concatenate([dx[:1], dx[:-1]]), np.concatenate([dy[:1], dy[:-1]])
+    absent = np.isnan(before_x)
+    if absent.any():
+        before_x, before_y = np.where(absent, dx, before_x), np.where(absent, dy, before_y)
+    return contact_share(a, b, before_x, before_y)
 
 
 def contact_share(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles, dx: Vector, dy: Vector) -> Vector:
@@ -111,9 +119,9 @@ def contact_share(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles, dx: Ve
         dy: (t,) y, likewise (m).
     """
     cos, sin = _axes(a, b)
-    reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)
-    end = (b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin  # (t, 4) centre distance along each axis
-    start = dx[:, None] * cos + dy[:, None] * sin
+    reach = _reaches(a, b, cos, sin)  # (4, t)
+    end = (b.x - a.x) * cos + (b.y - a.y) * sin  # (4, t) centre distance along each axis
+    start = dx * cos + dy * sin
     enter, leave = _overlap_span(start, end - start, reach)
     hit = (enter <= leave) & (leave >= 0) & (enter <= 1)
     return np.where(hit, np.maximum(enter, 0.0), np.inf)
@@ -123,9 +131,9 @@ def _overlap_span(start: np.ndarray, rate: np.ndarray, reach: np.ndarray) -> tup
     """Return (t,) the times at which moving rectangles begin and end to overlap on all four axes; begin > end if never.
 
     Args:
-        start: (t, 4) distance of the centres along each axis at time 0.
-        rate: (t, 4) its rate of change.
-        reach: (t, 4) sum of the half extents.
+        start: (4, t) distance of the centres along each axis at time 0.
+        rate: (4, t) its rate of change.
+        reach: (4, t) sum of the half extents.
     """
     signed = np.sign(rate) * reach
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -135,7 +143,7 @@ def _overlap_span(start: np.ndarray, rate: np.ndarray, reach: np.ndarray) -> tup
         outside = np.abs(start) > reach
         first = np.where(still, np.where(outside, np.inf, -np.inf), first)
         last = np.where(still, np.where(outside, -np.inf, np.inf), last)
-    return first.max(axis=1), last.min(axis=1)
+    return first.max(axis=0), last.min(axis=0)
 
 
 def time_to_contact(a: ActorTrace, b: ActorTrace) -> Vector:
@@ -149,11 +157,11 @@ def time_to_contact(a: ActorTrace, b: ActorTrace) -> Vector:
     if a.parts or b.parts:
         return np.minimum.reduce([time_to_contact(p, q) for p, q in part_pairs(a, b)])
     cos, sin = _axes(a, b)
-    reach = _reach(a, cos, sin) + _reach(b, cos, sin)  # (t, 4)
-    start = (b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin
+    reach = _reaches(a, b, cos, sin)  # (4, t)
+    start = (b.x - a.x) * cos + (b.y - a.y) * sin
     rate_x = b.speed * np.cos(b.heading) - a.speed * np.cos(a.heading)
     rate_y = b.speed * np.sin(b.heading) - a.speed * np.sin(a.heading)
-    enter, leave = _overlap_span(start, rate_x[:, None] * cos + rate_y[:, None] * sin, reach)
+    enter, leave = _overlap_span(start, rate_x * cos + rate_y * sin, reach)
     return np.where((enter <= leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
 
 
@@ -172,7 +180,7 @@ def contact_part(a: ActorTrace, b: ActorTrace) -> tuple[int, ActorTrace, ActorTr
 def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
     dx, dy = b.x - a.x, b.y - a.y
     reach = 0.5 * (math.hypot(a.length, a.width) + math.hypot(b.length, b.width))
-    moved = max(float(np.abs(d[1:] - d[:-1]).max(initial=0.0)) for d in (dx, dy))
+    moved = max(float(np.fmax.reduce(np.abs(d[1:] - d[:-1]), initial=0.0)) for d in (dx, dy))
     (near,) = (dx * dx + dy * dy <= (reach + 1.5 * moved) ** 2).nonzero()  # circumscribed circles first
     if near.size == 0:
         return None
@@ -194,9 +202,8 @@ def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:
     if a.parts or b.parts:
         return np.minimum.reduce([rectangle_distance(p, q) for p, q in part_pairs(a, b)])
     cos, sin = _axes(a, b)
-    reach = _reach(a, cos, sin) + _reach(b, cos, sin)
-    along = np.abs((b.x - a.x)[:, None] * cos + (b.y - a.y)[:, None] * sin)
-    overlap = (along <= reach).all(axis=1)
+    along = np.abs((b.x - a.x) * cos + (b.y - a.y) * sin)
+    overlap = (along <= _reaches(a, b, cos, sin)).all(axis=0)
     corner_a, corner_b = corners(a), corners(b)
     distance = np.minimum(_point_distance(corner_a, b), _point_distance(corner_b, a))
     return np.where(overlap, 0.0, distance)

@@ -1,7 +1,8 @@
 """Pairwise metrics and signals in traffic: computed for the ego and every other road user, of which the worst counts.
 
 In recorded traffic road users come and go, and their states are NaN while they are absent. A pairwise metric is
-computed on every interval of time in which both road users are present, as the actors `ego` and `co`.
+computed on every interval of time in which both road users are present, as the actors `ego` and `co`; one that compares
+different times, such as the post-encroachment time, on all of them at once.
 """
 
 from __future__ import annotations
@@ -53,13 +54,20 @@ def in_traffic(metric: Metric, ego: str, other: str | None = None, name: str = "
             metric.value(part)
             for actor in trace.actors
             if actor != ego and other in (None, actor)
-            for _, part in joint_intervals(trace, ego, actor)
+            for part in _parts(metric, trace, ego, actor)
         ]
         worst = max if metric.direction == "high" else min
         return worst(values, default=metric.without)
 
     times = None if metric.over_time is None else partial(_over_time, metric, metric.over_time, ego, other)
     return replace(metric, name=name or metric.name, function=function, over_time=times)
+
+
+def _parts(metric: Metric, trace: Trace, ego: str, other: str) -> list[Trace]:
+    """Return the traces of ego and another, `co`, of which a metric is to be computed."""
+    if metric.lagged:
+        return [trace.select(slice(None), {ego: "ego", other: "co"})]
+    return [part for _, part in joint_intervals(trace, ego, other)]
 
 
 def _over_time(metric: Metric, of_pair: Callable[[Trace], Vector], ego: str, other: str | None, trace: Trace) -> Vector:

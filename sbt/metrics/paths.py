@@ -159,17 +159,17 @@ def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -
         course = courses[begin]
         way, heading = course.way, course.heading
         travelled = way[rows[begin:end], None] + course.actor.speed[rows[begin:end], None] * after[begin:end]
-        beyond = np.maximum(travelled - way[-1], 0.0)
-        if course.leaves:
-            beyond[beyond > 0.0] = np.nan
-        x = np.interp(travelled, way, course.x) + beyond * np.cos(heading[-1])
-        y = np.interp(travelled, way, course.y) + beyond * np.sin(heading[-1])
+        x, y = np.interp(travelled, way, course.x), np.interp(travelled, way, course.y)
+        beyond = travelled - way[-1]
+        if beyond.max() > 0.0:
+            beyond = np.where(beyond > 0.0, np.nan, 0.0) if course.leaves else np.maximum(beyond, 0.0)
+            x, y = x + beyond * np.cos(heading[-1]), y + beyond * np.sin(heading[-1])
         parts.append((x, y, np.interp(travelled, way, heading)))
         sizes.append(np.broadcast_to([course.actor.length, course.actor.width], (end - begin, 2)))
     x, y, headings = (np.concatenate(column) for column in zip(*parts, strict=True))
     size = np.concatenate(sizes)
     turned = np.abs(headings[:, 1] - headings[:, 0]) * (0.5 * np.hypot(size[:, 0], size[:, 1]))
-    now = Rectangles(x[:, 1], y[:, 1], headings[:, 1], size[:, :1], size[:, 1:])
+    now = Rectangles(x[:, 1], y[:, 1], headings[:, 1], size[:, 0], size[:, 1])
     return (x[:, 0], y[:, 0]), now, turned
 
 

@@ -6,7 +6,7 @@ All of them are computed for rectangles that may turn, and account for contacts 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +14,15 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sbt.metrics.around import around, first_contacts
-from sbt.metrics.geometry import contact_index, contact_share, part_pairs, rectangle_distance, select_instants, time_to_contact
+from sbt.metrics.geometry import (
+    Rectangles,
+    contact_index,
+    contact_share,
+    part_pairs,
+    rectangle_distance,
+    select_instants,
+    time_to_contact,
+)
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
 from sbt.problem.arrays import Vector
 from sbt.problem.scenario import Metric
@@ -27,8 +35,13 @@ __all__ = [
 
 _BLOCK = 8
 """Instants that are first looked at together."""
-_BISECTIONS = 10
-"""The PET is accurate to the step of the trace divided by 2 to this power."""
+_DIVISIONS = (16, 8, 8)
+"""The PET is accurate to the step of the trace divided by the product of these."""
+_STRIDE = 5
+"""Shifts of which the middle one tells whether any of them may matter; an odd number."""
+_SLACK = 1e-6
+"""By how much farther apart than necessary those must be who are passed over (m)."""
+_Pair = tuple[ActorTrace, ActorTrace]
 
 
 def _zero_at_contact(trace: Trace, ego: str, other: str, values: Vector) -> Vector:
@@ -57,7 +70,7 @@ def ttc_2d_min(ego: str = "ego", other: str = "co") -> Metric:
 def distance(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Vector:
     """Return the (t,) distance between the rectangles (m), at most 1,000, 0 where they overlap."""
     values = rectangle_distance(trace.actor(ego), trace.actor(other))
-    return _zero_at_contact(trace, ego, other, np.minimum(values, FAR))
+    return _zero_at_contact(trace, ego, other, np.fmin(values, FAR))
 
 
 def distance_min(ego: str = "ego", other: str = "co") -> Metric:
@@ -87,8 +100,8 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
     """Return the smallest time between one road user leaving a spot and the other reaching it (s), at most 10.
 
     Computed as the smallest time shift of one of the two with which the rectangles would touch: the shift is
-    increased step by step until the swept rectangles touch (`contact_index`), and then refined by bisection to
-    step / 1,024. 0 for a collision. Only the recorded trace counts.
+    increased step by step until the swept rectangles touch (`contact_index`), and then refined to step / 1,024.
+    0 for a collision. Only the recorded trace counts.
 
     For straight paths that cross at right angles this is the time from the first road user leaving the conflict
     area to the second one entering it. (At an acute angle the conflict area is left later and entered earlier than
@@ -105,7 +118,7 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
     for k in range(1, min(n - 1, int(HORIZON / step)) + 1):
         found = [sign for sign in (1, -1) if _meet_shifted(a, b, sign, k)]
         if found:
-            return min(HORIZON, step * min(_bisected(k, partial(_meet_shifted, a, b, sign)) for sign in found))
+            return min(HORIZON, step * min(_refined(k, partial(_met_shifted, a, b, sign)) for sign in found))
     return HORIZON
 
 
@@ -134,16 +147,15 @@ def time_behind(
         return horizon
     first, n = int(inside[0]), int(inside[-1]) + 1 - int(inside[0])
     step = float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
-    least = horizon
-    others = _near_paths(trace, ego, math.ceil(horizon / step)) if other is None else [other]
-    for name in others:  # larger times than the least so far do not matter
-        b = trace.actor(name)
-        if other is None or _paths_near(a, b):
-            own, later = select_instants(a, slice(first, first + n)), select_instants(b, slice(first, None))
-            k = _smallest_shift(own, later, min(len(later.x) - 1, math.ceil(least / step)))
-            if k is not None:
-                least = min(least, step * _bisected(k, _behind(own, later, k)))
-    return least
+    limit = math.ceil(horizon / step)
+    others = _near_paths(trace, ego, limit) if other is None else [other]
+    own = select_instants(a, slice(first, first + n))
+    later = [select_instants(b, slice(first, None)) for b in map(trace.actor, others) if other is None or _paths_near(a, b)]
+    soonest = _smallest_shift([pair for b in later for pair in part_pairs(own, b)], min(len(trace.time) - first - 1, limit))
+    if soonest is None:
+        return horizon
+    k, touching = soonest
+    return min(horizon, step * min(_refined(k, _behind(*pair, k)) for pair in touching))
 
 
 def _near_paths(trace: Trace, ego: str, horizon: int) -> list[str]:
@@ -161,74 +173,115 @@ def _near_paths(trace: Trace, ego: str, horizon: int) -> list[str]:
     return [trace.actors[k] for k in seen.others if near[k]]
 
 
-def _behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[float], bool]:
-    """Return whether a and b touch if b comes a number of steps in (k - 1, k) earlier, as a function of this number."""
-    tests = [_rectangle_behind(p, q, k) for p, q in part_pairs(a, b)]
-    return lambda shift: any(test(shift) for test in tests)
+def _behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[Vector], np.ndarray]:
+    """Return whether two rectangles touch if b comes some numbers (s,) of steps in (k - 1, k) earlier, (s,).
 
-
-def _rectangle_behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[float], bool]:
-    """Return `_behind` for rectangles; circles around them select the instants."""
+    Circles around them select the instants.
+    """
     n = min(len(a.x), len(b.x) - k)
     old, new = select_instants(b, slice(k - 1, k - 1 + n)), select_instants(b, slice(k, k + n))
     a = select_instants(a, slice(n))
-    span = max(float(np.hypot(c.x[1:] - c.x[:-1], c.y[1:] - c.y[:-1]).max(initial=0.0)) for c in (a, old, new))
+    span = max(_longest(c) for c in (a, old, new))
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + 3.0 * span
     rows = np.flatnonzero(np.hypot(new.x - a.x, new.y - a.y) <= reach)
-    before = np.maximum(rows - 1, 0)
-    here, start = select_instants(a, rows), select_instants(a, before)
-    ends, starts = ((select_instants(old, i), select_instants(new, i)) for i in (rows, before))
 
-    def touches(shift: float) -> bool:
-        share = shift - (k - 1)
+    def touches(shifts: Vector) -> np.ndarray:
+        at, share = np.tile(rows, len(shifts)), np.repeat(shifts - (k - 1), len(rows))
+        before = np.maximum(at - 1, 0)
+        here, start = select_instants(a, at), select_instants(a, before)
+        ends, starts = ((select_instants(old, i), select_instants(new, i)) for i in (at, before))
         end, begin = _between(*ends, share), _between(*starts, share)
-        return bool(np.isfinite(contact_share(here, end, begin.x - start.x, begin.y - start.y)).any())
+        shares = contact_share(here, end, begin.x - start.x, begin.y - start.y)
+        return np.asarray(np.isfinite(shares).reshape(len(shifts), len(rows)).any(axis=1))
 
     return touches
 
 
-def _smallest_shift(a: ActorTrace, b: ActorTrace, limit: int) -> int | None:
-    """Return the smallest number of steps, 1 to `limit`, by which b must come earlier to touch a; None if there is none.
+def _smallest_shift(pairs: Sequence[_Pair], limit: int) -> tuple[int, list[_Pair]] | None:
+    """Return the smallest number of steps, 1 to `limit`, by which a second one must come earlier to touch the first.
 
     Circles around the rectangles, enlarged by the motion in a step, select the pairs of instants to be tested.
+
+    Args:
+        pairs: rectangles, the second ones with as many instants as each other, or more.
+        limit: of the steps.
+
+    Returns:
+        The number, and the pairs that touch then; None if none does.
     """
-    if a.parts or b.parts:
-        return min((k for p, q in part_pairs(a, b) if (k := _smallest_shift(p, q, limit)) is not None), default=None)
-    if limit < 1:
+    found = [_near_shifts(a, b, limit) for a, b in pairs] if limit >= 1 else []
+    if not any(len(shift) for _, shift, _, _ in found):
         return None
+    which = np.repeat(np.arange(len(pairs)), [len(shift) for _, shift, _, _ in found])
+    shifts = np.concatenate([shift for _, shift, _, _ in found])
+    ends = [_joined([(pair[c], f[0] + c * (f[1] + 1)) for pair, f in zip(pairs, found, strict=True)]) for c in (0, 1)]
+    dx, dy = (np.concatenate([f[c] for f in found]) for c in (2, 3))
+    hits = np.isfinite(contact_share(ends[0], ends[1], dx, dy))
+    if not hits.any():
+        return None
+    k = int(shifts[hits].min())
+    return k + 1, [pairs[i] for i in np.unique(which[hits & (shifts == k)]).tolist()]
+
+
+def _near_shifts(a: ActorTrace, b: ActorTrace, limit: int) -> tuple[np.ndarray, np.ndarray, Vector, Vector]:
+    """Return (n,) instants of a, shifts less 1 with which b may touch it there, and how far apart they were a step before."""
     steps = [(u[1:] - u[:-1], v[1:] - v[:-1]) for u, v in ((a.x, b.x), (a.y, b.y))]
-    moved = np.hypot(*(max(v.max() - u.min(), u.max() - v.min()) for u, v in steps))  # the most, relative to each other
+    ends = [[(np.fmin.reduce(s, initial=np.inf), np.fmax.reduce(s, initial=-np.inf)) for s in both] for both in steps]
+    moved = np.hypot(*(max(v[1] - u[0], u[1] - v[0], 0.0) for u, v in ends))  # the most, relative to each other
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + moved
-    dx, dy = (_later(v, len(u), limit) - u[:, None] for u, v in ((a.x, b.x), (a.y, b.y)))  # (t, limit)
-    i, shift = (dx * dx + dy * dy <= reach * reach).nonzero()
-    before = np.maximum(i - 1, 0)  # no step leads to the first instant
-    ends = select_instants(a, i), select_instants(b, i + shift + 1)
-    hits = np.isfinite(contact_share(*ends, dx[before, shift], dy[before, shift]))
-    return int(shift[hits].min()) + 1 if hits.any() else None
+    stride = 1 if np.isnan(b.x).any() else _STRIDE
+    far = reach + (stride // 2) * _longest(b) + _SLACK
+    x, y = (_later(v, len(a.x), -(-limit // stride) * stride)[:, stride // 2 :: stride] for v in (b.x, b.y))  # middles
+    x, y = x - a.x[:, None], y - a.y[:, None]
+    rows, which = (x * x + y * y <= far * far).nonzero()
+    i, shift = np.repeat(rows, stride), (stride * which[:, None] + np.arange(stride)).ravel()
+    known = (shift < limit) & (i + shift + 1 < len(b.x))
+    i, shift = i[known], shift[known]
+    later, before = i + shift + 1, np.maximum(i - 1, 0)  # no step leads to the first instant
+    dx, dy = b.x[later] - a.x[i], b.y[later] - a.y[i]
+    near = dx * dx + dy * dy <= reach * reach
+    i, shift, before = i[near], shift[near], before[near]
+    later = before + shift + 1
+    return i, shift, b.x[later] - a.x[before], b.y[later] - a.y[before]
+
+
+def _joined(some: Sequence[tuple[ActorTrace, np.ndarray]]) -> Rectangles:
+    """Return rectangles at some of their instants, one after another."""
+    x, y, heading = (np.concatenate([getattr(actor, name)[i] for actor, i in some]) for name in ("x", "y", "heading"))
+    counts = [len(i) for _, i in some]
+    return Rectangles(x, y, heading, *(np.repeat([getattr(actor, s) for actor, _ in some], counts) for s in ("length", "width")))
+
+
+def _longest(actor: ActorTrace) -> float:
+    """Return the longest way of a step (m)."""
+    x, y = actor.x, actor.y
+    return float(np.fmax.reduce(np.hypot(x[1:] - x[:-1], y[1:] - y[:-1]), initial=0.0))
 
 
 def _later(values: Vector, n: int, limit: int) -> np.ndarray:
-    """Return the values 1 to `limit` instants after each of n, (n, limit); inf after the last one."""
-    padded = np.full(n + limit, np.inf)
+    """Return the values 1 to `limit` instants after each of n, (n, limit); the last one after its end."""
+    padded = np.full(n + limit, values[-1])
     known = values[1 : n + limit]
     padded[: len(known)] = known
     return sliding_window_view(padded, limit)[:n]
 
 
-def _bisected(k: int, meets: Callable[[float], bool]) -> float:
+def _refined(k: int, meet: Callable[[Vector], np.ndarray]) -> float:
     """Return the smallest shift in (k - 1, k] steps with which the rectangles touch; they do with k."""
-    apart, touching = k - 1.0, float(k)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (apart + touching)
-        if meets(middle):
-            touching = middle
-        else:
-            apart = middle
-    return touching
+    least, width = float(k), 1.0
+    for divisions in _DIVISIONS:
+        begin, width = least - width, width / divisions
+        met = np.flatnonzero(meet(begin + width * np.arange(1.0, divisions)))
+        least = begin + width * (int(met[0]) + 1 if met.size else divisions)
+    return least
 
 
 def _meet_shifted(a: ActorTrace, b: ActorTrace, sign: int, shift: float) -> bool:
     return contact_index(*_shifted(a, b, sign * shift)) is not None
+
+
+def _met_shifted(a: ActorTrace, b: ActorTrace, sign: int, shifts: Vector) -> np.ndarray:
+    return np.array([_meet_shifted(a, b, sign, shift) for shift in shifts.tolist()])
 
 
 def _shifted(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:
@@ -244,8 +297,8 @@ def _shifted(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, Ac
     return own, _between(other, select_instants(b, slice(whole + 1, whole + 1 + n)), share)
 
 
-def _between(actor: ActorTrace, after: ActorTrace, share: float) -> ActorTrace:
-    """Return an actor between two states of each instant, at a share of the way."""
+def _between(actor: ActorTrace, after: ActorTrace, share: float | Vector) -> ActorTrace:
+    """Return an actor between two states of each instant, at a share of the way, or (t,) shares."""
     turn = after.heading - actor.heading
     return replace(
         actor,
@@ -261,7 +314,8 @@ def _paths_near(a: ActorTrace, b: ActorTrace) -> bool:
     if a.parts or b.parts:
         return any(_paths_near(p, q) for p, q in part_pairs(a, b))
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width))
-    return all(u.min() - reach <= v.max() and v.min() - reach <= u.max() for u, v in ((a.x, b.x), (a.y, b.y)))
+    low, high = np.fmin.reduce, np.fmax.reduce
+    return all(low(u) - reach <= high(v) and low(v) - reach <= high(u) for u, v in ((a.x, b.x), (a.y, b.y)))
 
 
 def pet(ego: str = "ego", other: str = "co") -> Metric:
@@ -269,7 +323,7 @@ def pet(ego: str = "ego", other: str = "co") -> Metric:
     return Metric(
         "pet", lambda trace: post_encroachment_time(trace, ego, other), "s", "low", HORIZON,
         "smallest time between one leaving a spot and the other reaching it",
-        "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions",
+        "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions", lagged=True,
     )  # fmt: skip
 
 

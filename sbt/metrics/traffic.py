@@ -43,7 +43,7 @@ def pet_ego_first(ego: str = "ego", horizon: float = HORIZON, zone: tuple[float,
     return Metric(
         "pet_ego_first", lambda trace: time_behind(trace, ego, None, horizon, zone), "s", "low", horizon,
         "smallest time between ego leaving a spot and anyone else reaching it",
-        "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions",
+        "after Allen, Shin and Cooper (1978), Analysis of traffic conflicts and collisions", lagged=True,
     )  # fmt: skip
 
 

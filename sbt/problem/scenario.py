@@ -99,6 +99,7 @@ class Metric:
         alone: it measures the ego alone, whoever else is there.
         over_time: trace to (t,) values whose worst is the metric; for one that knows, of an instant, what came after it, and
             that therefore cannot be told from the trace up to there.
+        lagged: it compares where two road users were at different times: the one may come when the other has gone.
     """
 
     name: str
@@ -110,6 +111,7 @@ class Metric:
     source: str = ""
     alone: bool = False
     over_time: Callable[[Trace], Vector] | None = None
+    lagged: bool = False
 
     def __call__(self, trace: Trace) -> float:
         """Return the metric of a trace.

@@ -99,6 +99,7 @@ class Onlooker(Mapping[str, State]):
         self._read: list[tuple[list[tuple[float, float]], list[float], list[float]]] = []
         self._at = [-1] * len(states)
         self._reach = 2.0 * max(s.length for s in states) + 2.0 * max(self._half)
+        self._far = 0.0
 
     def __getitem__(self, name: str) -> State:
         return self.look(len(self._read) - 1, self._index[name])
@@ -126,12 +127,22 @@ class Onlooker(Mapping[str, State]):
         self._read.append((positions, angles, speeds))
 
     def near(self, k: int) -> list[int]:
-        """Return which vehicles may have touched the first actor in the step to row k; their states and its are written."""
+        """Return which vehicles may have touched the first actor in the step to row k; their states and its are written.
+
+        Nobody is looked for while all of them together cannot have come near since they were looked for the last time.
+        """
         positions, _, speeds = self._read[k]
         own = self._slots[0]
-        (x, y), reach = positions[own], self._reach + (speeds[own] + max(speeds)) * self._dt
+        moved = (speeds[own] + max(speeds)) * self._dt
+        self._far -= 2.0 * moved  # twice what it is at a constant speed
+        if self._far > 0.0:
+            return []
+        (x, y), reach = positions[own], self._reach + moved
         left, right = x - reach, x + reach
         found = [s for s in self._solid if left < positions[s][0] < right and -reach < positions[s][1] - y < reach]
+        if not found:
+            others = [positions[s] for s in self._solid]
+            self._far = min((max(abs(u - x), abs(v - y)) for u, v in others), default=math.inf) - reach
         if found:
             found = [self._order[s] for s in found]
             for j in (0, *found):
