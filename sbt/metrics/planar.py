@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -16,7 +15,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from sbt.metrics.around import around, first_contacts
 from sbt.metrics.geometry import (
     Rectangles,
-    contact_index,
     contact_share,
     part_pairs,
     rectangle_distance,
@@ -99,8 +97,8 @@ def severity(ego: str = "ego", other: str = "co") -> Metric:
 def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") -> float:
     """Return the smallest time between one road user leaving a spot and the other reaching it (s), at most 10.
 
-    Computed as the smallest time shift of one of the two with which the rectangles would touch: the shift is
-    increased step by step until the swept rectangles touch (`contact_index`), and then refined to step / 1,024.
+    Computed as the smallest time shift of one of the two with which the rectangles would touch: the smallest number
+    of whole steps with which they do while they move, and then refined to step / 1,024.
     0 for a collision. Only the recorded trace counts.
 
     For straight paths that cross at right angles this is the time from the first road user leaving the conflict
@@ -115,11 +113,8 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
     if n < 2 or not _paths_near(a, b):
         return HORIZON
     step = float(trace.time[-1] - trace.time[0]) / (n - 1)
-    for k in range(1, min(n - 1, int(HORIZON / step)) + 1):
-        found = [sign for sign in (1, -1) if _meet_shifted(a, b, sign, k)]
-        if found:
-            return min(HORIZON, step * min(_refined(k, partial(_met_shifted, a, b, sign)) for sign in found))
-    return HORIZON
+    limit = min(n - 1, int(HORIZON / step))
+    return min(HORIZON, step * min(_least_shift(own, [later], limit) for own, later in ((a, b), (b, a))))
 
 
 def time_behind(
@@ -151,11 +146,7 @@ def time_behind(
     others = _near_paths(trace, ego, limit) if other is None else [other]
     own = select_instants(a, slice(first, first + n))
     later = [select_instants(b, slice(first, None)) for b in map(trace.actor, others) if other is None or _paths_near(a, b)]
-    soonest = _smallest_shift([pair for b in later for pair in part_pairs(own, b)], min(len(trace.time) - first - 1, limit))
-    if soonest is None:
-        return horizon
-    k, touching = soonest
-    return min(horizon, step * min(_refined(k, _behind(*pair, k)) for pair in touching))
+    return min(horizon, step * _least_shift(own, later, min(len(trace.time) - first - 1, limit)))
 
 
 def _near_paths(trace: Trace, ego: str, horizon: int) -> list[str]:
@@ -171,6 +162,15 @@ def _near_paths(trace: Trace, ego: str, horizon: int) -> list[str]:
         before = low[:, :n, own : own + 1], high[:, :n, own : own + 1]
         near |= ((low[:, k:] <= before[1] + reach) & (before[0] <= high[:, k:] + reach)).all(axis=0).any(axis=0)
     return [trace.actors[k] for k in seen.others if near[k]]
+
+
+def _least_shift(own: ActorTrace, others: Sequence[ActorTrace], limit: int) -> float:
+    """Return the least number of steps, at most `limit`, by which one of the others must come earlier to touch; inf: never."""
+    soonest = _smallest_shift([pair for other in others for pair in part_pairs(own, other)], limit)
+    if soonest is None:
+        return math.inf
+    k, touching = soonest
+    return min(_refined(k, _behind(*pair, k)) for pair in touching)
 
 
 def _behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[Vector], np.ndarray]:
@@ -274,27 +274,6 @@ def _refined(k: int, meet: Callable[[Vector], np.ndarray]) -> float:
         met = np.flatnonzero(meet(begin + width * np.arange(1.0, divisions)))
         least = begin + width * (int(met[0]) + 1 if met.size else divisions)
     return least
-
-
-def _meet_shifted(a: ActorTrace, b: ActorTrace, sign: int, shift: float) -> bool:
-    return contact_index(*_shifted(a, b, sign * shift)) is not None
-
-
-def _met_shifted(a: ActorTrace, b: ActorTrace, sign: int, shifts: Vector) -> np.ndarray:
-    return np.array([_meet_shifted(a, b, sign, shift) for shift in shifts.tolist()])
-
-
-def _shifted(a: ActorTrace, b: ActorTrace, shift: float) -> tuple[ActorTrace, ActorTrace]:
-    """Return the common instants of a and b if b comes `shift` steps earlier (later, if negative)."""
-    if shift < 0:
-        later, earlier = _shifted(b, a, -shift)
-        return earlier, later
-    whole, share = int(shift), shift - int(shift)
-    n = len(a.x) - whole - (share > 0)
-    own, other = select_instants(a, slice(n)), select_instants(b, slice(whole, whole + n))
-    if share == 0:
-        return own, other
-    return own, _between(other, select_instants(b, slice(whole + 1, whole + 1 + n)), share)
 
 
 def _between(actor: ActorTrace, after: ActorTrace, share: float | Vector) -> ActorTrace:
