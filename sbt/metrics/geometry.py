@@ -102,11 +102,7 @@ def swept_contact(a: ActorTrace, b: ActorTrace) -> Vector:
         Separating axes of moving convex bodies, e.g. Ericson (2005), Real-Time Collision Detection, 5.5.8.
     """
     dx, dy = b.x - a.x, b.y - a.y
-    before_x, before_y = np.concatenate([dx[:1], dx[:-1]]), np.concatenate([dy[:1], dy[:-1]])
-    absent = np.isnan(before_x)
-    if absent.any():
-        before_x, before_y = np.where(absent, dx, before_x), np.where(absent, dy, before_y)
-    return contact_share(a, b, before_x, before_y)
+    return contact_share(a, b, np.concatenate([dx[:1], dx[:-1]]), np.concatenate([dy[:1], dy[:-1]]))
 
 
 def contact_share(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles, dx: Vector, dy: Vector) -> Vector:
@@ -115,12 +111,17 @@ def contact_share(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles, dx: Ve
     Args:
         a: states at the end of the steps; the heading is that during the whole step.
         b: likewise.
-        dx: (t,) x from the centre of a to that of b at the start of the steps (m).
+        dx: (t,) x from the centre of a to that of b at the start of the steps (m); NaN: one of them was not there, and
+            the end counts alone.
         dy: (t,) y, likewise (m).
     """
     cos, sin = _axes(a, b)
     reach = _reaches(a, b, cos, sin)  # (4, t)
-    end = (b.x - a.x) * cos + (b.y - a.y) * sin  # (4, t) centre distance along each axis
+    end_x, end_y = b.x - a.x, b.y - a.y
+    absent = np.isnan(dx)
+    if absent.any():
+        dx, dy = np.where(absent, end_x, dx), np.where(absent, end_y, dy)
+    end = end_x * cos + end_y * sin  # (4, t) centre distance along each axis
     start = dx * cos + dy * sin
     enter, leave = _overlap_span(start, end - start, reach)
     hit = (enter <= leave) & (leave >= 0) & (enter <= 1)
