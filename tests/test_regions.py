@@ -44,6 +44,17 @@ def test_regions_of_known_problems_are_counted(name: str):
     assert sum(shares) == pytest.approx(truth(name).box_fraction, rel=0.1, abs=1e-3)
 
 
+def test_where_runs_fail_is_in_no_region_and_separates_none():
+    scenario = analytic(lambda x: x[:, 0], inputs={"a": (0.0, 1.0), "b": (0.0, 1.0)}, critical=(-np.inf, 0.0), name="f")
+    met = np.array([[0.2, 0.1], [0.2, 0.9]])
+
+    def log_success(u: Points) -> Vector:
+        return np.where(np.abs(u[:, 1] - 0.5) < 0.2, -5.0, 0.0)
+
+    (region,) = critical_regions(lambda u: 0.5 - u[:, 0], scenario, 0, met, log_success)
+    assert region.share == pytest.approx(0.3, abs=0.01)
+
+
 def test_what_only_a_choice_or_a_whole_number_divides_is_one_region():
     inputs = {"a": (0.0, 1.0), "n": Parameter("n", 1, 6, kind="integer"), "c": Parameter("c", choices=("x", "y", "z"))}
     scenario = analytic(lambda x: x[:, 0], inputs=inputs, critical=(-np.inf, 0.0), name="m")

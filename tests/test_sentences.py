@@ -53,6 +53,10 @@ def test_the_place_of_a_boundary_is_where_it_is_and_names_what_matters():
         assert cut.unsure == pytest.approx(np.log(19) / 20, abs=0.03)
     succeeds = boundary_place(log_odds, scenario, 1, lambda u: np.where(u[:, 2] < 0.5, -0.1, -3.0))  # runs fail where b > 0
     assert max(cut.at for cut in succeeds.cuts) <= 0.0 < max(cut.at for cut in found.cuts)
+    fails = boundary_place(log_odds, scenario, 1, lambda u: np.where(u[:, 1] > 0.2, -0.1, -3.0))  # runs fail where a < 2
+    assert all(cut.critical[0].low == pytest.approx(2.0, abs=0.03) and cut.lost for cut in fails.cuts)
+    assert "as far as runs give a metric" in fails.words({})
+    assert "as far as runs" not in found.words({})
     assert boundary_place(log_odds, scenario, 1, lambda u: np.full(len(u), -3.0)) is None
     for side in (-np.inf, 50.0):
         assert boundary_place(lambda u, p=side: np.full(len(u), p), scenario, seed=1) is None

@@ -17,7 +17,7 @@ from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
-from sbt.campaigns.place import BoundaryPlace, LogOdds, boundary_place, succeeding
+from sbt.campaigns.place import BoundaryPlace, boundary_place, succeeding
 from sbt.campaigns.regions import CriticalRegion, critical_regions
 from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -140,9 +140,8 @@ def recipe(settings: Settings) -> Campaign:
         shares = shares if every is None else (every.share, 0.0, 0.0)
         log_odds = partial(_log_odds, fitted, settings)
         place = boundary_place(log_odds, settings.scenario, settings.seed, fitted.log_success)
-        there = log_odds if fitted.log_success is None else partial(_log_odds_there, log_odds, fitted.log_success)
         met = _met(log.history, settings)
-        regions = None if place is None else critical_regions(there, settings.scenario, settings.seed, met)
+        regions = () if place is None else critical_regions(log_odds, settings.scenario, settings.seed, met, fitted.log_success)
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
@@ -166,11 +165,6 @@ def _log_odds(fitted: FittedMetamodel, settings: Settings, u: Points) -> Vector:
     critical, uncritical = fitted.predict(u).log_probability(settings.scenario.requirement.critical)
     with np.errstate(invalid="ignore"):
         return np.asarray(critical - uncritical)
-
-
-def _log_odds_there(log_odds: LogOdds, log_success: LogOdds, u: Points) -> Vector:
-    """Return (n,) log odds of critical, -inf where a run rather fails."""
-    return np.where(succeeding(log_success, u), log_odds(u), -np.inf)
 
 
 def _rule(settings: Settings) -> ChoiceRule:

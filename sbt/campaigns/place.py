@@ -15,6 +15,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
+from sbt.store.records import optional
 
 __all__ = ["BoundaryPlace", "Cut", "Stretch", "boundary_place", "succeeding"]
 
@@ -26,7 +27,7 @@ Probability = Callable[[Points], Vector]
 _LOOK_FROM = 2048
 _CROSSINGS = 64
 _STEP = 0.002  # of the unit cube, to both sides, for the direction of the steepest change
-_EVEN = float(np.log(0.5))  # log P(a run gives a metric) below which it rather fails
+_GIVES = 0.8  # P(a run gives a metric) below which it is said that runs may fail there
 _CELLS = 400  # of a line on which edges are looked for
 _CUTS = (0.1, 0.5, 0.9)  # quantiles of the second input along the boundary
 _MOST = 1e6  # log odds beyond which nothing is told apart
@@ -47,13 +48,15 @@ class Cut:
 
     Attributes:
         at: value of the second input; None where there is only one.
-        critical: stretches of the first one where P(critical) > 0.5.
+        critical: stretches of the first one where P(critical) > 0.5 and a run rather gives a metric.
         unsure: the widest part about an edge with P(critical) between 0.05 and 0.95, half of it, in the unit of the first input.
+        lost: a critical stretch ends where runs may fail: there, and beyond, little is known; None: none does.
     """
 
     at: float | None
     critical: tuple[Stretch, ...]
     unsure: float
+    lost: bool | None = optional()
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,8 @@ class BoundaryPlace:
                 where = f" at {second} {at[k]}" if at[k] and not k else f" at {at[k]}" if at[k] else ""
                 parts.append(f"{' and '.join(dict.fromkeys(self._stretches(cut, unit)))}{where}")
         unsure = measured("", max(cut.unsure for cut in self.cuts), unit, 2).strip()
-        said = f"{first} is {', '.join(parts)} (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)"
+        lost = ", as far as runs give a metric" if any(cut.lost for cut in self.cuts) else ""
+        said = f"{first} is {', '.join(parts)}{lost} (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)"
         if self.fixed:
             names = sorted(self.fixed, key=lambda name: -self.weights.get(name, 0.0))
             told = [measured(name, self.fixed[name], units.get(name, "")) for name in names[:_MOST_FIXED]]
@@ -138,7 +142,7 @@ def boundary_place(
     parameter = space.parameters[axes[0]]
     values = np.quantile(edge[:, axes[1]], _CUTS) if len(axes) > 1 else np.empty(0)
     lines = [_with(anchor, axes[1], value) for value in values] or [anchor]
-    cuts = [_cut(probability, line, axes, space) for line in lines]
+    cuts = [_cut(probability, log_success, line, axes, space) for line in lines]
     low, high = (float(v) for v in parameter.from_unit(np.array([0.0, 1.0])))
     cuts = [cut for cut in cuts if cut.critical and not _everywhere(cut, low, high)]
     names, row = [space.names[k] for k in axes], space.named(space.from_unit(anchor[None])[0])
@@ -147,11 +151,11 @@ def boundary_place(
     return BoundaryPlace(tuple(names), low, high, tuple(cuts), fixed, shares) if cuts else None
 
 
-def succeeding(log_success: LogOdds | None, u: Points) -> Mask:
-    """Return (n,) where at points of the unit cube a run rather gives a metric; everywhere where none failed."""
+def succeeding(log_success: LogOdds | None, u: Points, least: float = 0.5) -> Mask:
+    """Return (n,) where at points of the unit cube P(a run gives a metric) is at least so large; everywhere where none failed."""
     if log_success is None or len(u) == 0:
         return np.ones(len(u), dtype=bool)
-    return np.asarray(log_success(u) >= _EVEN)
+    return np.asarray(log_success(u) >= np.log(least))
 
 
 def _weights(log_odds: LogOdds, edge: Points, continuous: list[int]) -> Vector:
@@ -181,27 +185,31 @@ def _with(point: Vector, axis: int, value: float) -> Vector:
     return moved
 
 
-def _cut(probability: Probability, line: Vector, axes: list[int], space: ParameterSpace) -> Cut:
+def _cut(probability: Probability, log_success: LogOdds | None, line: Vector, axes: list[int], space: ParameterSpace) -> Cut:
     """Return the critical stretches of the first axis through a point."""
     t = np.linspace(0.0, 1.0, _CELLS + 1)
     points = np.repeat(line[None], len(t), axis=0)
     points[:, axes[0]] = t
-    p = probability(points)
+    p, ok = probability(points), succeeding(log_success, points)
     x = space.parameters[axes[0]].from_unit(t)
-    critical = np.flatnonzero(np.diff(np.concatenate([[0], (p > 0.5).astype(int), [0]])))
-    stretches = tuple(Stretch(_edge(x, p, a), _edge(x, p, b)) for a, b in critical.reshape(-1, 2))
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], ((p > 0.5) & ok).astype(int), [0]]))).reshape(-1, 2).tolist()
+    sure = succeeding(log_success, points, _GIVES)
+    lost = [0 < k < len(x) and not (sure[k - 1] and sure[k]) for pair in ends for k in pair]
+    stretches = tuple(Stretch(_edge(x, p, a, 0), _edge(x, p, b, -1)) for a, b in ends)
     unsure = np.flatnonzero(np.diff(np.concatenate([[0], ((p > 1 - _SURE) & (p < _SURE)).astype(int), [0]]))).reshape(-1, 2)
     edges = [e for s in stretches for e in (s.low, s.high)]
     step = float(x[1] - x[0])
     wide = [float(x[b - 1] - x[a]) for a, b in unsure if any(x[a] - step <= e <= x[b - 1] + step for e in edges)]
     at = float(space.parameters[axes[1]].from_unit(np.array([line[axes[1]]]))[0]) if len(axes) > 1 else None
-    return Cut(at, stretches, 0.5 * max([*wide, step]))
+    return Cut(at, stretches, 0.5 * max([*wide, step]), any(lost) or None)
 
 
-def _edge(x: Vector, p: Vector, k: int) -> float:
-    """Return where P crosses 0.5 between grid points k - 1 and k, or the end of the range."""
+def _edge(x: Vector, p: Vector, k: int, inside: int) -> float:
+    """Return where P crosses 0.5 between grid points k - 1 and k, the end of the range, or the last point where runs succeed."""
     if k in (0, len(x)):
         return float(x[min(k, len(x) - 1)])
+    if (p[k - 1] > 0.5) == (p[k] > 0.5):
+        return float(x[k + inside])
     share = (0.5 - p[k - 1]) / (p[k] - p[k - 1])
     return float(x[k - 1] + share * (x[k] - x[k - 1]))
 

@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.campaigns.place import LogOdds, Stretch
+from sbt.campaigns.place import LogOdds, Stretch, succeeding
 from sbt.campaigns.wording import measured, number, percent, plural
 from sbt.problem.arrays import Mask, Points
 from sbt.problem.scenario import LogicalScenario
@@ -41,23 +41,26 @@ class CriticalRegion:
     extent: Mapping[str, Stretch]
 
 
-def critical_regions(log_odds: LogOdds, scenario: LogicalScenario, seed: int, met: Points) -> tuple[CriticalRegion, ...]:
+def critical_regions(
+    log_odds: LogOdds, scenario: LogicalScenario, seed: int, met: Points, log_success: LogOdds | None = None
+) -> tuple[CriticalRegion, ...]:
     """Return the critical regions, the largest first; none where the metamodel sees none of two thousand points critical.
 
     Two points are in one region where P(critical) > 0.5 on a chain of segments between critical points; another choice is
     a step. Regions of fewer than three points of the 8,192 that are looked at are left out, and those that no critical run is
-    joined to.
+    joined to. Points where a run rather fails are in no region, and separate none: nobody knows whether it would be critical.
 
     Args:
         log_odds: of critical, at points of the unit cube.
         scenario: with its space.
         seed: of the points.
         met: (k, d) critical runs, in the unit cube.
+        log_success: log P(a run gives a metric); None: all did.
     """
     space = scenario.space
     u = SobolSequence(space.dimension, seed).admissible(lambda v: space.feasible(space.from_unit(v)), _POINTS, _LEAST)
     u = space.cube.snapped(u)
-    critical = u[log_odds(u) > 0.0] if len(u) else u
+    critical = u[(log_odds(u) > 0.0) & succeeding(log_success, u)] if len(u) else u
     if len(critical) == 0:
         return ()
     share = len(critical) / len(u)
