@@ -20,6 +20,7 @@ from sbt.estimators.transfer import Trend, trended
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sketched, with_target, without_repetitions
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.saturation import opened
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
@@ -220,8 +221,9 @@ def fit_log_probability(
         belief, edges = trended(metamodel, earlier[0], coordinates(z), z, warp.values(y), rng), warp.interval(critical)
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
-    least = noise[0] if noise else 0.0
-    u, warp = coordinates(z), Warp.around_edge(y, critical, quantile=_QUANTILE)
+    least, u = noise[0] if noise else 0.0, coordinates(z)
+    y = opened(u, y, critical)
+    warp = Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
     metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel
     whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=least / warp.scale**2)

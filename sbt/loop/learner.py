@@ -14,6 +14,7 @@ from sbt.loop.several import each_requirement, independence
 from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors, sketched
 from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.saturation import scored
 from sbt.metamodels.scores import scores
 from sbt.metamodels.success import log_success
 from sbt.problem.arrays import Mask, Points, Vector
@@ -164,7 +165,8 @@ class Learner:
     def _scores(self, predictor: Predictor, unseen: Prediction, y: Vector) -> dict[str, Any]:
         """Return the scores of a prediction of runs; of a combination (n, q) those of its margin."""
         if not isinstance(predictor, JointPredictor):
-            return scores(unseen, y, self.scenario.requirement.critical)
+            critical = self.scenario.requirement.critical
+            return scores(unseen, scored(y, unseen.mu, critical) if self.target_aware else y, critical)
         margin = predictor.critical.margin(y)
         known = np.isfinite(margin)
         return scores(unseen.take(known), margin[known], MARGIN)

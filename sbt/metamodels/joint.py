@@ -18,6 +18,7 @@ from scipy.special import ndtr
 from sbt.errors import InputError
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, check_rows, sample_paths, with_target
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.saturation import Opened
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.requirement import CriticalInterval
@@ -32,7 +33,7 @@ def metamodel_for(metamodel: Metamodel, critical: CriticalInterval, *, target_aw
     """Return the metamodel that learns what `critical` is asked of: itself, or one of each metric of a combination."""
     if isinstance(critical, CombinedInterval):
         return JointMetamodel(metamodel, critical, target_aware)
-    return with_target(metamodel, critical) if target_aware else metamodel
+    return Opened(with_target(metamodel, critical), critical) if target_aware else metamodel
 
 
 def joined_log_probability(critical: CombinedInterval, pairs: Sequence[LogPair]) -> LogPair:
@@ -72,7 +73,7 @@ class JointMetamodel:
             raise InputError(f"a combination of {len(leaves)} metrics needs y ({len(u)}, {len(leaves)}), but got {y.shape}")
         fitted = []
         for k, leaf in enumerate(leaves):
-            metamodel = with_target(self.metamodel, leaf) if self.target_aware else self.metamodel
+            metamodel = Opened(with_target(self.metamodel, leaf), leaf) if self.target_aware else self.metamodel
             fitted.append(metamodel.fit(*check_rows(u[np.isfinite(y[:, k])], y[np.isfinite(y[:, k]), k]), rng))
         return JointPredictor(tuple(fitted), self.critical.with_leaves(leaves, scale))
 

@@ -1,0 +1,81 @@
+"""Metrics that end at the critical edge, such as a distance that is 0 in every collision."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt.metamodels.saturation import opened, scored
+from sbt.problem.requirement import CriticalInterval
+
+CRITICAL = CriticalInterval(high=0.0)
+
+
+def test_runs_at_the_edge_go_into_it_and_others_stay():
+    rng = np.random.default_rng(1)
+    u = rng.random((200, 3))
+    distance = np.linalg.norm(u - 0.5, axis=1) - 0.45
+    y = np.maximum(distance, 0.0)
+    found = opened(u, y, CRITICAL)
+    assert np.array_equal(found[y > 0], y[y > 0])
+    assert (found[y == 0] < 0).all()
+    assert np.corrcoef(found, distance)[0, 1] > 0.9
+    assert np.array_equal(opened(u, -y, CriticalInterval(low=0.0)), -found), "the other direction likewise"
+
+
+@pytest.mark.parametrize(
+    ("y", "critical"),
+    [
+        ([0.0, 0.0, 1.0, -0.1], CRITICAL),  # one lies beyond: the metric goes on
+        ([0.0, 0.5, 1.0, 2.0], CRITICAL),  # one at the edge may be there by chance
+        ([0.0, 0.0, 1.0, 0.5], CriticalInterval(0.0, 0.2)),
+    ],
+)
+def test_a_metric_that_goes_on_is_left_alone(y, critical):
+    values = np.array(y)
+    assert opened(np.linspace(0, 1, 4)[:, None], values, critical) is values
+
+
+def test_where_all_runs_are_at_the_edge_all_is_critical():
+    assert (opened(np.random.default_rng(0).random((5, 2)), np.zeros(5), CRITICAL) < 0).all()
+
+
+def test_of_a_run_at_the_edge_its_side_is_scored():
+    y, mu = np.array([0.0, 0.0, 1.0]), np.array([-0.4, 0.2, 0.9])
+    assert scored(y, mu, CRITICAL).tolist() == [-0.4, 0.0, 1.0]
+    assert scored(np.array([0.0, -1.0]), mu[:2], CRITICAL).tolist() == [0.0, -1.0]
+
+
+def disc(values, seed):
+    """A distance, 0 in the disc."""
+    return {"gap": max(math.hypot(values["a"] - 0.6, values["b"] - 0.4) - 0.25, 0.0)}
+
+
+def corner(values, seed):
+    """Normal inputs; 0 beyond two standard deviations."""
+    return {"gap": max(2.0 - (values["a"] + values["b"]) / math.sqrt(2.0), 0.0)}
+
+
+def test_a_boundary_is_where_a_metric_ends(tmp_path):
+    inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]
+    scenario = sbt.Scenario("disc", inputs, sbt.Requirement("gap", high=0.0), evaluate=disc, metrics=["gap"])
+    result = sbt.run(campaign="boundary", scenario=scenario, budget=60, seed=0, store=tmp_path / "s", executor="serial")
+    a, b = np.random.default_rng(0).random((2, 2000))
+    critical, found = np.hypot(a - 0.6, b - 0.4) <= 0.25, result.predict({"a": a, "b": b})["p_critical"].to_numpy() > 0.5
+    assert result.conclusion.critical_fraction == pytest.approx(math.pi * 0.25**2, rel=0.1)
+    assert 2 * (critical & found).sum() / (critical.sum() + found.sum()) > 0.93
+
+
+def test_an_estimate_of_a_metric_that_ends_covers(tmp_path):
+    inputs = [sbt.Parameter(name, -6, 6, "", sbt.Normal(0.0, 1.0)) for name in "ab"]
+    scenario = sbt.Scenario("corner", inputs, sbt.Requirement("gap", high=0.0), evaluate=corner, metrics=["gap"])
+    result = sbt.run(
+        campaign="estimation", scenario=scenario, budget=120, seed=0, store=tmp_path / "s", executor="serial", report=False,
+        stop={"cov": None},
+    )  # fmt: skip
+    truth = 0.02275
+    assert result.conclusion.low <= truth <= result.conclusion.high
+    assert result.conclusion.probability == pytest.approx(truth, rel=0.15)
