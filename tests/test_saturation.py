@@ -79,3 +79,22 @@ def test_an_estimate_of_a_metric_that_ends_covers(tmp_path):
     truth = 0.02275
     assert result.conclusion.low <= truth <= result.conclusion.high
     assert result.conclusion.probability == pytest.approx(truth, rel=0.15)
+
+
+def test_what_all_runs_are_alike_in_is_called_no_lead(tmp_path):
+    """No run is the closest, or the worst, of a metric that is 0 or 1."""
+    inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]
+
+    def said(size, seed):
+        def bump(values, seed):
+            return {"bump": float(math.hypot(values["a"] - 0.5, values["b"] - 0.5) < size)}
+
+        scenario = sbt.Scenario("bump", inputs, sbt.Requirement("bump", low=1.0), evaluate=bump, metrics=["bump"])
+        store = tmp_path / f"{size}"
+        keys = {"campaign": "falsification", "budget": 30, "seed": seed, "executor": "serial", "report": False}
+        return sbt.run(scenario=scenario, store=store, **keys).sentences()
+
+    found = said(0.2, 1)[0].replace("\N{NO-BREAK SPACE}", " ")
+    assert "one of the worst" in found
+    assert "in 1 failure mode" in found or "1 distinct failure mode" in found
+    assert "runs at 28 inputs came equally close" in said(0.0, 1)[2].replace("\N{NO-BREAK SPACE}", " ")

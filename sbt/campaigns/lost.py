@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sbt.campaigns.wording import percent, plural
 from sbt.loop.stages import Facts
 
-__all__ = ["decides_bound", "decides_share", "lost_runs", "none_gave_a_metric", "nothing_known", "repetitions", "why_they_fail"]
+__all__ = [
+    "decides_bound", "decides_share", "equally_near", "lost_runs", "nearest_words", "none_gave_a_metric", "nothing_known",
+    "repetitions", "why_they_fail",
+]  # fmt: skip
 
 _HALF = 0.5
 """Of an interval or a bound: where failed runs alone make up as much, twice the precision is out of reach."""
@@ -51,6 +56,26 @@ def decides_bound(worst: float, bound: float) -> str | None:
     if worst <= 0.0 or worst < _HALF * bound:
         return None
     return f"failed runs decide the bound, and more runs never lower it much below {percent(worst)}: {why_they_fail()}"
+
+
+def equally_near(facts: Facts) -> int:
+    """Return at how many different inputs a run came as near to the critical interval, or as deep into it, as any."""
+    margins = facts.requirement.margins(facts.history)
+    nearest = np.nanmin(margins, initial=np.inf)
+    return len(np.unique(facts.history.x[margins == nearest], axis=0)) if np.isfinite(nearest) else 0
+
+
+def nearest_words(run: int, metric: str, facts: Facts) -> str:
+    """Return what to make of the run that came closest to the critical interval, where none lies in it."""
+    alike = equally_near(facts)
+    if alike < 2:
+        return f"look at run {run}, which came closest ({metric})"
+    if alike < _HALF * int(facts.history.ok.sum()):
+        return f"look at run {run}, which came closest, as others did ({metric})"
+    return (
+        f"runs at {alike:,} inputs came equally close ({metric}), so that nothing leads the search: take a metric that tells how near a run"
+        " came, such as severity, ttc_min or distance_min"
+    )
 
 
 def repetitions(again: int, n: int, lost: int, how: str = "") -> str:

@@ -13,7 +13,9 @@ import numpy as np
 from sbt.campaigns.lost import (
     decides_bound,
     decides_share,
+    equally_near,
     lost_runs,
+    nearest_words,
     none_gave_a_metric,
     nothing_known,
     repetitions,
@@ -220,13 +222,14 @@ def _most_often(modes: tuple[FailureMode, ...]) -> FailureMode | None:
 def _worst(mode: FailureMode, facts: Facts) -> str:
     """Return the deepest failure and how often it came back, in words."""
     metric, history = facts.requirement.told_as, facts.history
-    said = f"the worst, run {mode.representative} ({measured(metric, mode.metric, facts.unit)})"
     margins = facts.requirement.margins(history)
+    one = "one of the worst" if equally_near(facts) > 1 else "the worst"
+    said = f"{one}, run {mode.representative} ({measured(metric, mode.metric, facts.unit)})"
     if np.isfinite(margins).any():
         deepest = int(history.index[int(np.nanargmin(margins))])
         own = history.index == mode.representative
         if own.any() and np.nanmin(margins) < margins[own][0]:  # of a noisy simulator: the likeliest is not the deepest
-            said = said.replace("the worst, ", "", 1) + f", the likeliest to fail again (run {deepest} is the deepest)"
+            said = said.replace(f"{one}, ", "", 1) + f", the likeliest to fail again (run {deepest} is the deepest)"
     n = mode.confirmation_runs
     if mode.confirmed is None or n == 0:
         return f"{said}, was not repeated"
@@ -248,12 +251,14 @@ def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
             f"; with {percent(bound.confidence)} confidence at most {percent(share)} of the parameter space is, by the"
             f" {plural(bound.space_filling_runs, 'space-filling run')} alone"
         )
-        if share > _SMALL_SHARE:
+        decided = decides_bound(bound.failed_runs / bound.space_filling_runs, share)
+        if decided is not None:
+            further = decided
+        elif share > _SMALL_SHARE:
             further += f", or campaign: coverage with 300 runs, which bounds that by {percent(_SMALL_SHARE)} if none is critical"
     closest = found.closest
     if closest is not None:
-        near = measured(facts.requirement.told_as, closest.metric, facts.unit)
-        further += f"; look at run {closest.run}, which came closest ({near})"
+        further += f"; {nearest_words(closest.run, measured(facts.requirement.told_as, closest.metric, facts.unit), facts)}"
     silent += ", and a failure in a small part of the space may be there"
     return [f"{said}.", f"{silent}.", f"Next: {_every_combination(facts)}{further}."]
 

@@ -199,6 +199,8 @@ def _all_ok(runs: list[_Run], points: Sequence[Values]) -> Finding:
 
 def _finite(runs: list[_Run], scenario: LogicalScenario) -> Finding:
     """Return whether every run gives every declared metric: a number, or an end of its scale."""
+    if all(r.problem for r in runs):
+        return Finding("metrics are finite", ok=False, detail="not checked: no run gave a metric")
     for run in (r for r in runs if not r.problem):
         metrics = dict(run.metrics)
         missing = [name for name in scenario.measured if math.isnan(metrics.get(name, math.nan))]

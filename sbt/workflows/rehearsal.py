@@ -90,7 +90,8 @@ def _run(sample: _Sample, scenario: LogicalScenario, simulate: Simulate, values:
 def _invalid(sample: _Sample) -> Finding:
     """Return the share of invalid runs with its interval, and the most frequent reasons of runs that are not ok."""
     n, invalid = sample.runs, len(sample.reasons.get(str(Status.INVALID), []))
-    low, high = (float(limit) for limit in binomial.interval(invalid, n, _CONFIDENCE))
+    untold = sum(len(reasons) for status, reasons in sample.reasons.items() if status != Status.INVALID)  # they might have been
+    low, high = (float(binomial.interval(k, n, _CONFIDENCE)[end]) for end, k in enumerate((invalid, invalid + untold)))
     share = f"{invalid / n:.1%} ({low:.1%} to {high:.1%}, {_CONFIDENCE:.0%} interval)"
     detail = f"{share}: {invalid} of {n} runs drawn from the inputs' distribution"
     for status, reasons in sorted(sample.reasons.items()):
