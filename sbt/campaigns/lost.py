@@ -73,8 +73,8 @@ def nearest_words(run: int, metric: str, facts: Facts) -> str:
     if alike < _HALF * int(facts.history.ok.sum()):
         return f"look at run {run}, which came closest, as others did ({metric})"
     return (
-        f"runs at {alike:,} inputs came equally close ({metric}), so that nothing leads the search: take a metric that tells how near a run"
-        " came, such as severity, ttc_min or distance_min"
+        f"runs at {alike:,} inputs came equally close ({metric}), so that nothing leads the search: take a metric that tells how"
+        " near a run came, such as severity, ttc_min or distance_min"
     )
 
 
