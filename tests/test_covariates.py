@@ -15,7 +15,7 @@ from sbt.plugins import Scope, load
 from sbt.problem.covariates import Covariates, telling_all
 from sbt.seeds import stream
 from sbt.sumo.actors import Actor, VehicleType
-from sbt.sumo.projecting import Arrivals, arrivals_at, crossing_of, first_gap, gaps, time_to_reach
+from sbt.sumo.projecting import Arrivals, arrivals_at, crossing_of, first_gap, gaps, taken_gap, time_to_reach
 from sbt.workflows.drawn import covariates_first
 from sbt.workflows.study import Study
 
@@ -60,6 +60,32 @@ def test_the_first_gap_is_the_first_one_that_is_long_enough() -> None:
         assert all(end - start <= length + 1e-9 for start, end in zip(earlier, ends, strict=False))
         assert found["closing"] in (0.0, *arrivals.speed)
     assert gaps(Arrivals(np.empty(0), np.empty(0)), 5.0)["since"] == 30.0, "nobody comes"
+
+
+def test_the_gap_that_is_taken_is_the_first_that_suits_once_nobody_is_in_the_way() -> None:
+    rng = stream(4, "taken")
+    for _ in range(50):
+        n = int(rng.integers(0, 9))
+        arrivals = Arrivals(np.cumsum(rng.uniform(1.6, 9.0, n)) - 10.0, np.full(n, 12.0))
+        ready, need = rng.uniform(-5.0, 20.0), np.full(n, rng.uniform(1.0, 7.0))
+        found = taken_gap(arrivals, ready, need, -12.0, 6.0)
+        go = ready + found["wait"]
+        in_the_way = (arrivals.time + 0.5 > go + 1e-9) & (arrivals.time - 1.0 < go - 1e-9)
+        assert not (in_the_way & (arrivals.time - 1.0 < go + need - 1e-9)).any()
+        later = arrivals.time[arrivals.time + 0.5 > go + 1e-9]
+        assert found["until"] == pytest.approx(min(later[0] - go, 12.0) if len(later) else 12.0)
+        assert found["missed"] == -12.0 if found["wait"] == 0.0 else found["missed"] <= 0.0
+        assert found["slack"] > 0.0
+
+
+def test_a_left_turn_knows_its_pet_roughly() -> None:
+    scenario = load("scenarios", "unprotected_left_turn")
+    covariates = Covariates.of(scenario)
+    assert covariates is not None
+    x = scenario.space.from_unit(stream(5, "left").random((60, scenario.space.dimension)))
+    told = covariates.at(x, range(60))[:, covariates.names.index("likely_pet")]
+    found = [scenario.measure(scenario.simulate(scenario.space.named(row), k))["pet_ego_first"] for k, row in enumerate(x)]
+    assert np.corrcoef(told, found)[0, 1] > 0.6
 
 
 def test_paths_cross_where_they_come_near_and_oncoming_lanes_do_not() -> None:

@@ -17,7 +17,7 @@ from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.actors import Actor, EndCondition, Scene, State
 from sbt.sumo.ego import Ego
-from sbt.sumo.projecting import arrivals_at, driver_value, gaps
+from sbt.sumo.projecting import Arrivals, arrivals_at, driver_value, taken_gap, time_to_reach
 from sbt.sumo.road_ahead import on_road
 from sbt.sumo.simulation import SumoSimulation
 from sbt.sumo.traffic import TrafficStream, ego_type
@@ -41,8 +41,14 @@ DURATION = 38.0
 """Longest simulated time (s); even the fastest oncoming car has not arrived by then."""
 CONFLICT = 900.0
 """Position on the eastern arm, prolonged, at which the oncoming cars meet the ego's path (m)."""
-ENTRY, ACROSS = 68.5, 13.0
+ENTRY, ACROSS = 68.5, 14.7
 """From the ego's start to the stop line, and from where it waits inside the junction until it is across (m)."""
+INTO, OUT_OF = -11.5, 16.5
+"""Where an oncoming car's front is when it enters the junction, and when its rear is out of it (m from the conflict)."""
+ENOUGH = 6.0
+"""Time beyond which more makes no difference (s)."""
+LATE, CREEP = 0.23, 1.4
+"""By how much oncoming cars are later than projected, and from the stop line to where the ego waits, in the mean (s)."""
 TURNING = 5.8
 """Largest speed in the turn, of a driver whose speed factor is 1 (m/s)."""
 ROUTE = ("in_west", "out_north")
@@ -72,11 +78,27 @@ def end_condition() -> EndCondition:
 
 
 def covariates(values: Mapping[str, float], scene: Scene) -> dict[str, float]:
-    """Return the gaps in the oncoming stream from when the ego is at the junction, and how long it takes across."""
-    speed, accel = values["v_ego"] / 3.6, driver_value(scene.actors[0], "accel", 2.6)
-    turning = TURNING * speed / LIMIT
-    across = ACROSS / turning + 0.5 * turning / accel
-    return {"across": across, **gaps(arrivals_at(CONFLICT, scene.actors[1:], LIMIT), ENTRY / speed)}
+    """Return which gap the ego takes, how well it suits and the PET there, rolling from the stop line or after it has waited."""
+    speed, ego = values["v_ego"] / 3.6, scene.actors[0]
+    accel, turning = driver_value(ego, "accel", 2.6), TURNING * speed / LIMIT
+    impatience, spare = driver_value(ego, "impatience", 0.0), driver_value(ego, "jmTimegapMinor", 1.0)
+    line = ENTRY / speed + 2.5 - 0.113 * speed
+    across = float(time_to_reach(ACROSS, 0.0, turning, accel))
+    drawn = arrivals_at(CONFLICT, scene.actors[1:], LIMIT)
+    coming = Arrivals(drawn.time + LATE, drawn.speed)
+    wanted = 4.48 + (1.0 - impatience) * (0.56 * across + 0.21 * spare) - 14.04 * impatience + 8.74 * impatience**2
+    need = np.maximum(wanted + 0.194 * coming.speed, 1.0)
+    rolling = taken_gap(coming, line, need, INTO, OUT_OF)
+    found = {"line": line, "across": across, "rolling_next": rolling["offered"], "rolling_since": rolling["since"]}
+    found |= {"rolling_wait": rolling["wait"], "rolling_slack": min(rolling["slack"], ENOUGH)}
+    for name, way in (("stood", across), ("rolled", 20.0 / turning)):
+        found[f"rolling_pet_{name}"] = min(rolling["until"] - way, ENOUGH)
+    for name, more in (("bold", -0.5), ("likely", 0.0), ("shy", 0.5)):
+        taken = taken_gap(coming, line + CREEP, need + more, INTO, OUT_OF)
+        found |= {f"{name}_pet": min(taken["until"] - across, ENOUGH), f"{name}_slack": min(taken["slack"], ENOUGH)}
+        if more == 0.0:
+            found |= {key: taken[key] for key in ("wait", "closing", "missed")}
+    return found | {"least_pet": min(found[f"{name}_pet"] for name in ("bold", "likely", "shy"))}
 
 
 SCENARIO = LogicalScenario(

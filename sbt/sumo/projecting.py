@@ -15,7 +15,8 @@ import numpy as np
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.sumo.actors import Actor
 
-__all__ = ["FAR", "Arrivals", "arrivals_at", "beside", "crossing_of", "driver_value", "first_gap", "gaps", "time_to_reach"]
+__all__ = ["FAR", "Arrivals", "arrivals_at", "beside", "crossing_of", "driver_value", "first_gap", "gaps", "taken_gap",
+           "time_to_reach"]  # fmt: skip
 
 FAR = 30.0
 """Time that stands for "nobody comes" (s)."""
@@ -120,6 +121,36 @@ def first_gap(arrivals: Arrivals, ready: float, length: float) -> dict[str, floa
     return {
         "wait": min(float(begin[k]), FAR), "gap": min(float(end[k] - begin[k]), _LONG),
         "closing": float(speed[k]) if k < len(speed) else 0.0,
+    }  # fmt: skip
+
+
+def taken_gap(arrivals: Arrivals, ready: float, need: Vector, into: float, out_of: float) -> dict[str, float]:
+    """Return which gap the ego takes that goes at once, or as soon as somebody is out of the way, where the next is late enough.
+
+    Args:
+        arrivals: at the place of conflict.
+        ready: when the ego could go first (s).
+        need: (n,) time that the ego wants until each of them enters (s).
+        into: from the conflict to where they enter, negative (m).
+        out_of: from the conflict to where they are out of the way (m).
+
+    Returns:
+        In s, m/s: `wait` from ready until it goes, `until` the next one is at the conflict, `slack` of the gap beyond the need,
+        `missed`, the largest (negative) slack of gaps that it left, and `closing`, the speed of the next one; at ready,
+        `offered`, the time until the next one enters, and `since` the last one was out.
+    """
+    pace = np.maximum(arrivals.speed, _SLOWEST)
+    out = np.maximum.accumulate(arrivals.time + out_of / pace)
+    k = int(np.searchsorted(out, ready))
+    go = np.concatenate([[ready], out[k:]])
+    until = np.append(arrivals.time[k:], go[-1] + FAR) - go
+    entering = np.append(arrivals.time[k:] + into / pace[k:], go[-1] + FAR) - go
+    slack = entering - np.append(need[k:], 0.0)
+    j = int(np.argmax(slack > 0.0))
+    return {
+        "wait": min(float(go[j] - ready), FAR), "until": min(float(until[j]), _LONG), "slack": min(float(slack[j]), _LONG),
+        "missed": float(np.clip(slack[:j].max(), -_LONG, 0.0)) if j else -_LONG, "closing": float(np.append(pace[k:], 0.0)[j]),
+        "offered": min(float(entering[0]), _LONG), "since": min(float(ready - out[k - 1]), _LONG) if k else _LONG,
     }  # fmt: skip
 
 
