@@ -73,5 +73,5 @@ def _tried(function: Callable[[T], None], item: T) -> str | None:
     except BaseException as error:
         if interruption.is_interruption(error):
             raise KeyboardInterrupt from None
-        return described(error)
+        return str(error) if isinstance(error, SbtError) else described(error)
     return None

@@ -41,6 +41,7 @@ from sbt.sumo.formatting import plain_values
 from sbt.sumo.friction import Friction
 from sbt.sumo.guided import GuidedVehicle, Participant
 from sbt.sumo.levels import levels_of
+from sbt.sumo.messages import explained
 from sbt.sumo.phases import Stopwatch
 from sbt.sumo.recorder import RecordingSettings, RunEnded
 from sbt.sumo.session import scratch_folder, session
@@ -201,9 +202,16 @@ class UserSimulation:
         return self.isolation.warm and self._warmed.path_of(snapshot, self.isolation.states).is_file()
 
     def warm_up(self, snapshot: int) -> None:
-        """Make the state of one warm-up where it is not there yet."""
-        if self.isolation.warm:
-            self._warmed.state(snapshot, self.isolation.states)
+        """Make the state of one warm-up where it is not there yet.
+
+        Raises:
+            InputError: SUMO does not simulate the traffic; with the place in the files, where that is known.
+        """
+        if self.isolation.warm and self.files is not None:
+            try:
+                self._warmed.state(snapshot, self.isolation.states)
+            except RunError as error:
+                raise InputError(explained(error.reason, self.files)) from None
 
     def known_before(self, values: Values, seed: int) -> Mapping[str, float] | None:
         """Return what a seed draws by the user's function, at no simulation; None where there is none."""
