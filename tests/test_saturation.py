@@ -98,3 +98,21 @@ def test_what_all_runs_are_alike_in_is_called_no_lead(tmp_path):
     assert "one of the worst" in found
     assert "in 1 failure mode" in found or "1 distinct failure mode" in found
     assert "runs at 28 inputs came equally close" in said(0.0, 1)[2].replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_hits_of_a_metric_of_few_values_are_repeated_until_a_seed_disagrees(tmp_path):
+    """Two repeats of 0 or 1 agree by chance; taken for deterministic, the search would leave a place that fails half of the time."""
+    inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]
+
+    def hit(values, seed):
+        rate = 0.8 * math.exp(-((values["a"] - 0.6) ** 2 + (values["b"] - 0.4) ** 2) / (2 * 0.12**2))
+        return {"hit": float(np.random.default_rng(seed).random() < rate)}
+
+    scenario = sbt.Scenario("hit", inputs, sbt.Requirement("hit", low=1.0), evaluate=hit, metrics=["hit"])
+    found = []
+    for seed in (1, 2, 3):
+        keys = {"campaign": "falsification", "budget": 60, "seed": seed, "executor": "serial", "report": False}
+        result = sbt.run(scenario=scenario, store=tmp_path / f"{seed}", **keys)
+        found.append(result.conclusion.critical_runs)
+        assert result.conclusion.simulator_noise.noisy
+    assert np.median(found) > 60 * 0.8 * 2 * math.pi * 0.12**2, "as many random runs"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.campaigns.wording import number, percent, plural
-from sbt.problem.arrays import Points
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -25,6 +25,10 @@ WANTED = 2
 at an end of its range."""
 _ATTEMPTS = 4
 """Most of them, where some fail."""
+_HITS_AGAIN = 5
+"""Repeats of critical inputs, where the metric has few values: two of them agree by chance where every other seed fails."""
+_FEW_VALUES, _SHARE_OF_VALUES = 3, 0.1
+"""A metric has few values where there are at most three, or a tenth of the runs."""
 _DOUBT = 0.05
 """That noise in some share of the pairs was met by none of them."""
 _EQUAL = 1e-9
@@ -127,18 +131,33 @@ def repeats_wanted(history: History, scenario: LogicalScenario, most: int) -> tu
     """Return up to `most` runs that repeat inputs of earlier ones, until two repeats gave metrics.
 
     Those with the smallest margin are repeated; values that other inputs gave too come last: there the metric stands at an end of
-    its range, and hides the noise. Recorded rows cannot be repeated.
+    its range, and hides the noise. Where a metric has few values, such as 0 and 1, critical inputs are repeated up to five times,
+    as long as all agree. Recorded rows cannot be repeated.
     """
     runs = history.training
-    known = simulator_noise(history, scenario.requirement).repeats
-    tried = int((history.stage == REPEAT).sum())
-    awaited = int(((history.stage == REPEAT) & (history.status == PLANNED)).sum())
-    n = min(WANTED - known - awaited, _ATTEMPTS - tried, most)
-    if scenario.pool is not None or n <= 0 or len(runs) == 0:
+    noise, again = simulator_noise(history, scenario.requirement), history.where(history.stage == REPEAT)
+    awaited = int((again.status == PLANNED).sum())
+    n = min(WANTED - noise.repeats - awaited, _ATTEMPTS - len(again), most)
+    if scenario.pool is not None or len(runs) == 0:
         return ()
     y, margin = scenario.requirement.told(runs), scenario.requirement.margins(runs)
-    times = np.unique(y, return_inverse=True, return_counts=True)
-    common = times[2][times[1].reshape(-1)] > 1
-    tried_at = {tuple(row) for row in history.x[history.stage == REPEAT]}
+    values, which, count = np.unique(y, return_inverse=True, return_counts=True)
+    if n <= 0:
+        few = len(values) <= max(_FEW_VALUES, _SHARE_OF_VALUES * len(runs)) < len(runs)
+        return _hits_again(runs, again, margin, most) if few and noise.noisy is False and not awaited else ()
+    common = count[which.reshape(-1)] > 1
+    tried_at = {tuple(row) for row in again.x}
     order = [k for k in np.lexsort((margin, common)) if tuple(runs.x[k]) not in tried_at]
     return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in order[:n])
+
+
+def _hits_again(runs: History, again: History, margin: Vector, most: int) -> tuple[PlannedRun, ...]:
+    """Return repeats of critical inputs, in turn, until there are enough of them."""
+    hits = runs.where(margin <= 0.0)
+    if len(hits) == 0:
+        return ()
+    first = np.unique(hits.x, axis=0, return_index=True)[1]
+    done = np.array([int((again.x == hits.x[k]).all(axis=1).sum()) for k in first])
+    n = min(_HITS_AGAIN - int(done.sum()), most)
+    order = [first[k] for k in np.argsort(done, kind="stable")]
+    return tuple(PlannedRun(REPEAT, hits.inputs(int(order[k % len(order)]))) for k in range(n))
