@@ -101,7 +101,7 @@ def test_what_all_runs_are_alike_in_is_called_no_lead(tmp_path):
 
 
 def test_hits_of_a_metric_of_few_values_are_repeated_until_a_seed_disagrees(tmp_path):
-    """Two repeats of 0 or 1 agree by chance; taken for deterministic, the search would leave a place that fails half of the time."""
+    """Two repeats of 0 or 1 agree by chance: taken for deterministic, the search would leave a place that often fails."""
     inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]
 
     def hit(values, seed):
