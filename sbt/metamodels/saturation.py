@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.distance import cdist
+from scipy.special import log_ndtr
 
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
+from sbt.seeds import stream
 
 __all__ = ["Opened", "opened", "scored"]
 
@@ -22,19 +24,28 @@ _FEWEST = 2
 """Critical runs with the value of the edge: one may be there by chance."""
 _LEAST = 0.25
 """Least depth beyond the edge, in the median margin of the uncritical runs that are nearest to critical ones."""
-_CHUNK = 512
+_ENOUGH, _MOST = 8, 400
+"""Uncritical runs from which on a process is asked, and that it learns from at most: those nearest to the edge."""
+_USUAL = 0.9
+"""Quantile of the margins that asinh begins to bend at."""
+_LEAST_WARPED, _DEEPEST = 1e-3, 3.0
+"""Ends of a depth, in asinh(margin / usual margin)."""
 
 
 def opened(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
     """Return y with the values at the edge of M_c moved into it, where no run lies beyond the edge; else y itself.
 
-    The depth of a run is the least, over the uncritical ones, of slope times distance less their margin, with the median slope
-    from uncritical runs to the nearest critical one: a function of this slope is that deep there.
+    A Gaussian process of the uncritical margins says where each of them would lie; it is the mean of that prediction, cut off
+    at the edge (one step of the expectation maximisation for censored values). Where few runs are uncritical, the depth is the
+    least, over them, of slope times distance less their margin, with the median slope to the nearest critical run.
 
     Args:
         u: (n, d) metamodel inputs.
         y: (n,) finite values of the metric, in any unit in which `critical` is given.
         critical: M_c; with two finite ends nothing is moved.
+
+    Source:
+        Tobin (1958), Estimation of relationships for limited dependent variables, Econometrica 26.
 
     >>> u = np.array([[0.0], [0.2], [0.3], [0.4], [0.5]])
     >>> opened(u, np.array([0.0, 0.0, 0.1, 0.2, 0.3]), CriticalInterval(high=0.0)).round(2).tolist()
@@ -46,23 +57,37 @@ def opened(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
     tied = margin == 0.0
     if tied.sum() < _FEWEST or (margin < 0.0).any():
         return y
-    rows, depth = np.flatnonzero(tied), np.ones(int(tied.sum()))
-    if len(rows) < len(y):
-        m = margin[~tied]
-        nearest, least = np.full(len(m), np.inf), np.empty(len(rows), dtype=np.intp)
-        for start in range(0, len(rows), _CHUNK):
-            distance = cdist(u[rows[start : start + _CHUNK]], u[~tied])
-            nearest = np.minimum(nearest, distance.min(axis=0))
-            least[start : start + _CHUNK] = distance.argmin(axis=1)
-        apart = nearest > 0.0
-        slope = float(np.median(m[apart] / nearest[apart])) if apart.any() else 0.0
-        for start in range(0, len(rows), _CHUNK):
-            distance = cdist(u[rows[start : start + _CHUNK]], u[~tied])
-            depth[start : start + _CHUNK] = (slope * distance - m).min(axis=1)
-        depth = np.maximum(depth, _LEAST * float(np.median(m[least])))
+    depth = np.ones(int(tied.sum()))
+    if not tied.all():
+        told = _extrapolated if (~tied).sum() >= _ENOUGH else _by_slope
+        depth = told(u[tied], u[~tied], margin[~tied])
     moved = np.array(y, dtype=np.float64)
-    moved[rows] += depth if math.isfinite(critical.low) else -depth
+    moved[tied] += depth if math.isfinite(critical.low) else -depth
     return moved
+
+
+def _extrapolated(at: Points, u: Points, margin: Vector) -> Vector:
+    """Return how deep (k,) points are by a process of margins (m,) > 0 at u (m, d): the mean of what it predicts below 0."""
+    from sbt.metamodels.gaussian_process import GaussianProcess
+
+    scale, process = float(np.quantile(margin, _USUAL)), GaussianProcess(nu=2.5, input_noise=False)
+    rows = np.argsort(margin, kind="stable")[:_MOST]
+    with np.errstate(over="ignore"):
+        prediction = process.fit(u[rows], np.arcsinh(margin[rows] / scale), stream(0, "censored"))(at)
+        alpha = -prediction.mu / prediction.sigma
+        ratio = np.exp(-0.5 * alpha**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(alpha))
+        cut = np.minimum(prediction.mu - prediction.sigma * ratio, -_LEAST_WARPED)
+    return np.asarray(scale * np.sinh(np.minimum(-cut, _DEEPEST)))
+
+
+def _by_slope(at: Points, u: Points, margin: Vector) -> Vector:
+    """Return how deep (k,) points are by the usual slope from runs at u (m, d) with margins (m,) > 0 to the nearest of them."""
+    distance = cdist(at, u)
+    nearest = distance.min(axis=0)
+    apart = nearest > 0.0
+    slope = float(np.median(margin[apart] / nearest[apart])) if apart.any() else 0.0
+    least = _LEAST * float(np.median(margin[distance.argmin(axis=1)]))
+    return np.maximum((slope * distance - margin).min(axis=1), least)
 
 
 def scored(y: Vector, mu: Vector, critical: CriticalInterval) -> Vector:
