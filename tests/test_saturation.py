@@ -19,11 +19,12 @@ def test_runs_at_the_edge_go_into_it_and_others_stay():
     u = rng.random((200, 3))
     distance = np.linalg.norm(u - 0.5, axis=1) - 0.45
     y = np.maximum(distance, 0.0)
-    found = opened(u, y, CRITICAL)
+    found = opened(u, y, CRITICAL, np.random.default_rng(0))
     assert np.array_equal(found[y > 0], y[y > 0])
     assert (found[y == 0] < 0).all()
     assert np.corrcoef(found, distance)[0, 1] > 0.9
-    assert np.array_equal(opened(u, -y, CriticalInterval(low=0.0)), -found), "the other direction likewise"
+    other = opened(u, -y, CriticalInterval(low=0.0), np.random.default_rng(0))
+    assert np.array_equal(other, -found), "the other direction likewise"
 
 
 @pytest.mark.parametrize(
@@ -36,11 +37,11 @@ def test_runs_at_the_edge_go_into_it_and_others_stay():
 )
 def test_a_metric_that_goes_on_is_left_alone(y, critical):
     values = np.array(y)
-    assert opened(np.linspace(0, 1, 4)[:, None], values, critical) is values
+    assert opened(np.linspace(0, 1, 4)[:, None], values, critical, np.random.default_rng(0)) is values
 
 
 def test_where_all_runs_are_at_the_edge_all_is_critical():
-    assert (opened(np.random.default_rng(0).random((5, 2)), np.zeros(5), CRITICAL) < 0).all()
+    assert (opened(np.random.default_rng(0).random((5, 2)), np.zeros(5), CRITICAL, np.random.default_rng(0)) < 0).all()
 
 
 def test_of_a_run_at_the_edge_its_side_is_scored():

@@ -222,7 +222,7 @@ def fit_log_probability(
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
     least, u = noise[0] if noise else 0.0, coordinates(z)
-    y = opened(u, y, critical)
+    y = opened(u, y, critical, rng)
     warp = Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
     metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel

@@ -16,7 +16,6 @@ from scipy.special import log_ndtr
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
-from sbt.seeds import stream
 
 __all__ = ["Opened", "opened", "scored"]
 
@@ -32,7 +31,7 @@ _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 """Ends of a depth, in asinh(margin / usual margin)."""
 
 
-def opened(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
+def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
     """Return y with the values at the edge of M_c moved into it, where no run lies beyond the edge; else y itself.
 
     A Gaussian process of the uncritical margins says where each of them would lie; it is the mean of that prediction, cut off
@@ -43,12 +42,13 @@ def opened(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
         u: (n, d) metamodel inputs.
         y: (n,) finite values of the metric, in any unit in which `critical` is given.
         critical: M_c; with two finite ends nothing is moved.
+        rng: the only source of randomness, used where something is moved.
 
     Source:
         Tobin (1958), Estimation of relationships for limited dependent variables, Econometrica 26.
 
     >>> u = np.array([[0.0], [0.2], [0.3], [0.4], [0.5]])
-    >>> opened(u, np.array([0.0, 0.0, 0.1, 0.2, 0.3]), CriticalInterval(high=0.0)).round(2).tolist()
+    >>> opened(u, np.array([0.0, 0.0, 0.1, 0.2, 0.3]), CriticalInterval(high=0.0), None).round(2).tolist()
     [-0.2, -0.02, 0.1, 0.2, 0.3]
     """
     if math.isfinite(critical.low) == math.isfinite(critical.high):
@@ -60,28 +60,29 @@ def opened(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
     depth = np.ones(int(tied.sum()))
     if not tied.all():
         told = _extrapolated if (~tied).sum() >= _ENOUGH else _by_slope
-        depth = told(u[tied], u[~tied], margin[~tied])
+        depth = told(u[tied], u[~tied], margin[~tied], rng)
     moved = np.array(y, dtype=np.float64)
     moved[tied] += depth if math.isfinite(critical.low) else -depth
     return moved
 
 
-def _extrapolated(at: Points, u: Points, margin: Vector) -> Vector:
+def _extrapolated(at: Points, u: Points, margin: Vector, rng: np.random.Generator) -> Vector:
     """Return how deep (k,) points are by a process of margins (m,) > 0 at u (m, d): the mean of what it predicts below 0."""
     from sbt.metamodels.gaussian_process import GaussianProcess
 
     scale, process = float(np.quantile(margin, _USUAL)), GaussianProcess(nu=2.5, input_noise=False)
     rows = np.argsort(margin, kind="stable")[:_MOST]
     with np.errstate(over="ignore"):
-        prediction = process.fit(u[rows], np.arcsinh(margin[rows] / scale), stream(0, "censored"))(at)
+        prediction = process.fit(u[rows], np.arcsinh(margin[rows] / scale), rng)(at)
         alpha = -prediction.mu / prediction.sigma
         ratio = np.exp(-0.5 * alpha**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(alpha))
         cut = np.minimum(prediction.mu - prediction.sigma * ratio, -_LEAST_WARPED)
     return np.asarray(scale * np.sinh(np.minimum(-cut, _DEEPEST)))
 
 
-def _by_slope(at: Points, u: Points, margin: Vector) -> Vector:
+def _by_slope(at: Points, u: Points, margin: Vector, rng: np.random.Generator) -> Vector:
     """Return how deep (k,) points are by the usual slope from runs at u (m, d) with margins (m,) > 0 to the nearest of them."""
+    del rng
     distance = cdist(at, u)
     nearest = distance.min(axis=0)
     apart = nearest > 0.0
@@ -113,4 +114,4 @@ class Opened:
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> Predictor:
         """Return the predictor; see `Metamodel.fit`."""
-        return self.metamodel.fit(u, opened(u, y, self.critical), rng)
+        return self.metamodel.fit(u, opened(u, y, self.critical, rng), rng)
