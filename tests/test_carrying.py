@@ -155,7 +155,7 @@ def test_modules_are_carried_by_name_again_afterwards(analytic: Path):
 @pytest.mark.sumo
 def test_choices_apply_to_what_is_carried_as_to_what_is_named(tmp_path: Path):
     (tmp_path / "mine.py").write_text("def farthest(trace):\n    return float(trace.x.max())\n")
-    choices = ({"kind": "acc_aeb"}, "fresh", 0.1, "G[0,20](gap > 2)", True, ("mine.py:farthest",))
+    choices = ({"kind": "acc_aeb"}, "fresh", 0.1, "G[0,20](gap > 2)", (), ("mine.py:farthest",))
     named = ScenarioSpec("cut_in", str(tmp_path), *choices)
     carried = replace(named, name="of a script", carried=carry(load("scenarios", "cut_in")))
     jobs = [Job(k, {"d_v": 10.0 + 20 * k, "d_t": 1.0}, k) for k in range(4)]

@@ -125,7 +125,7 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
     """Return the scenario as plain data for other processes; files are absolute, objects given in Python are carried by value."""
     config, scope = loaded.config, loaded.scope
     ego = None if config.ego is None else _plain_ego(config.ego, loaded.folder)
-    types = config.campaign == "falsification"  # its failure modes are told apart by them
+    types = config.requirement.decisive if config.campaign == "falsification" else None  # failure modes are told apart by them
     named = tuple(name for name in config.metrics if not name.startswith(OBJECT))
     own = tuple(metric_from(scope.load("metrics", name)) for name in config.metrics if name.startswith(OBJECT))
     carried = b""

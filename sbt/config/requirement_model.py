@@ -121,6 +121,16 @@ class RequirementChange(BaseModel):
         )
 
 
+    @property
+    def decisive(self) -> tuple[tuple[str, tuple[float, float] | None], ...]:
+        """The metrics that decide ("": the scenario's own) with their critical intervals (None: its own); none: all its own."""
+        if self.combined is not None:
+            return tuple(pair for item in self.combined[1] for pair in item.decisive)
+        if self.stl is not None:
+            return ((getattr(self, "name", None) or "stl", self.critical or (-math.inf, 0.0)),)
+        return () if self.metric is None and self.critical is None else ((self.metric or "", self.critical),)
+
+
 class RequirementItem(RequirementChange):
     """One of several requirements."""
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sbt.errors import InputError
+from sbt.metrics.conflict_types import Decisive
 from sbt.metrics.preventability import applicability
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
@@ -58,19 +59,22 @@ class ExchangedEgo:
         raise InputError("a scenario whose ego is exchanged takes no further choices")
 
 
-def with_drivers(scenario: LogicalScenario, drivers: Sequence[Mapping[str, Any]]) -> LogicalScenario:
+def with_drivers(
+    scenario: LogicalScenario, drivers: Sequence[Mapping[str, Any]], decisive: Sequence[Decisive] = ()
+) -> LogicalScenario:
     """Return the scenario with the further input `DRIVER`, and with the metrics that say whether drivers can judge a run.
 
     Args:
         scenario: with its own ego.
         drivers: other egos: kind and settings.
+        decisive: metrics that decide whether a run is critical, and so whom its conflict is with.
 
     Raises:
         InputError: it does not take one of them.
     """
     egos = (scenario, *(scenario.configured(ego=dict(driver)) for driver in drivers))
     who = Parameter(DRIVER, 0, max(len(drivers), 1), "", kind="integer")
-    found = applicability(scenario.roles.ego)
+    found = applicability(scenario.roles.ego, decisive)
     metrics = (*(m for m in scenario.metrics if m.name != found.name), found)
     space = ParameterSpace((*scenario.space.parameters, who))
     return replace(scenario, space=space, simulate=ExchangedEgo(egos), metrics=metrics)

@@ -16,11 +16,11 @@ from typing import Any
 from sbt.errors import InputError, PluginError
 from sbt.execution.carrying import delivered
 from sbt.execution.exchange import with_drivers
-from sbt.metrics.conflict_types import conflict_type
+from sbt.metrics.conflict_types import Decisive, conflict_type
 from sbt.metrics.pairwise import in_traffic, without_overtaking
 from sbt.plugins import kept, load
 from sbt.problem.isolation import Isolation, Warmable
-from sbt.problem.requirement import Requirement
+from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario, Metric
 
 __all__ = ["CoarseLevel", "ScenarioSpec"]
@@ -57,7 +57,8 @@ class ScenarioSpec:
         formulas: further formulas, the metric that measures each and its text; they change no requirement.
         friction: smallest and largest coefficient of friction of the roads, an input where they differ; None: the scenario's own.
         formula: of signal temporal logic, measured as the metric `stl` and required; None: the scenario's own requirement.
-        conflict_type: measure how ego and the nearest other met as well, where runs have a trace.
+        conflict_type: measure also how ego met whom its failure is about, or the nearest other, where runs have a trace; by the
+            metrics that decide ("": its own), each with its critical interval (None: its own); none: those of its requirement.
         metrics: measured as well, in place of the scenario's of the same name: installed ones (of ego and each
             other in turn, the worst counts), or `file.py:NAME`, a `Metric` or a function of the trace.
         drivers: egos (kind and settings) that are exchanged for the scenario's own from run to run, as `sbt.execution.exchange`
@@ -73,7 +74,7 @@ class ScenarioSpec:
     isolation: str = "auto"
     step_length: float | None = None
     formula: str | None = None
-    conflict_type: bool = False
+    conflict_type: tuple[tuple[str, tuple[float, float] | None], ...] | None = None
     metrics: tuple[str, ...] = ()
     carried: bytes = field(default=b"", repr=False)
     drivers: tuple[Mapping[str, Any], ...] = ()
@@ -113,7 +114,7 @@ class ScenarioSpec:
         ego = None if self.ego is None else json.dumps(dict(self.ego), sort_keys=True)
         plain = replace(self, ego=None, drivers=(), coarse=None, folder=str(Path(self.folder).resolve()))
         scenario = _resolved(plain, ego)
-        return with_drivers(scenario, self.drivers) if self.drivers else scenario
+        return with_drivers(scenario, self.drivers, decisive(scenario, self.conflict_type or ())) if self.drivers else scenario
 
     def resolve_at(self, attempt: Attempt) -> LogicalScenario | None:
         """Return the scenario, one choice after the other.
@@ -140,8 +141,8 @@ class ScenarioSpec:
             yield ("requirement", "stl"), partial(_requiring, formula=self.formula)
         for metric, formula in self.formulas:
             yield ("requirement",), partial(_with_formula, metric, formula)
-        if self.conflict_type:
-            yield ("campaign",), _with_conflict_type
+        if self.conflict_type is not None:
+            yield ("campaign",), partial(_with_conflict_type, self.conflict_type)
         if self.ego is not None:
             yield ("ego",), partial(LogicalScenario.configured, ego=self.ego)
         if self.step_length is not None:
@@ -184,9 +185,22 @@ def _with_metric(name: str, folder: Path, scenario: LogicalScenario) -> LogicalS
     return _measuring(scenario, _metric(name, folder, scenario))
 
 
-def _with_conflict_type(scenario: LogicalScenario) -> LogicalScenario:
+def _with_conflict_type(
+    deciding: tuple[tuple[str, tuple[float, float] | None], ...], scenario: LogicalScenario
+) -> LogicalScenario:
     """Return the scenario with the type of conflict as a metric, where runs have a trace."""
-    return scenario if scenario.simulate is None else _measuring(scenario, conflict_type(scenario.roles.ego))
+    if scenario.simulate is None:
+        return scenario
+    return _measuring(scenario, conflict_type(scenario.roles.ego, decisive(scenario, deciding)))
+
+
+def decisive(scenario: LogicalScenario, deciding: tuple[tuple[str, tuple[float, float] | None], ...]) -> tuple[Decisive, ...]:
+    """Return the metrics that decide whether a run of the scenario is critical, those that runs do not give left out."""
+    own = {part.metric: CriticalInterval(part.low, part.high) for part in scenario.requirement.parts}
+    metrics = {metric.name: metric for metric in scenario.metrics}
+    named = [(name or scenario.requirement.metric, ends) for name, ends in deciding]
+    asked = {name: own.get(name) if ends is None else CriticalInterval(*ends) for name, ends in named} if named else own
+    return tuple((metrics[name], critical) for name, critical in asked.items() if name in metrics and critical is not None)
 
 
 def _metric(name: str, folder: Path, scenario: LogicalScenario) -> Metric:

@@ -1,21 +1,28 @@
-"""The type of a conflict: the side of the ego and the course of the nearest road user at the smallest distance.
+"""The type of a conflict: on which side of the ego whom it is about was at the smallest distance, and on which course.
 
-Runs that fail in the same way have the same type; falsification distinguishes failure modes by it.
+Runs that fail in the same way have the same type; falsification distinguishes failure modes by it. In traffic whoever is
+nearest may have nothing to do with the failure, as a car that is overtaken while the ego closes in on its leader.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sbt.metrics.geometry import part_pairs, rectangle_distance
 from sbt.metrics.longitudinal import FAR
 from sbt.problem.arrays import Vector
+from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["METRIC_NAME", "conflict_type", "describe_conflict_type", "from_behind", "without_standing"]
+__all__ = [
+    "METRIC_NAME", "Decisive", "conflict", "conflict_type", "describe_conflict_type", "from_behind", "side_and_course",
+    "without_standing",
+]  # fmt: skip
 
 METRIC_NAME = "conflict_type"
 """Name of the metric."""
@@ -31,35 +38,87 @@ _NOBODY = -1
 """Value if there is no other road user within 1 km."""
 
 
-def conflict_type(ego: str = "ego") -> Metric:
+Decisive = tuple[Metric, CriticalInterval]
+"""A metric with the values of it that are critical."""
+
+
+def conflict_type(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric:
     """Return the metric `conflict_type`: 4 side + course at the smallest distance; -1: nobody within 1 km.
 
     Side: 0 ahead, 1 left, 2 behind, 3 right of the ego's rectangle, by the side that the other is farther away from.
     Course: heading of the other relative to the ego's; 0 the same, 1 turned left by 45 to 135 degrees (it comes from
     the right), 2 oncoming, 3 turned right. 16 more where ego stands, 32 more where one of `Trace.unreacting` comes from
     behind. Absent road users (NaN) do not count. If no actor has the name `ego`, the first actor is the ego.
+
+    Args:
+        ego: the road user under test.
+        decisive: metrics that decide whether a run is critical: in a critical one the conflict is that with the other whose
+            sole presence gives the same value. Without them, or where no single one does, it is that with the nearest.
     """
 
     def function(trace: Trace) -> float:
-        column = trace.actors.index(ego) if ego in trace.actors else 0
-        own = trace.actor(trace.actors[column])
-        bent = np.array([name in trace.parts for name in trace.actors])
-        reach = np.where(bent, 1.5, 0.5) * np.hypot(trace.length, trace.width)
-        centres = np.hypot(trace.x - own.x[:, None], trace.y - own.y[:, None])  # (t, m)
-        least = np.where(np.isfinite(centres), centres, np.inf).min(axis=0) - reach - reach[column]
-        best, code = FAR, _NOBODY
-        for k in np.argsort(least, kind="stable").tolist():  # the nearest ones first
-            if k != column and least[k] < best:
-                for part, other in part_pairs(own, trace.actor(trace.actors[k])):
-                    distance, at = _nearest(part, other)
-                    if distance < best:
-                        best, code = distance, _code(part, other, at, unreacting=trace.actors[k] in trace.unreacting)
-        return float(code)
+        met = conflict(trace, ego, decisive)
+        return float(_NOBODY if met is None else _code(*met[1:], unreacting=met[0] in trace.unreacting))
 
     return Metric(
         METRIC_NAME, function, "", "low", _NOBODY,
-        "side of ego and course of the nearest other: 4 side + course, + 16 ego stands, + 32 recorded, behind; -1 nobody",
+        "side of ego and course of whom a failure is about, else of the nearest other: 4 side + course, + 16 ego stands, "
+        "+ 32 recorded, behind; -1 nobody",
     )  # fmt: skip
+
+
+def conflict(trace: Trace, ego: str, decisive: Sequence[Decisive] = ()) -> tuple[str, ActorTrace, ActorTrace, int] | None:
+    """Return whom a run's conflict is with, what of the two came nearest, and the index of that instant.
+
+    Args:
+        trace: of the run.
+        ego: the road user under test; the first actor where none has this name.
+        decisive: as of `conflict_type`.
+
+    Returns:
+        None: nobody is within 1 km.
+    """
+    ego = ego if ego in trace.actors else trace.actors[0]
+    others = _nearest_first(trace, ego)
+    if len(others) > 1 and (culprit := _decides(trace, ego, list(others), decisive)) is not None:
+        others = {culprit: others[culprit]}
+    own, best, met = trace.actor(ego), FAR, None
+    for name, least in others.items():
+        if least < best:
+            for part, other in part_pairs(own, trace.actor(name)):
+                distance, at = _nearest(part, other)
+                if distance < best:
+                    best, met = distance, (name, part, other, at)
+    return met
+
+
+def _nearest_first(trace: Trace, ego: str) -> dict[str, float]:
+    """Return the others, and the distance to each that its rectangle is never below (m), the nearest ones first."""
+    own = trace.actors.index(ego)
+    bent = np.array([name in trace.parts for name in trace.actors])
+    reach = np.where(bent, 1.5, 0.5) * np.hypot(trace.length, trace.width)
+    centres = np.hypot(trace.x - trace.x[:, own : own + 1], trace.y - trace.y[:, own : own + 1])  # (t, m)
+    least = np.where(np.isfinite(centres), centres, np.inf).min(axis=0) - reach - reach[own]
+    return {trace.actors[k]: float(least[k]) for k in np.argsort(least, kind="stable").tolist() if k != own}
+
+
+def _decides(trace: Trace, ego: str, others: Sequence[str], decisive: Sequence[Decisive]) -> str | None:
+    """Return the first of the others who alone makes the first critical metric what it is; None: nobody does, or none is."""
+    for metric, interval in decisive:
+        value = math.nan if metric.alone else metric.value(trace)
+        if interval.contains(np.array([value]))[0]:
+            alike = (name for name in others if math.isclose(_with_one(metric, trace, ego, name), value, rel_tol=1e-9))
+            return next(alike, None)
+    return None
+
+
+def _with_one(metric: Metric, trace: Trace, ego: str, other: str) -> float:
+    """Return a metric of the trace without anybody but these two; NaN where it needs somebody else."""
+    two = trace.select(slice(None), {ego: ego, other: other})
+    try:
+        return metric.value(replace(two, signals=trace.signals, reported=trace.reported, unreacting=trace.unreacting))
+    except Exception:  # a metric of one's own that looks for another by name: it is not about this one
+        return math.nan
 
 
 def _nearest(ego: ActorTrace, other: ActorTrace) -> tuple[float, int]:
@@ -71,17 +130,18 @@ def _nearest(ego: ActorTrace, other: ActorTrace) -> tuple[float, int]:
 
 
 def _code(ego: ActorTrace, other: ActorTrace, k: int, *, unreacting: bool) -> int:
-    side, course = _side_and_course(ego, other, k)
+    side, course = side_and_course(ego, other, k)
     standing = _STANDING if abs(ego.speed[k]) < _STANDS else 0
     return 4 * side + course + standing + (_UNREACTING if unreacting and (side, course) == _FROM_BEHIND else 0)
 
 
 def from_behind(ego: ActorTrace, other: ActorTrace) -> bool:
     """Return whether the other is behind the ego at the last instant, in the same direction."""
-    return _side_and_course(ego, other, -1) == _FROM_BEHIND
+    return side_and_course(ego, other, -1) == _FROM_BEHIND
 
 
-def _side_and_course(ego: ActorTrace, other: ActorTrace, k: int) -> tuple[int, int]:
+def side_and_course(ego: ActorTrace, other: ActorTrace, k: int) -> tuple[int, int]:
+    """Return side and course (see `conflict_type`) of another at an instant."""
     cos, sin = math.cos(ego.heading[k]), math.sin(ego.heading[k])
     dx, dy = other.x[k] - ego.x[k], other.y[k] - ego.y[k]
     along, across = cos * dx + sin * dy, cos * dy - sin * dx

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from sbt.metrics.conflict_types import conflict_type
-from sbt.metrics.geometry import rectangle_distance
+from sbt.metrics.conflict_types import Decisive, conflict, side_and_course
 from sbt.problem.scenario import Metric
-from sbt.problem.trace import ActorTrace, Trace
+from sbt.problem.trace import Trace
 
 __all__ = ["APPLICABLE", "METRIC_NAME", "applicability", "why_not"]
 
@@ -32,19 +33,20 @@ _BEFORE = 5.0
 """Time before the smallest distance in which a turn of the ego by more than 30 degrees counts (s)."""
 
 
-def applicability(ego: str = "ego") -> Metric:
+def applicability(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric:
     """Return the metric `applicability`: 0 where the reference drivers can judge the conflict of a run, or a code.
 
-    The conflict is that with the road user at the smallest distance, and classified as by `conflict_type`.
+    Args:
+        ego: the road user under test.
+        decisive: metrics that decide whose the conflict is, as of `conflict_type`.
     """
-    classified = conflict_type(ego)
 
     def function(trace: Trace) -> float:
-        code = int(classified.value(trace))
-        if code < 0:
+        met = conflict(trace, ego, decisive)
+        if met is None:
             return float(_NOBODY)
-        own, other, at = _nearest(trace, ego)
-        side, course = divmod(code, 4)
+        _, own, other, at = met
+        side, course = side_and_course(own, other, at)
         if max(other.length, other.width) <= _PERSON:
             return float(_PEDESTRIAN)
         if course:
@@ -64,16 +66,3 @@ def why_not(code: float) -> str:
     ('', "the other crosses ego's course: the models are of traffic in the same direction")
     """
     return _REASONS[int(code)]
-
-
-def _nearest(trace: Trace, ego: str) -> tuple[ActorTrace, ActorTrace, int]:
-    """Return the ego, the road user that comes nearest, and the instant."""
-    column = trace.actors.index(ego) if ego in trace.actors else 0
-    own, best = trace.actor(trace.actors[column]), (float("inf"), column, 0)
-    for k, name in enumerate(trace.actors):
-        if k != column:
-            distance = rectangle_distance(own, trace.actor(name))
-            distance = np.where(np.isfinite(distance), distance, np.inf)
-            at = int(distance.argmin())
-            best = min(best, (float(distance[at]), k, at))
-    return own, trace.actor(trace.actors[best[1]]), best[2]
