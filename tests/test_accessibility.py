@@ -44,6 +44,7 @@ def browser() -> Iterator[Browser]:
         yield found
 
 
+@pytest.mark.slow
 def test_the_report_has_no_serious_fault(browser: Browser, tmp_path: Path) -> None:
     """With its explorer, a film, slices, figures and tables."""
     scenario = scenario_of(3)

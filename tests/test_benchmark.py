@@ -82,6 +82,7 @@ def test_killed_and_run_again_ends_as_one_that_was_not(analytic, tmp_path, monke
     assert len(table(whole)) == 2 * 2 * 3
 
 
+@pytest.mark.slow
 def test_the_command_runs_resumes_and_draws(analytic):
     folder = analytic.parent
     loaded = written(folder)

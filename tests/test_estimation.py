@@ -95,6 +95,7 @@ def test_everything_critical(campaign: Run):
     assert 0.7 < found["low"] < 1.0
 
 
+@pytest.mark.slow
 def test_half_of_the_space_fails(campaign: Run):
     result = campaign(scenario="SOME_FAIL", **QUICK | {"budget": 100})
     found = result["conclusion"]

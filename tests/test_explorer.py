@@ -131,6 +131,7 @@ def test_data_cannot_leave_its_element():
 SCRIPT = (Path(__file__).parent / "data" / "tries_explorer.js").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="needs chromium, which is not installed")
 def test_a_browser_goes_from_a_point_to_its_film(tmp_path):
     scenario = scenario_of(3, description=EVIL)

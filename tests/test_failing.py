@@ -42,6 +42,7 @@ def test_a_search_stays_where_runs_give_a_metric(testbed: str, tmp_path: Path):
     assert frame.critical.fillna(False).any()
 
 
+@pytest.mark.slow
 def test_a_boundary_stays_there_and_states_shares_of_what_gives_a_metric(tmp_path: Path):
     result = campaign("boundary", "wavy_half_fails", tmp_path, 150)
     guided = result.frame[result.frame.stage == "boundary"]

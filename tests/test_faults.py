@@ -102,7 +102,7 @@ def begun(store: Path) -> bool:
         (signal.SIGINT, {"kind": "local", "workers": 2}),
         pytest.param(signal.SIGHUP, {"kind": "local", "workers": 2}, marks=pytest.mark.slow),
         pytest.param(signal.SIGQUIT, {"kind": "serial"}, marks=pytest.mark.slow),
-        (signal.SIGTERM, {"kind": "local", "workers": 1}),
+        pytest.param(signal.SIGTERM, {"kind": "local", "workers": 1}, marks=pytest.mark.slow),
     ],
     ids=["INT", "HUP", "QUIT", "TERM"],
 )
@@ -191,6 +191,7 @@ def test_before_there_is_a_store_an_interruption_says_so(configured: Callable[..
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_ignored_signals_stay_ignored(configured: Callable[..., Path], started: Any):
     """As under nohup."""
     config = configured("c", "SLOW", campaign="coverage", budget=300, batch=300)
@@ -259,7 +260,7 @@ def test_a_signal_is_told_from_what_code_raises():
 
 
 @pytest.mark.parametrize(
-    "part", ["coverage", *(pytest.param(part, marks=pytest.mark.slow) for part in ("merge", "bundle", "doctor", "storm"))]
+    "part", [pytest.param(part, marks=pytest.mark.slow) for part in ("coverage", "merge", "bundle", "doctor", "storm")]
 )
 def test_what_is_killed_leaves_nothing_and_goes_on_to_the_same_rows(part: str):
     """A few kills of those that `benchmarks/faults.py` makes: of a driver, and of a command that writes."""
@@ -327,7 +328,7 @@ STRAY = scenario(stray)
 """
 
 
-@pytest.mark.parametrize("kind", ["serial", "local"])
+@pytest.mark.parametrize("kind", [pytest.param("serial", marks=pytest.mark.slow), "local"])
 def test_a_run_that_forks_and_leaves_its_folder_changes_nothing(
     kind: str, analytic: Path, configured: Callable[..., Path], started: Any, temporary: Path
 ):
@@ -428,7 +429,7 @@ def test_a_process_is_known_by_its_identifier_and_its_start():
     ("kind", "ending"),
     [
         pytest.param("serial", "2>&-", marks=pytest.mark.slow), pytest.param("serial", ">&-", marks=pytest.mark.slow),
-        ("serial", "2>&1 >/dev/null | head -1"), ("serial", ">&- 2>&- <&-"),
+        pytest.param("serial", "2>&1 >/dev/null | head -1", marks=pytest.mark.slow), ("serial", ">&- 2>&- <&-"),
         pytest.param("local", "2>&-", marks=pytest.mark.slow), ("local", "2>&1 | head -1"),
     ],
 )  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "fuzz.py"
 
 
+@pytest.mark.slow
 @pytest.mark.sumo
 def test_wrong_configurations_and_scenario_files_are_errors_in_words():
     done = subprocess.run(

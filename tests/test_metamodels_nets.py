@@ -212,6 +212,7 @@ def test_global_random_states_are_neither_used_nor_changed(name):
     np.testing.assert_array_equal(first.mean, QUICK[name].fit(u, y, np.random.default_rng(0))(u).mean)
 
 
+@pytest.mark.slow
 def test_bits_do_not_depend_on_the_number_of_threads():
     code = """
 import hashlib, numpy as np

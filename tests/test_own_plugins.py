@@ -233,7 +233,7 @@ def test_scores_above_zero_are_drawn_from(run, campaign, kind):
     assert len(np.unique(x, axis=0)) >= 60 - REPEATS
 
 
-@pytest.mark.parametrize("campaign", ["boundary", "falsification"])
+@pytest.mark.parametrize("campaign", ["boundary", pytest.param("falsification", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["straddle", "expected_feasibility", "u", "own.py:farthest", "own.py:WIDE"])
 def test_greedy_acquisitions_are_chosen_greedily(run, campaign, kind):
     """No point twice but the repeats; where the score is the distance to the runs, points lie farther apart than even ones."""

@@ -60,6 +60,7 @@ def corner(values, seed):
     return {"gap": max(2.0 - (values["a"] + values["b"]) / math.sqrt(2.0), 0.0)}
 
 
+@pytest.mark.slow
 def test_a_boundary_is_where_a_metric_ends(tmp_path):
     inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]
     scenario = sbt.Scenario("disc", inputs, sbt.Requirement("gap", high=0.0), evaluate=disc, metrics=["gap"])

@@ -196,7 +196,7 @@ def test_a_campaign_is_stopped_and_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.sumo
 @pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium")
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_the_pages_work_in_a_browser(served: Served, width: int) -> None:
     """From the list by keyboard to a campaign, its runs, a film made on demand; no error, no request to elsewhere."""
     with Browser(width=width, dark=width < 600) as browser:

@@ -183,6 +183,7 @@ def test_a_falsification_finds_both_and_says_which(tmp_path):
     result.plot.runs()
 
 
+@pytest.mark.slow
 def test_boundary_and_coverage_tell_the_share_of_each(tmp_path):
     _campaign(tmp_path, "boundary", 20, initial=10, batch=10)
     result = _campaign(tmp_path, "boundary", 40, initial=10, batch=10)
@@ -200,7 +201,7 @@ def test_boundary_and_coverage_tell_the_share_of_each(tmp_path):
     assert even.requirements["left"].critical_fraction == pytest.approx(0.32, abs=0.05)
 
 
-@pytest.mark.parametrize("how", ["auto", "monte_carlo"])
+@pytest.mark.parametrize("how", [pytest.param("auto", marks=pytest.mark.slow), "monte_carlo"])
 def test_an_estimation_tells_the_probability_of_each_from_the_same_draws(tmp_path, how):
     sides = np.array([-1.8 / np.sqrt(1.01), -2.2 / np.sqrt(1.04)])  # of -(a + b / 10) and b - a / 5, correlated by .1
     truth = dict(zip(("left", "high"), norm.cdf(sides), strict=True))

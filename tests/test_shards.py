@@ -51,7 +51,10 @@ def timeless(result: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("keys", "n"), [(COVERAGE, 3), (LEARNED, 4), (CRUDE, 2), ({**CRUDE, "batch": 2, "initial": 1}, 7), (COVERAGE, 1)],
+    ("keys", "n"), [
+        pytest.param(COVERAGE, 3, marks=pytest.mark.slow), (LEARNED, 4), pytest.param(CRUDE, 2, marks=pytest.mark.slow), ({**CRUDE, "batch": 2, "initial": 1}, 7),
+        pytest.param(COVERAGE, 1, marks=pytest.mark.slow),
+    ],
     ids=["coverage", "with a metamodel", "monte carlo", "batches smaller than shards", "one shard"],
 )  # fmt: skip
 def test_merged_shards_are_the_campaign_row_for_row(
@@ -175,7 +178,7 @@ sbt.workflows.merging.merge_shards([Path(p) for p in sys.argv[3:]], Path(sys.arg
 """
 
 
-@pytest.mark.parametrize("moves", [0, 1])
+@pytest.mark.parametrize("moves", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_killed_merge_leaves_no_store_and_can_be_repeated(
     moves: int, configured: Configured, rows: Rows, campaign: Run, tmp_path: Path
 ):
