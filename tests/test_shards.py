@@ -52,8 +52,8 @@ def timeless(result: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     ("keys", "n"), [
-        pytest.param(COVERAGE, 3, marks=pytest.mark.slow), (LEARNED, 4), pytest.param(CRUDE, 2, marks=pytest.mark.slow), ({**CRUDE, "batch": 2, "initial": 1}, 7),
-        pytest.param(COVERAGE, 1, marks=pytest.mark.slow),
+        pytest.param(COVERAGE, 3, marks=pytest.mark.slow), (LEARNED, 4), pytest.param(CRUDE, 2, marks=pytest.mark.slow),
+        ({**CRUDE, "batch": 2, "initial": 1}, 7), pytest.param(COVERAGE, 1, marks=pytest.mark.slow),
     ],
     ids=["coverage", "with a metamodel", "monte carlo", "batches smaller than shards", "one shard"],
 )  # fmt: skip

@@ -208,26 +208,27 @@ def _targets(v: Points, whole: Event, parts: tuple[Event, ...]) -> list[Vector]:
 
 def draw_batch(
     space: ParameterSpace, pool: Pool, n: int, rng: np.random.Generator, *, counts: bool, once: bool = True,
-    fallback: bool = False, existing: Points | None = None,
+    fallback: bool = False, existing: Points | None = None, phase: str = LEARN,
 ) -> tuple[tuple[PlannedRun, ...], EstimationProposal]:  # fmt: skip
     """Return n runs drawn from a pool with known density, that count or only teach, and what the log keeps of them.
 
     `once`: the metamodel has no point drawn twice, as where the simulator is deterministic. `existing`: (k, d) normal scores of
-    earlier runs; where they are given, runs that only teach are chosen apart from them and from each other.
+    earlier runs; where they are given, runs that only teach are chosen apart from them and from each other. `phase`: what the log
+    calls a batch that only teaches.
     """
     log_pi, log_not = pool.whole.safe
     if not counts and existing is not None and len(existing):
         rows, first = select_teaching(pool.plan, n, pool.z, existing, rng)
         summary = PoolSummary(len(pool.z), pool.plan.predicted, pool.plan.anticipated, len(pool.mixture.shares), fallback)
         nominal = NominalDraws(tuple(np.exp(log_pi[rows[:first]]).tolist()))
-        return planned(space, pool.z[rows], LEARNED), EstimationProposal(LEARN, "uncertainty", pool=summary, nominal=nominal)
+        return planned(space, pool.z[rows], LEARNED), EstimationProposal(phase, "uncertainty", pool=summary, nominal=nominal)
     draws = draw_systematic(pool.plan, n, log_pi - log_not, rng, once=once)
     plan = draws.plan
     summary = PoolSummary(len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback)
     pi = tuple(np.exp(log_pi[draws.rows]).tolist())
     z, nominal = pool.z[draws.rows], NominalDraws(pi[: draws.nominal])
     if not counts:
-        return planned(space, z, LEARNED), EstimationProposal(LEARN, "uncertainty", pool=summary, nominal=nominal)
+        return planned(space, z, LEARNED), EstimationProposal(phase, "uncertainty", pool=summary, nominal=nominal)
     log_q = space.log_density(pool.x[draws.rows]) - np.log(draws.coefficient)
     counted = CountedDraws(
         plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi,

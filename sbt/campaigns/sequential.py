@@ -22,7 +22,7 @@ from sbt.campaigns.repeats import repeats_wanted, simulator_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.stopping import count_begins, is_precise, relative_error, steadier
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, to_cube
-from sbt.estimators.importance import BLIND, SHARES
+from sbt.estimators.importance import SHARES
 from sbt.estimators.mixture import wide_scales
 from sbt.estimators.surrogate import MOST_LEARNED, Coordinates, LogProbability, sketch_of
 from sbt.loop.stages import Batch, Log
@@ -53,6 +53,10 @@ _BEYOND = 1e-9
 """Mass of the inputs' distribution beyond the ball in normal scores that is searched: failures out there do not count."""
 _SEARCH_SHARE = (0.2, 0.1)
 """Of later batches, the share that still searches: before and after the count has begun."""
+_SEARCH_BLIND = 0.4
+"""The same while all runs are on one side of the boundary."""
+_BLIND = (0.0, 0.75, 0.1, 0.15)
+"""Shares of the draws (`SHARES`) until then; they only teach, as what would count then is rarely met, and weighs much if it is."""
 
 _GAIN = 4.0
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""
@@ -210,19 +214,21 @@ class SequentialStage:
     def _drawn(self, log: Log, known: Known, log_probability: LogProbability | None, size: int) -> Batch:
         """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
-        shares = BLIND if known.one_sided else SHARES
+        one_sided = known.one_sided
+        shares = _BLIND if one_sided else SHARES
         proposal = self._proposal(log_probability, known, shares, rng)
         fallback = self._fallback(log, known, relative_error(proposal.pilot.anticipated, proposal.pilot.predicted))
         if fallback is not None:
             proposal = self._proposal(fallback, known, shares, rng)
         pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng, min(len(known.y), MOST_LEARNED), size)
-        counts = known.one_sided or count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
-        blind = not len(known.y) or self._common(log_probability, log.iteration)
-        searched = 0 if blind else min(round(_SEARCH_SHARE[counts] * size), size - 1)
+        counts = count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
+        aimless = not len(known.y) or self._common(log_probability, log.iteration)
+        searching = _SEARCH_BLIND if one_sided else _SEARCH_SHARE[counts]
+        searched = 0 if aimless else min(round(searching * size), size - 1)
         noisy = simulator_noise(log.history, s.scenario.requirement).noisy is True
         runs, kept = draw_batch(
             s.scenario.space, pool, size - searched, rng, counts=counts, once=not noisy, fallback=fallback is not None,
-            existing=np.vstack([known.z, s.scenario.space.to_normal(log.planned.x)]),
+            phase=EXPLORE if one_sided else LEARN, existing=np.vstack([known.z, s.scenario.space.to_normal(log.planned.x)]),
         )  # fmt: skip
         return Batch((*runs, *self._runs(self._search_modes(known, log, searched), SEARCHED)), kept)
 

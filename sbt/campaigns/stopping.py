@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from sbt.campaigns.clustering import spread_of_draws
 from sbt.campaigns.counting import counted_batches
-from sbt.campaigns.records import EstimationProposal, PoolSummary
+from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST, combine_estimates
@@ -16,8 +16,9 @@ from sbt.store.records import Iteration
 
 __all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative_error", "relative_error_of", "steadier"]
 
-_LATEST = 0.6
-"""The count begins at the latest after this share of the budget: fewer batches would say little about their own spread."""
+_LATEST = (0.6, 0.8)
+"""The count begins at the latest after this share of the budget, as fewer batches would say little about their own spread; and after
+the second one where so few batches taught since runs are on both sides of the boundary that it would count what weighs too much."""
 _FEWEST_LEARNED = 3
 """Batches that only teach, at least."""
 _VALUES, _STALLED, _USABLE = 4, 1.5, 0.5
@@ -50,12 +51,12 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
     drawn = list(pools_of(log))
     if any(batch.read(EstimationProposal).counted is not None for batch, _ in drawn):
         return True
-    spent = len(log.planned)
-    if spent + size > _LATEST * settings.budget:
-        return True
     noisy = simulator_noise(log.history, settings.scenario.requirement).noisy is True
     values, fewest = (_VALUES_IN_NOISE, _VALUES_IN_NOISE) if noisy else (_VALUES, _FEWEST_LEARNED)
-    if len(drawn) < (fewest if settings.transfer is None else 1):
+    fewest, spent = fewest if settings.transfer is None else 1, len(log.planned)
+    if spent + size > _LATEST[len(drawn) < fewest] * settings.budget:
+        return True
+    if len(drawn) < fewest:
         return False
     left = math.sqrt(drawn_share * (settings.budget - spent))
     errors = [relative_error_of(pool) / left for _, pool in drawn[-values:]]
@@ -97,11 +98,11 @@ def steadier(log: Log, error: float) -> int | None:
 
 
 def pools_of(log: Log) -> Iterator[tuple[Iteration, PoolSummary]]:
-    """Yield the batches that were drawn from a pool, with the pool."""
+    """Yield the batches that were drawn from a pool, with the pool, since runs are on both sides of the boundary."""
     for batch in log.iterations:
-        pool = batch.read(EstimationProposal).pool
-        if pool is not None:
-            yield batch, pool
+        proposal = batch.read(EstimationProposal)
+        if proposal.pool is not None and proposal.phase != EXPLORE:
+            yield batch, proposal.pool
 
 
 def relative_error_of(pool: PoolSummary) -> float:
