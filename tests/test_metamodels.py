@@ -169,20 +169,26 @@ def test_kernel_is_gpytorchs(nu):
     kernel = gpytorch.kernels.MaternKernel(nu).double()
     kernel.lengthscale = 0.4
     expected = kernel(torch.from_numpy(a), torch.from_numpy(b)).to_dense().detach().numpy()
-    found = Hyperparameters(nu, np.full(a.shape[1], 0.4), 2.0, 0.1).covariance(a, b)
+    found = Hyperparameters(nu, np.full((1, a.shape[1]), 0.4), np.array([2.0]), 0.1).covariance(a, b)
     np.testing.assert_allclose(found, 2.0 * expected, rtol=1e-6)
 
 
-def objective(nu: float, noise_mode: float | None = None) -> Objective:
+def objective(nu: float, noise_mode: float | None = None, kernels: int = 1) -> Objective:
     u, y = rows(150, noise=0.1)
-    return Objective(nu, u, standardise(y)[0], np.linspace(0.5, 2.0, 150), torch.device("cpu"), noise_mode)
+    return Objective(nu, u, standardise(y)[0], np.linspace(0.5, 2.0, 150), torch.device("cpu"), noise_mode, kernels)
 
 
+def hyper(nu: float, kernels: int = 1) -> Hyperparameters:
+    lengths, scales = np.array([[0.3, 0.7, 2.0], [1.5, 0.2, 0.4]]), np.array([1.0, 0.3])
+    return Hyperparameters(nu, lengths[:kernels], scales[:kernels], 0.05)
+
+
+@pytest.mark.parametrize("kernels", [1, 2])
 @pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
-def test_gradient_is_that_of_the_objective(nu):
+def test_gradient_is_that_of_the_objective(nu, kernels):
     for mode in (None, -0.7):
-        value = objective(nu, mode)
-        at = value.vector(Hyperparameters(nu, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
+        value = objective(nu, mode, kernels)
+        at = value.vector(hyper(nu, kernels))
         assert value.hyperparameters(at).noise == pytest.approx(0.05)
         np.testing.assert_allclose(value(at)[1], approx_fprime(at, lambda v, f=value: f(v)[0], 1e-6), atol=1e-5)
 
@@ -190,7 +196,7 @@ def test_gradient_is_that_of_the_objective(nu):
 @pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
 def test_likelihood_and_priors_are_those_of_gpytorch_and_torch(nu):
     found = objective(nu, -5.0)
-    at = found.vector(Hyperparameters(nu, np.array([0.3, 0.7, 2.0]), 1.0, 0.05))
+    at = found.vector(hyper(nu))
     kernel = gpytorch.kernels.MaternKernel(nu, ard_num_dims=3).double()
     kernel.lengthscale = torch.tensor([0.3, 0.7, 2.0])
     noise, z = torch.from_numpy(0.05 * found.spread), torch.from_numpy(found.z)

@@ -116,12 +116,12 @@ def _left_out(search: Search, u: Points, y: Vector, inputs: Points, rng: np.rand
 
     warp = warp_around(y, search.critical)
     interval = MARGIN if isinstance(warp, JointWarp) else warp.interval(search.critical)
-    process = GaussianProcess(nu=2.5, input_noise=False)
+    process = GaussianProcess(nu=2.5, input_noise=False, kernels=1)
     process = process.for_noise if hidden_by_noise(u, search.margins(y)) else process
     learned = warp.values(y)
     fitted = process.fit(inputs, learned, rng)
     log_probability = fitted.leave_one_out(inputs, learned).log_probability(interval)[0]
-    return np.exp(log_probability), np.asarray(fitted.hyper.lengthscale, dtype=np.float64).reshape(-1)
+    return np.exp(log_probability), fitted.hyper.roughness**-0.5
 
 
 def _near(at: Points, counts: Points) -> NDArray[np.float64]:

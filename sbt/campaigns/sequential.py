@@ -56,7 +56,7 @@ _SEARCH_SHARE = (0.2, 0.1)
 _SEARCH_BLIND = 0.4
 """The same while all runs are on one side of the boundary."""
 _BLIND = (0.0, 0.75, 0.1, 0.15)
-"""Shares of the draws (`SHARES`) until then; they only teach, as what would count then is rarely met, and weighs much if it is."""
+"""Shares of the draws (`SHARES`) until then; they only teach: what would count then is rarely met, and weighs much if it is."""
 
 _GAIN = 4.0
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""

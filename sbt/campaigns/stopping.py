@@ -17,8 +17,8 @@ from sbt.store.records import Iteration
 __all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative_error", "relative_error_of", "steadier"]
 
 _LATEST = (0.6, 0.8)
-"""The count begins at the latest after this share of the budget, as fewer batches would say little about their own spread; and after
-the second one where so few batches taught since runs are on both sides of the boundary that it would count what weighs too much."""
+"""The count begins at the latest after this share of the budget: fewer batches would say little about their own spread. After the
+second one where few batches taught since runs are on both sides of the boundary: it would count what is rare and weighs much."""
 _FEWEST_LEARNED = 3
 """Batches that only teach, at least."""
 _VALUES, _STALLED, _USABLE = 4, 1.5, 0.5

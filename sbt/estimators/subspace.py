@@ -111,7 +111,7 @@ def _relevant(z: Points, t: Vector, rng: np.random.Generator) -> tuple[int, ...]
     from sbt.metamodels.gaussian_process import GaussianProcess
 
     rows = rng.permutation(len(t))[:_ROWS]
-    predictor = GaussianProcess(nu=2.5, input_noise=False).fit(unit(z[rows]), t[rows], rng)
-    weight = predictor.hyper.lengthscale**-2.0
+    predictor = GaussianProcess(nu=2.5, input_noise=False, kernels=1).fit(unit(z[rows]), t[rows], rng)
+    weight = predictor.hyper.roughness
     order = np.argsort(-weight, kind="stable")[:_MOST_INPUTS]
     return tuple(sorted(int(k) for k in order if weight[k] > _RELEVANT * weight.max()))

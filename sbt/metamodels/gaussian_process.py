@@ -26,7 +26,7 @@ from sbt.metamodels.gp_algebra import (
     solve,
     solve_right,
 )
-from sbt.metamodels.gp_fit import HEAVY_NOISE, LIKELY_NOISE, Objective, fit_posterior
+from sbt.metamodels.gp_fit import HEAVY_NOISE, LIKELY_NOISE, Objective, fit_kernels, fit_posterior
 from sbt.metamodels.gp_paper import fit_early_stopped
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative_variance
 from sbt.metamodels.tails import student_widths
@@ -37,13 +37,14 @@ __all__ = ["GaussianProcess", "GaussianProcessPredictor"]
 
 _FOLDS = 5  # of the noise regression
 _FEWEST_FOR_NOISE = 2 * _FOLDS  # rows: two a fold
+_FEWEST_FOR_TWO = 20  # rows from which on two kernels are tried
 _FOREST = ExtraTrees(trees=10, min_samples_split=20)  # of the noise: a smooth average, since squared residuals vary a lot
 _RESIDUAL_FLOOR = 1e-4  # of squared standardised residuals, before the logarithm
 
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """Settings of a Gaussian process (GP): constant mean, Matern kernel, one length scale per input.
+    """Settings of a Gaussian process (GP): constant mean, Matern kernel, one length scale per input, or two such kernels.
 
     Defaults: maximum a posteriori by L-BFGS under priors that scale with the dimension, on at most
     `fit_rows` rows, then conditioned on all rows; noise that depends on the input, from one regression
@@ -65,6 +66,8 @@ class GaussianProcess:
         device: auto (CUDA where there is one), cpu or cuda.
         certainly_noisy: the prior of the noise is that of a noisy metric alone, as for labels of a class.
         heavy_noise: the noise is large: its prior lies about half of the variance of y.
+        kernels: 2: the sum of two kernels of other length scales where its posterior density is larger (from 20 rows and two
+            inputs on; not with heavy noise, and not without priors); 1: never.
 
     Raises:
         InputError: a value outside its range; at the fit, a device that is not available.
@@ -86,6 +89,7 @@ class GaussianProcess:
     device: str = "cpu"
     certainly_noisy: bool = False
     heavy_noise: bool = False
+    kernels: int = 2
 
     CUBIC: ClassVar[bool] = True  # a fit costs the cube of its rows, a prediction their square: estimations give it few
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
@@ -95,6 +99,8 @@ class GaussianProcess:
     def __post_init__(self) -> None:
         if self.nu not in (0.5, 1.5, 2.5):
             raise InputError(f"nu must be 0.5, 1.5 or 2.5, but got {self.nu}")
+        if self.kernels not in (1, 2):
+            raise InputError(f"kernels must be 1 or 2, but got {self.kernels}")
         if not (self.fit_rows >= 2 and self.most_rows >= 2 and self.patience >= 1 and self.max_epochs >= 1):
             raise InputError(
                 "GaussianProcess needs fit_rows >= 2, most_rows >= 2, patience >= 1 and max_epochs >= 1, "
@@ -146,7 +152,10 @@ class GaussianProcess:
             return _condition(self, hyper, u[training], z[training], ones, None, shift, scale)
         rows = rng.permutation(len(z))[: self.fit_rows]
         objective = Objective(self.nu, u[rows], z[rows], np.ones(len(rows)), device, noise_mode=self._noise_mode)
-        hyper = fit_posterior(objective)
+        if self.kernels == 1 or self._noise_mode is not None or len(rows) < _FEWEST_FOR_TWO or u.shape[1] == 1:
+            hyper = fit_posterior(objective)
+        else:
+            objective, hyper = fit_kernels(objective)
         if not self.input_noise or len(z) < _FEWEST_FOR_NOISE:
             return _condition(self, hyper, u, z, np.ones(len(z)), None, shift, scale)
         spread, at_rows = _fit_noise_spread(hyper, u, z, rng, device)

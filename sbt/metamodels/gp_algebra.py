@@ -31,50 +31,78 @@ _CACHED = 2**15  # entries of a matrix that are computed at once: three arrays o
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """Kernel and noise variance, for standardised y."""
+    """Kernel, a sum of q Matern kernels of other length scales, and noise variance, for standardised y.
+
+    Attributes:
+        nu: smoothness of the kernels.
+        lengthscale: (q, d) of each kernel.
+        outputscale: (q,) its variance.
+        noise: variance.
+    """
 
     nu: float
-    lengthscale: Vector  # (d,)
-    outputscale: float
+    lengthscale: Points
+    outputscale: Vector
     noise: float
 
     @property
-    def scaling(self) -> Vector:
-        """(d,) factors on coordinates, with which the kernel depends on their distance alone."""
+    def scaling(self) -> Points:
+        """(q, d) factors on coordinates, with which each kernel depends on their distance alone."""
         return np.asarray(math.sqrt(2.0 * self.nu) / self.lengthscale)
+
+    @property
+    def variance(self) -> float:
+        """Of the latent function."""
+        return float(self.outputscale.sum())
+
+    @property
+    def roughness(self) -> Vector:
+        """(d,) how fast the function varies along each input: the square root is one over a length scale for all kernels."""
+        return np.asarray(self.outputscale @ self.lengthscale**-2.0 / self.variance)
 
     def covariance(self, a: Matrix, b: Matrix) -> Matrix:
         """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
-        scale = like(self.scaling, a)
+        parts = [self._covariance(a, b, k) for k in range(len(self.outputscale))]
+        for other in parts[1:]:
+            parts[0] += other
+        return parts[0]
+
+    def _covariance(self, a: Matrix, b: Matrix, k: int) -> Matrix:
+        """Return the (n, m) covariance of one kernel."""
+        scale, variance = like(self.scaling[k], a), float(self.outputscale[k])
         if isinstance(a, torch.Tensor):
-            return self.outputscale * _matern(_distances(a * scale, b * scale), self.nu)
+            return variance * _matern(_distances(a * scale, b * scale), self.nu)
         found, rows = cdist(a * scale, b * scale), max(_CACHED // max(len(b), 1), 1)
         for start in range(0, len(found), rows):
             part = found[start : start + rows]
             part[:] = _matern(part, self.nu)
-            if self.outputscale != 1.0:
-                part *= self.outputscale
+            if variance != 1.0:
+                part *= variance
         return found
 
-    def covariance_and_slope(self, a: Matrix) -> tuple[Matrix, Matrix]:
-        """Return the lower triangle of the (n, n) covariance at a (n, d), and f (n, n).
+    def covariances_and_slopes(self, a: Matrix) -> list[tuple[Matrix, Matrix]]:
+        """Return of each kernel the lower triangle of the (n, n) covariance at a (n, d), and f (n, n).
 
-        The covariance of two points a and b has the derivative f (a_k - b_k)^2 by the logarithm of length scale k, of
+        The covariance of two points a and b has the derivative f (a_j - b_j)^2 by the logarithm of length scale j, of
         coordinates that are multiplied by `scaling`.
         """
-        n, at = len(a), a * like(self.scaling, a)
+        return [self._covariance_and_slope(a, k) for k in range(len(self.outputscale))]
+
+    def _covariance_and_slope(self, a: Matrix, k: int) -> tuple[Matrix, Matrix]:
+        n, at, variance = len(a), a * like(self.scaling[k], a), float(self.outputscale[k])
         if isinstance(a, torch.Tensor):
-            return tuple(part.tril_() for part in self._with_slope(_distances(at, at)))
+            covariance, slope = self._with_slope(_distances(at, at), variance)
+            return covariance.tril_(), slope.tril_()
         both, rows = np.zeros((2, n, n)), max(_CACHED // max(n, 1), 1)
         for start in range(0, n, rows):
             part = both[:, start : start + rows, start:]
-            part[:] = self._with_slope(cdist(at[start : start + rows], at[start:]))
+            part[:] = self._with_slope(cdist(at[start : start + rows], at[start:]), variance)
             part[..., :rows] = np.triu(part[..., :rows])
         return both[0].T, both[1].T
 
-    def _with_slope(self, r: Matrix) -> tuple[Matrix, Matrix]:
+    def _with_slope(self, r: Matrix, variance: float) -> tuple[Matrix, Matrix]:
         """Return the covariance at distances r, and its derivative by r, divided by -r; writes on `r`."""
-        decay = self.outputscale * (torch if isinstance(r, torch.Tensor) else np).exp(-r)
+        decay = variance * (torch if isinstance(r, torch.Tensor) else np).exp(-r)
         if self.nu == 0.5:
             r[r == 0.0] = math.inf  # of equal points nothing depends on the length
             return decay, decay / r

@@ -7,7 +7,7 @@ differentiation, which takes as long as the mathematics, nor conjugate gradients
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.special import expit
 from sbt.metamodels.gp_algebra import NOISE_FLOOR, Hyperparameters, cholesky, diagonal, host, like, placed, solve
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["HEAVY_NOISE", "LIKELY_NOISE", "Objective", "fit_posterior"]
+__all__ = ["HEAVY_NOISE", "LIKELY_NOISE", "Objective", "fit_kernels", "fit_posterior"]
 
 LIKELY_NOISE, HEAVY_NOISE = -5.0, -0.7
 """Log variances: the mode of a noisy metric, and about half of y's, the mode where a simulator is known to be noisy."""
@@ -27,6 +27,9 @@ _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the 
 _LEAST_NOISE = 1e-4  # where there is certainly noise
 _FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
 _HEAVY_LENGTH, _HEAVY_START = 0.6, 0.5  # the same where noise is heavy: from short ones the fit takes noise for structure
+_FIRST_LENGTHS, _FIRST_SCALES = (1.5, 0.4), (1.0, 0.2)  # the same of two kernels, and their variances
+_SCALE_SPREAD = 2.0  # of the prior of log variances of two kernels
+_COMPARED = 200  # rows that one kernel is compared with two on
 _ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
 _PRIOR_SPREAD = math.sqrt(3.0)  # of the log length scales
 _LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
@@ -36,16 +39,17 @@ _LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
 class Objective:
     """Minus the log posterior density of n rows as a function of the vector of log hyperparameters, per row.
 
-    The vector has the d log length scales and the log of what the noise variance has above its floor; the output scale is
-    that of standardised y, 1.
+    The vector has the q d log length scales, of more than one kernel the q log output scales (of one it is that of
+    standardised y, 1), and the log of what the noise variance has above its floor.
 
     Args:
-        nu: smoothness of the kernel.
+        nu: smoothness of the kernels.
         u: (n, d) rows.
         z: (n,) standardised y.
         spread: (n,) noise variance relative to the common one.
         device: where it is computed.
         noise_mode: log variance about which the noise is expected; None: there may be none.
+        kernels: q, the number of kernels whose sum is fitted.
 
     Source:
         Rasmussen & Williams (2006), algorithm 2.1, eqs. (4.17), (5.9); priors: Hvarfner et al. (2024), as in BoTorch
@@ -58,6 +62,7 @@ class Objective:
     spread: Vector
     device: torch.device
     noise_mode: float | None = None
+    kernels: int = 1
 
     @property
     def floor(self) -> float:
@@ -71,32 +76,46 @@ class Objective:
     def vector(self, hyper: Hyperparameters) -> Vector:
         """Return the vector of hyperparameters."""
         noise = max(hyper.noise, 1.001 * self.floor) - self.floor
-        return np.append(np.log(hyper.lengthscale), math.log(noise))
+        scales = np.log(hyper.outputscale) if self.kernels > 1 else np.empty(0)
+        return np.concatenate([np.log(hyper.lengthscale).reshape(-1), scales, [math.log(noise)]])
 
     def hyperparameters(self, vector: Vector) -> Hyperparameters:
         """Return the hyperparameters of a vector."""
-        return Hyperparameters(self.nu, np.exp(vector[:-1]), 1.0, self.floor + math.exp(vector[-1]))
+        q, d = self.kernels, self.u.shape[1]
+        scales = np.exp(vector[q * d : -1]) if q > 1 else np.ones(1)
+        return Hyperparameters(self.nu, np.exp(vector[: q * d]).reshape(q, d), scales, self.floor + math.exp(vector[-1]))
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
         """Return the objective at a vector, and its gradient; the mean is profiled out, so it adds nothing to the gradient."""
         hyper, n, d = self.hyperparameters(vector), len(self.z), self.u.shape[1]
-        covariance, factors = hyper.covariance_and_slope(self._rows)
-        solved = solve(cholesky(covariance, hyper.noise * self.spread), self.z)
+        parts = hyper.covariances_and_slopes(self._rows)
+        total = parts[0][0]
+        for covariance, _ in parts[1:]:
+            total = total + covariance
+        solved = solve(cholesky(total, hyper.noise * self.spread), self.z)
         slope = solved.inverse  # from here on, twice n times that by the covariance
         slope -= (solved.alpha[:, None] * solved.alpha).T  # symmetric; its memory is laid out as the inverse's
         by_noise = 0.5 / n * float(host(diagonal(slope)) @ self.spread)
-        slope *= factors
-        at = self._rows * like(hyper.scaling, self._rows)
-        at = at - at.mean(axis=0)  # differences of small numbers are exact
-        sums = slope.sum(axis=0) + slope.sum(axis=1)
-        by_length = host(sums @ (at * at) - 2.0 * (at * (slope @ at)).sum(axis=0)) / n
-        gradient = np.append(by_length, by_noise * (hyper.noise - self.floor))
-        away = (vector[:d] - math.sqrt(2.0) - 0.5 * math.log(d)) / _PRIOR_SPREAD
-        log_prior = -vector[:d] - 0.5 * away**2 - math.log(_PRIOR_SPREAD) - _LOG_ROOT
-        gradient[:d] += (1.0 + away / _PRIOR_SPREAD) / n
+        by_length, by_scale = [], []
+        for k, (covariance, factors) in enumerate(parts):
+            if len(parts) > 1:  # of the covariance there is the lower triangle: the diagonal counts half
+                at_zero = 0.5 * float(hyper.outputscale[k]) * float(host(diagonal(slope)).sum())
+                by_scale.append((float((slope * covariance).sum()) - at_zero) / n)
+            factors *= slope
+            at = self._rows * like(hyper.scaling[k], self._rows)
+            at = at - at.mean(axis=0)  # differences of small numbers are exact
+            sums = factors.sum(axis=0) + factors.sum(axis=1)
+            by_length.append(host(sums @ (at * at) - 2.0 * (at * (factors @ at)).sum(axis=0)) / n)
+        gradient = np.concatenate([*by_length, by_scale, [by_noise * (hyper.noise - self.floor)]])
+        lengths, scales = vector[: len(parts) * d], vector[len(parts) * d : -1]
+        away = (lengths - math.sqrt(2.0) - 0.5 * math.log(d)) / _PRIOR_SPREAD
+        log_prior = float((-lengths - 0.5 * away**2 - math.log(_PRIOR_SPREAD) - _LOG_ROOT).sum())
+        gradient[: len(lengths)] += (1.0 + away / _PRIOR_SPREAD) / n
+        log_prior += float((-0.5 * (scales / _SCALE_SPREAD) ** 2 - math.log(_SCALE_SPREAD) - _LOG_ROOT).sum())
+        gradient[len(lengths) : -1] += scales / _SCALE_SPREAD**2 / n
         of_noise, by_log_noise = _log_prior_of_noise(math.log(hyper.noise), self.noise_mode)
         gradient[-1] -= by_log_noise * (1.0 - self.floor / hyper.noise) / n
-        return -(solved.log_likelihood + float(log_prior.sum()) + of_noise) / n, gradient
+        return -(solved.log_likelihood + log_prior + of_noise) / n, gradient
 
 
 def _log_prior_of_noise(log_noise: float, mode: float | None) -> tuple[float, float]:
@@ -118,13 +137,42 @@ def _log_prior_of_noise(log_noise: float, mode: float | None) -> tuple[float, fl
 
 def fit_posterior(objective: Objective, start: Hyperparameters | None = None) -> Hyperparameters:
     """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
+    return _fitted(objective, start)[0]
+
+
+def _fitted(objective: Objective, start: Hyperparameters | None = None) -> tuple[Hyperparameters, float]:
+    """Return the hyperparameters of largest posterior density, and its logarithm."""
     if start is None:
-        d, heavy = objective.u.shape[1], objective.noise_mode == HEAVY_NOISE
-        length, noise = (_HEAVY_LENGTH, _HEAVY_START) if heavy else (_FIRST_LENGTH, _FIRST_NOISE)
-        start = Hyperparameters(objective.nu, np.full(d, length * math.sqrt(d)), 1.0, noise)
+        start = _first(objective)
     first = objective.vector(start)
     found = minimize(
         objective, first, jac=True, method="L-BFGS-B", bounds=[_BOUNDS] * (len(first) - 1) + [(_NO_NOISE - 1.0, _BOUNDS[1])],
         options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE},
     )  # fmt: skip
-    return objective.hyperparameters(found.x)
+    return objective.hyperparameters(found.x), -float(found.fun) * len(objective.z)
+
+
+def _first(objective: Objective) -> Hyperparameters:
+    """Return where L-BFGS starts."""
+    d, heavy = objective.u.shape[1], objective.noise_mode == HEAVY_NOISE
+    if objective.kernels > 1:
+        lengths = np.repeat(np.array(_FIRST_LENGTHS)[:, None] * math.sqrt(d), d, axis=1)
+        return Hyperparameters(objective.nu, lengths, np.array(_FIRST_SCALES), _FIRST_NOISE)
+    length, noise = (_HEAVY_LENGTH, _HEAVY_START) if heavy else (_FIRST_LENGTH, _FIRST_NOISE)
+    return Hyperparameters(objective.nu, np.full((1, d), length * math.sqrt(d)), np.ones(1), noise)
+
+
+def fit_kernels(objective: Objective) -> tuple[Objective, Hyperparameters]:
+    """Return the objective with one kernel or with two, whichever has the larger posterior density, and its hyperparameters.
+
+    A function that bends slowly over the space and quickly somewhere, or along few inputs here and along others there, has no
+    one length scale an input. Which it is, a share of many rows tells.
+    """
+    n = len(objective.z)
+    some = replace(objective, u=objective.u[:_COMPARED], z=objective.z[:_COMPARED], spread=objective.spread[:_COMPARED])
+    one, by_one = _fitted(some)
+    two, by_two = _fitted(replace(some, kernels=2))
+    if by_two > by_one:
+        chosen = replace(objective, kernels=2)
+        return chosen, two if n <= _COMPARED else fit_posterior(chosen, two)
+    return objective, one if n <= _COMPARED else fit_posterior(objective)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from sbt.metamodels.gp_algebra import Hyperparameters
@@ -81,6 +82,6 @@ def _process(nu: float, rows: torch.Tensor, values: torch.Tensor, likelihood: An
 def _hyperparameters(nu: float, process: Any) -> Hyperparameters:
     kernel = process.covar_module
     return Hyperparameters(
-        nu, kernel.base_kernel.lengthscale.detach().cpu().numpy().ravel().copy(), float(kernel.outputscale.detach()),
-        float(process.likelihood.noise.detach()),
+        nu, kernel.base_kernel.lengthscale.detach().cpu().numpy().reshape(1, -1).copy(),
+        np.array([float(kernel.outputscale.detach())]), float(process.likelihood.noise.detach()),
     )  # fmt: skip

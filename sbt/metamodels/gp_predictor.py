@@ -166,14 +166,13 @@ class GaussianProcessPredictor:
         The variance given all rows is at most that given one of them, and P grows with it where the mean
         lies outside of M_c, shrinks where it lies inside. Many times quicker than the prediction.
         """
-        scale, noise = self.hyper.outputscale, self.hyper.noise
+        scale, noise = self.hyper.variance, self.hyper.noise
         most = 1.0 if self.spread is None else self.spread.largest
         with single_threaded():
-            b = u * self.hyper.scaling
-            scaled = np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)])
+            scaled = [np.column_stack([b, np.ones(len(b)), (b**2).sum(axis=1)]) for b in (u * k for k in self.hyper.scaling)]
             shape = (min(_QUICK, len(u)), len(self.u))
-            room = np.empty(shape), np.empty(shape, self._precision), np.empty(shape, self._precision)
-            chunks = [self._quick(scaled[i : i + _QUICK], room) for i in range(0, max(len(u), 1), _QUICK)]
+            room = [np.empty(shape), *(np.empty(shape, self._precision) for _ in range(min(len(scaled), 2) + 1))]
+            chunks = [self._quick([b[i : i + _QUICK] for b in scaled], room) for i in range(0, max(len(u), 1), _QUICK)]
         quick, nearest = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
         rough = self.spread is None or noise * most <= 0.1 * scale or len(u) == 0  # an upper bound of a small noise will do
         at = np.full(len(u), most) if rough or self.spread is None else self.spread(u)
@@ -194,31 +193,38 @@ class GaussianProcessPredictor:
                 low += at_least / len(self.widths)
         return low * (1.0 - 1e-9), np.minimum(high * (1.0 + 1e-9), 1.0)
 
-    def _quick(self, scaled: Points, room: tuple[Points, Any, Any]) -> tuple[Vector, Vector]:
-        """Return (m,) means, standardised, and (m,) correlations with the nearest row, of scaled points (m, d + 2).
+    def _quick(self, scaled: list[Points], room: list[Any]) -> tuple[Vector, Vector]:
+        """Return (m,) means, standardised, and (m,) correlations with the nearest row, of points (m, d + 2) scaled by kernel.
 
         Correlations are in single precision where that will do (not where weights are large, as without noise), with an
-        error of at most `_off`; sums are in double precision. All is computed in `room`, three arrays (at least m, n):
+        error of at most `_off`; sums are in double precision. All is computed in `room`, a few arrays (at least m, n):
         new ones for every chunk cost a sixth more time.
         """
-        across, weights = self._prepared
-        squares, r, correlation = (part[: len(scaled)] for part in room)
-        np.dot(scaled, across, out=squares)
-        np.copyto(r, squares, casting="same_kind")
-        np.sqrt(r, out=r)
-        np.exp(np.negative(r, out=correlation), out=correlation)
-        if self.hyper.nu == 1.5:
-            r += 1.0
-            correlation *= r
-        elif self.hyper.nu == 2.5:
-            correlation *= r * r / self._precision(3.0) + r + self._precision(1.0)
+        across, weights, shares = self._prepared
+        squares, r, *found = (part[: len(scaled[0])] for part in room)
+        for k, (points, columns) in enumerate(zip(scaled, across, strict=True)):
+            correlation = found[min(k, 1)]
+            np.dot(points, columns, out=squares)
+            np.copyto(r, squares, casting="same_kind")
+            np.sqrt(r, out=r)
+            np.exp(np.negative(r, out=correlation), out=correlation)
+            if self.hyper.nu == 1.5:
+                r += 1.0
+                correlation *= r
+            elif self.hyper.nu == 2.5:
+                correlation *= r * r / self._precision(3.0) + r + self._precision(1.0)
+            if len(scaled) > 1:
+                correlation *= self._precision(shares[k])
+            if k > 0:
+                found[0] += correlation
+        correlation = found[0]
         nearest = correlation[np.arange(len(r)), correlation.argmax(axis=1)]  # quicker than max
         return self.centre + correlation @ weights, nearest.astype(np.float64)
 
     @cached_property
     def _total_weight(self) -> float:
         """What an error of 1 in every correlation would make of the mean, standardised."""
-        return self.hyper.outputscale * float(np.abs(self.alpha).sum())
+        return self.hyper.variance * float(np.abs(self.alpha).sum())
 
     @cached_property
     def _precision(self) -> Any:
@@ -227,19 +233,21 @@ class GaussianProcessPredictor:
     @cached_property
     def _off(self) -> float:
         """Upper bound of the error of a correlation that `_quick` computes in the unit cube; nu 0.5 has a slope at distance 0."""
-        return _ROUNDED[self._precision] + (math.sqrt(2.0 * self._cancelled) if self.hyper.nu == 0.5 else 2.0 * self._cancelled)
+        cancelled = math.sqrt(2.0 * self._cancelled) if self.hyper.nu == 0.5 else 2.0 * self._cancelled
+        return len(self.hyper.outputscale) * _ROUNDED[self._precision] + cancelled
 
     @cached_property
     def _cancelled(self) -> float:
         """Upper bound of the rounding error of squared distances, computed as differences; added, so that none is < 0."""
-        return _CANCELLED * 8.0 * self.hyper.nu * float((self.hyper.lengthscale**-2.0).sum())
+        return _CANCELLED * 8.0 * self.hyper.nu * float((self.hyper.lengthscale**-2.0).sum(axis=1).max())
 
     @cached_property
-    def _prepared(self) -> tuple[Points, Vector]:
-        """Return what squared distances of points and rows are made from, (d + 2, n), and (n,) weights."""
-        a = self.u * self.hyper.scaling
-        across = np.column_stack([-2.0 * a, (a**2).sum(axis=1) + self._cancelled, np.ones(len(a))]).T
-        return np.ascontiguousarray(across), self.hyper.outputscale * self.alpha
+    def _prepared(self) -> tuple[list[Points], Vector, Vector]:
+        """Return what squared distances of points and rows are made from, (d + 2, n) a kernel; (n,) weights; kernels' shares."""
+        rows = [self.u * k for k in self.hyper.scaling]
+        across = [np.column_stack([-2.0 * a, (a**2).sum(axis=1) + self._cancelled, np.ones(len(a))]).T for a in rows]
+        variance = self.hyper.variance
+        return [np.ascontiguousarray(a) for a in across], variance * self.alpha, self.hyper.outputscale / variance
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) functions drawn from the process, without noise, at u (m, d); the cost is cubic in m.
@@ -254,7 +262,7 @@ class GaussianProcessPredictor:
             mean = self.centre + host(alpha @ cross)
             half = self._half(cross)
             latent = self.hyper.covariance(at, at) - half.T @ half
-            root = host(cholesky(latent, np.full(len(u), 1e-8 * self.hyper.outputscale)))
+            root = host(cholesky(latent, np.full(len(u), 1e-8 * self.hyper.variance)))
             return self.shift + self.scale * (mean + rng.standard_normal((n, len(u))) @ root.T)
 
     def left_out(self, groups: Sequence[Sequence[int]]) -> list[tuple[Vector, Vector]]:
@@ -279,8 +287,8 @@ class GaussianProcessPredictor:
         rows, _, alpha = self._placed
         cross = self.hyper.covariance(like(u, rows), rows).T  # (n, m), column by column as BLAS wants it: nothing is copied
         mean = self.centre + host(alpha @ cross)
-        variance = self.hyper.outputscale - squared_columns(self._half(cross))
-        return mean, np.maximum(variance, 1e-10 * self.hyper.outputscale)
+        variance = self.hyper.variance - squared_columns(self._half(cross))
+        return mean, np.maximum(variance, 1e-10 * self.hyper.variance)
 
     def _half(self, cross: Matrix) -> Matrix:
         """Return the inverse of the factor times `cross` (n, m); may write on `cross`."""

@@ -70,7 +70,7 @@ def _extrapolated(at: Points, u: Points, margin: Vector, rng: np.random.Generato
     """Return how deep (k,) points are by a process of margins (m,) > 0 at u (m, d): the mean of what it predicts below 0."""
     from sbt.metamodels.gaussian_process import GaussianProcess
 
-    scale, process = float(np.quantile(margin, _USUAL)), GaussianProcess(nu=2.5, input_noise=False)
+    scale, process = float(np.quantile(margin, _USUAL)), GaussianProcess(nu=2.5, input_noise=False, kernels=1)
     rows = np.argsort(margin, kind="stable")[:_MOST]
     with np.errstate(over="ignore"):
         prediction = process.fit(u[rows], np.arcsinh(margin[rows] / scale), rng)(at)

@@ -78,5 +78,5 @@ def _fitted(u: Points, ok: Mask, rng: np.random.Generator, *, input_noise: bool)
     from sbt.metamodels.gaussian_process import GaussianProcess
 
     if len(u) <= _MOST_EXACT:
-        return GaussianProcess(certainly_noisy=True, input_noise=input_noise).fit(u, ok.astype(np.float64), rng)
+        return GaussianProcess(certainly_noisy=True, input_noise=input_noise, kernels=1).fit(u, ok.astype(np.float64), rng)
     return ExtraTrees().fit(u, ok.astype(np.float64), rng)
