@@ -193,6 +193,22 @@ def test_gradient_is_that_of_the_objective(nu, kernels):
         np.testing.assert_allclose(value(at)[1], approx_fprime(at, lambda v, f=value: f(v)[0], 1e-6), atol=1e-5)
 
 
+def test_two_kernels_are_taken_where_one_length_scale_an_input_is_too_few():
+    """A broad bowl with a ripple along one input; a product of two inputs beside a wave along a third; a rough surface."""
+    rng = np.random.default_rng(0)
+    u, at = rng.random((120, 5)), rng.random((2000, 5))
+    for function, better in (
+        (lambda v: 4.0 * ((v - 0.5) ** 2).sum(axis=1) + 0.3 * np.sin(25.0 * v[:, 0]), 10.0),
+        (lambda v: np.sin(3.0 * v[:, 0]) + v[:, 1] * v[:, 2], 2.0),
+        (lambda v: np.abs(np.sin(9.0 * v)).sum(axis=1), 1.0),
+    ):
+        two, one = (GaussianProcess(nu=2.5, input_noise=False, kernels=q).fit(u, function(u), np.random.default_rng(1)) for q in (2, 1))
+        errors = [float(np.sqrt(np.mean((fitted.mu(at) - function(at)) ** 2))) for fitted in (two, one)]
+        assert errors[1] >= better * errors[0]
+        if better == 1.0:
+            np.testing.assert_array_equal(two.mu(at), one.mu(at)), "what one kernel says is not changed"
+
+
 @pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
 def test_likelihood_and_priors_are_those_of_gpytorch_and_torch(nu):
     found = objective(nu, -5.0)

@@ -17,7 +17,7 @@ from sbt.seeds import stream
 KINDS = {
     "nu 0.5": GaussianProcess(nu=0.5), "nu 1.5": GaussianProcess(), "nu 2.5": GaussianProcess(nu=2.5),
     "student": GaussianProcess(student_t=True), "paper": GaussianProcess(input_noise=False, priors=False, max_epochs=30),
-    "auto": Auto(ensemble_rows=1000, folds=2),
+    "auto": Auto(ensemble_rows=1000, folds=2), "two kernels": GaussianProcess(nu=2.5, input_noise=False),
 }  # fmt: skip
 INTERVALS = (CriticalInterval(high=-0.4), CriticalInterval(low=0.9), CriticalInterval(-0.7, -0.3), CriticalInterval(-9.0, 9.0))
 
@@ -26,7 +26,11 @@ def fitted(kind: str, n: int = 90, d: int = 3):
     rng = np.random.default_rng(2)
     u = rng.random((n, d))
     y = np.minimum(1.5 * u[:, 0] + np.sin(6 * u[:, 1]) - u[:, -1], 1.0) + rng.normal(scale=0.02 + 0.3 * (u[:, 0] < 0.2))
-    return KINDS[kind].fit(u, y, stream(0, "fit")), u
+    if kind == "two kernels":
+        y = 4.0 * ((u - 0.5) ** 2).sum(axis=1) + 0.1 * np.sin(25.0 * u[:, 0]) - 1.0
+    predictor = KINDS[kind].fit(u, y, stream(0, "fit"))
+    assert (getattr(getattr(predictor, "hyper", None), "outputscale", np.ones(1)).size == 2) == (kind == "two kernels")
+    return predictor, u
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -18,7 +18,8 @@ __all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative
 
 _LATEST = (0.6, 0.8)
 """The count begins at the latest after this share of the budget: fewer batches would say little about their own spread. After the
-second one where few batches taught since runs are on both sides of the boundary: it would count what is rare and weighs much."""
+second one, if batches are left, where few taught since runs are on both sides of the boundary: it would count what is rare and
+weighs much."""
 _FEWEST_LEARNED = 3
 """Batches that only teach, at least."""
 _VALUES, _STALLED, _USABLE = 4, 1.5, 0.5
@@ -54,7 +55,8 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
     noisy = simulator_noise(log.history, settings.scenario.requirement).noisy is True
     values, fewest = (_VALUES_IN_NOISE, _VALUES_IN_NOISE) if noisy else (_VALUES, _FEWEST_LEARNED)
     fewest, spent = fewest if settings.transfer is None else 1, len(log.planned)
-    if spent + size > _LATEST[len(drawn) < fewest] * settings.budget:
+    latest, later = (share * settings.budget for share in _LATEST)
+    if spent + size > (latest if len(drawn) >= fewest else max(latest, min(later, settings.budget - FEWEST_BATCHES * size))):
         return True
     if len(drawn) < fewest:
         return False

@@ -28,6 +28,7 @@ _LEAST_NOISE = 1e-4  # where there is certainly noise
 _FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
 _HEAVY_LENGTH, _HEAVY_START = 0.6, 0.5  # the same where noise is heavy: from short ones the fit takes noise for structure
 _FIRST_LENGTHS, _FIRST_SCALES = (1.5, 0.4), (1.0, 0.2)  # the same of two kernels, and their variances
+_SCALE_BOUNDS = (_BOUNDS[0], math.log(100.0))  # with larger ones the least noise would be lost in rounding
 _SCALE_SPREAD = 2.0  # of the prior of log variances of two kernels
 _COMPARED = 200  # rows that one kernel is compared with two on
 _ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
@@ -144,9 +145,10 @@ def _fitted(objective: Objective, start: Hyperparameters | None = None) -> tuple
     """Return the hyperparameters of largest posterior density, and its logarithm."""
     if start is None:
         start = _first(objective)
-    first = objective.vector(start)
+    first, scales = objective.vector(start), [_SCALE_BOUNDS] * objective.kernels if objective.kernels > 1 else []
     found = minimize(
-        objective, first, jac=True, method="L-BFGS-B", bounds=[_BOUNDS] * (len(first) - 1) + [(_NO_NOISE - 1.0, _BOUNDS[1])],
+        objective, first, jac=True, method="L-BFGS-B",
+        bounds=[_BOUNDS] * start.lengthscale.size + scales + [(_NO_NOISE - 1.0, _BOUNDS[1])],
         options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE},
     )  # fmt: skip
     return objective.hyperparameters(found.x), -float(found.fun) * len(objective.z)
