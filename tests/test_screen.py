@@ -44,7 +44,7 @@ def test_bounds_hold(kind):
         assert (low <= p).all()
         assert (p <= high).all()
         bound = log_ambiguity_bound(predict, u, critical)
-        assert (np.maximum(boundary(prediction, critical, np.zeros(len(u))), -699.0) <= bound).all()
+        assert (np.maximum(boundary(prediction, critical, np.zeros(len(u))), -700.0) <= bound).all()
 
 
 @pytest.mark.parametrize("kind", ["nu 1.5", "auto"])
