@@ -31,6 +31,7 @@ _FIRST_LENGTHS, _FIRST_SCALES = (1.5, 0.4), (1.0, 0.2)  # the same of two kernel
 _SCALE_BOUNDS = (_BOUNDS[0], math.log(100.0))  # with larger ones the least noise would be lost in rounding
 _SCALE_SPREAD = 2.0  # of the prior of log variances of two kernels
 _COMPARED = 200  # rows that one kernel is compared with two on
+_CLEARLY = 3.0  # by which the log posterior density of two kernels must be larger
 _ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
 _PRIOR_SPREAD = math.sqrt(3.0)  # of the log length scales
 _LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
@@ -174,7 +175,7 @@ def fit_kernels(objective: Objective) -> tuple[Objective, Hyperparameters]:
     some = replace(objective, u=objective.u[:_COMPARED], z=objective.z[:_COMPARED], spread=objective.spread[:_COMPARED])
     one, by_one = _fitted(some)
     two, by_two = _fitted(replace(some, kernels=2))
-    if by_two > by_one:
+    if by_two > by_one + _CLEARLY:
         chosen = replace(objective, kernels=2)
         return chosen, two if n <= _COMPARED else fit_posterior(chosen, two)
     return objective, one if n <= _COMPARED else fit_posterior(objective)
