@@ -1,14 +1,15 @@
-"""Metrics that end at the critical edge, such as a distance that is 0 in every collision."""
+"""Metrics that end at the critical edge, such as a distance that is 0 in every collision, and metrics that come in steps."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import sbt
-from sbt.metamodels.saturation import opened, scored
+from sbt.metamodels.saturation import centred, opened, scored
 from sbt.problem.requirement import CriticalInterval
 
 CRITICAL = CriticalInterval(high=0.0)
@@ -48,6 +49,51 @@ def test_of_a_run_at_the_edge_its_side_is_scored():
     y, mu = np.array([0.0, 0.0, 1.0]), np.array([-0.4, 0.2, 0.9])
     assert scored(y, mu, CRITICAL).tolist() == [-0.4, 0.0, 1.0]
     assert scored(np.array([0.0, -1.0]), mu[:2], CRITICAL).tolist() == [0.0, -1.0]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_edge_of_a_metric_in_steps_lies_midway_between_two_of_them(sign):
+    u = np.arange(7.0)[:, None]
+    y = np.array([-2.0, -1.0, 0.0, 0.0, 1.0, 1.0, 2.0])
+    for edge in (0.0, 0.3):  # what lies between two steps makes no difference
+        critical = CriticalInterval(high=edge) if sign > 0 else CriticalInterval(low=-edge)
+        found = centred(u, sign * y, critical)
+        assert np.array_equal(critical.contains(found), critical.contains(sign * y))
+        assert (sign * found).tolist() == [-2.0, -1.0, edge - 0.5, edge - 0.5, edge + 0.5, edge + 0.5, 2.0]
+        assert opened(u, sign * y, critical, np.random.default_rng(0)).tolist() == found.tolist()
+
+
+@pytest.mark.parametrize(
+    ("u", "y", "critical"),
+    [
+        ([0, 1, 2, 3, 4], [-1.0, 0.0, 0.0, 1.0, 2.0], CRITICAL),  # one value next to the edge may be there by chance
+        ([0, 1, 1, 3, 3], [-1.0, 0.0, 0.0, 1.0, 1.0], CRITICAL),  # repetitions of the same inputs are no step
+        ([0, 1, 2, 3, 4], [-1.0, 0.0, 0.0, 1.0, 1.0], CriticalInterval(-0.5, 0.5)),
+        ([0, 1, 2, 3, 4], [1.0, 1.0, 2.0, 2.0, 2.0], CRITICAL),  # nothing is critical
+    ],
+)
+def test_a_metric_without_steps_is_left_alone(u, y, critical):
+    values = np.array(y)
+    assert centred(np.array(u, dtype=float)[:, None], values, critical) is values
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "coverage"])
+def test_of_a_count_the_stated_share_is_right(tmp_path, campaign):
+    """Conflicts are counted: 0 to 9 on the square, two or fewer are critical where 2.5 would be."""
+    scenario = sbt.Scenario(
+        "count", inputs=[sbt.Parameter(name, 0.0, 1.0) for name in "ab"],
+        evaluate=lambda v, _: {"conflicts": float(round(9.0 * math.hypot(v["a"], v["b"]) / math.sqrt(2.0)))},
+        requirement=sbt.Requirement("conflicts", high=2.0),
+    )  # fmt: skip
+    found = sbt.run(
+        campaign=campaign, scenario=scenario, budget=60, seed=0, executor="serial", store=tmp_path / "s", report=False,
+        metamodel={"kind": "gp", "nu": 2.5, "input_noise": False},
+    )  # fmt: skip
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, 101), np.linspace(0, 1, 101)), axis=-1).reshape(-1, 2)
+    critical = 9.0 * np.hypot(*grid.T) / math.sqrt(2.0) < 2.5
+    p = found.predict(pd.DataFrame(grid, columns=["a", "b"]))["p_critical"].to_numpy()
+    assert ((p > 0.5) == critical).mean() > 0.98
+    assert p.mean() == pytest.approx(critical.mean(), abs=0.01)
 
 
 def disc(values, seed):

@@ -33,7 +33,7 @@ def metamodel_for(metamodel: Metamodel, critical: CriticalInterval, *, target_aw
     """Return the metamodel that learns what `critical` is asked of: itself, or one of each metric of a combination."""
     if isinstance(critical, CombinedInterval):
         return JointMetamodel(metamodel, critical, target_aware)
-    return Opened(with_target(metamodel, critical), critical) if target_aware else metamodel
+    return Opened(with_target(metamodel, critical) if target_aware else metamodel, critical, target_aware)
 
 
 def joined_log_probability(critical: CombinedInterval, pairs: Sequence[LogPair]) -> LogPair:
@@ -73,7 +73,7 @@ class JointMetamodel:
             raise InputError(f"a combination of {len(leaves)} metrics needs y ({len(u)}, {len(leaves)}), but got {y.shape}")
         fitted = []
         for k, leaf in enumerate(leaves):
-            metamodel = Opened(with_target(self.metamodel, leaf), leaf) if self.target_aware else self.metamodel
+            metamodel = metamodel_for(self.metamodel, leaf, target_aware=self.target_aware)
             fitted.append(metamodel.fit(*check_rows(u[np.isfinite(y[:, k])], y[np.isfinite(y[:, k]), k]), rng))
         return JointPredictor(tuple(fitted), self.critical.with_leaves(leaves, scale))
 

@@ -1,7 +1,8 @@
-"""Metrics that end at the critical edge: a distance that is 0 in every collision, where critical is "at most 0".
+"""Metrics that end at the critical edge, such as a distance that is 0 in every collision, and metrics that come in steps.
 
-Their critical runs all have the value of the edge, so that a metamodel of the metric is as unsure inside the critical region as
-on its boundary. What is learned in their place goes on beyond the edge, as deep as the nearest uncritical runs are far.
+Where critical is "at most 0", all critical runs have the value of the edge, so that a metamodel of the metric is as unsure inside
+the critical region as on its boundary. What is learned in their place goes on beyond the edge, as deep as the nearest uncritical
+runs are far. Of a count, or a rounded number, whole regions have the value of the edge: the boundary lies midway to the next one.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from sbt.metamodels.base import Metamodel, Predictor
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Opened", "opened", "scored"]
+__all__ = ["Opened", "centred", "opened", "scored"]
 
 _FEWEST = 2
 """Critical runs with the value of the edge: one may be there by chance."""
@@ -32,7 +33,7 @@ _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 
 
 def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
-    """Return y with the values at the edge of M_c moved into it, where no run lies beyond the edge; else y itself.
+    """Return y with the values at the edge of M_c moved into it, where no run lies beyond the edge; else `centred`.
 
     A Gaussian process of the uncritical margins says where each of them would lie; it is the mean of that prediction, cut off
     at the edge (one step of the expectation maximisation for censored values). Where few runs are uncritical, the depth is the
@@ -56,13 +57,42 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
     margin = critical.margin(y)
     tied = margin == 0.0
     if tied.sum() < _FEWEST or (margin < 0.0).any():
-        return y
+        return centred(u, y, critical)
     depth = np.ones(int(tied.sum()))
     if not tied.all():
         told = _extrapolated if (~tied).sum() >= _ENOUGH else _by_slope
         depth = told(u[tied], u[~tied], margin[~tied], rng)
     moved = np.array(y, dtype=np.float64)
     moved[tied] += depth if math.isfinite(critical.low) else -depth
+    return moved
+
+
+def centred(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
+    """Return y with the values next to the edge of M_c moved as far to either side of it, where metrics come in steps.
+
+    They do where both the last critical and the first uncritical value occur at two inputs or more; else y is returned.
+
+    Args:
+        u: (n, d) metamodel inputs.
+        y: (n,) finite values of the metric.
+        critical: M_c; with two finite ends y is returned.
+
+    >>> u = np.arange(6.0)[:, None]
+    >>> centred(u, np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0]), CriticalInterval(low=2.0)).tolist()
+    [0.0, 1.5, 1.5, 2.5, 2.5, 3.0]
+    """
+    margin = critical.margin(y)
+    inside = margin <= 0.0
+    if inside.all() or not inside.any() or math.isfinite(critical.low) == math.isfinite(critical.high):
+        return y
+    ends = float(margin[inside].max()), float(margin[~inside].min())
+    steps = [margin == end for end in ends]
+    if any(step.sum() < _FEWEST or len(np.unique(u[step], axis=0)) < _FEWEST for step in steps):
+        return y
+    half, sign = 0.5 * (ends[1] - ends[0]), -1.0 if math.isfinite(critical.low) else 1.0
+    moved = np.array(y, dtype=np.float64)
+    for step, end, to in zip(steps, ends, (-half, half), strict=True):
+        moved[step] += sign * (to - end)
     return moved
 
 
@@ -102,16 +132,19 @@ def scored(y: Vector, mu: Vector, critical: CriticalInterval) -> Vector:
 
 @dataclass(frozen=True)
 class Opened:
-    """A metamodel that learns metrics which end at the critical edge as if they went on.
+    """A metamodel that learns metrics which end at the critical edge as if they went on, and steps by where they lie.
 
     Args:
         metamodel: learns them.
-        critical: M_c.
+        critical: M_c; with two finite ends nothing is changed.
+        beyond: metrics that end go on; otherwise only steps are looked for.
     """
 
     metamodel: Metamodel
     critical: CriticalInterval
+    beyond: bool = True
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> Predictor:
         """Return the predictor; see `Metamodel.fit`."""
-        return self.metamodel.fit(u, opened(u, y, self.critical, rng), rng)
+        learned = opened(u, y, self.critical, rng) if self.beyond else centred(u, y, self.critical)
+        return self.metamodel.fit(u, learned, rng)
