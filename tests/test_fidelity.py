@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +16,7 @@ import pandas as pd
 import pytest
 
 from sbt.config.source import ConfigError
-from sbt.errors import InputError
+from sbt.errors import InputError, SbtError
 from sbt.estimators.two_level import TwoPhases, drawn, inclusion, split_as_if_normal
 from sbt.seeds import stream
 from sbt.store.database import Store
@@ -134,6 +138,40 @@ def test_rows_are_a_function_of_the_log(tmp_path: Path) -> None:
         run_study(killed, progress=kill, report=False)
     run_study(killed, report=False)
     assert rows(tmp_path / "whole") == rows(tmp_path / "killed")
+
+
+@pytest.mark.slow
+@pytest.mark.sumo
+@pytest.mark.parametrize("campaign", ["estimation", "falsification"])
+def test_killed_among_coarse_runs_and_run_again_gives_the_same_rows(tmp_path: Path, campaign: str) -> None:
+    """The driver is killed five times, at the same numbers of finished runs in every campaign, once or more amid coarse ones."""
+    data = {
+        **LEFT_TURN, "campaign": campaign, "budget": 60, "initial": 12, "batch": 12,
+        **({"stop": {"cov": None}} if campaign == "estimation" else {}),
+        "fidelity": {"step_length": [0.1, 0.5], "cost": 0.3}, "executor": {"kind": "local", "workers": 2},
+    }  # fmt: skip
+    whole = run(tmp_path / "whole", data)
+    study(tmp_path / "killed", data)
+    command = [sys.executable, "-m", "sbt", "run", str(tmp_path / "killed" / "c.yaml")]
+    found = 0
+    for least in (1, 9, 20, 34, 55):
+        driver = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        while driver.poll() is None and found < least:
+            time.sleep(0.002)
+            found = _finished(tmp_path / "killed")
+        driver.send_signal(signal.SIGKILL)
+        assert driver.wait() == -signal.SIGKILL, "it was over before it was killed"
+    again = run(tmp_path / "killed", data)
+    assert rows(tmp_path / "killed") == rows(tmp_path / "whole")
+    assert any(row[5] == 1 for row in rows(tmp_path / "whole")), "there are coarse runs"
+    assert again.conclusion == whole.conclusion
+
+
+def _finished(folder: Path) -> int:
+    try:
+        return len(rows(folder))
+    except SbtError:
+        return 0
 
 
 def test_what_does_not_pay_is_left_out_and_said(tmp_path: Path) -> None:
