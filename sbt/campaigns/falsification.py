@@ -293,4 +293,5 @@ def _share_of(share: float, spent: int, size: int) -> int:
 FALSIFICATION = CampaignKind(
     "find critical concrete scenarios, and distinct failure modes", recipe, FalsificationConclusion, acquisition="portfolio",
     methods=METHODS, stop={"failures": None, "modes": None}, most_initial=10, batch=10, takes_transfer=True, takes_fidelity=True,
+    metamodel={"kind": "gp", "nu": 2.5, "input_noise": False, "kernels": 1},
 )  # fmt: skip
