@@ -62,22 +62,21 @@ class Hyperparameters:
 
     def covariance(self, a: Matrix, b: Matrix) -> Matrix:
         """Return the (n, m) covariance of the latent function at a (n, d) and b (m, d)."""
-        parts = [self._covariance(a, b, k) for k in range(len(self.outputscale))]
-        for other in parts[1:]:
-            parts[0] += other
-        return parts[0]
-
-    def _covariance(self, a: Matrix, b: Matrix, k: int) -> Matrix:
-        """Return the (n, m) covariance of one kernel."""
-        scale, variance = like(self.scaling[k], a), float(self.outputscale[k])
+        scales = [like(scale, a) for scale in self.scaling]
+        kernels = [(a * k, b * k, v) for k, v in zip(scales, self.outputscale.tolist(), strict=True)]
         if isinstance(a, torch.Tensor):
-            return variance * _matern(_distances(a * scale, b * scale), self.nu)
-        found, rows = cdist(a * scale, b * scale), max(_CACHED // max(len(b), 1), 1)
+            return sum(variance * _matern(_distances(at, to), self.nu) for at, to, variance in kernels)
+        found, rows = np.empty((len(a), len(b))), max(_CACHED // max(len(b), 1), 1)
         for start in range(0, len(found), rows):
             part = found[start : start + rows]
-            part[:] = _matern(part, self.nu)
-            if variance != 1.0:
-                part *= variance
+            for at, to, variance in kernels:
+                correlation = _matern(cdist(at[start : start + rows], to), self.nu)
+                if variance != 1.0:
+                    correlation *= variance
+                if at is kernels[0][0]:
+                    part[:] = correlation
+                else:
+                    part += correlation
         return found
 
     def covariances_and_slopes(self, a: Matrix) -> list[tuple[Matrix, Matrix]]:
