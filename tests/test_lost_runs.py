@@ -5,6 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sbt
+from sbt.campaigns.boundary import BoundaryConclusion
 from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.parts import CriticalShare
 from sbt.campaigns.telling import tell_boundary, tell_estimation, tell_share
@@ -115,3 +116,15 @@ def test_sums_over_all_combinations_have_exact_derivatives(tmp_path):
     told = estimate_again(result.store, objects=result.objects).sensitivity
     assert told
     assert all(each.std_error == 0.0 for each in told)
+
+
+def test_held_out_runs_that_fail_tell_nothing_of_the_share_among_those_that_give_a_metric():
+    share = CriticalShare(0.5, 0.0252, 0.975, 0.95, 10, 6)
+    given = share.given_a_metric
+    assert (given.counted, given.lost) == (4, None)
+    assert (given.low, given.high) == pytest.approx((0.0676, 0.9324), abs=1e-4), "2 of 4"
+    assert CriticalShare(0.5, 0.2, 0.8, 0.95, 10).given_a_metric.counted == 10
+    found = BoundaryConclusion(0.4, 0.01, 0.1, None, failing_fraction=0.5)
+    said = " ".join(tell_boundary(found, share, Facts(History.of(("a",)), LOW, "m", "s")))
+    assert "of what gives a metric" in said
+    assert "the 4 held-out runs that gave one alone say 50" in said

@@ -51,6 +51,15 @@ class CriticalShare:
     counted: int = 0
     lost: int | None = optional()
 
+    @property
+    def given_a_metric(self) -> CriticalShare:
+        """The share among the runs that gave a metric, with the interval of their number; itself where all did."""
+        if not self.lost or self.critical_fraction is None:
+            return self
+        ok = self.counted - self.lost
+        low, high = (float(end) for end in interval(round(self.critical_fraction * ok), ok, self.confidence))
+        return replace(self, low=low, high=high, counted=ok, lost=None)
+
     def sentence(self) -> list[str]:
         """Return the share in words; nothing where it is not known."""
         if self.critical_fraction is None:

@@ -150,12 +150,12 @@ def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) ->
 
 def _reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
     """Return the critical share by the metamodel and by the held-out runs alone, and whether they agree."""
-    share = found.critical_fraction or 0.0
-    where = "the parameter space" if found.failing_fraction is None else "what gives a metric"
+    share, runs = found.critical_fraction or 0.0, runs if found.failing_fraction is None else runs.given_a_metric
+    where, told = ("the parameter space", "") if found.failing_fraction is None else ("what gives a metric", " that gave one")
     said = f"The metamodel takes {percent(share)} of {where} to be critical"
     if runs.critical_fraction is None:
         return [f"{said}; no held-out run checks that."]
-    alone = f"the {plural(runs.counted, 'held-out run')} alone say {percent(runs.critical_fraction)} ({_ends(runs)})"
+    alone = f"the {plural(runs.counted, 'held-out run')}{told} alone say {percent(runs.critical_fraction)} ({_ends(runs)})"
     if not runs.low <= share <= runs.high:
         return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
     if runs.counted < _HARDLY:
