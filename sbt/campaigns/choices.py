@@ -167,6 +167,10 @@ def _rough_score(settings: Settings, fitted: FittedMetamodel, acquisition: Acqui
     return None if fitted.sketch is None else _score_by(settings, fitted, acquisition, fitted.sketch)
 
 
+_WARY = 2.0
+"""Power of P(a run gives a metric): one that fails shows nothing. With 1, draws go where failing begins once the rest is known."""
+
+
 def _score_by(
     settings: Settings, fitted: FittedMetamodel, acquisition: Acquisition, predict: Callable[[Points], Prediction]
 ) -> Callable[[Points], Vector]:
@@ -174,7 +178,7 @@ def _score_by(
 
     def score(u: Points) -> Vector:
         found = log_scores(acquisition, predict(u), critical, space.log_density(space.from_unit(u)))
-        return found if fitted.log_success is None else found + fitted.log_success(u)  # a run that fails shows nothing
+        return found if fitted.log_success is None else found + _WARY * fitted.log_success(u)
 
     return score
 
