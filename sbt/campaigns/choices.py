@@ -168,7 +168,7 @@ def _rough_score(settings: Settings, fitted: FittedMetamodel, acquisition: Acqui
 
 
 _WARY = 2.0
-"""Power of P(a run gives a metric): one that fails shows nothing. With 1, draws go where failing begins once the rest is known."""
+"""Power of P(a run gives a metric): one that fails shows nothing. With 1, draws go to where failing begins in the end."""
 
 
 def _score_by(
