@@ -204,8 +204,8 @@ def test_a_warm_start_teaches_and_is_not_counted(campaign: Run, configured: Call
         assert all(r.stage != "boundary" for r in store.history().records)
     with pytest.raises(InputError, match="same scenario"):
         campaign("other", "LINE", **QUICK, warm_start={"store": before["store"]})
-    with pytest.raises(ConfigError, match="warm_start: only an estimation campaign"):
-        load(configured("wrong", warm_start={"store": before["store"]}))
+    with pytest.raises(ConfigError, match="warm_start: a campaign falsification does not take it"):
+        load(configured("wrong", campaign="falsification", warm_start={"store": before["store"]}))
 
 
 def test_the_gate_decides_by_one_sided_limits():

@@ -98,5 +98,5 @@ def test_a_falsification_begins_with_the_old_failures(old, tmp_path):
     first = found.frame[found.frame["stage"] == "transfer"]
     assert len(first) == 5
     assert first["critical"].mean() > 0.5  # old failures with a distance above 3, an edge at 3.2 now
-    with pytest.raises(ConfigError, match="warm_start: only an estimation campaign takes it"):
-        run(tmp_path / "g", scenario("after", LATER), campaign="boundary", warm_start=warm)
+    with pytest.raises(ConfigError, match="a campaign falsification does not take it without transfer"):
+        run(tmp_path / "g", scenario("after", LATER), campaign="falsification", warm_start={"store": str(old)})

@@ -23,7 +23,7 @@ from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_boundary
 from sbt.campaigns.warmed import conditional_on
-from sbt.campaigns.wording import percent, requirement_words
+from sbt.campaigns.wording import percent, plural, requirement_words
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
@@ -62,6 +62,7 @@ class BoundaryConclusion:
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
         doubt: what inputs and drawn traffic decide of whether a run is critical; None: it is not known.
         every_combination: what is known because every combination of the inputs was run; None: some were not.
+        earlier: runs of an earlier campaign that the metamodel learned from, too; 0: they do not help; None: there are none.
     """
 
     critical_fraction: float | None
@@ -81,6 +82,7 @@ class BoundaryConclusion:
     doubt: TrafficDoubt | None = optional()
     every_combination: EveryCombination | None = optional()
     regions: tuple[CriticalRegion, ...] | None = optional()
+    earlier: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -99,6 +101,8 @@ class BoundaryConclusion:
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
         if self.failing_fraction is not None:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
+        if self.earlier is not None:
+            found.append(_earlier_words(self.earlier))
         if self.weights is not None:
             found.append(f"The metamodel chose among its members: {self.chosen_because}.")
         if self.simulator_noise is not None:
@@ -146,12 +150,18 @@ def recipe(settings: Settings) -> Campaign:
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history), traffic_doubt(settings, log.history),
-            every, regions or None,
+            every, regions or None, r.earlier,
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None
     stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even, most=most)
     return Campaign((stage,), conclude)
+
+
+def _earlier_words(n: int) -> str:
+    if n == 0:
+        return "The runs of the earlier campaign were left out: the metamodel predicts this campaign's own better without them."
+    return f"The metamodel also learned from {plural(n, 'run')} of the earlier campaign, which count nowhere else."
 
 
 def _met(history: History, settings: Settings) -> Points:
@@ -185,13 +195,13 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
     if settings.learner is None or len(history.finished) < 2:
         raise InputError("boundary points need a metamodel and two finished runs, but there are none")
     predictor = settings.learner.train(history.finished)
-    space, critical = settings.scenario.space, settings.scenario.requirement.critical
+    space, critical, inputs = settings.scenario.space, settings.scenario.requirement.critical, settings.learner.inputs
     sequence = SobolSequence(space.dimension, settings.seed)
     u = sequence.admissible(lambda v: space.feasible(space.from_unit(v)), 8192, 2048)
     group = np.unique(space.cube.cells(u), axis=0, return_inverse=True)[1].reshape(-1)  # there is nothing between choices
     alike = space.cube.snapped(u)
     found = np.concatenate([
-        crossings(lambda v: predictor(space.metamodel_inputs(v)).probability(critical), alike[group == g], most)
+        crossings(lambda v: predictor(inputs(v)).probability(critical), alike[group == g], most)
         for g in range(group.max() + 1)
     ])  # fmt: skip
     found = found[succeeding(settings.learner.success(history), found)]
@@ -201,5 +211,5 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
 
 BOUNDARY = CampaignKind(
     "identify where critical meets uncritical", recipe, BoundaryConclusion, acquisition="mix", methods=("mix",),
-    stop={"stable": None, "misclassified": None}, metamodel={"kind": "auto", "preset": "quick"},
+    stop={"stable": None, "misclassified": None}, metamodel={"kind": "auto", "preset": "quick"}, takes_earlier=True,
 )  # fmt: skip

@@ -75,7 +75,7 @@ def greedily(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: in
     if fitted is None:
         return evenly(settings, fitted, log, n)
     acquisition = settings.acquisition if settings.acquisition is not None else boundary
-    start = _position(log)
+    start = _position(settings, log)
     x, looked = _greedy(settings, fitted, acquisition, log, n, np.empty((0, settings.scenario.space.dimension)))
     if len(x) == n:
         return Chosen(x, BatchProposal("greedy", start, looked))
@@ -150,10 +150,11 @@ def _proposal(draw: RoiDraw) -> BatchProposal:
     return BatchProposal(draw.method, draw.next_position, draw.candidates, draw.acceptance)
 
 
-def _position(log: Log) -> int:
-    """Return where the Sobol sequence goes on."""
-    last = log.last(BatchProposal)
-    return 0 if last is None else last.next_position
+def _position(settings: Settings, log: Log) -> int:
+    """Return where the Sobol sequence goes on; behind the first runs of an earlier campaign of the same scenario and seed."""
+    last, earlier = log.last(BatchProposal), None if settings.learner is None else settings.learner.earlier
+    begin = 0 if earlier is None or earlier.other else len(earlier)
+    return begin if last is None else last.next_position
 
 
 def _score(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acquisition) -> Callable[[Points], Vector]:
@@ -208,7 +209,7 @@ def _draw(
         )  # fmt: skip
         return draw, scenario.pool.x[rows.rows[draw.positions]]
     sobol = SobolSequence(scenario.space.dimension, settings.seed)
-    begin = _position(log) if start is None else start
+    begin = _position(settings, log) if start is None else start
     bound = fitted.log_ambiguity_bound if fitted is not None and acquisition is boundary else None
     most = _MOST_EVEN if acquisition is even or fitted is None else most
     draw = rejection(

@@ -116,6 +116,8 @@ class CampaignKind:
         takes_gate: it takes the keys `gate` and `warm_start`.
         takes_transfer: it takes the key `warm_start` with `transfer: true`.
         takes_fidelity: it takes the key `fidelity`.
+        takes_earlier: its metamodel learns from the runs of an earlier campaign beside its own: it takes the key `warm_start`,
+            with `transfer: true` or without.
     """
 
     description: str
@@ -133,6 +135,7 @@ class CampaignKind:
     takes_gate: bool = False
     takes_transfer: bool = False
     takes_fidelity: bool = False
+    takes_earlier: bool = False
 
     @classmethod
     def of(cls, found: Any, name: str) -> CampaignKind:

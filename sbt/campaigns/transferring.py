@@ -8,6 +8,7 @@ import numpy as np
 
 from sbt.errors import InputError, did_you_mean
 from sbt.estimators.transfer import Transfer, Trend
+from sbt.loop.earlier import EarlierRuns
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
@@ -19,11 +20,13 @@ from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.history import History
 
-__all__ = ["transfer_of"]
+__all__ = ["earlier_runs", "transfer_of"]
 
 _ROWS, _NEAREST = 250, 180
 """Old runs that the trend learns from, and how many of them are those nearest to the critical edge: every prediction of a trend
 costs the square of its rows."""
+_POOLED, _POOLED_NEAREST = 500, 350
+"""Old runs that a metamodel learns from beside those of its campaign, and how many of them are nearest to the critical edge."""
 _INTEGRATED = 16
 """Points over which an input is integrated that only the old campaign has."""
 _QUANTILE = 0.5
@@ -47,12 +50,62 @@ def transfer_of(
     Raises:
         InputError: no input in common, a metric that was not measured, or a fixed input that the old one does not have.
     """
-    shared = [name for name in new.space.names if name in old.space.names]
+    _check_common(old.space, runs, new, fixed or {})
+    at = _taken(old.space, new.space, runs)
+    runs = runs.where(at[1])
+    rng = stream(seed, "transfer")
+    trends = tuple(_trend(part, old.space, runs, new.space, metamodel, dict(fixed or {}), rng) for part in new.requirement.parts)
+    hits = at[0][at[1]][new.requirement.critical_runs(runs)]
+    return Transfer(trends, new.space.to_normal(hits[new.space.feasible(hits)]))
+
+
+def earlier_runs(
+    old: LogicalScenario, runs: History, new: LogicalScenario, metamodel: Metamodel, seed: int, *,
+    other: bool, fixed: Mapping[str, Value] | None = None,
+) -> EarlierRuns:  # fmt: skip
+    """Return the runs of an old campaign that a metamodel of a new one learns from beside its own.
+
+    Args:
+        old: the scenario of the old campaign.
+        runs: of it, with metrics.
+        new: the scenario of the new campaign; its requirement decides.
+        metamodel: learns the old metrics, where inputs are integrated.
+        seed: of the new campaign.
+        other: the old campaign had another setup.
+        fixed: values of inputs that only the old one has; the others are integrated over their distribution.
+
+    Raises:
+        InputError: no input in common, a metric that was not measured, or a fixed input that the old one does not have.
+    """
+    _check_common(old.space, runs, new, fixed or {})
+    rng, requirement = stream(seed, "earlier"), new.requirement
+    x, inside = _taken(old.space, new.space, runs)
+    margin = requirement.margins(runs)
+    rows = np.flatnonzero(inside & np.isfinite(margin) & new.space.feasible(x))
+    if len(rows) > _POOLED:
+        order = rows[np.argsort(np.abs(margin[rows]), kind="stable")]
+        others = rng.permutation(order[_POOLED_NEAREST:])[: _POOLED - _POOLED_NEAREST]
+        rows = np.sort(np.concatenate([order[:_POOLED_NEAREST], others]))
+    kept = runs.where(np.isin(np.arange(len(runs)), rows))
+    y, gone = requirement.values(kept), [k for k, name in enumerate(old.space.names) if name not in new.space.names]
+    if gone and len(rows) > 1:
+        columns = []
+        for column in np.atleast_2d(y.T):
+            known = np.isfinite(column)
+            predict = metamodel.fit(_inputs(old.space, kept.x[known]), column[known], rng)
+            columns.append(_integrated(predict, old.space, kept.x, gone, dict(fixed or {})))
+        y = np.squeeze(np.array(columns).T, axis=-1) if y.ndim == 1 else np.array(columns).T
+    return EarlierRuns(_inputs(new.space, x[rows]), y, other)
+
+
+def _check_common(old: ParameterSpace, runs: History, new: LogicalScenario, fixed: Mapping[str, Value]) -> None:
+    """Refuse a campaign without an input in common, without a metric, or fixed inputs that it does not have."""
+    shared = [name for name in new.space.names if name in old.names]
     if not shared:
-        named = ", ".join(old.space.names), ", ".join(new.space.names)
+        named = ", ".join(old.names), ", ".join(new.space.names)
         raise InputError("warm_start.transfer needs an input in common, but got {} there, {} here".format(*named))
-    gone = [name for name in old.space.names if name not in shared]
-    for name in fixed or {}:
+    gone = [name for name in old.names if name not in shared]
+    for name in fixed:
         if name not in gone:
             rule = f"warm_start.fixed must name inputs that only the earlier campaign has ({', '.join(gone) or 'none'})"
             raise InputError(f"{rule}, but got '{name}'{did_you_mean(name, gone)}")
@@ -60,12 +113,6 @@ def transfer_of(
         if part.metric not in runs.metrics:
             rule = f"warm_start.store must have measured {part.metric}"
             raise InputError(f"{rule}, but only measured {', '.join(runs.metrics) or 'nothing'}")
-    at = _taken(old.space, new.space, runs)
-    runs = runs.where(at[1])
-    rng = stream(seed, "transfer")
-    trends = tuple(_trend(part, old.space, runs, new.space, metamodel, dict(fixed or {}), rng) for part in new.requirement.parts)
-    hits = at[0][at[1]][new.requirement.critical_runs(runs)]
-    return Transfer(trends, new.space.to_normal(hits[new.space.feasible(hits)]))
 
 
 def _taken(old: ParameterSpace, new: ParameterSpace, runs: History) -> tuple[Points, Mask]:

@@ -207,9 +207,10 @@ def _tenth(data: Json) -> int:
 
 def _batch(data: Json) -> int:
     warm = data.get("warm_start")
-    if warm is not None and warm.transfer and kind_of(data["campaign"]).takes_gate:
+    kind = kind_of(data["campaign"])
+    if warm is not None and (kind.takes_earlier or (warm.transfer and kind.takes_gate)):
         return min(_TRANSFERRED, int(data["initial"]))
-    return (_learns(data) and kind_of(data["campaign"]).batch) or int(data["initial"])
+    return (_learns(data) and kind.batch) or int(data["initial"])
 
 
 def _learns(data: Json) -> bool:
@@ -240,7 +241,7 @@ class WarmStart(_Strict):
 
     store: Name = Field(description="Store of a finished campaign of the same scenario, ego, step and inputs.")
     transfer: bool = Field(
-        default=False, description="It had another ego, step, net, version or other inputs: its metrics are a trend only."
+        default=False, description="It had another ego, step, net, version or other inputs: it is told apart from this one."
     )
     fixed: dict[str, float | str] = Field(
         default={}, description="With transfer: values of inputs that only the earlier campaign has; the others are integrated."
@@ -293,9 +294,7 @@ class Configuration(_Strict):
         default_factory=_acquisition,
         description="How runs are chosen; default: that of the campaign.",
     )
-    warm_start: WarmStart | None = Field(
-        default=None, description="An earlier campaign to learn from; null: none."
-    )
+    warm_start: WarmStart | None = Field(default=None, description="An earlier campaign to learn from; null: none.")
     initial: int = Field(
         default_factory=_tenth, ge=1, le=MOST_RUNS,
         description="Evenly distributed runs before the first fit; default: budget / 10, at least 10; at most 10 in a "
@@ -368,11 +367,11 @@ class Configuration(_Strict):
     @classmethod
     def _of_estimation(cls, value: Any, info: ValidationInfo) -> Any:
         name = info.data.get("campaign")
-        if isinstance(value, WarmStart) and value.transfer and name is not None and kind_of(name).takes_transfer:
+        kind, warm = None if name is None or value is None else kind_of(name), isinstance(value, WarmStart)
+        if kind is None or kind.takes_gate or (warm and (kind.takes_earlier or (value.transfer and kind.takes_transfer))):
             return value
-        if value is not None and name is not None and not kind_of(name).takes_gate:
-            raise ValueError(f"only an estimation campaign takes it, but the campaign is {name}")
-        return value
+        less = " without transfer: true" if warm and kind.takes_transfer else ""
+        raise ValueError(f"a campaign {name} does not take it{less}")
 
     @field_validator("fidelity")
     @classmethod

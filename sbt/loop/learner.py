@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sbt.loop.earlier import EarlierRuns
 from sbt.loop.several import each_requirement, independence
 from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors, sketched
 from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
@@ -71,23 +72,25 @@ class Learner:
         metamodel: its settings.
         seed: of the campaign.
         target_aware: the critical edge is what is looked for, and the metamodel knows where it is; otherwise all of y counts.
+        earlier: runs of an earlier campaign that it learns from, too, where they help; None: there are none.
     """
 
     scenario: LogicalScenario
     metamodel: Metamodel
     seed: int
     target_aware: bool = True
+    earlier: EarlierRuns | None = None
 
     def fit(self, history: History) -> FittedMetamodel | None:
         """Return the metamodel fitted to these runs, and scored; None with fewer than two to learn from."""
         training, start = history.training, time.perf_counter()
         if len(training) < 2:
             return None
-        predictor = self.train(training)
+        predictor, taken = self._trained(training)
         seconds = time.perf_counter() - start
         predict = self.on_inputs(predictor, len(training))
         success = self.success(history)
-        record = self._record(predict, predictor, history, len(training), success)
+        record = self._record(predict, predictor, history, len(training), success, taken)
         rough = sketched(predictor, _SKETCH)
         sketch, quick = None, None
         if rough is not predictor:
@@ -98,8 +101,8 @@ class Learner:
         """Return quick upper bounds of log a_BI at the inputs' (n, d) unit-cube points; None: the predictor has none."""
         if not isinstance(predictor, Screened):
             return None
-        critical, space = self.scenario.requirement.critical, self.scenario.space
-        return lambda points: log_ambiguity_bound(predictor, space.metamodel_inputs(points), critical)
+        critical = self.scenario.requirement.critical
+        return lambda points: log_ambiguity_bound(predictor, self.inputs(points), critical)
 
     def success(self, history: History) -> Callable[[Points], Vector] | None:
         """Return log P(a run gives a metric) at the inputs' (n, d) unit-cube points; None where all runs did, or none."""
@@ -112,23 +115,35 @@ class Learner:
 
     def on_inputs(self, predictor: Predictor, learned: int) -> Predictor:
         """Return a predictor as a function of the inputs' (n, d) unit-cube points; derived features are added here."""
-        space = self.scenario.space
 
         def predict(points: Points) -> Prediction:
-            inputs = space.metamodel_inputs(points)
+            inputs = self.inputs(points)
             with named_errors(self.metamodel, learned):
                 return check_prediction(predictor(inputs), len(inputs))
 
         return predict
 
+    def inputs(self, points: Points) -> Points:
+        """Return what the metamodel takes for (n, d) unit-cube points of the inputs."""
+        own = self.scenario.space.metamodel_inputs(points)
+        return own if self.earlier is None else self.earlier.own(own)
+
     def train(self, training: History) -> Predictor:
-        """Return the metamodel fitted to these runs; it takes `metamodel_inputs` of the space."""
-        space, requirement = self.scenario.space, self.scenario.requirement
-        y = requirement.values(training)
-        u = space.metamodel_inputs(space.to_unit(training.x))
+        """Return the metamodel fitted to these runs; it takes `inputs`."""
+        return self._trained(training)[0]
+
+    def _trained(self, training: History) -> tuple[Predictor, int | None]:
+        """Return the metamodel fitted to these runs, and how many earlier ones it learned from; None: there are none."""
+        requirement, rng = self.scenario.requirement, stream(self.seed, "fit", len(training))
+        u, y = self.inputs(self.scenario.space.to_unit(training.x)), requirement.values(training)
+        taken, earlier = None, self.earlier
+        if earlier is not None:
+            helps = earlier.helps(u, y, requirement.critical, stream(self.seed, "earlier", len(training)))
+            taken = len(earlier) if helps else 0
+            u, y = earlier.joined(u, y) if helps else (u, y)
         metamodel = metamodel_for(self.metamodel, requirement.critical, target_aware=self.target_aware)
-        with named_errors(self.metamodel, len(training)):
-            return metamodel.fit(u, y, stream(self.seed, "fit", len(training)))
+        with named_errors(self.metamodel, len(y)):
+            return metamodel.fit(u, y, rng), taken
 
     def unseen(self, history: History) -> tuple[Points, Vector]:
         """Return x (n, d) and what is learned of runs, (n,) or (n, q), that no metamodel learned from.
@@ -143,7 +158,7 @@ class Learner:
 
     def _record(
         self, predict: Predictor, predictor: Predictor, history: History, learned: int,
-        success: Callable[[Points], Vector] | None,
+        success: Callable[[Points], Vector] | None, taken: int | None,
     ) -> FitRecord:  # fmt: skip
         """Return the scores of a fitted metamodel, and its classification of fixed points."""
         (x, y), critical = self.unseen(history), self.scenario.requirement.critical
@@ -159,7 +174,8 @@ class Learner:
             learned, shares[0], shares[1], shares[2],
             np.packbits(p > 0.5).tobytes().hex(), None if found is None else Validation(**found),
             None if comparison is None else dict(comparison.weights), None if comparison is None else comparison.reason,
-            failing_fraction=None if ok is None else float(1.0 - ok.mean()), **self._several(predictor, at_probe, ok, unseen, y),
+            failing_fraction=None if ok is None else float(1.0 - ok.mean()), earlier=taken,
+            **self._several(predictor, at_probe, ok, unseen, y),
         )  # fmt: skip
 
     def _scores(self, predictor: Predictor, unseen: Prediction, y: Vector) -> dict[str, Any]:

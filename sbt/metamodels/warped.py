@@ -29,9 +29,10 @@ _FARTHEST = 300.0  # warped units, beyond which values are no numbers any more
 
 
 def warp_of_heavy_tails(settings: GaussianProcess, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:
-    """Return the warp in whose unit y is learned best; None where tails are not heavy, or M_c has two ends or none.
+    """Return the warp in whose unit y is learned best; None where its own is, tails are not heavy, or M_c has two ends or none.
 
-    Of a few scales, the one under which the process gives left-out rows the largest density.
+    The process gives left-out rows the largest density there, of a few scales. Where runs crowd at the edge of a smooth metric
+    tails look heavy, too, and its own unit is the best.
 
     Args:
         settings: of the process.
@@ -46,13 +47,12 @@ def warp_of_heavy_tails(settings: GaussianProcess, u: Points, y: Vector, critica
     if not np.std(y) > _HEAVY * np.median(distance) > 0.0 or not _heavy_over_space(distance, cell_shares(u, rng)):
         return None
 
-    def score(warp: Warp) -> float:
-        warped = warp.values(y)
-        left_out = settings.fit(u, warped, rng).leave_one_out(u, warped)
-        return float((left_out.log_density(warped) + warp.log_slope(y)).mean())
+    def score(warp: Warp | None) -> float:
+        learned, slope = (y, 0.0) if warp is None else (warp.values(y), warp.log_slope(y))
+        return float((settings.fit(u, learned, rng).leave_one_out(u, learned).log_density(learned) + slope).mean())
 
     scales = np.unique(np.quantile(distance[distance > 0.0], _QUANTILES)).tolist()
-    return max((Warp(edge, scale) for scale in scales), key=score)
+    return max((None, *(Warp(edge, scale) for scale in scales)), key=score)
 
 
 def _heavy_over_space(distance: Vector, share: Vector) -> bool:

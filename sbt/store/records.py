@@ -148,6 +148,7 @@ class FitRecord:
         failing_fraction: mean P(a run gives no metric) over the points; None: all runs gave one.
         requirements: of a combination, each of them; its own scores are those of the margin.
         independence: of their metrics.
+        earlier: runs of an earlier campaign that it learned from, too; 0: they do not help; None: there are none.
         runs, iteration: of the campaign when it was fitted.
     """
 
@@ -164,6 +165,7 @@ class FitRecord:
     failing_fraction: float | None = optional()
     requirements: tuple[RequirementFit, ...] | None = optional()
     independence: Independence | None = optional()
+    earlier: int | None = optional()
     runs: int = 0
     iteration: int = 0
 

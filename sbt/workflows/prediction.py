@@ -122,7 +122,7 @@ def predict_inputs(
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
     predictor, source = _predictor(folder, learner, training, json.dumps(choice.model_dump(mode="json"), sort_keys=True), device)
-    u = space.metamodel_inputs(space.to_unit(x))
+    u = learner.inputs(space.to_unit(x))
     parts = []
     for k in range(0, len(u), _CHUNK):
         p = predictor(u[k : k + _CHUNK])

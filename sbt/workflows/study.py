@@ -6,19 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sbt.campaigns.settings import CampaignKind, Gate, Settings
-from sbt.campaigns.transferring import transfer_of
 from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of, spec_of
 from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, read_text, resumed
-from sbt.config.model import Configuration, WarmStart
+from sbt.config.model import Configuration
 from sbt.config.source import ConfigError
 from sbt.errors import InputError, PluginError
 from sbt.execution.dask import DaskExecutor
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
+from sbt.loop.earlier import EarlierRuns
 from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.running import ahead_of
 from sbt.loop.stages import Campaign, Conclusion, Shard
@@ -30,20 +30,17 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History
-from sbt.workflows.earlier import usable_runs
+from sbt.workflows.earlier import EarlierCampaign
 from sbt.workflows.fidelity import COARSE_COST, stated_cost
 from sbt.workflows.mistakes import further_mistakes
 from sbt.workflows.portable import place_of, where_it_is
-
-if TYPE_CHECKING:
-    from sbt.estimators.transfer import Transfer
 
 __all__ = ["RESOLVED", "Study", "changed_since"]
 
 STATES = "snapshots"
 """Folder of the warmed states in that of a store."""
-COVARIATES = "covariate_names"
-"""Key under which a store remembers that seeds are looked at."""
+COVARIATES, EARLIER = "covariate_names", "earlier"
+"""Keys under which a store remembers that seeds are looked at, and the runs of an earlier campaign that it learns from."""
 RESOLVED = "config.resolved.yaml"
 """The configuration with its defaults, in a store's folder."""
 
@@ -249,12 +246,55 @@ class Study:
 
     @cached_property
     def learner(self) -> Learner | None:
-        """Fits and scores the metamodel; None where the campaign learns nothing."""
+        """Fits and scores the metamodel; None where the campaign learns nothing.
+
+        Raises:
+            InputError: `warm_start` names no finished campaign, or none that it could learn from.
+        """
         config = self.config
         metamodel = self._assembly.metamodel if self.live else metamodel_of(self.loaded)
         if metamodel is None or config.acquisition.kind in self.kind.metamodel_free:
             return None
-        return Learner(self.scenario, metamodel, config.seed, self.kind.target_aware)
+        learner = Learner(self.scenario, metamodel, config.seed, self.kind.target_aware)
+        if config.warm_start is None or not self.kind.takes_earlier:
+            return learner
+        known = EarlierRuns.from_json(self.kept[EARLIER]) if EARLIER in self.kept else self._before().pooled(learner, config)
+        return replace(learner, earlier=known)
+
+    def _before(self) -> EarlierCampaign:
+        """Return the campaign that `warm_start` names.
+
+        Raises:
+            InputError: it has not concluded, or has another scenario, ego or step and is no transfer.
+        """
+        choice = self.config.warm_start
+        if choice is None:
+            raise InputError("there is no earlier campaign: warm_start names none")
+        folder = self.loaded.folder / Path(choice.store).expanduser()
+        with Store.read(folder) as store:
+            before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
+        if not finished:
+            raise InputError(f"warm_start.store must be a finished campaign, but the one in {folder} has not concluded")
+        if not choice.transfer and before._simulator != self._simulator:
+            names = f"{before.config.scenario} there, {self.config.scenario} here"
+            rule = f"warm_start.store must have the same scenario, ego and step, but {folder} has another ({names})"
+            raise InputError(f"{rule}; transfer: true takes it as another setup")
+        return EarlierCampaign(folder, before.scenario, history, choice)
+
+    def _taught(self) -> dict[str, Any]:
+        """Return what an earlier campaign gives the settings; nothing where its runs are learned beside the campaign's own.
+
+        Raises:
+            InputError: it has no input or metric in common with this one, or there is no metamodel to learn it with.
+        """
+        choice = self.config.warm_start
+        if choice is None or self.kind.takes_earlier:
+            return {}
+        if not choice.transfer:
+            return {"prior_runs": self._before().same_runs(self.scenario)}
+        if self.learner is None:
+            raise InputError(f"warm_start.transfer needs a metamodel, but {self.config.acquisition.kind} uses none")
+        return {"transfer": self._before().trend(self.learner, self.config)}
 
     @cached_property
     def settings(self) -> Settings:
@@ -266,7 +306,7 @@ class Study:
             reference=0 if recorded else config.validation.reference, learner=self.learner,
             acquisition=self._assembly.acquisition if self.live else None, method=config.acquisition.kind,
             stop=config.stop.model_dump(), gate=None if config.gate is None else Gate(**config.gate.model_dump()),
-            prior_runs=self._prior_runs(), transfer=self._transfer(), ahead=config.ahead,
+            ahead=config.ahead, **self._taught(),
             covariates=self.covariates, coarse_cost=self.coarse_cost,
         )  # fmt: skip
 
@@ -312,7 +352,7 @@ class Study:
 
     def snapshot(self, shard: Shard | None = None) -> Json:
         """Return what the store remembers of the configuration: plain JSON, and the YAML to read back."""
-        config, described = self.config, self.kept.get("described")
+        config, described, known = self.config, self.kept.get("described"), None if self.learner is None else self.learner.earlier
         if self.live or described is None:  # otherwise the scenario itself may be made from its description
             described = describe_scenario(self.scenario)
         return {
@@ -321,6 +361,7 @@ class Study:
             "yaml": dump(config), "kind": self.kind.described(),
             **({} if shard is None else {"shard": {"number": shard.number, "of": shard.of}}),
             **self._told_names(), **({} if self.coarse_cost is None else {COARSE_COST: self.coarse_cost}),
+            **({EARLIER: known.to_json()} if known is not None else {}),
             **({"isolation": self.isolation.described()} if self.isolation is not None and self.isolation.warm else {}),
         }  # fmt: skip
 
@@ -337,50 +378,6 @@ class Study:
     def fit(self, history: History) -> FittedMetamodel | None:
         """Return the metamodel fitted to the runs that teach it, and scored; None where there is none."""
         return None if self.learner is None else self.learner.fit(history)
-
-    def _prior_runs(self) -> History | None:
-        """Return the runs of the campaign that `warm_start` names, to learn from; None where it names none.
-
-        Raises:
-            InputError: there is no finished campaign, or it ran another scenario, ego, step or other inputs, or
-                did not measure the metric.
-        """
-        if self.config.warm_start is None or self.config.warm_start.transfer:
-            return None
-        folder, before, history = self._earlier(self.config.warm_start)
-        if before._simulator != self._simulator:
-            names = f"{before.config.scenario} there, {self.config.scenario} here"
-            rule = f"warm_start.store must have the same scenario, ego and step, but {folder} has another ({names})"
-            raise InputError(f"{rule}; transfer: true takes it as a trend")
-        return usable_runs(self.scenario, folder, tuple(before.kept["names"]), history)
-
-    def _earlier(self, choice: WarmStart) -> tuple[Path, Study, History]:
-        """Return folder, study and runs of the campaign that `warm_start` names.
-
-        Raises:
-            InputError: it has not concluded.
-        """
-        folder = self.loaded.folder / Path(choice.store).expanduser()
-        with Store.read(folder) as store:
-            before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
-        if not finished:
-            raise InputError(f"warm_start.store must be a finished campaign, but the one in {folder} has not concluded")
-        return folder, before, history
-
-    def _transfer(self) -> Transfer | None:
-        """Return what a campaign of another setup tells; None where `warm_start` names none.
-
-        Raises:
-            InputError: it has no input or metric in common with this one, or there is no metamodel to learn it with.
-        """
-        choice = self.config.warm_start
-        if choice is None or not choice.transfer:
-            return None
-        if self.learner is None:
-            raise InputError(f"warm_start.transfer needs a metamodel, but {self.config.acquisition.kind} uses none")
-        _, before, history = self._earlier(choice)
-        learn = self.learner.metamodel
-        return transfer_of(before.scenario, history.training, self.scenario, learn, self.config.seed, choice.fixed)
 
     @property
     def _simulator(self) -> tuple[Any, ...]:
