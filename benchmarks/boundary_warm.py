@@ -1,10 +1,10 @@
 """How many runs does a boundary save that learns from an earlier campaign of another setup?
 
-    python benchmarks/boundary_warm.py [--seeds 6] [--budget 160] [--cases shifted,cut_in] [--table runs/boundary_warm.jsonl]
+    python benchmarks/boundary_warm.py [--seeds 3] [--budget 160] [--cases "shifted;cut_in, step"] [--table runs/warm.jsonl]
 
-The earlier campaign is a boundary of 500 runs of the other setup (`cut_in`, `emergency_braking`: a reaction time of 0.2 s, the new
-one 0.5 s; two of them). After 20, 40, 80 and 160 runs the metamodel is asked which of 4,096 random points are critical (F1; in SUMO
-4,096 even runs).
+The earlier campaign is a boundary of 500 runs of the other setup, of two of them. In SUMO it has a reaction time of 0.2 s and the
+new one 0.5 s, or a step of 0.2 s and the new one 0.02 s. After 20, 40, 80 and 160 runs the metamodel is asked which of 4,096
+random points are critical (F1; in SUMO of as many even runs).
 Finished cells are lines of the table: run again to go on, or split seeds over processes (`resumed.py`).
 """
 
@@ -22,7 +22,13 @@ from resumed import arguments, collect, seeds
 import sbt
 from sbt.seeds import stream
 
-REACTION = {"cut_in": (0.2, 0.5), "emergency_braking": (0.2, 0.5)}
+SLOW, SLOWER = ({"ego": {"kind": "acc_aeb", "reaction_time": seconds}} for seconds in (0.2, 0.5))
+SUMO = {
+    "cut_in": (SLOW, SLOWER),
+    "emergency_braking": (SLOW, SLOWER),
+    "cut_in, step": ({"simulation": {"step_length": 0.2}}, {"simulation": {"step_length": 0.02}}),
+}
+"""What the earlier and the new campaign of a scenario are given."""
 
 
 def _hartmann(x):
@@ -67,8 +73,8 @@ def scenario(case: str, which: int):
 
 def keys_of(case: str, which: int) -> dict:
     """Return what a campaign of the setup is given."""
-    if case in REACTION:
-        return {"scenario": case, "ego": {"kind": "acc_aeb", "reaction_time": REACTION[case][which]}}
+    if case in SUMO:
+        return {"scenario": case.partition(",")[0], **SUMO[case][which]}
     return {"scenario": scenario(case, which)}
 
 
@@ -124,9 +130,9 @@ def main() -> None:
     parser.add_argument("--budget", type=int, default=160)
     parser.add_argument("--earlier", type=int, default=500, help="runs of the earlier campaign")
     parser.add_argument("--reference", type=int, default=4096, help="even runs in SUMO that tell the truth")
-    parser.add_argument("--cases", default=",".join([*CASES, *REACTION]))
+    parser.add_argument("--cases", default=";".join([*CASES, *SUMO]))
     args = parser.parse_args()
-    jobs = [{"case": c, "way": w, "seed": s} for c in args.cases.split(",") for s in seeds(args) for w in ("scratch", "warm")]
+    jobs = [{"case": c, "way": w, "seed": s} for c in args.cases.split(";") for s in seeds(args) for w in ("scratch", "warm")]
     with tempfile.TemporaryDirectory() as folder:
         rows = collect(args, jobs, Campaigns(Path(folder), args.budget, args.earlier, args.reference).run)
     points = _points(args.budget)

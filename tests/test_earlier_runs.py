@@ -36,7 +36,7 @@ def scenario(name: str, function: Any, inputs: str = "abc") -> sbt.Scenario:
     return sbt.Scenario(name, inputs=space, evaluate=evaluate, requirement=sbt.Requirement("y", high=0.0))
 
 
-def boundary(folder: Path, which: sbt.Scenario, **keys: Any) -> sbt.Result:
+def boundary(folder: Path, which: sbt.Scenario | str, **keys: Any) -> sbt.Result:
     given: dict[str, Any] = {"campaign": "boundary", "budget": 20, "seed": 0, "metamodel": "gp", **keys}
     return sbt.run(scenario=which, store=folder, executor="serial", report=False, **given)
 
@@ -98,6 +98,23 @@ def test_a_new_input_is_learned_beside_the_earlier_runs(old, tmp_path):
     result = boundary(tmp_path / "new", scenario("wet", later, "abcd"), budget=40, warm_start=warm)
     assert result.conclusion.earlier == 72
     assert np.isfinite(result.predict({k: [0.5] for k in "abcd"})["p_critical"]).all()
+
+
+def test_what_cannot_teach_is_refused(old, tmp_path):
+    elsewhere = sbt.Scenario(
+        "elsewhere", inputs=[sbt.Parameter(k, 2.0, 3.0) for k in "abc"], evaluate=lambda values, seed: {"y": values["a"]},
+        requirement=sbt.Requirement("y", high=0.0),
+    )  # fmt: skip
+    cases = [
+        (scenario("after", later), {"store": str(old)}, "must have the same scenario, ego and step.*transfer: true"),
+        (elsewhere, {"store": str(old), "transfer": True}, "two runs with a metric inside of the ranges"),
+        (scenario("after", later), {"store": str(old), "transfer": True, "fixed": {"a": 0.5}}, "only the earlier campaign has"),
+    ]
+    for k, (which, warm, message) in enumerate(cases):
+        with pytest.raises(sbt.InputError, match=message):
+            boundary(tmp_path / str(k), which, warm_start=warm)
+    with pytest.raises(sbt.InputError, match="warm_start learns from a coarse campaign"):
+        boundary(tmp_path / "fidelity", "cut_in", fidelity={"step_length": [0.05, 0.5]})
 
 
 def test_earlier_runs_that_mislead_are_left_out():

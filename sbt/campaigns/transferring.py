@@ -75,20 +75,24 @@ def earlier_runs(
         fixed: values of inputs that only the old one has; the others are integrated over their distribution.
 
     Raises:
-        InputError: no input in common, a metric that was not measured, or a fixed input that the old one does not have.
+        InputError: no input in common, a metric that was not measured, a fixed input that the old one does not have, or fewer
+            than two runs to learn from.
     """
     _check_common(old.space, runs, new, fixed or {})
     rng, requirement = stream(seed, "earlier"), new.requirement
     x, inside = _taken(old.space, new.space, runs)
     margin = requirement.margins(runs)
     rows = np.flatnonzero(inside & np.isfinite(margin) & new.space.feasible(x))
+    if len(rows) < 2:
+        rule = "warm_start.store must have two runs with a metric inside of the ranges and constraints here"
+        raise InputError(f"{rule}, but has {len(rows)}")
     if len(rows) > _POOLED:
         order = rows[np.argsort(np.abs(margin[rows]), kind="stable")]
         others = rng.permutation(order[_POOLED_NEAREST:])[: _POOLED - _POOLED_NEAREST]
         rows = np.sort(np.concatenate([order[:_POOLED_NEAREST], others]))
     kept = runs.where(np.isin(np.arange(len(runs)), rows))
     y, gone = requirement.values(kept), [k for k, name in enumerate(old.space.names) if name not in new.space.names]
-    if gone and len(rows) > 1:
+    if gone:
         columns = []
         for column in np.atleast_2d(y.T):
             known = np.isfinite(column)
@@ -123,8 +127,9 @@ def _taken(old: ParameterSpace, new: ParameterSpace, runs: History) -> tuple[Poi
         if p.name in old.names:
             values = runs.x[:, old.names.index(p.name)]
             x[:, k] = _recoded(old.parameters[old.names.index(p.name)], p, values)
-            inside &= x[:, k] >= 0 if p.choices else inside
-            x[:, k] = np.clip(np.round(x[:, k]) if p.discrete else x[:, k], *p.bounds)
+            x[:, k] = np.round(x[:, k]) if p.discrete else x[:, k]
+            inside &= p.contains(x[:, k])
+            x[:, k] = np.clip(x[:, k], *p.bounds)
     return x, inside
 
 

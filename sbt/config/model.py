@@ -378,7 +378,8 @@ class Configuration(_Strict):
     def _learns_from_coarse(cls, value: FidelityChoice | None, info: ValidationInfo) -> FidelityChoice | None:
         name = info.data.get("campaign")
         if value is not None and name is not None and not kind_of(name).takes_fidelity:
-            raise ValueError(f"only estimation and falsification learn from coarse runs, but the campaign is {name}")
+            other = "; warm_start learns from a coarse campaign" if kind_of(name).takes_earlier else ""
+            raise ValueError(f"only estimation and falsification run coarse ones between, but the campaign is {name}{other}")
         batch = info.data.get("batch")
         if value is not None and isinstance(batch, BatchChoice) and batch.ahead:
             raise ValueError("coarse runs choose those that follow them: batch.ahead must be 0")
