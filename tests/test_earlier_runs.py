@@ -15,6 +15,7 @@ from sbt.loop.earlier import EarlierRuns
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.requirement import CriticalInterval
 from sbt.store.database import Store
+from sbt.workflows.front import findings_in
 
 BELOW = CriticalInterval(high=0.0)
 
@@ -60,7 +61,9 @@ def test_another_setup_teaches_a_boundary_of_few_runs(old, tmp_path):
     warm = boundary(tmp_path / "warm", scenario("after", later), warm_start={"store": str(old), "transfer": True})
     assert misjudged(warm, later) < 0.03 < misjudged(alone, later)
     assert len(warm.history) == 20  # old runs are nobody's
-    assert any("also learned from 72 runs of the earlier campaign" in line for line in warm.sentences())
+    told = " ".join(warm.sentences())
+    assert "learned that from 18 runs and 72 earlier ones" in told
+    assert "also learned from 72 runs of the earlier campaign" in told
 
 
 def test_the_store_remembers_the_earlier_runs(old, tmp_path):
@@ -115,6 +118,15 @@ def test_what_cannot_teach_is_refused(old, tmp_path):
             boundary(tmp_path / str(k), which, warm_start=warm)
     with pytest.raises(sbt.InputError, match="warm_start learns from a coarse campaign"):
         boundary(tmp_path / "fidelity", "cut_in", fidelity={"step_length": [0.05, 0.5]})
+
+
+def test_check_says_whether_the_earlier_campaign_can_teach(tmp_path):
+    config = "campaign: boundary\nscenario: following\nwarm_start: {store: %s}\n"
+    boundary(tmp_path / "before", "following", budget=10, initial=10)
+    for store, ok in (("before", True), ("nowhere", False)):
+        (tmp_path / "config.yaml").write_text(config % (tmp_path / store))
+        first = next(findings_in(tmp_path / "config.yaml", seed=0, isolation="auto"))
+        assert ("earlier campaign can teach" in first.rule, first.ok) == (True, ok)
 
 
 def test_earlier_runs_that_mislead_are_left_out():

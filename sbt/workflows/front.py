@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -16,7 +17,7 @@ from sbt import plugins
 from sbt.config.load import load
 from sbt.config.scenario_file import is_scenario
 from sbt.config.source import read_yaml
-from sbt.errors import InputError, PluginError, did_you_mean
+from sbt.errors import InputError, PluginError, SbtError, did_you_mean
 from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_traced
@@ -338,8 +339,20 @@ def findings_in(target: LogicalScenario | str | Path, *, seed: int, isolation: s
     plugins.forget_changed()
     if not isinstance(target, LogicalScenario) and Path(target).suffix in (".yaml", ".yml") and not is_scenario(Path(target)):
         study = Study(load(target))
-        return findings_of(study.spec, seed, study.scenario)
+        return chain(_starts_warm(study), findings_of(study.spec, seed, study.scenario))
     return findings_of(_spec(target, isolation), seed)
+
+
+def _starts_warm(study: Study) -> Iterator[Finding]:
+    """Yield whether the campaign that `warm_start` names can teach this one; nothing where there is none."""
+    if study.config.warm_start is None:
+        return
+    try:
+        _ = study.settings
+        problem = ""
+    except SbtError as error:
+        problem = str(error)
+    yield Finding("the earlier campaign can teach this one", not problem, problem)
 
 
 _WRITTEN = {"table": "table:FOLDER", "testbed": "testbed:NAME", "yaml": "FOLDER/scenario.yaml"}
