@@ -62,7 +62,7 @@ def test_another_setup_teaches_a_boundary_of_few_runs(old, tmp_path):
     assert misjudged(warm, later) < 0.03 < misjudged(alone, later)
     assert len(warm.history) == 20  # old runs are nobody's
     told = " ".join(warm.sentences())
-    assert "learned that from 18 runs and 72 earlier ones" in told
+    assert "learned that from 18 runs and 72 earlier" in told
     assert "also learned from 72 runs of the earlier campaign" in told
 
 

@@ -108,7 +108,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         lead += f" by the metamodel, but {few}" if few else ""
     if none_critical(facts):
         lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
-    rests = f"the metamodel learned that from {plural(learned, 'run')}{f' and {found.earlier} earlier ones' if found.earlier else ''}"
+    rests = f"the metamodel learned that from {plural(learned, 'run')}{f' and {found.earlier} earlier' if found.earlier else ''}"
     missing = "an uncritical" if all_critical(facts) else "a critical"
     denied = " The held-out runs deny its figures (below): do not rely on it yet." if _denied(found, measured_share) else ""
     said = [
