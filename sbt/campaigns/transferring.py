@@ -96,8 +96,10 @@ def earlier_runs(
         columns = []
         for column in np.atleast_2d(y.T):
             known = np.isfinite(column)
-            predict = metamodel.fit(_inputs(old.space, kept.x[known]), column[known], rng)
-            columns.append(_integrated(predict, old.space, kept.x, gone, dict(fixed or {})))
+            if known.sum() >= 2:
+                predict = metamodel.fit(_inputs(old.space, kept.x[known]), column[known], rng)
+                column = _integrated(predict, old.space, kept.x, gone, dict(fixed or {}))
+            columns.append(column)
         y = np.squeeze(np.array(columns).T, axis=-1) if y.ndim == 1 else np.array(columns).T
     return EarlierRuns(_inputs(new.space, x[rows]), y, other)
 
