@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.metamodels.base import named_errors
-from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.stacking import Bins
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
@@ -25,7 +24,6 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["EarlierRuns"]
 
-_JUDGE = GaussianProcess(nu=2.5, input_noise=False)
 _FEWEST, _MOST = 6, 300
 """Own runs from which on the earlier ones are judged, and that they are judged by at most."""
 
@@ -104,5 +102,8 @@ def _gain(u: Points, y: Vector, all_u: Points, all_y: Vector, critical: Critical
 
 def _left_out(u: Points, y: Vector, bins: Bins, rng: np.random.Generator) -> Vector:
     """Return (n,) log probabilities of the range that each row fell into, predicted from all others."""
-    with named_errors(_JUDGE, len(y)):
-        return bins.log_score(_JUDGE.fit(u, y, rng).leave_one_out(u, y), y)
+    from sbt.metamodels.gaussian_process import GaussianProcess
+
+    judge = GaussianProcess(nu=2.5, input_noise=False)
+    with named_errors(judge, len(y)):
+        return bins.log_score(judge.fit(u, y, rng).leave_one_out(u, y), y)
