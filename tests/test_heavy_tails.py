@@ -12,7 +12,7 @@ from sbt.metamodels.automatic import Auto
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.persistence import load, save
 from sbt.metamodels.warp import Warp
-from sbt.metamodels.warped import WarpedPredictor, warp_of_heavy_tails
+from sbt.metamodels.warped import WarpedPredictor, better_warp
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
@@ -57,8 +57,8 @@ def test_other_metrics_are_learned_as_they_are():
     rng = stream(2, "light")
     u = rng.random((200, 3))
     crowded = 0.5 + 1e-4 * rng.standard_normal((180, 3))
-    for y in (u.sum(axis=1) - 0.5, np.exp(u.sum(axis=1)), rng.standard_exponential(200), np.where(u[:, 0] < 0.1, 0.5, 100.0)):
-        assert warp_of_heavy_tails(PROCESS, u, y, LOW) is None
+    for y in (u.sum(axis=1) - 0.5, np.sin(6.0 * u[:, 0]) + u[:, 1], rng.standard_normal(200), np.full(200, 3.0)):
+        assert better_warp(PROCESS, u, y, LOW) is None
     beside = np.vstack([u, crowded])
-    assert warp_of_heavy_tails(PROCESS, beside, beside.sum(axis=1) - 1.5, LOW) is None, "runs crowd at the edge of a plain metric"
-    assert warp_of_heavy_tails(PROCESS, u, np.exp(30.0 * u[:, 0]), CriticalInterval(1.0, 2.0)) is None
+    assert better_warp(PROCESS, beside, beside.sum(axis=1) - 1.5, LOW) is None, "runs crowd at the edge of a plain metric"
+    assert better_warp(PROCESS, u, np.exp(30.0 * u[:, 0]), CriticalInterval(1.0, 2.0)) is None

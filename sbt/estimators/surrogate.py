@@ -22,6 +22,7 @@ from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import opened
 from sbt.metamodels.warp import Warp
+from sbt.metamodels.warped import better_warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.cube import Cube
@@ -223,24 +224,35 @@ def fit_log_probability(
             return lambda points: belief(coordinates(points), points).log_probability(edges)
     least, u = noise[0] if noise else 0.0, coordinates(z)
     y = opened(u, y, critical, rng)
-    warp = Warp.around_edge(y, critical, quantile=_QUANTILE)
+    better = _better_warp(metamodel, u, y, critical)
+    warp = better or Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
     metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel
-    whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=least / warp.scale**2)
+    whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=least / (warp.scale * float(warp.scale_at(np.array(1.0)))))
     plain = _Form(y, critical, np.zeros(len(y)), noise=least)
-    trends = [replace(form, trend=_trend(u, form.values)) for form in (whole, plain)]
-    forms = [whole, plain, *(form for form in trends if form.trend is not None)]
+    wholes = [whole] if better else [whole, plain]
+    trends = [replace(form, trend=_trend(u, form.values)) for form in wholes]
+    forms = [*wholes, *(form for form in trends if form.trend is not None)]
     every = np.arange(len(y))
     if len(y) > MOST_LEARNED and getattr(metamodel, "CUBIC", False):
         every = np.sort(rng.permutation(len(y))[:MOST_LEARNED])
     if len(y) < _FEWEST_SCORED:
-        chosen = [whole, *forms[2:3]]
+        chosen = [whole, *forms[len(wholes) :][:1]]
     else:
         gain = _gains(metamodel, forms, u, np.exp(-0.5 * t**2), rng)
         best = int(np.argmax(gain))
         sure = forms[best].trend is None or gain[best] > _SURE
         chosen = [forms[best]] if sure else [whole, forms[best]]
     return _Largest(coordinates, tuple(form.fit(metamodel, u, every, rng) for form in chosen))
+
+
+def _better_warp(metamodel: Metamodel, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:
+    """Return the warp in which left-out runs are predicted better than as they are; None: there is none, or no process learns."""
+    if not getattr(metamodel, "CUBIC", False):
+        return None
+    from sbt.metamodels.gaussian_process import GaussianProcess
+
+    return better_warp(metamodel, u, y, critical) if isinstance(metamodel, GaussianProcess) else None
 
 
 def _for_uneven_noise(metamodel: Metamodel, u: Points, t: Vector, rng: np.random.Generator) -> Metamodel:

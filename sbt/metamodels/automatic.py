@@ -21,7 +21,7 @@ from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surel
 from sbt.metamodels.stepped import better_stepped
 from sbt.metamodels.torch_tools import check_device
 from sbt.metamodels.warp import Warp
-from sbt.metamodels.warped import WarpedPredictor, warp_of_heavy_tails
+from sbt.metamodels.warped import WarpedPredictor, better_warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -180,7 +180,7 @@ class _TargetedAuto:
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor | WarpedPredictor:
         """Return the mixture fitted to u (n, d) and y (n,), in a warped unit where its tails are heavy; see `Metamodel.fit`."""
         u, y = without_repetitions(*check_rows(u, y))
-        warp = warp_of_heavy_tails(self.settings.simplest, u, y, self.critical)
+        warp = better_warp(self.settings.simplest, u, y, self.critical)
         if warp is None:
             return self.settings._fit(u, y, rng, self.critical)
         return WarpedPredictor(self.settings._fit(u, warp.values(y), rng, warp.interval(self.critical), warp), warp)

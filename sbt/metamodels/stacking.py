@@ -64,9 +64,10 @@ class Bins:
         ends = [end for end in (self.critical.low, self.critical.high) if np.isfinite(end)]
         return np.unique([end + step for end in ends for step in (-self.near, 0.0, self.near)])
 
-    def log_score(self, prediction: Prediction, y: Vector) -> Vector:
-        """Return (n,) log probabilities of the ranges that y (n,) fell into; M_c is closed."""
+    def log_score(self, prediction: Prediction, y: Vector, unit: Warp | None = None) -> Vector:
+        """Return (n,) log probabilities of the ranges that y (n,) fell into; M_c is closed; `unit`: of the prediction."""
         ends, score = np.array([-np.inf, *self.cuts, np.inf]), np.empty(len(y))
+        ends = ends if unit is None else unit.values(ends)
         fell = np.searchsorted(self.cuts, y, side="right") - (y == self.critical.high)
         for k in np.unique(fell):
             mine = fell == k

@@ -21,11 +21,12 @@ __all__ = ["JointWarp", "Warp", "warp_around"]
 
 @dataclass(frozen=True)
 class Warp:
-    """w = asinh((y - edge) / scale).
+    """w = asinh((y - edge) / scale), on either side of the edge with its own scale.
 
     Args:
         edge: end of the critical interval, in the unit of y.
         scale: > 0; within it the warp is nearly straight.
+        above: > 0, the scale of values above the edge; None: the same.
 
     >>> warp = Warp.around_edge(np.array([1.0, 5.0, 1e6]), CriticalInterval(high=0.0))
     >>> warp.interval(CriticalInterval(high=0.0)).high, bool(warp.values(np.array([1e6]))[0] < 14)
@@ -34,6 +35,7 @@ class Warp:
 
     edge: float
     scale: float
+    above: float | None = None
 
     @classmethod
     def around_edge(cls, y: Vector, critical: CriticalInterval, quantile: float = 0.25) -> Warp:
@@ -50,17 +52,23 @@ class Warp:
         scale = float(np.quantile(distance, quantile)) if len(distance) else 1.0
         return cls(edge, scale)
 
+    def scale_at(self, beyond: Vector) -> Vector:
+        """Return the scale where y is so far beyond the edge (negative: below it), in any unit; shape kept."""
+        return np.where(np.asarray(beyond) > 0.0, self.scale if self.above is None else self.above, self.scale)
+
     def values(self, y: Vector) -> Vector:
         """Return the warped y, shape kept."""
-        return np.arcsinh((np.asarray(y) - self.edge) / self.scale)
+        beyond = np.asarray(y) - self.edge
+        return np.asarray(np.arcsinh(beyond / self.scale_at(beyond)))
 
     def back(self, warped: Vector) -> Vector:
         """Return the y of warped values, shape kept."""
-        return np.asarray(self.edge + self.scale * np.sinh(warped))
+        return np.asarray(self.edge + self.scale_at(warped) * np.sinh(warped))
 
     def log_slope(self, y: Vector) -> Vector:
         """Return (n,) the logarithm of the warp's derivative at y (n,)."""
-        return np.asarray(-0.5 * np.log1p(((y - self.edge) / self.scale) ** 2) - math.log(self.scale))
+        scale = self.scale_at(np.asarray(y) - self.edge)
+        return np.asarray(-0.5 * np.log1p(((y - self.edge) / scale) ** 2) - np.log(scale))
 
     def learned(self, y: Vector) -> Vector:
         """Return what a metamodel learns: the warped y."""

@@ -1,38 +1,43 @@
-"""Metrics with heavy tails are learned in a warped unit: 1e6 where nothing happens, or values over many orders of magnitude.
+"""Metrics are learned in the unit in which their runs are predicted best: warped around the critical edge, on either side apart.
 
-Such values decide the scale of a process and the means of a tree, and near the edge nothing is left of the metric. In the warped
-unit an outlier is a few units away, and P(critical) is the same before and after.
+Far values decide the scale of a process and the means of a tree: 1e6 where nothing happens, values over many orders of magnitude,
+a slope that is steeper on one side of the edge, a jump at it. In the warped unit an outlier is a few units away, both sides are
+alike, and P(critical) is the same before and after.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sbt.metamodels.base import Predictor, Screened, sample_paths, sketched
-from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.stacking import cell_shares
+from sbt.metamodels.stacking import Bins, cell_shares
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["WarpedPredictor", "warp_of_heavy_tails"]
+if TYPE_CHECKING:
+    from sbt.metamodels.gaussian_process import GaussianProcess
 
-_HEAVY = 10.0  # standard deviation over the median distance to the edge: 0.7 of a normal metric, 2 of an exponential one
-_QUANTILES = (0.5, 0.25, 0.1, 0.03)  # of the distances to the edge: scales that are tried
-_FEWEST = 10  # rows, from which on scales are compared
+__all__ = ["WarpedPredictor", "better_warp"]
+
+_QUANTILES = (0.5, 0.25)  # of the distances to the edge: scales that are tried
+_HEAVY, _SMALLER = 10.0, (0.1, 0.03)  # standard deviation over the median distance from which on smaller ones are, too
+_STEEPEST = 16.0  # one side's scale over the other's
+_FEWEST, _MOST = 10, 200  # rows, from which on warps are compared, and on which at most: half of them those nearest to the edge
+_SURE = 1.5  # standard errors
 _FARTHEST = 300.0  # warped units, beyond which values are no numbers any more
 
 
-def warp_of_heavy_tails(settings: GaussianProcess, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:
-    """Return the warp in whose unit y is learned best; None where its own is, tails are not heavy, or M_c has two ends or none.
+def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:
+    """Return the warp in whose unit y is learned best; None where its own is, or where M_c has two ends or none.
 
-    The process gives left-out rows the largest density there, of a few scales. Where runs crowd at the edge of a smooth metric
-    tails look heavy, too, and its own unit is the best.
+    Rows are predicted from all others, and scored by the range that they fell into (see `Bins`), half of the weight even, half by
+    the share of the space that a row stands for. Scales come first, then how much larger one side's is than the other's.
 
     Args:
         settings: of the process.
@@ -43,24 +48,50 @@ def warp_of_heavy_tails(settings: GaussianProcess, u: Points, y: Vector, critica
     if math.isfinite(critical.low) == math.isfinite(critical.high) or len(y) < _FEWEST:
         return None
     edge = critical.high if math.isfinite(critical.high) else critical.low
-    distance, rng = np.abs(y - edge), np.random.Generator(np.random.PCG64(0))
-    if not np.std(y) > _HEAVY * np.median(distance) > 0.0 or not _heavy_over_space(distance, cell_shares(u, rng)):
+    rng = np.random.Generator(np.random.PCG64(0))
+    if len(y) > _MOST:
+        order = np.argsort(np.abs(y - edge), kind="stable")
+        rows = np.sort(np.concatenate([order[: _MOST // 2], rng.permutation(order[_MOST // 2 :])[: _MOST - _MOST // 2]]))
+        u, y = u[rows], y[rows]
+    distance = np.abs(y - edge)
+    if not (distance > 0.0).any() or not np.ptp(y) > 0.0:
         return None
+    judge, bins = replace(settings, kernels=1), Bins.around_edge(y, critical)
+    weight = 0.5 / len(y) + 0.5 * cell_shares(u, rng)
 
-    def score(warp: Warp | None) -> float:
-        learned, slope = (y, 0.0) if warp is None else (warp.values(y), warp.log_slope(y))
-        return float((settings.fit(u, learned, rng).leave_one_out(u, learned).log_density(learned) + slope).mean())
+    def score(warp: Warp | None) -> Vector:
+        values = y if warp is None else warp.values(y)
+        return bins.log_score(judge.fit(u, values, np.random.Generator(np.random.PCG64(1))).leave_one_out(u, values), y, warp)
 
-    scales = np.unique(np.quantile(distance[distance > 0.0], _QUANTILES)).tolist()
-    return max((None, *(Warp(edge, scale) for scale in scales)), key=score)
+    plain = score(None)
+
+    def gained(warp: Warp) -> tuple[float, float]:
+        """Return the mean gain over no warp, and its standard error."""
+        gain = score(warp) - plain
+        mean = float(weight @ gain)
+        return mean, float(np.sqrt((weight**2) @ (gain - mean) ** 2))
+
+    inside, heavy = critical.contains(y), float(np.std(y)) > _HEAVY * float(np.median(distance))
+    safe = distance[(distance > 0.0) & ~inside]
+    scales = np.unique(np.quantile(safe if len(safe) else distance[distance > 0.0], _QUANTILES + _SMALLER * heavy))
+    tried = {warp: gained(warp) for warp in (Warp(edge, scale) for scale in scales.tolist())}
+    best = max(tried, key=lambda warp: tried[warp][0])
+    if tried[best][0] < -_SURE * tried[best][1]:
+        return None  # as good as never is one side's scale another then
+    for factor in (2.0, 0.5) if inside.any() and not inside.all() else ():
+        while (warp := _steeper(best, factor, critical)) not in tried:
+            tried[warp] = gained(warp)
+            if tried[warp][0] > tried[best][0]:
+                best = warp
+    mean, error = tried[best]
+    return best if mean > _SURE * error else None
 
 
-def _heavy_over_space(distance: Vector, share: Vector) -> bool:
-    """Say whether distances to the edge (n,) are heavy-tailed over the space, as runs crowd at the edge."""
-    order = np.argsort(distance)
-    middle = float(distance[order][np.searchsorted(np.cumsum(share[order]), 0.5 * share.sum())])
-    mean = float(np.average(distance, weights=share))
-    return math.sqrt(float(np.average((distance - mean) ** 2, weights=share))) > _HEAVY * middle
+def _steeper(warp: Warp, factor: float, critical: CriticalInterval) -> Warp:
+    """Return the warp with a scale of the critical side that is so much larger; itself where it is large, or small, enough."""
+    above = warp.scale if warp.above is None else warp.above
+    below, above = (warp.scale * factor, above) if math.isfinite(critical.high) else (warp.scale, above * factor)
+    return Warp(warp.edge, below, above) if 1.0 / _STEEPEST <= below / above <= _STEEPEST else warp
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +110,7 @@ class WarpedPredictor:
         """Return the prediction of y at u (n, d): of each component the mean goes back, and P(y beyond the edge) stays."""
         found = self.predictor(u)
         mean = np.clip(found.mean, -_FARTHEST, _FARTHEST)
-        ratio = self.warp.scale * np.divide(np.sinh(mean), mean, out=np.ones_like(mean), where=np.abs(mean) > 1e-6)
+        ratio = self.warp.scale_at(mean) * np.divide(np.sinh(mean), mean, out=np.ones_like(mean), where=np.abs(mean) > 1e-6)
         return Prediction(self.warp.edge + ratio * mean, found.std * ratio, found.weight, found.noise * (found.weight @ ratio))
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
