@@ -1,4 +1,4 @@
-"""Metrics with heavy tails are learned in a warped unit: P(critical) is the same before and after."""
+"""Metrics are learned in the unit in which runs are predicted best: P(critical) is the same before and after."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ LOW = CriticalInterval(high=0.0)
 PROCESS = GaussianProcess(nu=2.5, input_noise=False)
 
 
+@pytest.mark.parametrize("above", [None, 0.1])
 @pytest.mark.parametrize(("critical", "sign"), [(LOW, 1.0), (CriticalInterval(low=0.0), -1.0)])
-def test_a_warped_predictor_keeps_the_probabilities(critical: CriticalInterval, sign: float, tmp_path: Path):
+def test_a_warped_predictor_keeps_the_probabilities(critical: CriticalInterval, sign: float, above: float | None, tmp_path: Path):
     rng = stream(3, "warped")
-    u, warp = rng.random((40, 2)), Warp(0.0, 0.5)
+    u, warp = rng.random((40, 2)), Warp(0.0, 0.5, above)
     w = sign * (8.0 * u[:, 0] - 1.0 + u[:, 1])
     predictor = WarpedPredictor(PROCESS.fit(u, w, rng), warp)
     at = rng.random((300, 2))
@@ -38,6 +39,39 @@ def test_a_warped_predictor_keeps_the_probabilities(critical: CriticalInterval, 
     np.testing.assert_allclose(drawn, p[:5], atol=0.12)
     save(predictor, tmp_path / "m.sbtmodel")
     np.testing.assert_array_equal(load(tmp_path / "m.sbtmodel")(at).mean, predictor(at).mean)
+
+
+def test_a_warp_has_its_own_scale_on_either_side():
+    warp, y = Warp(1.0, 2.0, 0.5), np.array([-np.inf, -7.0, 0.3, 1.0, 1.1, 4.0, np.inf])
+    assert (np.diff(warp.values(y)) > 0.0).all()
+    np.testing.assert_allclose(warp.back(warp.values(y)), y, rtol=1e-12)
+    at = y[[1, 2, 4, 5]]
+    slope = (warp.values(at + 1e-6) - warp.values(at - 1e-6)) / 2e-6
+    np.testing.assert_allclose(warp.log_slope(at), np.log(slope), atol=1e-6)
+    assert warp.interval(CriticalInterval(high=1.0)).high == 0.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_metric_that_is_steeper_where_it_is_critical_is_learned_in_a_unit_with_two_scales(sign: float):
+    """Of a process of the metric as it is the boundary lies next to the safe runs."""
+    critical = LOW if sign > 0.0 else CriticalInterval(low=0.0)
+    rng = stream(5, "steep")
+
+    def metric(u):
+        margin = np.hypot(u[:, 0] - 0.4, u[:, 1] - 0.6) - 0.25 - 0.05 * np.sin(9.0 * u[:, 0])
+        return sign * np.where(margin > 0.0, margin, 30.0 * margin - 2.0)
+
+    u, at = SobolSequence(2, 3).points(0, 60), rng.random((4000, 2))
+    y, truth = metric(u), critical.contains(metric(at))
+    warp = better_warp(PROCESS, u, y, critical)
+    assert warp is not None
+    assert warp.above is not None
+    inside, outside = (warp.scale, warp.above) if sign > 0.0 else (warp.above, warp.scale)
+    assert inside > outside
+    auto = Auto(ensemble_rows=1000)
+    learned = auto.with_target(critical).fit(u, y, rng), PROCESS.fit(u, y, rng)
+    share = [predict(at).probability(critical).mean() for predict in learned]
+    assert abs(share[0] - truth.mean()) < 0.5 * abs(share[1] - truth.mean())
 
 
 def test_values_over_many_orders_are_learned_as_well_as_a_bowl():
