@@ -1,8 +1,8 @@
 """The metamodel as the estimator uses it: P(critical) at points of the standard-normal space.
 
-The metric is warped by asinh around the critical edge, so that precision goes where critical meets
-uncritical and a far tail does not decide the length scales. A ridge trend carries many inputs; a second fit
-without trend limits its confidence where it only extrapolates.
+The metric is warped by asinh around the critical edge, on either side with the scale by which left-out runs are predicted best,
+so that precision goes where critical meets uncritical and a far tail does not decide the length scales. A ridge trend carries
+many inputs; a second fit without trend limits its confidence where it only extrapolates.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ _QUANTILES = (0.5, 0.25)  # of the distances to the edge: scales that are tried
 _HEAVY, _SMALLER = 10.0, (0.1, 0.03)  # standard deviation over the median distance from which on smaller ones are, too
 _STEEPEST = 16.0  # one side's scale over the other's
 _FEWEST, _MOST = 10, 200  # rows, from which on warps are compared, and on which at most: half of them those nearest to the edge
-_SURE = 1.5  # standard errors
+_SURE = 3.0  # standard errors: with half as many units were taken by chance, below 30 rows above all
 _FARTHEST = 300.0  # warped units, beyond which values are no numbers any more
 
 
@@ -76,7 +76,7 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
     scales = np.unique(np.quantile(safe if len(safe) else distance[distance > 0.0], _QUANTILES + _SMALLER * heavy))
     tried = {warp: gained(warp) for warp in (Warp(edge, scale) for scale in scales.tolist())}
     best = max(tried, key=lambda warp: tried[warp][0])
-    if tried[best][0] < -_SURE * tried[best][1]:
+    if tried[best][0] < -tried[best][1]:
         return None  # as good as never is one side's scale another then
     for factor in (2.0, 0.5) if inside.any() and not inside.all() else ():
         while (warp := _steeper(best, factor, critical)) not in tried:
