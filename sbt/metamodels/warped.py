@@ -29,7 +29,7 @@ _QUANTILES = (0.5, 0.25)  # of the distances to the edge: scales that are tried
 _HEAVY, _SMALLER = 10.0, (0.1, 0.03)  # standard deviation over the median distance from which on smaller ones are, too
 _STEEPEST = 16.0  # one side's scale over the other's
 _FEWEST, _MOST = 10, 200  # rows, from which on warps are compared, and on which at most: half of them those nearest to the edge
-_SURE = 3.0  # standard errors: with half as many units were taken by chance, below 30 rows above all
+_SURE, _SURER, _FEW = 2.0, 3.0, 8  # standard errors, and while so few rows lie on one side: units were taken by chance
 _FARTHEST = 300.0  # warped units, beyond which values are no numbers any more
 
 
@@ -84,7 +84,8 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
             if tried[warp][0] > tried[best][0]:
                 best = warp
     mean, error = tried[best]
-    return best if mean > _SURE * error else None
+    few = min(int(inside.sum()), int((~inside).sum())) < _FEW
+    return best if mean > (_SURER if few else _SURE) * error else None
 
 
 def _steeper(warp: Warp, factor: float, critical: CriticalInterval) -> Warp:
