@@ -80,8 +80,7 @@ def test_values_over_many_orders_are_learned_as_well_as_a_bowl():
     near = 0.7 + 0.2 * rng.uniform(-1.0, 1.0, (60, 4))
     u, at = np.vstack([SobolSequence(4, 1).points(0, 60), near]), SobolSequence(4, 2).points(0, 4000)
     y, truth = testbeds.values(name, u), testbeds.values(name, at) <= 0.0
-    auto = Auto(ensemble_rows=1000)
-    warped, plain = auto.with_target(LOW).fit(u, y, rng), auto._fit(u, y, rng, LOW)
+    warped, plain = Auto(ensemble_rows=1000).with_target(LOW).fit(u, y, rng), PROCESS.fit(u, y, rng)
     wrong = [float(np.abs(predict(at).probability(LOW) - truth).mean()) for predict in (warped, plain)]
     assert wrong[0] < 1e-3
     assert wrong[1] > 0.02, "what the metric as it is teaches"

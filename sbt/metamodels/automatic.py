@@ -129,8 +129,9 @@ class Auto:
         """Return the process alone, or the mixture where it is better for where the runs fell, at the edge and over the space."""
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
         plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
-        process = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng) or plain
-        own = bins.log_score(process.leave_one_out(u, y), y)
+        stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
+        process = plain if stepped is None else stepped
+        own = bins.log_score(plain.leave_one_out(u, y), y) if stepped is None else stepped.log_score(bins, u, y)
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             left = f"of {n} rows, each predicted from all others, {-own.mean():.1g}: others could add no more"
             reason = f"100 % gp: it misses a mean log likelihood {left}"

@@ -37,9 +37,9 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "log_ambiguity_bound",
-    "named_errors", "sample_paths", "simplest", "sketched", "split_validation", "standardise", "with_target",
-    "without_repetitions",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "gives_different",
+    "log_ambiguity_bound", "named_errors", "sample_paths", "simplest", "sketched", "split_validation", "standardise",
+    "with_target", "without_repetitions",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -310,6 +310,14 @@ def without_repetitions(u: Points, y: Vector) -> tuple[Points, Vector]:
         return u, y
     kept = np.sort(first)
     return u[kept], y[kept]
+
+
+def gives_different(u: Points, y: Vector) -> bool:
+    """Say whether equal rows of u (n, d) have different values of y (n,): the simulator is noisy."""
+    if len(u) < 2:
+        return False
+    _, first, group = np.unique(u, axis=0, return_index=True, return_inverse=True)
+    return not np.allclose(y, y[first][group.reshape(-1)], rtol=1e-9, atol=0.0)
 
 
 def standardise(y: Vector) -> tuple[Vector, float, float]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from sbt.errors import InputError
-from sbt.metamodels.base import check_rows, split_validation, standardise, without_repetitions
+from sbt.metamodels.base import check_rows, gives_different, split_validation, standardise, without_repetitions
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gp_algebra import (
     NOISE_FLOOR,
@@ -26,7 +26,7 @@ from sbt.metamodels.gp_algebra import (
     solve,
     solve_right,
 )
-from sbt.metamodels.gp_fit import HEAVY_NOISE, LIKELY_NOISE, Objective, fit_kernels, fit_posterior
+from sbt.metamodels.gp_fit import HEAVY_NOISE, LIKELY_NOISE, Objective, fit_kernels, fit_noise, fit_posterior
 from sbt.metamodels.gp_paper import fit_early_stopped
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor, NoiseSpread, relative_variance
 from sbt.metamodels.tails import student_widths
@@ -49,7 +49,8 @@ class GaussianProcess:
     Defaults: maximum a posteriori by L-BFGS under priors that scale with the dimension, on at most
     `fit_rows` rows, then conditioned on all rows; noise that depends on the input, from one regression
     on the leave-one-out residuals. The likelihood decides whether there is noise at all: half of its prior
-    is that of a noisy metric, half is flat down to jitter. Without priors (the paper's preset): Adam on the
+    is that of a noisy metric, half is flat down to jitter; where rows look like noise alone, or equal ones differ, a fit from
+    heavy noise competes. Without priors (the paper's preset): Adam on the
     marginal likelihood of the last 80 % of the rows, stopped early by the likelihood of the first 20 %.
 
     Args:
@@ -156,6 +157,8 @@ class GaussianProcess:
             hyper = fit_posterior(objective)
         else:
             objective, hyper = fit_kernels(objective)
+        if self._noise_mode is None:
+            objective, hyper = fit_noise(objective, hyper, certain=gives_different(u, y))
         if not self.input_noise or len(z) < _FEWEST_FOR_NOISE:
             return _condition(self, hyper, u, z, np.ones(len(z)), None, shift, scale)
         spread, at_rows = _fit_noise_spread(hyper, u, z, rng, device)

@@ -18,7 +18,7 @@ from scipy.special import expit
 from sbt.metamodels.gp_algebra import NOISE_FLOOR, Hyperparameters, cholesky, diagonal, host, like, placed, solve
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["HEAVY_NOISE", "LIKELY_NOISE", "Objective", "fit_kernels", "fit_posterior"]
+__all__ = ["HEAVY_NOISE", "LIKELY_NOISE", "Objective", "fit_kernels", "fit_noise", "fit_posterior"]
 
 LIKELY_NOISE, HEAVY_NOISE = -5.0, -0.7
 """Log variances: the mode of a noisy metric, and about half of y's, the mode where a simulator is known to be noisy."""
@@ -31,7 +31,8 @@ _FIRST_LENGTHS, _FIRST_SCALES = (1.5, 0.4), (1.0, 0.2)  # the same of two kernel
 _SCALE_BOUNDS = (_BOUNDS[0], math.log(100.0))  # with larger ones the least noise would be lost in rounding
 _SCALE_SPREAD = 2.0  # of the prior of log variances of two kernels
 _COMPARED = 200  # rows that one kernel is compared with two on
-_CLEARLY = 3.0  # by which the log posterior density of two kernels must be larger
+_CLEARLY = 3.0  # by which a log posterior density must be larger
+_EXPLAINED = 30.0  # log density above that of noise alone from which on it is not tried
 _ITERATIONS, _TOLERANCE = 100, 1e-6  # of L-BFGS: about 30 are usual; of the log posterior per row
 _PRIOR_SPREAD = math.sqrt(3.0)  # of the log length scales
 _LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
@@ -179,3 +180,23 @@ def fit_kernels(objective: Objective) -> tuple[Objective, Hyperparameters]:
         chosen = replace(objective, kernels=2)
         return chosen, two if n <= _COMPARED else fit_posterior(chosen, two)
     return objective, one if n <= _COMPARED else fit_posterior(objective)
+
+
+def fit_noise(objective: Objective, hyper: Hyperparameters, *, certain: bool) -> tuple[Objective, Hyperparameters]:
+    """Return the objective and its hyperparameters, or those of one kernel and heavy noise, whichever has the larger density.
+
+    Noise can as well be taken for a function that bends between any two rows, and L-BFGS stays where it starts: 100 rows that
+    were noise alone were learned with length scales of .05 of the space, and P(critical) was worse than its mean.
+
+    Args:
+        objective: without a mode of the noise.
+        hyper: fitted to it.
+        certain: equal rows differ: heavy noise is taken unless the other density is clearly larger. Otherwise it is only tried
+            where the rows are explained hardly better than by noise alone.
+    """
+    n, plain = len(objective.z), -float(objective(objective.vector(hyper))[0]) * len(objective.z)
+    if not certain and plain > _EXPLAINED - n * (0.5 + _LOG_ROOT):
+        return objective, hyper
+    heavy = replace(objective, kernels=1, noise_mode=HEAVY_NOISE)
+    found, density = _fitted(heavy)
+    return (heavy, found) if density > plain - _CLEARLY * certain else (objective, hyper)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,14 @@ _PROBES = 4096  # points that tell which part of the space a row stands for
 _ROUNDS, _MOVED = 500, 1e-6  # of expectation maximisation: at most, and the change of a weight at which it ends
 
 
+class Unit(Protocol):
+    """An increasing map of the metric."""
+
+    def values(self, y: Vector) -> Vector:
+        """Return y (n,) in that unit; infinite ends stay."""
+        ...
+
+
 @dataclass(frozen=True)
 class Bins:
     """Ranges of y that a score tells apart: on which side of the critical edge a run fell, and whether near it.
@@ -32,7 +41,7 @@ class Bins:
 
     Args:
         critical: M_c, in the unit of y.
-        near: distance > 0 from an end of M_c that counts as near.
+        near: distance > 0 from an end of M_c that counts as near; infinite: only the sides are told apart.
         warp: in whose unit both are; None: in that of y.
 
     Source:
@@ -45,8 +54,16 @@ class Bins:
 
     @classmethod
     def around_edge(cls, y: Vector, critical: CriticalInterval, warp: Warp | None = None) -> Bins:
-        """Return the ranges for runs y (n,): the quarter of them that is nearest to the edge is near."""
-        return cls(critical, Warp.around_edge(y, critical).scale, warp)
+        """Return the ranges for runs y (n,): the quarter of them that is nearest to the edge is near.
+
+        No value lies on a cut: of a metric of two values only the side of the edge counts, nearness would favour one of them.
+        """
+        around = Warp.around_edge(y, critical)
+        distance = np.abs(y - around.edge)
+        nearer = distance[(distance > 0.0) & (distance < around.scale)]
+        if not (distance == around.scale).any():
+            return cls(critical, around.scale, warp)
+        return cls(critical, 0.5 * (float(nearer.max()) + around.scale) if len(nearer) else np.inf, warp)
 
     @property
     def told(self) -> str:
@@ -62,9 +79,10 @@ class Bins:
         [-1.0, 0.0, 1.0, 4.0, 5.0, 6.0]
         """
         ends = [end for end in (self.critical.low, self.critical.high) if np.isfinite(end)]
-        return np.unique([end + step for end in ends for step in (-self.near, 0.0, self.near)])
+        steps = (-self.near, 0.0, self.near) if np.isfinite(self.near) else (0.0,)
+        return np.unique([end + step for end in ends for step in steps])
 
-    def log_score(self, prediction: Prediction, y: Vector, unit: Warp | None = None) -> Vector:
+    def log_score(self, prediction: Prediction, y: Vector, unit: Unit | None = None) -> Vector:
         """Return (n,) log probabilities of the ranges that y (n,) fell into; M_c is closed; `unit`: of the prediction."""
         ends, score = np.array([-np.inf, *self.cuts, np.inf]), np.empty(len(y))
         ends = ends if unit is None else unit.values(ends)

@@ -15,6 +15,7 @@ import numpy as np
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.stacking import Bins
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -52,6 +53,10 @@ class Step:
     def moved(self, y: Vector) -> Vector:
         """Return y (n,) moved."""
         return y + np.where(self.critical.contains(y), -1.0, 1.0) * self._sign * self.half
+
+    def values(self, ends: Vector) -> Vector:
+        """Return ends (n,) of ranges of y, moved: one at the edge stays there."""
+        return ends + np.sign(ends - self.edge) * self.half
 
     def back(self, moved: Vector) -> Vector:
         """Return values (...,) of y: within the jump they are next to the edge."""
@@ -95,6 +100,10 @@ class SteppedPredictor:
     def leave_one_out(self, u: Points, y: Vector) -> Prediction:
         """Return the prediction of each row from all others, see `GaussianProcessPredictor`."""
         return self.step.prediction(self.process.leave_one_out(u, self.step.moved(y)))
+
+    def log_score(self, bins: Bins, u: Points, y: Vector) -> Vector:
+        """Return (n,) log probabilities of the ranges that y (n,) at u (n, d) fell into, each row predicted from all others."""
+        return bins.log_score(self.process.leave_one_out(u, self.step.moved(y)), y, self.step)
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) lower and upper bounds of P(y in M_c) for the interval that the step is at the edge of."""

@@ -59,19 +59,23 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
     judge, bins = replace(settings, kernels=1), Bins.around_edge(y, critical)
     weight = 0.5 / len(y) + 0.5 * cell_shares(u, rng)
 
-    def score(warp: Warp | None) -> Vector:
-        values = y if warp is None else warp.values(y)
-        return bins.log_score(judge.fit(u, values, np.random.Generator(np.random.PCG64(1))).leave_one_out(u, values), y, warp)
+    inside, heavy = critical.contains(y), float(np.std(y)) > _HEAVY * float(np.median(distance))
+
+    def score(warp: Warp | None) -> Points:
+        """Return (2, n) log probabilities of the range that y fell into, and of the side of the edge."""
+        values, ends = (y, critical) if warp is None else (warp.values(y), warp.interval(critical))
+        left_out = judge.fit(u, values, np.random.Generator(np.random.PCG64(1))).leave_one_out(u, values)
+        return np.stack([bins.log_score(left_out, y, warp), np.where(inside, *left_out.log_probability(ends))])
 
     plain = score(None)
 
     def gained(warp: Warp) -> tuple[float, float]:
-        """Return the mean gain over no warp, and its standard error."""
+        """Return the mean gain over no warp, and its standard error; none where the sides alone are predicted worse."""
         gain = score(warp) - plain
-        mean = float(weight @ gain)
-        return mean, float(np.sqrt((weight**2) @ (gain - mean) ** 2))
+        mean = gain @ weight
+        error = np.sqrt((gain - mean[:, None]) ** 2 @ weight**2)
+        return float(mean[0]) if mean[1] >= 0.0 else -math.inf, float(error[0])
 
-    inside, heavy = critical.contains(y), float(np.std(y)) > _HEAVY * float(np.median(distance))
     safe = distance[(distance > 0.0) & ~inside]
     scales = np.unique(np.quantile(safe if len(safe) else distance[distance > 0.0], _QUANTILES + _SMALLER * heavy))
     tried = {warp: gained(warp) for warp in (Warp(edge, scale) for scale in scales.tolist())}

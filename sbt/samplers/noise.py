@@ -7,18 +7,10 @@ from numpy.typing import NDArray
 
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["gives_different", "hidden_by_noise", "more_repeats", "scores"]
+__all__ = ["hidden_by_noise", "more_repeats", "scores"]
 
 _HIDDEN = 0.1  # share of the noise in the variance of the scores, from which on values of single runs mislead
 _REPEATS = 4  # of any inputs: two tell whether there is noise, four whether it is large
-
-
-def gives_different(u: Points, y: Vector) -> bool:
-    """Say whether equal rows of u (n, d) have different values of y (n,): the simulator is noisy."""
-    if len(u) < 2:
-        return False
-    _, first, group = np.unique(u, axis=0, return_index=True, return_inverse=True)
-    return not np.allclose(y, y[first][group.reshape(-1)], rtol=1e-9, atol=0.0)
 
 
 def scores(margin: Vector) -> Vector:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sample_paths
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, gives_different, named_errors, sample_paths
 from sbt.metamodels.joint import metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.success import LogSuccess, log_success
@@ -25,7 +25,7 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN, CombinedInterval
 from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.problem.requirement import CriticalInterval
-from sbt.samplers.noise import gives_different, hidden_by_noise
+from sbt.samplers.noise import hidden_by_noise
 
 __all__ = [
     "DEFLATION", "FreeRegion", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fill_uniformly", "fit_warped",
