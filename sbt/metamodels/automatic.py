@@ -12,7 +12,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, sample_paths, sketched, without_repetitions
+from sbt.metamodels.base import (
+    Metamodel,
+    Predictor,
+    Screened,
+    check_rows,
+    gives_different,
+    sample_paths,
+    sketched,
+    without_repetitions,
+)
+from sbt.metamodels.chance import Chance, learned_chance
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -137,6 +147,7 @@ class Auto:
             reason = f"100 % gp: it misses a mean log likelihood {left}"
             comparison = ModelComparison({name: float(name == "gp") for name in models}, {"gp": float(own.mean())}, reason)
             return self._mixed(models, {"gp": process}, comparison, u, y, rng)
+        every = shares
         folds = max(self.folds, 5 if n < 1000 else 10 if self.compare_rows >= n else min(max(n // self.compare_rows, 5), 10))
         rivals = self._models(n, n - n // folds, target_aware=True)
         enough = self.compare_rows if n < 1000 or self.compare_rows >= n else round(_NEARLY * self.compare_rows)
@@ -145,7 +156,11 @@ class Auto:
         shares = shares[rows]
         weights = stacking_weights(scores, self.prior, 0.5 + 0.5 * len(rows) * shares / shares.sum())
         comparison = _explain(list(models), weights, scores, len(rows), self, bins, shares)
-        return self._mixed(models, {"gp": process}, comparison, u, y, rng)
+        found = self._mixed(models, {"gp": process}, comparison, u, y, rng)
+        if len(found.weight) > 1 or not gives_different(u, y):
+            return found
+        chance = learned_chance(process.leave_one_out(u, y), y, bins.critical, every)
+        return found if chance is None else found.beside(*chance)
 
     def _mixed(
         self, models: Mapping[str, Metamodel], fitted: Mapping[str, Predictor], comparison: ModelComparison, u: Points, y: Vector,
@@ -227,6 +242,12 @@ class MixturePredictor:
     predictors: tuple[Predictor, ...]
     weight: Vector
     comparison: ModelComparison
+
+    def beside(self, chance: Chance, share: float) -> MixturePredictor:
+        """Return the same with a share in (0, 1) of chance."""
+        reason = f"{self.comparison.reason}; with {100 * share:.2g} % probability a run is taken to fall anywhere among all"
+        weight = np.append((1.0 - share) * self.weight, share)
+        return MixturePredictor((*self.predictors, chance), weight, replace(self.comparison, reason=reason))
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) lower and (n,) upper bounds of P(y in M_c): quick where the predictors have quick ones."""

@@ -117,11 +117,17 @@ def held_out_scores(
 def cell_shares(u: Points, rng: np.random.Generator) -> Vector:
     """Return (n,) the share of the unit cube that is nearest to each row u (n, d): where rows crowd, one counts less.
 
+    Equal rows divide theirs.
+
     >>> cell_shares(np.array([[0.1], [0.12], [0.9]]), np.random.Generator(np.random.PCG64(0))).round(1).tolist()
     [0.1, 0.4, 0.5]
+    >>> cell_shares(np.array([[0.25], [0.75], [0.25]]), np.random.Generator(np.random.PCG64(0))).round(1).tolist()
+    [0.3, 0.5, 0.3]
     """
-    nearest = cKDTree(u).query(rng.random((_PROBES, u.shape[1])))[1]
-    return np.asarray(np.bincount(nearest, minlength=len(u)) / _PROBES)
+    rows, group, count = np.unique(u, axis=0, return_inverse=True, return_counts=True)
+    nearest = cKDTree(rows).query(rng.random((_PROBES, u.shape[1])))[1]
+    share = np.bincount(nearest, minlength=len(rows)) / (_PROBES * count)
+    return np.asarray(share[group.reshape(-1)])
 
 
 def stacking_weights(log_score: Points, prior: float, counts: Vector | None = None) -> Vector:
