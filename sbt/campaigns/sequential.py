@@ -59,6 +59,7 @@ _BLIND = (0.0, 0.75, 0.1, 0.15)
 """Shares of the draws (`SHARES`) until then; they only teach: what would count then is rarely met, and weighs much if it is."""
 
 _GAIN = 4.0
+_MANY_HITS, _ENOUGH = 10.0, 0.2  # expected of crude Monte Carlo; share of the budget before fewer leave the estimation to it
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""
 _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
@@ -143,7 +144,9 @@ class SequentialStage:
         z = stream(s.seed, "noise", log.iteration).standard_normal((2000, len(self._wide)))
         pi = np.exp(log_probability(z)[0])
         p, spread = float(pi.mean()), float(np.sqrt(pi * (1.0 - pi)).mean())
-        return p * (s.budget - len(log.planned)) >= 1.0 and p * (1.0 - p) * SHARES[0] < _GAIN * spread**2
+        hits = p * (s.budget - len(log.planned))
+        known = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget
+        return known and hits >= 1.0 and p * (1.0 - p) * SHARES[0] < _GAIN * spread**2
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""

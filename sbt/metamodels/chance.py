@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.stacking import stacking_weights
+from sbt.metamodels.stacking import mixture_score, stacking_weights
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -20,6 +20,7 @@ __all__ = ["Chance", "learned_chance"]
 
 _VALUES = 8  # of either side, at its quantiles
 _NARROW = 8.0  # a value's distance to the edge over its width: none spills over the edge
+_PRICE = 2.0  # of two more parameters, in log likelihood (Akaike's criterion)
 _PRIOR = 1.0  # rows: of equal weights of chance and process, and of an even rate
 
 
@@ -49,7 +50,7 @@ class Chance:
 def learned_chance(
     left_out: Prediction, y: Vector, critical: CriticalInterval, shares: Vector
 ) -> tuple[Chance, float] | None:
-    """Return chance and its weight in (0, 1); None where all runs lie on one side.
+    """Return chance and its weight in (0, 1); None where all runs lie on one side, or it explains them hardly better.
 
     Args:
         left_out: prediction of each row from all others.
@@ -64,10 +65,13 @@ def learned_chance(
     weight = n * shares / shares.sum()
     others = (weight @ side - weight * side + 0.5 * _PRIOR) / (n - weight + _PRIOR)
     own = np.where(inside, *left_out.log_probability(critical))
-    share = float(stacking_weights(np.stack([own, np.log(np.where(inside, others, 1.0 - others))]), _PRIOR)[1])
+    scores = np.stack([own, np.log(np.where(inside, others, 1.0 - others))])
+    mixed = stacking_weights(scores, _PRIOR)
+    if float((mixture_score(scores, mixed) - own).sum()) < _PRICE:
+        return None
     rate = float((weight @ side + 0.5 * _PRIOR) / (n + _PRIOR))
     ends = [end for end in (critical.low, critical.high) if np.isfinite(end)]
     value = np.concatenate([np.quantile(y[part], (np.arange(_VALUES) + 0.5) / _VALUES) for part in (inside, ~inside)])
     away = np.abs(value[:, None] - np.array(ends)).min(axis=1)
     floor = 1e-9 * max(float(np.std(y)), float(np.abs(y).max()) * 1e-6)
-    return Chance(value, np.maximum(away, floor) / _NARROW, np.repeat([rate, 1.0 - rate], _VALUES) / _VALUES), share
+    return Chance(value, np.maximum(away, floor) / _NARROW, np.repeat([rate, 1.0 - rate], _VALUES) / _VALUES), float(mixed[1])
