@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sbt.metamodels.chance import learned_chance
 from scipy.special import ndtr
 
 import sbt
 from sbt.metamodels.automatic import Auto
-from sbt.metamodels.chance import learned_chance
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins

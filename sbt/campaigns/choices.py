@@ -15,6 +15,7 @@ import numpy as np
 from sbt.acquisitions import boundary, even, log_scores
 from sbt.campaigns.exploration import about_regions, exploration_share, explore, should_explore
 from sbt.campaigns.records import BatchProposal
+from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Acquisition, Settings
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
@@ -33,6 +34,8 @@ __all__ = ["ChoiceRule", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
 _MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to particles: about a second with a GP
 _MOST_EVEN = 2**23  # where none is scored: 8,000 runs of a space of which constraints leave a thousandth
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
+_MOST_FILLING = 0.6  # the same where noise alone decides: where P is said to be small nobody would look again
+_PROBED = 512  # points at which the noise is taken
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
 
@@ -98,7 +101,8 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     share = exploration_share(settings, log) if exploring else 0.0
     fitted = _within(fitted, about_regions(settings, log) if exploring else None)
     looking = explore(settings, log, min(_rounded(share * n, log), n))
-    filling = min(_rounded(max(_FILLING - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
+    filled = max(_FILLING, _MOST_FILLING * _hidden(settings, fitted, log))
+    filling = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
     second, typical = _typical(settings, fitted, log, _rounded(_TYPICAL * (n - len(so_far)), log), so_far, first.next_position)
@@ -113,6 +117,16 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
         filling=len(fill), representative=len(typical), greedy=len(greedy),
     )  # fmt: skip
     return Chosen(so_far, proposal)
+
+
+def _hidden(settings: Settings, fitted: FittedMetamodel, log: Log) -> float:
+    """Return the share of the metric's variance in [0, 1] that a noisy simulator draws, as the metamodel takes it; else 0."""
+    scenario, runs = settings.scenario, log.history.training
+    if scenario.requirement.combined or scenario.pool is not None or not simulator_noise(log.history, scenario.requirement).noisy:
+        return 0.0
+    spread = float(np.var(scenario.requirement.values(runs)))
+    noise = fitted.predict(SobolSequence(scenario.space.dimension, settings.seed).points(0, _PROBED)).noise
+    return min(float((noise**2).mean()) / spread, 1.0) if spread > 0.0 else 0.0
 
 
 def _within(fitted: FittedMetamodel, places: Callable[[Points], Mask] | None) -> FittedMetamodel:

@@ -12,20 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metamodels.base import (
-    Metamodel,
-    Predictor,
-    Screened,
-    check_rows,
-    gives_different,
-    sample_paths,
-    sketched,
-    without_repetitions,
-)
-from sbt.metamodels.chance import Chance, learned_chance
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, sample_paths, sketched, without_repetitions
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.noise_shape import shaped
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.stepped import better_stepped
@@ -140,14 +131,13 @@ class Auto:
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
         plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
         stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
-        process = plain if stepped is None else stepped
-        own = bins.log_score(plain.leave_one_out(u, y), y) if stepped is None else stepped.log_score(bins, u, y)
+        process = (shaped(plain, u, y, bins.critical, rng) or plain) if stepped is None else stepped
+        own = bins.log_score(process.leave_one_out(u, y), y) if stepped is None else stepped.log_score(bins, u, y)
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             left = f"of {n} rows, each predicted from all others, {-own.mean():.1g}: others could add no more"
             reason = f"100 % gp: it misses a mean log likelihood {left}"
             comparison = ModelComparison({name: float(name == "gp") for name in models}, {"gp": float(own.mean())}, reason)
             return self._mixed(models, {"gp": process}, comparison, u, y, rng)
-        every = shares
         folds = max(self.folds, 5 if n < 1000 else 10 if self.compare_rows >= n else min(max(n // self.compare_rows, 5), 10))
         rivals = self._models(n, n - n // folds, target_aware=True)
         enough = self.compare_rows if n < 1000 or self.compare_rows >= n else round(_NEARLY * self.compare_rows)
@@ -156,11 +146,7 @@ class Auto:
         shares = shares[rows]
         weights = stacking_weights(scores, self.prior, 0.5 + 0.5 * len(rows) * shares / shares.sum())
         comparison = _explain(list(models), weights, scores, len(rows), self, bins, shares)
-        found = self._mixed(models, {"gp": process}, comparison, u, y, rng)
-        if len(found.weight) > 1 or not gives_different(u, y):
-            return found
-        chance = learned_chance(process.leave_one_out(u, y), y, bins.critical, every)
-        return found if chance is None else found.beside(*chance)
+        return self._mixed(models, {"gp": process}, comparison, u, y, rng)
 
     def _mixed(
         self, models: Mapping[str, Metamodel], fitted: Mapping[str, Predictor], comparison: ModelComparison, u: Points, y: Vector,
@@ -242,12 +228,6 @@ class MixturePredictor:
     predictors: tuple[Predictor, ...]
     weight: Vector
     comparison: ModelComparison
-
-    def beside(self, chance: Chance, share: float) -> MixturePredictor:
-        """Return the same with a share in (0, 1) of chance."""
-        reason = f"{self.comparison.reason}; with {100 * share:.2g} % probability a run is taken to fall anywhere among all"
-        weight = np.append((1.0 - share) * self.weight, share)
-        return MixturePredictor((*self.predictors, chance), weight, replace(self.comparison, reason=reason))
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) lower and (n,) upper bounds of P(y in M_c): quick where the predictors have quick ones."""

@@ -22,9 +22,9 @@ from sbt.errors import InputError
 from sbt.files import write_atomically
 from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
-from sbt.metamodels import chance, gp_algebra, gp_predictor, joint, recalibrated, sparse, stepped, warp, warped
 from sbt.metamodels import deep_ensemble as ensemble
 from sbt.metamodels import extra_trees as et
+from sbt.metamodels import gp_algebra, gp_predictor, joint, noise_shape, recalibrated, sparse, stepped, warp, warped
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
 from sbt.problem.combination import CombinedInterval
@@ -54,7 +54,7 @@ _KINDS: dict[str, Any] = {
         sparse.SparseLayer,
         sparse.SparseMixture,
         sparse.SparsePredictor,
-        chance.Chance,
+        noise_shape.ShapedPredictor,
         stepped.Step,
         stepped.SteppedPredictor,
         warp.Warp,
