@@ -6,18 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sbt.metamodels.chance import learned_chance
 from scipy.special import ndtr
 
 import sbt
 from sbt.metamodels.automatic import Auto
 from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.noise_shape import shaped
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins
 from sbt.metamodels.warped import better_warp
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
+from sbt.store.database import Store
 
 LOW = CriticalInterval(high=0.0)
 PROCESS = GaussianProcess(nu=2.5, input_noise=False)
@@ -69,19 +70,23 @@ def test_of_a_metric_of_two_values_only_the_sides_count():
     assert better_warp(PROCESS, repeated(1, 60), y, LOW) is None, "no unit makes one of the values likelier"
 
 
-def test_chance_is_as_often_critical_as_the_space_and_only_where_the_process_denies_what_happened():
-    n, shares = 100, np.full(100, 0.01)
-    y = np.ones(n)
-    y[[3, 50]] = -1.0
-    denies = Prediction.gaussian(np.full(n, 1.0), np.full(n, 0.1))
-    found = learned_chance(denies, y, LOW, shares)
+def test_the_shape_of_noise_is_learned_where_it_tells_the_sides_better():
+    """Noise of two values far apart, critical with one seed in six, whose Gaussian would say .25 and more."""
+    u, rng = repeated(5, 120), stream(5, "shape")
+    hit = rng.random(len(u)) < 1.0 / 6.0
+    y = np.where(hit, -1.0, 1.5) + 0.05 * rng.standard_normal(len(u)) + 0.1 * u[:, 0]
+    y[-1] = y[1] - 2.0
+    process = PROCESS.fit(u, y, rng)
+    found = shaped(process, u, y, LOW, rng)
     assert found is not None
-    chance, share = found
-    assert chance(AT).probability(LOW) == pytest.approx(np.full(len(AT), 2.5 / 101.0))
-    assert 0.3 < share < 1.0
-    knows = Prediction.gaussian(y, np.full(n, 0.3))
-    assert learned_chance(knows, y, LOW, shares) is None
-    assert learned_chance(denies, np.ones(n), LOW, shares) is None
+    truth, at = hit.mean(), found(AT)
+    assert abs(float(at.probability(LOW).mean()) - truth) < abs(float(process(AT).probability(LOW).mean()) - truth)
+    assert np.allclose(at.mu, process.mu(AT), atol=1e-9), "the mean is that of the process"
+    assert found.offset @ found.weight == pytest.approx(0.0, abs=1e-9)
+    gaussian = disc(u) + rng.standard_normal(len(u))
+    assert shaped(PROCESS.fit(u, gaussian, rng), u, gaussian, LOW, rng) is None, "what is Gaussian stays"
+    even = SobolSequence(2, 5).points(0, 100)
+    assert shaped(PROCESS.fit(even, disc(even), rng), even, disc(even), LOW, rng) is None, "nothing was repeated"
 
 
 @pytest.mark.parametrize("value", [1.0, 1e-6, 1e6])
@@ -109,3 +114,24 @@ def test_a_boundary_of_a_coin_says_that_it_knows_nothing(tmp_path: Path):
     found = result.conclusion.to_dict()
     assert 0.3 < found["critical_fraction"] < 0.7
     assert found["expected_misclassified"] > 0.3
+
+
+def test_where_noise_decides_the_space_is_filled(tmp_path: Path):
+    """Where P was said to be small nobody looked again: of a left turn half of the critical share was stated."""
+
+    def noisy(inputs: dict[str, float], seed: int) -> dict[str, float]:
+        return {"y": float(np.random.default_rng(seed).standard_normal()) + 0.7}
+
+    def exact(inputs: dict[str, float], seed: int) -> dict[str, float]:
+        return {"y": inputs["a"] - 0.3}
+
+    inputs, need, filled = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)], sbt.Requirement("y", high=0.0), []
+    for name, evaluate in (("noisy", noisy), ("exact", exact)):
+        scenario = sbt.Scenario(name, inputs, need, evaluate=evaluate)
+        sbt.run(
+            campaign="boundary", scenario=scenario, budget=60, seed=2, executor="serial", store=tmp_path / name, report=False,
+        )  # fmt: skip
+        with Store.read(tmp_path / name) as store:
+            filled.append([batch.proposal.get("filling") or 0 for batch in store.iterations()])
+    assert sum(filled[0]) >= 12
+    assert sum(filled[1]) == 0, "the held-out tenth fills it"

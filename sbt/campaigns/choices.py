@@ -101,7 +101,7 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     share = exploration_share(settings, log) if exploring else 0.0
     fitted = _within(fitted, about_regions(settings, log) if exploring else None)
     looking = explore(settings, log, min(_rounded(share * n, log), n))
-    filled = max(_FILLING, _MOST_FILLING * _hidden(settings, fitted, log))
+    filled = max(_FILLING, _MOST_FILLING * _open_share(settings, fitted, log))
     filling = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
@@ -119,14 +119,15 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     return Chosen(so_far, proposal)
 
 
-def _hidden(settings: Settings, fitted: FittedMetamodel, log: Log) -> float:
-    """Return the share of the metric's variance in [0, 1] that a noisy simulator draws, as the metamodel takes it; else 0."""
-    scenario, runs = settings.scenario, log.history.training
-    if scenario.requirement.combined or scenario.pool is not None or not simulator_noise(log.history, scenario.requirement).noisy:
+def _open_share(settings: Settings, fitted: FittedMetamodel, log: Log) -> float:
+    """Return the share in [0, 1] of the variance of "critical or not" that inputs leave open; 0 of a deterministic simulator."""
+    scenario = settings.scenario
+    if scenario.pool is not None or not simulator_noise(log.history, scenario.requirement).noisy:
         return 0.0
-    spread = float(np.var(scenario.requirement.values(runs)))
-    noise = fitted.predict(SobolSequence(scenario.space.dimension, settings.seed).points(0, _PROBED)).noise
-    return min(float((noise**2).mean()) / spread, 1.0) if spread > 0.0 else 0.0
+    at = SobolSequence(scenario.space.dimension, settings.seed).points(0, _PROBED)
+    p = fitted.predict(at).probability(scenario.requirement.critical)
+    mean = float(p.mean())
+    return float((p * (1.0 - p)).mean()) / (mean * (1.0 - mean)) if 0.0 < mean < 1.0 else 0.0
 
 
 def _within(fitted: FittedMetamodel, places: Callable[[Points], Mask] | None) -> FittedMetamodel:

@@ -1,8 +1,7 @@
-"""The shape of noise: what a run of a noisy simulator adds is seldom Gaussian.
+"""The shape of noise: what a seed adds is seldom Gaussian.
 
-A time to collision has a cap, traffic that does not meet ego gives none, one seed in fifty ends in a collision wherever: of a left
-turn with .23 critical runs a process with Gaussian noise stated .12, of a metric that is critical with 2 % of the seeds 1e-6. So the
-noise is a mixture of Gaussians, learned from left-out rows.
+A time to collision has a cap, and one seed in fifty ends in a collision wherever: of a metric that is critical with 2 % of the
+seeds a process with Gaussian noise stated 1e-6. So the noise is a mixture of Gaussians, learned from left-out rows.
 """
 
 from __future__ import annotations
