@@ -215,6 +215,15 @@ def test_the_gate_decides_by_one_sided_limits():
     assert gate_verdict(limits, Gate(0.01)).verdict == "undecided"
 
 
+def test_a_gate_does_not_pass_on_a_metamodel_that_was_refuted():
+    limits = Limits(lambda _: 0.001, lambda _: 0.002)
+    refuted = gate_verdict(limits, Gate(0.02), 0.12, 1)
+    assert refuted.verdict == "undecided"
+    assert "1 draw was critical where the metamodel denied it" in refuted.statement
+    assert gate_verdict(limits, Gate(0.02), 0.01, 1).verdict == "pass", "few enough of them by these draws alone"
+    assert gate_verdict(Limits(lambda _: 0.03, lambda _: 0.05), Gate(0.02), 0.12, 1).verdict == "fail"
+
+
 @pytest.mark.parametrize(("undetected", "told"), [(0.12, True), (0.01, False)])
 def test_a_gate_that_passes_says_what_it_cannot_exclude(undetected, told):
     verdict = gate_verdict(Limits(lambda _: 0.001, lambda _: 0.002), Gate(0.02), undetected)

@@ -175,7 +175,8 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         if traffic is not None:
             found, limits = _on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
-        gate = None if settings.gate is None else gate_verdict(limits, settings.gate, found.undetected_mass_bound)
+        asked, unseen, met = settings.gate, found.undetected_mass_bound, Seen.of(log, settings).surprises
+        gate = None if asked is None else gate_verdict(limits, asked, unseen, met)
         each = each_estimate(log, settings)
         return replace(
             found, gate=gate, simulator_noise=noise, requirements=each, warmed_traffic=traffic,

@@ -37,21 +37,29 @@ class GateVerdict:
     statement: str
 
 
-def gate_verdict(limits: Limits, gate: Gate, undetected: float = 0.0) -> GateVerdict:
+def gate_verdict(limits: Limits, gate: Gate, undetected: float = 0.0, surprises: int = 0) -> GateVerdict:
     """Return the verdict: `pass`, `fail` or `undecided`, with the limits it rests on and a sentence.
 
     `pass`: the one-sided upper limit (failed runs as critical) is at most the threshold. `fail`: the one-sided
     lower limit (failed runs as safe) is above it. Each is wrong with probability 1 - confidence at most,
-    as far as the interval is right. Otherwise nothing is decided, and a larger budget may help.
+    as far as the interval is right. Otherwise nothing is decided, and a larger budget may help. Neither is it where draws met
+    critical runs that the metamodel denied, of which there may be more than is allowed: the interval rests on that metamodel.
 
     Args:
         limits: of the probability.
         gate: what was asked.
         undetected: what a critical region that no run has met may hold: a `pass` says so where it is more than is allowed.
+        surprises: draws from the inputs' distribution that were critical where the metamodel denied it.
     """
     low, high = limits.lower(gate.confidence), limits.upper(gate.confidence)
     sure, allowed = f"with {gate.confidence:.3g} confidence", f"{gate.probability:.3g}"
-    if high <= gate.probability:
+    if high <= gate.probability < undetected and surprises:
+        were = "draw was" if surprises == 1 else "draws were"
+        verdict, statement = "undecided", (
+            f"{surprises} {were} critical where the metamodel denied it: by these draws alone such runs may hold up to"
+            f" {undetected:.2g}, and the upper limit of {high:.3g} cannot be relied on; whether it is within {allowed} is open"
+        )
+    elif high <= gate.probability:
         verdict, statement = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {allowed}"
         if undetected > gate.probability:
             statement += f"; it trusts the search: a critical region that no run has met could hold up to {undetected:.2g}"

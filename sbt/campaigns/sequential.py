@@ -59,7 +59,7 @@ _BLIND = (0.0, 0.75, 0.1, 0.15)
 """Shares of the draws (`SHARES`) until then; they only teach: what would count then is rarely met, and weighs much if it is."""
 
 _GAIN = 4.0
-_MANY_HITS, _ENOUGH = 10.0, 0.2  # expected of crude Monte Carlo; share of the budget before fewer leave the estimation to it
+_MANY_HITS, _ENOUGH = 5.0, 0.2  # expected of crude Monte Carlo; share of the budget before fewer leave the estimation to it
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""
 _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
