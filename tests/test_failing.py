@@ -124,3 +124,29 @@ def test_runs_that_fail_for_no_reason_do_not_stop_the_search(tmp_path: Path):
     )
     assert result.frame.critical.fillna(False).any()
     assert 0.15 < (result.frame.status != "ok").mean() < 0.45
+
+
+def test_a_boundary_says_what_failing_leaves_open(tmp_path: Path):
+    """Runs fail right beyond contact, so that what is critical ends where nobody looks: .167 of what gives a metric."""
+
+    def crash(inputs: dict[str, float], seed: int) -> dict[str, float]:
+        y = inputs["a"] + inputs["b"] - inputs["c"]
+        if y < 0.1:
+            raise sbt.RunError("failed", "no metric beyond a contact")
+        return {"y": y}
+
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+    scenario = sbt.Scenario("crash", inputs, sbt.Requirement("y", high=0.3), evaluate=crash)
+    result = sbt.run(
+        campaign="boundary", scenario=scenario, budget=80, seed=1, executor="serial", store=tmp_path / "s", report=False,
+    )  # fmt: skip
+    least, most = result.conclusion.critical_range
+    assert least < 0.167 < most
+    assert any(told.endswith("may be critical.") for told in result.sentences())
+
+
+def test_one_run_is_too_few_and_none_failed(tmp_path: Path):
+    result = sbt.run(
+        campaign="boundary", scenario="testbed:gayton_hat", budget=1, executor="serial", store=tmp_path / "s", report=False
+    )
+    assert not any("failed" in told for told in result.sentences())

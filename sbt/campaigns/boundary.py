@@ -16,6 +16,7 @@ from sbt.campaigns.each import each_share, fits_words, independence_words, share
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
+from sbt.campaigns.openness import open_range
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place, succeeding
 from sbt.campaigns.regions import CriticalRegion, critical_regions
@@ -63,6 +64,7 @@ class BoundaryConclusion:
         doubt: what inputs and drawn traffic decide of whether a run is critical; None: it is not known.
         every_combination: what is known because every combination of the inputs was run; None: some were not.
         earlier: runs of an earlier campaign that the metamodel learned from, too; 0: they do not help; None: there are none.
+        critical_range: least and largest critical fraction, as runs fail or not where that is open; None: it hardly matters.
     """
 
     critical_fraction: float | None
@@ -83,6 +85,7 @@ class BoundaryConclusion:
     every_combination: EveryCombination | None = optional()
     regions: tuple[CriticalRegion, ...] | None = optional()
     earlier: int | None = optional()
+    critical_range: tuple[float, float] | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -101,6 +104,12 @@ class BoundaryConclusion:
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
         if self.failing_fraction is not None:
             found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
+        if self.critical_range is not None:
+            least, most = map(percent, self.critical_range)
+            found.append(
+                "Where failing begins is not known sharply, and critical runs lie beside it: of what gives a metric between"
+                f" {least} and {most} may be critical."
+            )
         if self.earlier is not None:
             found.append(_earlier_words(self.earlier))
         if self.weights is not None:
@@ -150,7 +159,7 @@ def recipe(settings: Settings) -> Campaign:
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history), traffic_doubt(settings, log.history),
-            every, regions or None, r.earlier,
+            every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

@@ -25,6 +25,8 @@ def nothing_known(facts: Facts) -> list[str]:
     """Return that so few runs gave a metric that nothing follows from them, and what to do."""
     n, ok = len(facts.history), int(facts.history.ok.sum())
     of = f" of {facts.scenario}" if facts.scenario else ""
+    if ok == n:
+        return [f"Nothing is known{of}: {plural(n, 'run')} {'is' if n == 1 else 'are'} too few.", "Next: a larger budget."]
     return [
         f"Nothing is known{of}: {f'only {ok:,}' if ok else 'none'} of {plural(n, 'run')} gave a metric.",
         f"Next: {why_they_fail()}.",
