@@ -6,9 +6,11 @@ seeds a process with Gaussian noise stated 1e-6. So the noise is a mixture of Ga
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sbt.metamodels.base import gives_different
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor
@@ -83,15 +85,18 @@ def shaped(
     """
     if len(y) < _FEWEST or process.hyper.noise < _NOISY or not gives_different(u, y):
         return None
+    from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture  # its import takes a quarter of a second
 
     left_out, inside = process.leave_one_out(u, y), critical.contains(y)
     error = ((y - left_out.mean[0]) / left_out.std[0])[:, None]
     best, least = None, float((error**2 + np.log(2.0 * np.pi)).sum())
-    for k in range(1, min(_MOST, len(np.unique(error))) + 1):
-        found = GaussianMixture(k, reg_covar=_NARROWEST, n_init=2, random_state=int(rng.integers(2**31))).fit(error)
-        if found.aic(error) < least:
-            best, least = found, float(found.aic(error))
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # of two values there is hardly a mixture: it need not be the best
+        for k in range(1, min(_MOST, len(np.unique(error))) + 1):
+            mixture = GaussianMixture(k, reg_covar=_NARROWEST, n_init=2, random_state=int(rng.integers(2**31))).fit(error)
+            if mixture.aic(error) < least:
+                best, least = mixture, float(mixture.aic(error))
     if best is None:
         return None
     offset = best.means_[:, 0] - float(best.weights_ @ best.means_[:, 0])
