@@ -93,3 +93,55 @@ def test_noise_of_other_metrics_is_not_called_a_deviation_of_zero():
     said = SimulatorNoise(2, noisy=True, std=0.0).sentences("ttc_min", "s")
     told = "where 2 runs repeated inputs with other seeds, other metrics differed; ttc_min did not."
     assert said == [f"The simulator is noisy: {told}"]
+
+
+def test_critical_runs_that_stand_alone_are_repeated_until_a_repeat_differs():
+    line = [(0.05 * k, 1.0 + 0.05 * k) for k in range(20)] + [(0.0, 1.0), (0.05, 1.05)]
+    assert repeats_wanted(history([*line, (0.51, 0.5)]), PLANE, 5) == (), "nothing is critical"
+    lone = history([*line, (0.51, -1.0), (0.72, -1.1)])
+    assert [run.inputs["a"] for run in repeats_wanted(lone, PLANE, 5)] == [0.51, 0.72]
+    assert [run.inputs["a"] for run in repeats_wanted(lone, PLANE, 1)] == [0.51]
+    agreed = lone.extended(history([(0.51, -1.0)], REPEAT))
+    assert [run.inputs["a"] for run in repeats_wanted(agreed, PLANE, 5)] == [0.72]
+    assert repeats_wanted(lone.extended(history([(0.51, 1.5)], REPEAT)), PLANE, 5) == (), "noise is known"
+    assert repeats_wanted(history([*line, (0.51, -1.0), (0.515, -1.1)]), PLANE, 5) == (), "each has the other beside it"
+    many = history([*line, *((0.12 + 0.2 * k, -1.0 - k) for k in range(5))])
+    assert [run.inputs["a"] for run in repeats_wanted(many, PLANE, 5)] == pytest.approx([0.12, 0.32, 0.52])
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "estimation", "falsification"])
+def test_a_failure_of_one_seed_in_fifty_gives_its_noise_away(campaign: str, tmp_path: Path):
+    def dropout(inputs: dict[str, float], seed: int) -> dict[str, float]:
+        return {"y": -1.0 if np.random.default_rng(seed).random() < 0.02 else 0.3 + inputs["a"]}
+
+    inputs = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)]
+    scenario = sbt.Scenario("dropout", inputs, sbt.Requirement("y", high=0.0), evaluate=dropout)
+    result = sbt.run(
+        campaign=campaign, scenario=scenario, budget=150, seed=1, executor="serial", store=tmp_path / "s", report=False,
+        metamodel="gp",
+    )  # fmt: skip
+    assert result.conclusion.simulator_noise.noisy
+
+
+def test_modes_of_one_input_each_may_be_parts_of_one_region(tmp_path: Path):
+    def bent(x: np.ndarray) -> np.ndarray:
+        return abs(x[:, 1] - 0.5 - 0.3 * np.sin(2.0 * np.pi * x[:, 0])) - 0.01
+
+    def round_(x: np.ndarray) -> np.ndarray:
+        return np.hypot(x[:, 0] - 0.3, x[:, 1] - 0.6) - 0.3
+
+    said = {}
+    for region in (bent, round_):
+        scenario = analytic(
+            region, inputs={"a": (0.0, 1.0), "b": (0.0, 1.0)}, critical=(-np.inf, 0.0), name=region.__name__,
+        )  # fmt: skip
+        result = sbt.run(
+            campaign="falsification", scenario=scenario, budget=60, executor="serial", store=tmp_path / scenario.name,
+            report=False,
+        )  # fmt: skip
+        modes, runs = result.conclusion.failure_modes, result.history
+        alone = sum(len({tuple(runs.x[k]) for k in mode.runs}) == 1 for mode in modes)
+        said[region.__name__] = next((line for line in result.sentences() if "one input each" in line), "")
+        assert (f"({alone} of {len(modes)})" in said[region.__name__] or f"(all {alone})" in said[region.__name__]) is (alone > 1)
+    assert said["bent"]
+    assert not said["round_"]

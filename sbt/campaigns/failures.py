@@ -12,7 +12,7 @@ from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.levels import ScreeningTold
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
-from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, violations
+from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, single, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.rates import LocalRates, local_rates
@@ -308,6 +308,9 @@ def _more(found: FalsificationConclusion, facts: Facts) -> list[str]:
     failed = int((~runs.ok).sum())
     if found.critical_runs and found.critical_runs == len(runs) - failed:
         said.append("Every run that gave a metric was critical: no boundary was met.")
+    alone = single(found.failure_modes, runs)
+    whose = f"all {alone}" if alone == len(found.failure_modes) else f"{alone} of {len(found.failure_modes)}"
+    said += [f"Modes of one input each ({whose}) may be parts of one thin or bent region."] if alone > 1 else []
     unsure = [mode for mode in found.failure_modes[1:] if mode.confirmed is not None and _uncritical(mode.confirmed, mode)]
     said += [f"Of the other modes {len(unsure)} did not fail in every repetition with fresh seeds."] if unsure else []
     says = "says" if failed == 1 else "say"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,7 @@ from sbt.store.records import Judgement, optional
 
 __all__ = [
     "FailureMode", "FailureRate", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of",
-    "representative_of", "violations",
+    "representative_of", "single", "violations",
 ]  # fmt: skip
 
 _PROBES = 9  # on the segment between two runs
@@ -271,6 +271,12 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, again: His
         failure_rate=FailureRate.of(requirement.critical_runs(again), ~again.ok) if noisy and len(again) else None,
         confirmations_lost=int((~again.ok).sum()) or None,
     )  # fmt: skip
+
+
+def single(modes: Sequence[FailureMode], history: History) -> int:
+    """Return how many modes are of one input each: a thin or bent critical region gives many."""
+    row = {int(index): k for k, index in enumerate(history.index)}
+    return sum(len(np.unique(history.x[[row[run] for run in mode.runs]], axis=0)) == 1 for mode in modes)
 
 
 def violations(requirement: Requirement, runs: History) -> dict[str, int] | None:

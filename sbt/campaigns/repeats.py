@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from sbt.campaigns.wording import number, percent, plural
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
 from sbt.store.database import PlannedRun
 from sbt.store.history import PLANNED, History
 from sbt.store.records import optional, to_json
@@ -27,6 +29,9 @@ _ATTEMPTS = 4
 """Most of them, where some fail."""
 _HITS_AGAIN = 5
 """Repeats of critical inputs, where the metric has few values: two of them agree by chance where every other seed fails."""
+_ALONE, _ALONE_AGAIN = 3, 3
+"""A critical run stands alone where so many nearest inputs are uncritical; up to so many of these are repeated: what fails with
+one seed in a hundred, wherever, no repeat of other runs shows."""
 _FEW_VALUES, _SHARE_OF_VALUES = 3, 0.1
 """A metric has few values where there are at most three, or a tenth of the runs."""
 _DOUBT = 0.05
@@ -131,8 +136,8 @@ def repeats_wanted(history: History, scenario: LogicalScenario, most: int) -> tu
     """Return up to `most` runs that repeat inputs of earlier ones, until two repeats gave metrics.
 
     Those with the smallest margin are repeated; values that other inputs gave too come last: there the metric stands at an end of
-    its range, and hides the noise. Where a metric has few values, such as 0 and 1, critical inputs are repeated up to five times,
-    as long as all agree. Recorded rows cannot be repeated.
+    its range, and hides the noise. As long as all agree, critical runs that stand alone are repeated as well, up to three, and,
+    where a metric has few values, such as 0 and 1, critical inputs up to five times. Recorded rows cannot be repeated.
     """
     runs = history.training
     noise, again = simulator_noise(history, scenario.requirement), history.where(history.stage == REPEAT)
@@ -143,8 +148,11 @@ def repeats_wanted(history: History, scenario: LogicalScenario, most: int) -> tu
     y, margin = scenario.requirement.told(runs), scenario.requirement.margins(runs)
     values, which, count = np.unique(y, return_inverse=True, return_counts=True)
     if n <= 0:
-        few = len(values) <= max(_FEW_VALUES, _SHARE_OF_VALUES * len(runs)) < len(runs)
-        return _hits_again(runs, again, margin, most) if few and noise.noisy is False and not awaited else ()
+        if noise.noisy is not False or awaited:
+            return ()
+        if len(values) <= max(_FEW_VALUES, _SHARE_OF_VALUES * len(runs)) < len(runs):
+            return _hits_again(runs, again, margin, most)
+        return _alone_again(runs, again, margin, scenario.space, most)
     common = count[which.reshape(-1)] > 1
     tried_at = {tuple(row) for row in again.x}
     order = [k for k in np.lexsort((margin, common)) if tuple(runs.x[k]) not in tried_at]
@@ -161,3 +169,18 @@ def _hits_again(runs: History, again: History, margin: Vector, most: int) -> tup
     n = min(_HITS_AGAIN - int(done.sum()), most)
     order = [first[k] for k in np.argsort(done, kind="stable")]
     return tuple(PlannedRun(REPEAT, hits.inputs(int(order[k % len(order)]))) for k in range(n))
+
+
+def _alone_again(runs: History, again: History, margin: Vector, space: ParameterSpace, most: int) -> tuple[PlannedRun, ...]:
+    """Return repeats of critical runs that no other is near, each once, until there are enough of them."""
+    x, first = np.unique(runs.x, axis=0, return_index=True)
+    critical = margin[first] <= 0.0
+    if len(x) <= _ALONE or not critical.any():
+        return ()
+    u = space.to_unit(x)
+    near = cKDTree(u).query(u[critical], k=_ALONE + 1)[1][:, 1:]
+    alone = first[critical][~critical[near].any(axis=1)]
+    repeated = {tuple(row) for row in again.x}
+    times = sum(tuple(runs.x[k]) in repeated for k in alone)
+    rows = [k for k in sorted(alone) if tuple(runs.x[k]) not in repeated][: min(_ALONE_AGAIN - times, most)]
+    return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in rows)
