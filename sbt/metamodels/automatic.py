@@ -18,6 +18,7 @@ from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.noise_shape import shaped
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.sided import better_sided
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.stepped import better_stepped
 from sbt.metamodels.torch_tools import check_device
@@ -131,8 +132,11 @@ class Auto:
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
         plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
         stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
-        process = (shaped(plain, u, y, bins.critical, rng) or plain) if stepped is None else stepped
-        own = bins.log_score(process.leave_one_out(u, y), y) if stepped is None else stepped.log_score(bins, u, y)
+        values = (shaped(plain, u, y, bins.critical, rng) or plain) if stepped is None else stepped
+        own = stepped.log_score(bins, u, y) if stepped is not None else bins.log_score(values.leave_one_out(u, y), y)
+        sided = better_sided(self.simplest, values, bins.critical, u, y, shares, rng)
+        process = values if sided is None else sided[0]
+        own = own if sided is None else own + sided[1]
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             left = f"of {n} rows, each predicted from all others, {-own.mean():.1g}: others could add no more"
             reason = f"100 % gp: it misses a mean log likelihood {left}"

@@ -24,7 +24,7 @@ from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
 from sbt.metamodels import deep_ensemble as ensemble
 from sbt.metamodels import extra_trees as et
-from sbt.metamodels import gp_algebra, gp_predictor, joint, noise_shape, recalibrated, sparse, stepped, warp, warped
+from sbt.metamodels import gp_algebra, gp_predictor, joint, noise_shape, recalibrated, sided, sparse, stepped, warp, warped
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
 from sbt.problem.combination import CombinedInterval
@@ -55,6 +55,7 @@ _KINDS: dict[str, Any] = {
         sparse.SparseMixture,
         sparse.SparsePredictor,
         noise_shape.ShapedPredictor,
+        sided.SidedPredictor,
         stepped.Step,
         stepped.SteppedPredictor,
         warp.Warp,

@@ -19,7 +19,7 @@ from sbt.metamodels.stacking import Bins
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Step", "SteppedPredictor", "better_stepped"]
+__all__ = ["Step", "SteppedPredictor", "better_stepped", "jumps", "side_score"]
 
 _HALF_WIDTHS = (1.0, 4.0)  # of the standard deviation of y
 _FEWEST = 4  # runs of equal value next to the edge: a floor
@@ -131,27 +131,27 @@ def better_stepped(
         shares: (n,) of the space that each row stands for.
         rng: the only source of randomness.
     """
-    if not _jumps(y, critical):
+    if not jumps(y, critical):
         return None
     edge = critical.high if math.isfinite(critical.high) else critical.low
-    plain, best, found = _side_score(process.leave_one_out(u, y), y, critical), 0.0, None
+    plain, best, found = side_score(process.leave_one_out(u, y), y, critical), 0.0, None
     for width in _HALF_WIDTHS:
         step = Step(edge, width * float(np.std(y)), critical)
         stepped = SteppedPredictor(settings.fit(u, step.moved(y), rng), step)
-        score = _side_score(stepped.leave_one_out(u, y), y, critical)
+        score = side_score(stepped.leave_one_out(u, y), y, critical)
         gain = score - plain
         if gain.mean() > max(_SURE * gain.std() / math.sqrt(len(y)), best) and shares @ gain > 0.0:
             best, found = float(gain.mean()), stepped
     return found
 
 
-def _side_score(prediction: Prediction, y: Vector, critical: CriticalInterval) -> Vector:
+def side_score(prediction: Prediction, y: Vector, critical: CriticalInterval) -> Vector:
     """Return (n,) log P(the side of the edge that y fell on)."""
     inside, outside = prediction.log_probability(critical)
     return np.where(critical.contains(y), inside, outside)
 
 
-def _jumps(y: Vector, critical: CriticalInterval) -> bool:
+def jumps(y: Vector, critical: CriticalInterval) -> bool:
     """Say whether y (n,) seems to jump at the only end of the critical interval: a floor at it, or a gap."""
     if math.isfinite(critical.low) == math.isfinite(critical.high):
         return False
