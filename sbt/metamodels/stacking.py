@@ -60,10 +60,10 @@ class Bins:
         """
         around = Warp.around_edge(y, critical)
         distance = np.abs(y - around.edge)
-        nearer = distance[(distance > 0.0) & (distance < around.scale)]
+        farther = distance[distance > around.scale]
         if not (distance == around.scale).any():
             return cls(critical, around.scale, warp)
-        return cls(critical, 0.5 * (float(nearer.max()) + around.scale) if len(nearer) else np.inf, warp)
+        return cls(critical, 0.5 * (around.scale + float(farther.min())) if len(farther) else np.inf, warp)
 
     @property
     def told(self) -> str:

@@ -69,12 +69,12 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
 
     plain = score(None)
 
-    def gained(warp: Warp) -> tuple[float, float]:
-        """Return the mean gain over no warp, and its standard error; none where the sides alone are predicted worse."""
+    def gained(warp: Warp) -> tuple[float, float, float]:
+        """Return the mean gain over no warp, its standard error, and the mean gain of the sides alone."""
         gain = score(warp) - plain
         mean = gain @ weight
         error = np.sqrt((gain - mean[:, None]) ** 2 @ weight**2)
-        return float(mean[0]) if mean[1] >= 0.0 else -math.inf, float(error[0])
+        return float(mean[0]), float(error[0]), float(mean[1])
 
     safe = distance[(distance > 0.0) & ~inside]
     scales = np.unique(np.quantile(safe if len(safe) else distance[distance > 0.0], _QUANTILES + _SMALLER * heavy))
@@ -87,9 +87,10 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
             tried[warp] = gained(warp)
             if tried[warp][0] > tried[best][0]:
                 best = warp
-    mean, error = tried[best]
+    best = max(tried, key=lambda warp: tried[warp][0] if tried[warp][2] >= 0.0 else -math.inf)  # no unit may hide the sides
+    mean, error, sides = tried[best]
     few = min(int(inside.sum()), int((~inside).sum())) < _FEW
-    return best if mean > (_SURER if few else _SURE) * error else None
+    return best if sides >= 0.0 and mean > (_SURER if few else _SURE) * error else None
 
 
 def _steeper(warp: Warp, factor: float, critical: CriticalInterval) -> Warp:
