@@ -107,6 +107,8 @@ def test_critical_runs_that_stand_alone_are_repeated_until_a_repeat_differs():
     assert repeats_wanted(history([*line, (0.51, -1.0), (0.515, -1.1)]), PLANE, 5) == (), "each has the other beside it"
     many = history([*line, *((0.12 + 0.2 * k, -1.0 - k) for k in range(5))])
     assert [run.inputs["a"] for run in repeats_wanted(many, PLANE, 5)] == pytest.approx([0.12, 0.32, 0.52])
+    enough = many.extended(history([(0.12 + 0.2 * k, -1.0 - k) for k in range(4)], REPEAT))
+    assert repeats_wanted(enough, PLANE, 5) == (), "four were repeated, one for another reason"
 
 
 @pytest.mark.parametrize("campaign", ["boundary", "estimation", "falsification"])

@@ -182,5 +182,5 @@ def _alone_again(runs: History, again: History, margin: Vector, space: Parameter
     alone = first[critical][~critical[near].any(axis=1)]
     repeated = {tuple(row) for row in again.x}
     times = sum(tuple(runs.x[k]) in repeated for k in alone)
-    rows = [k for k in sorted(alone) if tuple(runs.x[k]) not in repeated][: min(_ALONE_AGAIN - times, most)]
-    return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in rows)
+    rows, n = [k for k in sorted(alone) if tuple(runs.x[k]) not in repeated], max(min(_ALONE_AGAIN - times, most), 0)
+    return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in rows[:n])

@@ -21,6 +21,7 @@ from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_er
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import opened
+from sbt.metamodels.stacking import cell_shares
 from sbt.metamodels.warp import Warp
 from sbt.metamodels.warped import better_warp
 from sbt.problem.arrays import Points, Vector
@@ -233,6 +234,8 @@ def fit_log_probability(
     wholes = [whole] if better else [whole, plain]
     trends = [replace(form, trend=_trend(u, form.values)) for form in wholes]
     forms = [*wholes, *(form for form in trends if form.trend is not None)]
+    if least == 0.0 and (sided := _sided(metamodel, whole, u, rng)) is not None:
+        return _Largest(coordinates, (sided,))
     every = np.arange(len(y))
     if len(y) > MOST_LEARNED and getattr(metamodel, "CUBIC", False):
         every = np.sort(rng.permutation(len(y))[:MOST_LEARNED])
@@ -253,6 +256,19 @@ def _better_warp(metamodel: Metamodel, u: Points, y: Vector, critical: CriticalI
     from sbt.metamodels.gaussian_process import GaussianProcess
 
     return better_warp(metamodel, u, y, critical) if isinstance(metamodel, GaussianProcess) else None
+
+
+def _sided(metamodel: Metamodel, form: _Form, u: Points, rng: np.random.Generator) -> _Learned | None:
+    """Return a process of the sides where the metric jumps at the edge and they are better known so; see `better_sided`."""
+    from sbt.metamodels.gaussian_process import GaussianProcess
+    from sbt.metamodels.sided import better_sided
+    from sbt.metamodels.stepped import jumps
+
+    if not isinstance(metamodel, GaussianProcess) or not jumps(form.values, form.interval):
+        return None
+    u, t = without_repetitions(u, form.values)
+    found = better_sided(metamodel, metamodel.fit(u, t, rng), form.interval, u, t, cell_shares(u, rng), rng)
+    return None if found is None else _Learned(form, found[0], metamodel, len(u))
 
 
 def _for_uneven_noise(metamodel: Metamodel, u: Points, t: Vector, rng: np.random.Generator) -> Metamodel:
