@@ -28,7 +28,7 @@ from sbt.campaigns.wording import percent, plural, requirement_words
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.plain import Json
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
@@ -65,6 +65,7 @@ class BoundaryConclusion:
         every_combination: what is known because every combination of the inputs was run; None: some were not.
         earlier: runs of an earlier campaign that the metamodel learned from, too; 0: they do not help; None: there are none.
         critical_range: least and largest critical fraction, as runs fail or not where that is open; None: it hardly matters.
+        even_fraction: critical share of all runs that fill the space evenly, the held-out ones among them.
     """
 
     critical_fraction: float | None
@@ -86,6 +87,7 @@ class BoundaryConclusion:
     regions: tuple[CriticalRegion, ...] | None = optional()
     earlier: int | None = optional()
     critical_range: tuple[float, float] | None = optional()
+    even_fraction: CriticalShare | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -160,6 +162,7 @@ def recipe(settings: Settings) -> Campaign:
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history), traffic_doubt(settings, log.history),
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted),
+            critical_share(log.history.where(_fills_space(log.history, settings)), settings.scenario),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None
@@ -177,6 +180,13 @@ def _met(history: History, settings: Settings) -> Points:
     """Return (k, d) critical runs, in the unit cube."""
     scenario = settings.scenario
     return scenario.space.cube.snapped(scenario.space.to_unit(history.x[scenario.requirement.critical_runs(history)]))
+
+
+def _fills_space(history: History, settings: Settings) -> Mask:
+    """Return (n,) booleans: the run fills the space, whatever the results: held out, of the first design, or of even batches."""
+    if settings.acquisition is even:
+        return np.ones(len(history), dtype=np.bool_)
+    return np.isin(history.stage, (VALIDATION, "initial"))
 
 
 def _log_odds(fitted: FittedMetamodel, settings: Settings, u: Points) -> Vector:

@@ -21,6 +21,8 @@ from sbt.campaigns.lost import (
     repetitions,
     why_they_fail,
 )  # fmt: skip
+from sbt.campaigns.modes import single
+from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
 from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical
@@ -39,10 +41,8 @@ if TYPE_CHECKING:
 __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
 _PRECISE = 0.1  # coefficient of variation that is asked for by default
-_HARDLY = 100  # held-out runs, below which their interval is too wide to confirm a share
 _FAR = 100.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
-_MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
 _WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"
 _SMALL_SHARE = 0.01  # bound of the critical share that a coverage of 300 runs without a critical one gives
 
@@ -53,10 +53,10 @@ def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
         return nothing_known(facts)
     where, runs, lost = _of(facts), plural(share.counted, "run"), share.lost or 0
     space = f"what gives a metric in the parameter space{where}" if lost else f"the parameter space{where}"
-    said = f"{percent(share.critical_fraction)} of {space} is critical ({_condition(facts)}; {_ends(share)})"
+    said = f"{percent(share.critical_fraction)} of {space} is critical ({_condition(facts)}; {ends(share)})"
     if share.critical_fraction == 0.0:
         most = f"at most {percent(share.high)} of the parameter space is"
-        said = f"No run{where} was critical ({_condition(facts)}): {most} ({_ends(share)})"
+        said = f"No run{where} was critical ({_condition(facts)}): {most} ({ends(share)})"
         further = "campaign: falsification searches for the rare critical run; as many even runs again only halve the bound"
     elif share.critical_fraction == 1.0:
         further = _WIDEN
@@ -104,28 +104,20 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
                 f" guess is that a run is critical where {where}"
             )
     else:
-        lead = f"{percent(found.critical_fraction)} of the parameter space{_of(facts)} is critical ({_condition(facts)})"
-        lead += f" by the metamodel, but {few}" if few else ""
+        lead = nowhere_likely(found, _of(facts), _condition(facts), few)
     if none_critical(facts):
         lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
     rests = f"the metamodel learned that from {plural(learned, 'run')}{f' and {found.earlier} earlier' if found.earlier else ''}"
     missing = "an uncritical" if all_critical(facts) else "a critical"
-    denied = " The held-out runs deny its figures (below): do not rely on it yet." if _denied(found, measured_share) else ""
     said = [
-        f"{lead}; {rests}, and {sure}.{denied}",
+        f"{lead}; {rests}, and {sure}.{denial(found, measured_share)}",
         f"This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same; {missing}"
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
         f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
     ]
     if found.place is not None and where != section and not none_critical(facts):
         said.append(f"On lines across the boundary, a run is critical where {section}.")
-    return [*said, *_reconciled(found, measured_share), *_too_sure(found)]
-
-
-def _denied(found: BoundaryConclusion, runs: CriticalShare) -> bool:
-    """Return whether held-out runs deny the share of the metamodel, or its certainty."""
-    share = found.critical_fraction or 0.0
-    return bool(_too_sure(found)) or (runs.critical_fraction is not None and not runs.low <= share <= runs.high)
+    return [*said, *reconciled(found, measured_share)]
 
 
 def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:
@@ -148,36 +140,6 @@ def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) ->
     )
 
 
-def _reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
-    """Return the critical share by the metamodel and by the held-out runs alone, and whether they agree."""
-    share, runs = found.critical_fraction or 0.0, runs if found.failing_fraction is None else runs.given_a_metric
-    where, told = ("the parameter space", "") if found.failing_fraction is None else ("what gives a metric", " that gave one")
-    said = f"The metamodel takes {percent(share)} of {where} to be critical"
-    if runs.critical_fraction is None:
-        return [f"{said}; no held-out run checks that."]
-    alone = f"the {plural(runs.counted, 'held-out run')}{told} alone say {percent(runs.critical_fraction)} ({_ends(runs)})"
-    if not runs.low <= share <= runs.high:
-        return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
-    if runs.counted < _HARDLY:
-        return [f"{said}; {alone}. So few runs hardly test it: it lies within their interval."]
-    sharper = "; the metamodel's figure, which rests on all runs, is the sharper one" if share and runs.counted < _MANY else ""
-    return [f"{said}; {alone}. They agree: it lies within that interval{sharper}."]
-
-
-def _too_sure(found: BoundaryConclusion) -> list[str]:
-    """Return where the held-out runs deny the certainty that the metamodel states; nothing where they do not."""
-    scores, expected = found.validation, found.expected_misclassified
-    if scores is None or scores.error_rate is None or expected is None:
-        return []
-    least = float(interval(round(scores.error_rate * scores.n), scores.n)[0])
-    if expected >= least:
-        return []
-    return [
-        f"The metamodel is too sure: it expects {percent(expected)} on the wrong side, but of the held-out runs"
-        f" {percent(scores.error_rate)} were (at least {percent(least)} with 97.5 % confidence)."
-    ]
-
-
 def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: Facts) -> list[str]:
     """Return the three sentences of a falsification."""
     if found.first_critical_run is None:
@@ -190,17 +152,18 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
         worst += f"; run {often.representative} came back more often, in {again}"
     searched = int((facts.history.stage != CONFIRM).sum())
+    most = "up to " if single(modes, facts.history) > 1 else ""
     said = (
         f"The requirement{_of(facts)} is falsified: {found.critical_runs:,} of {plural(searched, 'run')} of the search"
         f" {'was' if found.critical_runs == 1 else 'were'} critical ({_condition(facts)}), the first after"
-        f" {plural(found.runs_to_first or 0, 'run')}, in {plural(len(modes), 'distinct failure mode')}{worst}."
+        f" {plural(found.runs_to_first or 0, 'run')}, in {most}{plural(len(modes), 'distinct failure mode')}{worst}."
     )
     silent = "This does not tell how probable a failure is, since results chose the runs, nor that there is no other mode"
     if random.critical_fraction is not None:
         few = "too few to meet what is rare" if random.critical_fraction == 0.0 else "all that may be read as a share"
         silent += (
             f"; the {plural(random.counted, 'run')} among them drawn at random say {percent(random.critical_fraction)} of the"
-            f" parameter space ({_ends(random)}), {few}"
+            f" parameter space ({ends(random)}), {few}"
         )
     never = "" if often is None or often.confirmed != 0.0 else ", with its own seed, as no repetition failed"
     look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "
@@ -386,10 +349,6 @@ def _condition(facts: Facts) -> str:
 
 def _of(facts: Facts, word: str = "of") -> str:
     return f" {word} {facts.scenario}" if facts.scenario else ""
-
-
-def _ends(share: CriticalShare) -> str:
-    return f"{percent(share.confidence)} interval {percent(share.low)} to {percent(share.high)}"
 
 
 def _round(value: float) -> int:

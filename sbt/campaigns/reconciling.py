@@ -1,0 +1,89 @@
+"""Do the figures of a boundary fit what its runs say? Held-out runs, and all that fill the space evenly."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sbt.campaigns.wording import percent, plural
+from sbt.estimators.binomial import interval
+
+if TYPE_CHECKING:
+    from sbt.campaigns.boundary import BoundaryConclusion
+    from sbt.campaigns.parts import CriticalShare
+
+__all__ = ["denial", "ends", "nowhere_likely", "reconciled"]
+
+_HARDLY = 100  # held-out runs, below which their interval is too wide to confirm a share
+_MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
+_VAGUE = 0.5  # of the critical share: expected on the wrong side, from which on no place is known
+
+
+def nowhere_likely(found: BoundaryConclusion, where: str, condition: str, few: str | None) -> str:
+    """Return how much of the space is critical, where the metamodel sees no boundary: P may be small everywhere."""
+    share, wrong = found.critical_fraction or 0.0, found.expected_misclassified or 0.0
+    if share < 0.5 and wrong > 0.0 and wrong >= _VAGUE * share:
+        lead = f"The metamodel expects {percent(share)} of runs{where} that fill the parameter space to be critical ({condition})"
+        return f"{lead}, but knows no place where most are{f': {few}' if few else ''}"
+    lead = f"{percent(share)} of the parameter space{where} is critical ({condition})"
+    return f"{lead} by the metamodel, but {few}" if few else lead
+
+
+def denial(found: BoundaryConclusion, runs: CriticalShare) -> str:
+    """Return that held-out runs deny the share of the metamodel, or its certainty, or all even runs its share; else nothing."""
+    share = found.critical_fraction or 0.0
+    denied = runs.critical_fraction is not None and not runs.low <= share <= runs.high
+    whose = "held-out runs" if denied or _too_sure(found) else "runs that fill the space evenly" if _unlike_even(found) else None
+    return "" if whose is None else f" The {whose} deny its figures (below): do not rely on it yet."
+
+
+def reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
+    """Return the critical share by the metamodel and by the held-out runs alone, whether they agree, and what runs deny."""
+    return [*_by_held_out(found, runs), *_unlike_even(found), *_too_sure(found)]
+
+
+def _by_held_out(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
+    share, runs = found.critical_fraction or 0.0, runs if found.failing_fraction is None else runs.given_a_metric
+    where, told = ("the parameter space", "") if found.failing_fraction is None else ("what gives a metric", " that gave one")
+    said = f"The metamodel takes {percent(share)} of {where} to be critical"
+    if runs.critical_fraction is None:
+        return [f"{said}; no held-out run checks that."]
+    alone = f"the {plural(runs.counted, 'held-out run')}{told} alone say {percent(runs.critical_fraction)} ({ends(runs)})"
+    if not runs.low <= share <= runs.high:
+        return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
+    if runs.counted < _HARDLY:
+        return [f"{said}; {alone}. So few runs hardly test it: it lies within their interval."]
+    sharper = "; the metamodel's figure, which rests on all runs, is the sharper one" if share and runs.counted < _MANY else ""
+    return [f"{said}; {alone}. They agree: it lies within that interval{sharper}."]
+
+
+def _unlike_even(found: BoundaryConclusion) -> list[str]:
+    """Return that the runs that fill the space deny the share of the metamodel; nothing where they do not."""
+    runs, share = found.even_fraction, found.critical_fraction or 0.0
+    if runs is None or found.every_combination is not None:
+        return []
+    runs = runs if found.failing_fraction is None else runs.given_a_metric
+    if runs.critical_fraction is None or runs.low <= share <= runs.high:
+        return []
+    return [
+        f"All {plural(runs.counted, 'run')} that fill the space evenly say {percent(runs.critical_fraction)} ({ends(runs)}). They"
+        f" deny the metamodel's {percent(share)}: critical runs lie where it does not expect them. Trust the runs."
+    ]
+
+
+def _too_sure(found: BoundaryConclusion) -> list[str]:
+    """Return where the held-out runs deny the certainty that the metamodel states; nothing where they do not."""
+    scores, expected = found.validation, found.expected_misclassified
+    if scores is None or scores.error_rate is None or expected is None:
+        return []
+    least = float(interval(round(scores.error_rate * scores.n), scores.n)[0])
+    if expected >= least:
+        return []
+    return [
+        f"The metamodel is too sure: it expects {percent(expected)} on the wrong side, but of the held-out runs"
+        f" {percent(scores.error_rate)} were (at least {percent(least)} with 97.5 % confidence)."
+    ]
+
+
+def ends(share: CriticalShare) -> str:
+    """Return the ends of the interval of a share, in words."""
+    return f"{percent(share.confidence)} interval {percent(share.low)} to {percent(share.high)}"
