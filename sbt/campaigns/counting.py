@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sbt.campaigns.gate import Limits
 from sbt.campaigns.records import CountedDraws, EstimationProposal, EventDraws, PoolSummary
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
@@ -15,7 +16,7 @@ from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.store.records import Iteration
 
-__all__ = ["DRAWN", "LEARNED", "Seen", "counted_batches", "counted_iterations", "with_event"]
+__all__ = ["DRAWN", "LEARNED", "Seen", "counted_batches", "counted_iterations", "held", "with_event"]
 
 DRAWN = "estimation"
 """Stage of runs that were drawn with a known density."""
@@ -88,6 +89,7 @@ class Seen:
         hits: critical ones of these draws.
         failed: failed ones of these draws.
         surprises: critical ones of these draws to which the metamodel gave next to no probability.
+        known: different inputs of critical runs.
     """
 
     critical: int
@@ -96,6 +98,7 @@ class Seen:
     hits: int
     failed: int
     surprises: int
+    known: int
 
     @classmethod
     def of(cls, log: Log, settings: Settings) -> Seen:
@@ -115,8 +118,26 @@ class Seen:
         return cls(
             int(critical.sum()), int((history.ok & ~critical).sum()), len(mine), int(critical[mine].sum()),
             int((~history.ok[mine]).sum()), int((critical[mine] & denied).sum()),
+            len(np.unique(history.x[critical], axis=0)),
         )  # fmt: skip
 
     def most(self, hits: int, confidence: float) -> float:
         """Return the exact upper limit of the probability of what these draws met so many times."""
         return float(binomial.upper(hits, self.draws, confidence)) if self.draws else 1.0
+
+
+def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool) -> Limits:
+    """Return limits that reach the exact bounds by draws from the inputs' distribution, where an estimate left [0, 1].
+
+    Args:
+        limits: by the estimates.
+        seen: what these draws met.
+        low: the estimate with failed runs as safe.
+        high: as critical.
+        unstated: runs failed, and no belief states where: the upper limit reaches the exact bound too.
+    """
+    unmet = high <= 0.0 or unstated
+    return Limits(
+        (lambda c: min(limits.lower(c), 1.0 - seen.most(seen.draws - seen.hits, c))) if low >= 1.0 else limits.lower,
+        (lambda c: max(limits.upper(c), seen.most(seen.hits + seen.failed, c))) if unmet else limits.upper,
+    )

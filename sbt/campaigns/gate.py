@@ -17,6 +17,10 @@ class Limits:
     lower: Callable[[float], float]
     upper: Callable[[float], float]
 
+    def reaching(self, upper: Callable[[float], float]) -> Limits:
+        """Return limits of which the upper one is at least this one."""
+        return Limits(self.lower, lambda confidence: max(self.upper(confidence), upper(confidence)))
+
 
 @dataclass(frozen=True)
 class GateVerdict:

@@ -1,0 +1,75 @@
+"""What is concluded where few critical runs are known, and the metamodel makes too little of them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt.testbeds import analytic
+
+INPUTS = {"a": (0.0, 1.0), "b": (0.0, 1.0), "c": (0.0, 1.0)}
+BALL = 4.0 / 3.0 * math.pi / 6.0**3
+
+
+def beside_a_plateau(x: np.ndarray) -> np.ndarray:
+    """Critical up to .5: a ball of radius 1/6. Nothing is seen of it from farther away than .18."""
+    distance = np.sqrt(((x - np.array([0.2, 0.75, 0.4])) ** 2).sum(axis=1))
+    return np.where(distance < 0.18, 3.0 * distance, 10.0)
+
+
+def plateau() -> sbt.Scenario:
+    return analytic(beside_a_plateau, inputs=INPUTS, critical=(-np.inf, 0.5), name="plateau")
+
+
+@pytest.mark.parametrize("seed", [4, 22])
+def test_an_interval_reaches_what_random_draws_allow_while_few_critical_runs_are_known(seed: int, tmp_path: Path):
+    """One of these stated at most a twentieth of the truth, and a gate at half of it passed."""
+    result = sbt.run(
+        campaign="estimation", scenario=plateau(), budget=150, seed=seed, executor="serial", store=tmp_path / "s", report=False,
+        gate={"probability": 0.01, "confidence": 0.95}, stop={"cov": None},
+    )  # fmt: skip
+    found = result.conclusion
+    assert found.low <= BALL <= found.high
+    assert found.gate is not None
+    assert found.gate.verdict != "pass"
+    runs = result.history
+    known = len(np.unique(runs.x[runs.y("y") <= 0.5], axis=0))
+    assert any(f"known at {known} input" in text for text in found.warnings) is (known < 10)
+
+
+def test_a_boundary_says_where_runs_that_fill_the_space_deny_its_share(tmp_path: Path):
+    denied = []
+    for seed in range(3):
+        result = sbt.run(
+            campaign="boundary", scenario=plateau(), budget=120, seed=seed, acquisition="even", executor="serial",
+            store=tmp_path / str(seed), report=False,
+        )  # fmt: skip
+        found, runs = result.conclusion, result.history
+        assert found.even_fraction.counted == 120
+        assert found.even_fraction.critical_fraction == pytest.approx((runs.y("y") <= 0.5).mean())
+        inside = found.even_fraction.low <= found.critical_fraction <= found.even_fraction.high
+        said = result.sentences()
+        assert any("that fill the space evenly say" in line for line in said) is not inside
+        assert inside or "deny its figures" in said[0]
+        denied.append(not inside)
+    assert any(denied), "what the metamodel makes of two runs in a plateau"
+
+
+def test_where_no_place_is_likely_critical_no_share_is_told_as_known(tmp_path: Path):
+    """Every input fails with a fiftieth of the seeds: the mean is a rate, and no part of the space is critical."""
+
+    def dropout(inputs: dict[str, float], seed: int) -> dict[str, float]:
+        return {"y": -1.0 if np.random.default_rng(seed).random() < 0.06 else 1.0 + inputs["a"]}
+
+    inputs = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)]
+    scenario = sbt.Scenario("dropout", inputs, sbt.Requirement("y", high=0.0), evaluate=dropout)
+    result = sbt.run(
+        campaign="boundary", scenario=scenario, budget=100, seed=1, executor="serial", store=tmp_path / "s", report=False
+    )
+    first = result.sentences()[0]
+    assert "% of the parameter space of dropout is critical" not in first
+    assert ("knows no place where most are" in first) is (result.conclusion.place is None)
