@@ -40,6 +40,7 @@ SMALLEST = {
     "asked_again.py": "--seeds 1 --table {folder}/again.jsonl",
     "ahead.py": "--seeds 1 --budget 40",
     "fuzz.py": "--configurations 2 --scenarios 1",
+    "jumps.py": "--problems disc_count --seeds 1 --budget 30",
     "kernels.py": "--problems metaball --runs 40 --seeds 1",
     "large.py": "--runs 200 --batch 100",
     "pairs.py": "crossing_pedestrian --seeds 1 --runs 30",

@@ -1,0 +1,140 @@
+"""Metrics that jump at the critical edge, as collisions, counts and sentinels do: are boundaries sharp, and do intervals cover?
+
+    python benchmarks/jumps.py [--campaign boundary|estimation] [--problems a,b] [--seeds 6] [--first-seed 0] [--budget 100]
+
+A row is a problem, campaigns with the product's defaults. Boundary: F1 and log loss at 8,000 fixed points, the stated share and
+what is expected on the wrong side, beside the truth. Estimation (without a stop rule): relative error beside that of crude Monte
+Carlo of as many runs, intervals that cover, and their half width over 1.96 of that error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+import sbt
+from sbt.problem.arrays import Points, Vector
+from sbt.seeds import stream
+
+
+def disc(x: Points) -> Vector:
+    return np.hypot(x[:, 0] - 0.6, x[:, 1] - 0.4) - 0.25
+
+
+def wave(x: Points) -> Vector:
+    return x[:, 1] - 0.5 - 0.25 * np.sin(2.0 * np.pi * x[:, 0])
+
+
+def corner(x: Points) -> Vector:
+    return np.maximum(0.5 - x[:, 0], 0.6 - x[:, 1])
+
+
+def ball(x: Points) -> Vector:
+    return np.sqrt(((x[:, :3] - np.array([0.2, 0.75, 0.4])) ** 2).sum(axis=1)) - 1.0 / 6.0
+
+
+def two_values(d: Vector, x: Points) -> Vector:
+    return np.where(d <= 0.0, -1.0, 1.0)
+
+
+def three_values(d: Vector, x: Points) -> Vector:
+    return np.where(d <= 0.0, -1.0, np.where(x[:, 0] < 0.3, 1.0, 2.0))
+
+
+def count(d: Vector, x: Points) -> Vector:
+    return np.floor(8.0 * d) + 0.5
+
+
+def contact(d: Vector, x: Points) -> Vector:
+    """A distance, and below 0 minus a speed of impact."""
+    return np.where(d <= 0.0, x[:, 0] - 3.0, d)
+
+
+def sentinel(d: Vector, x: Points) -> Vector:
+    """A metric that is 10 where nothing happens, and known a little beyond the edge only."""
+    return np.where(d < 0.013, 3.0 * d, 10.0)
+
+
+Metric = Callable[[Vector, Points], Vector]
+PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
+    "disc_01": (2, disc, two_values), "wave_01": (2, wave, two_values),
+    "corner_01": (2, corner, two_values),
+    "disc_three_values": (2, disc, three_values), "disc_count": (2, disc, count), "disc_contact": (2, disc, contact),
+    "disc6_01": (6, disc, two_values), "ball_01": (3, ball, two_values),
+    "ball_sentinel": (3, ball, sentinel),
+}  # fmt: skip
+
+
+def evaluate(given: dict[str, float], seed: int, problem: str) -> dict[str, float]:
+    _, region, metric = PROBLEMS[problem]
+    x = np.array([list(given.values())])
+    return {"y": float(metric(region(x), x)[0])}
+
+
+def campaign(kind: str, problem: str, seed: int, budget: int, folder: Path) -> sbt.Result:
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abcdef"[: PROBLEMS[problem][0]]]
+    scenario = sbt.Scenario("jumps", inputs, sbt.Requirement("y", high=0.0), evaluate=partial(evaluate, problem=problem))
+    stop = {"stop": {"cov": None}} if kind == "estimation" else {}
+    return sbt.run(
+        campaign=kind, scenario=scenario, budget=budget, seed=seed, store=folder / "store", executor="serial", report=False,
+        **stop,
+    )  # fmt: skip
+
+
+def boundary(problem: str, seed: int, budget: int) -> tuple[float, ...]:
+    """Return F1, log loss, stated and true share, expected and true share on the wrong side."""
+    dimension, region, _ = PROBLEMS[problem]
+    x = stream(7, "points").random((8000, dimension))
+    with tempfile.TemporaryDirectory() as folder:
+        result = campaign("boundary", problem, seed, budget, Path(folder))
+        found, space = result.conclusion, result.scenario.space
+        p = result.predict(dict(zip(space.names, x.T, strict=True)))["p_critical"].to_numpy()
+    inside, said = region(x) <= 0.0, p > 0.5
+    f1 = 2.0 * (said & inside).sum() / max(said.sum() + inside.sum(), 1)
+    loss = -np.log(np.clip(np.where(inside, p, 1.0 - p), 1e-9, 1.0)).mean()
+    return f1, loss, found.critical_fraction or 0.0, inside.mean(), found.expected_misclassified or 0.0, (said != inside).mean()
+
+
+def estimation(problem: str, seed: int, budget: int) -> tuple[float, float, float]:
+    """Return the estimate and the ends of its interval."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = campaign("estimation", problem, seed, budget, Path(folder)).conclusion
+    return found.probability or 0.0, found.low, found.high
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--campaign", choices=("boundary", "estimation"), default="boundary")
+    parser.add_argument("--problems", default=",".join(PROBLEMS))
+    parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--budget", type=int, default=100)
+    given = parser.parse_args()
+    seeds = range(given.first_seed, given.first_seed + given.seeds)
+    if given.campaign == "boundary":
+        print("| problem | F1 | log loss | share stated | true | wrong side, stated | true |")
+    else:
+        print("| problem | P | RMSE / P | crude | covered | half width / (1.96 RMSE) |")
+    print("|---|---|---|---|---|---|" + "---|" * (given.campaign == "boundary"), flush=True)
+    for problem in given.problems.split(","):
+        if given.campaign == "boundary":
+            f1, loss, *shares = np.mean([boundary(problem, seed, given.budget) for seed in seeds], axis=0)
+            print(f"| {problem} | {f1:.3f} | {loss:.3f} | {' | '.join(f'{share:.3f}' for share in shares)} |", flush=True)
+            continue
+        dimension, region, _ = PROBLEMS[problem]
+        truth = float((region(stream(8, "truth").random((4_000_000, dimension))) <= 0.0).mean())
+        value, low, high = np.array([estimation(problem, seed, given.budget) for seed in seeds]).T
+        error, crude = math.sqrt(np.mean((value / truth - 1.0) ** 2)), math.sqrt((1.0 - truth) / truth / given.budget)
+        width = float(np.median(high - low)) / 2.0 / (1.96 * error * truth)
+        covered = int(((low <= truth) & (truth <= high)).sum())
+        print(f"| {problem} | {truth:.4f} | {error:.3f} | {crude:.3f} | {covered} of {len(seeds)} | {width:.1f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
