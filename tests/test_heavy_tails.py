@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sbt
 from sbt import testbeds
 from sbt.metamodels.automatic import Auto
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -95,3 +96,17 @@ def test_other_metrics_are_learned_as_they_are():
     beside = np.vstack([u, crowded])
     assert better_warp(PROCESS, beside, beside.sum(axis=1) - 1.5, LOW) is None, "runs crowd at the edge of a plain metric"
     assert better_warp(PROCESS, u, np.exp(30.0 * u[:, 0]), CriticalInterval(1.0, 2.0)) is None
+
+
+def test_a_floor_beneath_the_edge_does_not_keep_a_metric_from_its_unit(tmp_path: Path):
+    """`ttc_min` is 0 in a collision and critical up to .1: in its own unit F1 was .74, as no scale alike on both sides helps."""
+    result = sbt.run(
+        campaign="coverage", scenario="emergency_braking", budget=200, seed=3, store=tmp_path / "s", workers=2, report=False
+    )
+    runs, scenario = result.history, result.scenario
+    y = runs.y("ttc_min")
+    assert (y == 0.0).sum() >= 3, "a floor, beneath the edge"
+    warp = better_warp(PROCESS, scenario.space.to_unit(runs.x), y, scenario.requirement.critical)
+    assert warp is not None
+    assert warp.above is not None
+    assert warp.scale < warp.above
