@@ -45,7 +45,7 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_another_version_needs_few_runs_and_none_of_the_old_ones(old, tmp_path):
     warm = run(tmp_path / "warm", scenario("after", LATER), warm_start={"store": str(old), "transfer": True})
     assert warm.conclusion.low <= norm.sf(LATER) <= warm.conclusion.high
-    assert (warm.summary["stopped"], warm.summary["runs"] <= 70) == ("cov", True)  # from scratch 104 at least
+    assert (warm.summary["stopped"], warm.summary["runs"] <= 80) == ("cov", True)  # from scratch 104 at least; three repeats
     assert set(warm.frame["stage"]) <= {"learn", "estimation", "hunt", "repeat"}  # no even start
 
 
