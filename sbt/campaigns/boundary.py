@@ -14,7 +14,7 @@ from sbt.campaigns.combinations import EveryCombination, every_combination
 from sbt.campaigns.doubt import TrafficDoubt, traffic_doubt
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
-from sbt.campaigns.exploration import largest_batch
+from sbt.campaigns.exploration import largest_batch, space_filling
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.openness import open_range
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
@@ -28,7 +28,7 @@ from sbt.campaigns.wording import percent, plural, requirement_words
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
-from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Json
 from sbt.samplers.sobol import SobolSequence
 from sbt.samplers.surface import crossings
@@ -162,7 +162,7 @@ def recipe(settings: Settings) -> Campaign:
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history), traffic_doubt(settings, log.history),
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted),
-            critical_share(log.history.where(_fills_space(log.history, settings)), settings.scenario),
+            critical_share(log.history.where(space_filling(log) | (settings.acquisition is even)), settings.scenario),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None
@@ -180,13 +180,6 @@ def _met(history: History, settings: Settings) -> Points:
     """Return (k, d) critical runs, in the unit cube."""
     scenario = settings.scenario
     return scenario.space.cube.snapped(scenario.space.to_unit(history.x[scenario.requirement.critical_runs(history)]))
-
-
-def _fills_space(history: History, settings: Settings) -> Mask:
-    """Return (n,) booleans: the run fills the space, whatever the results: held out, of the first design, or of even batches."""
-    if settings.acquisition is even:
-        return np.ones(len(history), dtype=np.bool_)
-    return np.isin(history.stage, (VALIDATION, "initial"))
 
 
 def _log_odds(fitted: FittedMetamodel, settings: Settings, u: Points) -> Vector:

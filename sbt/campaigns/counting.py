@@ -125,6 +125,10 @@ class Seen:
         """Return the exact upper limit of the probability of what these draws met so many times."""
         return float(binomial.upper(hits, self.draws, confidence)) if self.draws else 1.0
 
+    def most_critical(self, confidence: float) -> float:
+        """Return the exact upper limit of the probability of being critical by these draws alone, failed ones as critical."""
+        return self.most(self.hits + self.failed, confidence)
+
 
 def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool) -> Limits:
     """Return limits that reach the exact bounds by draws from the inputs' distribution, where an estimate left [0, 1].
@@ -136,8 +140,6 @@ def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool)
         high: as critical.
         unstated: runs failed, and no belief states where: the upper limit reaches the exact bound too.
     """
-    unmet = high <= 0.0 or unstated
-    return Limits(
-        (lambda c: min(limits.lower(c), 1.0 - seen.most(seen.draws - seen.hits, c))) if low >= 1.0 else limits.lower,
-        (lambda c: max(limits.upper(c), seen.most(seen.hits + seen.failed, c))) if unmet else limits.upper,
-    )
+    lower = (lambda c: min(limits.lower(c), 1.0 - seen.most(seen.draws - seen.hits, c))) if low >= 1.0 else limits.lower
+    found = Limits(lower, limits.upper)
+    return found.reaching(seen.most_critical) if high <= 0.0 or unstated else found

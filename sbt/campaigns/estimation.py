@@ -238,7 +238,7 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
             "everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution"
         )
     elif hits == 0:
-        missed = (lambda c: seen.most(seen.hits + seen.failed, c)) if few_high else limits.upper
+        missed = seen.most_critical if few_high else limits.upper
         limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), missed(c)))
         warnings.append("no counted draw was critical: only an upper bound is given")
     elif misses == 0:
@@ -246,7 +246,7 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         limits = Limits(lambda c: min(low.limit(c, side=-1), missed(c)), lambda _: 1.0)
         warnings.append("no counted draw was safe: only a lower bound is given")
     elif seen.known < _FEW_KNOWN:
-        limits = limits.reaching(lambda c: seen.most(seen.hits + seen.failed, c))
+        limits = limits.reaching(seen.most_critical)
         draws = f"the upper end is at least that of {plural(seen.draws, 'draw')} from the inputs' distribution"
         warnings.append(f"critical runs are known at {plural(seen.known, 'input')}, fewer than {_FEW_KNOWN}: {draws}")
     elif min(hits, misses) < FEW_HITS:

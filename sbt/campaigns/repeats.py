@@ -30,8 +30,8 @@ _ATTEMPTS = 4
 _HITS_AGAIN = 5
 """Repeats of critical inputs, where the metric has few values: two of them agree by chance where every other seed fails."""
 _ALONE, _ALONE_AGAIN = 3, 3
-"""A critical run stands alone where so many nearest inputs are uncritical; up to so many of these are repeated: what fails with
-one seed in a hundred, wherever, no repeat of other runs shows."""
+"""A critical run stands alone where so many nearest inputs are uncritical; these are repeated until so many critical inputs
+were: what fails with one seed in a hundred, wherever, no repeat of other runs shows."""
 _FEW_VALUES, _SHARE_OF_VALUES = 3, 0.1
 """A metric has few values where there are at most three, or a tenth of the runs."""
 _DOUBT = 0.05
@@ -181,6 +181,6 @@ def _alone_again(runs: History, again: History, margin: Vector, space: Parameter
     near = cKDTree(u).query(u[critical], k=_ALONE + 1)[1][:, 1:]
     alone = first[critical][~critical[near].any(axis=1)]
     repeated = {tuple(row) for row in again.x}
-    times = sum(tuple(runs.x[k]) in repeated for k in alone)
-    rows, n = [k for k in sorted(alone) if tuple(runs.x[k]) not in repeated], max(min(_ALONE_AGAIN - times, most), 0)
-    return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in rows[:n])
+    n = min(_ALONE_AGAIN - sum(tuple(row) in repeated for row in x[critical]), most)
+    rows = [k for k in sorted(alone) if tuple(runs.x[k]) not in repeated]
+    return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in rows[: max(n, 0)])

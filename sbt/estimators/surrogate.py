@@ -264,7 +264,7 @@ def _sided(metamodel: Metamodel, form: _Form, u: Points, rng: np.random.Generato
     from sbt.metamodels.sided import better_sided
     from sbt.metamodels.stepped import jumps
 
-    if not isinstance(metamodel, GaussianProcess) or not jumps(form.values, form.interval):
+    if not isinstance(metamodel, GaussianProcess) or len(u) > MOST_LEARNED or not jumps(form.values, form.interval):
         return None
     u, t = without_repetitions(u, form.values)
     found = better_sided(metamodel, metamodel.fit(u, t, rng), form.interval, u, t, cell_shares(u, rng), rng)

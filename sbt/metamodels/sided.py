@@ -12,16 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
 from scipy.spatial import cKDTree
 from scipy.special import log_ndtr
 
 from sbt.metamodels.base import gives_different
 from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.gp_algebra import inverse_lower
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor
 from sbt.metamodels.noise_shape import ShapedPredictor
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stepped import SteppedPredictor, jumps, side_score
+from sbt.metamodels.torch_tools import single_threaded
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -56,7 +57,8 @@ class SidedPredictor:
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction of y at u (n, d): P of the critical interval is that of a negative distance."""
         found = self.process(u)
-        return self._of_values(found.mean[0] / (self.factor * found.std[0]), self.values.mu(u))
+        mean, std = self._of_values(found.mean[0] / (self.factor * found.std[0]), self.values.mu(u))
+        return Prediction(mean[None], std[None], np.ones(1), np.zeros(len(u)))
 
     def mu(self, u: Points) -> Vector:
         """Return the (n,) mean of y at u (n, d)."""
@@ -72,10 +74,10 @@ class SidedPredictor:
         mean, std = found.mean[0], found.std[0]
         latent = np.sqrt(np.maximum(std**2 - found.noise**2, 1e-12 * std**2))  # what the distance is not sure of is the side's
         ratio = mean / (self.factor * std) + (drawn - mean) / latent
-        return np.array([self._of_values(row, self.values.mu(u)).mean[0] for row in ratio]).reshape(n, len(u))
+        return self._of_values(ratio, self.values.mu(u))[0]
 
-    def _of_values(self, ratio: Vector, value: Vector) -> Prediction:
-        """Return the prediction of y where the distance is (n,) times its standard deviation and the mean of y (n,).
+    def _of_values(self, ratio: Points, value: Vector) -> tuple[Points, Points]:
+        """Return mean and standard deviation of y where the distance is (..., n) of its own and `values` predicts (n,).
 
         The mean is on the likelier side, at the edge where neither is likelier.
         """
@@ -84,7 +86,7 @@ class SidedPredictor:
         side = np.where(ratio < 0.0, -1.0, 1.0) * (1.0 if upwards else -1.0)
         far = np.maximum(side * (value - edge), self.least)
         size = np.sqrt(1.0 + ratio**2)
-        return Prediction((edge + side * far * np.abs(ratio) / size)[None], (far / size)[None], np.ones(1), np.zeros(len(ratio)))
+        return edge + side * far * np.abs(ratio) / size, far / size
 
 
 def better_sided(
@@ -139,8 +141,9 @@ def _left_out(
     process: GaussianProcessPredictor, u: Points, distance: Vector, without: Vector, nearest: NDArray[np.intp]
 ) -> Vector:
     """Return (n,) means over standard deviations of each distance, predicted from all other rows."""
-    found, n = process.leave_one_out(u, distance), len(u)
-    inverse = cho_solve((process.factor, True), np.eye(n))
-    mean, rows = found.mean[0].copy(), np.arange(n)
-    np.add.at(mean, nearest, -inverse[nearest, rows] / inverse[nearest, nearest] * (without - distance))
+    found, rows = process.leave_one_out(u, distance), np.arange(len(u))
+    with single_threaded():
+        inverse = inverse_lower(process.factor)
+    mean, across = found.mean[0].copy(), inverse[np.maximum(nearest, rows), np.minimum(nearest, rows)]
+    np.add.at(mean, nearest, -across / inverse[nearest, nearest] * (without - distance))
     return np.asarray(mean / found.std[0])
