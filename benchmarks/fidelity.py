@@ -1,4 +1,4 @@
-"""What coarse runs do for an estimation: errors and intervals on problems of known truth, and CPU time (docs/traffic.md).
+"""What coarse runs do for an estimation: errors, intervals on problems of known truth, CPU time (docs/measured/traffic.md).
 
     python benchmarks/fidelity.py problems --budget 200 --seeds 50
     python benchmarks/fidelity.py problems --campaign falsification --probabilities .003 --budget 100 --seeds 10

@@ -1,4 +1,4 @@
-"""Critical runs of distinct traffic in 200 runs of a falsification, with and without covariates: the table in docs/traffic.md.
+"""Critical runs of distinct traffic in 200 runs of a falsification, with and without covariates (docs/measured/traffic.md).
 
     python benchmarks/pairs.py unprotected_left_turn highway_merge --seeds 2
 

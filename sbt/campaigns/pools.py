@@ -27,7 +27,7 @@ from sbt.store.database import PlannedRun
 
 __all__ = ["SKETCH", "Frame", "Pool", "Proposal", "draw_batch", "draw_pool", "fit_proposal", "planned"]
 
-# Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/estimation.md).
+# Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/measured/estimation.md).
 _POOL, _POOL_COST, _POOL_EACH = 10_000, 2e10, 300
 """Points of a pool: its own variance is a hundredth of what 100 draws leave. Fewer with many runs (points times squared runs),
 but so many for each draw."""

@@ -40,7 +40,7 @@ def fit_belief(known: Points, told: Vector, rng: np.random.Generator, trees: int
     """Return P(critical) as learned from runs: forests of their verdicts and of their margins, and a line through the margins.
 
     The one forest knows nothing of near misses, the other takes leaves for normal: where events are rare, their mean is better
-    than either (docs/traffic.md). From few runs a line tells more than both; it counts by how it does on runs left out.
+    than either (docs/measured/traffic.md). From few runs a line tells more than both; it counts by how it does on runs left out.
 
     Args:
         known: (n, k) of the pairs.

@@ -60,7 +60,7 @@ def failure_probability(u: Points, ok: Mask, rng: np.random.Generator) -> Callab
     """Return P(a run gives no metric) as a function of the metamodel's inputs, never closer to 0 or 1 than n runs can tell.
 
     The ends are 1 / (n + 2) away: that of an event which n runs have not met, by the rule of succession. Noise of labels that
-    depends on the inputs would cost five times as much, and predicted new labels no better (docs/estimation.md).
+    depends on the inputs would cost five times as much, and predicted new labels no better (docs/measured/estimation.md).
 
     Args:
         u: (n, d) metamodel inputs of all runs, n >= 2.
