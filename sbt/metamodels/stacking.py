@@ -18,7 +18,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Bins", "cell_shares", "held_out_scores", "is_surely_better", "mixture_score", "stacking_weights"]
 
-_SURE = 3.0  # standard errors: with two, mixtures were taken that lost on whole campaigns (docs/boundary.md)
+_SURE = 3.0  # standard errors: with two, mixtures were taken that lost on whole campaigns (docs/measured/boundary.md)
 _PROBES = 4096  # points that tell which part of the space a row stands for
 _ROUNDS, _MOVED = 500, 1e-6  # of expectation maximisation: at most, and the change of a weight at which it ends
 
