@@ -18,7 +18,7 @@ from sbt.samplers.search import Search
 
 __all__ = ["LocalRates", "local_rates", "next_repetitions"]
 
-_WIDTHS = (0.4, 0.7, 1.0)  # of the kernel, in length scales of the metamodel; 0.15 counts too few runs (docs/falsification.md)
+_WIDTHS = (0.4, 0.7, 1.0)  # of the kernel, in length scales; 0.15 counts too few runs (docs/measured/falsification.md)
 _WEIGHTS = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 1e9])[:, None]  # of P(critical), in runs; last: P alone
 _LEAST = 1e-4  # rates within this of 0 and 1 are not told apart
 _CHUNK = 512  # inputs whose neighbours are weighed at once

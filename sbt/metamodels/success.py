@@ -31,8 +31,8 @@ def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | N
     """Return log P(a run gives a metric) as a function of the metamodel's inputs; None where all runs did, or none.
 
     A Gaussian process is fitted to the labels 0 and 1, and P is its mean: far from all runs that is the share of those that
-    succeed. Its log likelihood on new points was that of a Laplace-approximated classifier (docs/falsification.md). Where P is so
-    small that a run would most likely be lost, the log is -inf.
+    succeed. Its log likelihood on new points was that of a Laplace-approximated classifier (docs/measured/falsification.md).
+    Where P is so small that a run would most likely be lost, the log is -inf.
 
     Args:
         u: (n, d) metamodel inputs of all runs.

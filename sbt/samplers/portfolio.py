@@ -36,7 +36,7 @@ __all__ = ["Region", "propose", "regions"]
 _BENEATH = 0.55  # share of the picks that look beneath a plateau, where there is one
 _HOPELESS = 1e-4  # largest inflated P(critical) in a region that is given up, and below which all candidates are alike
 _INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a fit to few runs is too sure; measured
-_THOMPSON = 0.6  # share of the picks; 75 % and 30 % were measured, see docs/falsification.md
+_THOMPSON = 0.6  # share of the picks; 75 % and 30 % were measured, see docs/measured/falsification.md
 _STAGNANT = 60  # runs without a better one or a new failure, after which the Thompson draws give way to filling:
 _THOMPSON_LATE, _FILLING_LATE = 0.2, 0.4  # shares of the picks from then on
 _REPEATED = 0.1  # of the picks, rounded up: repetitions of critical runs of a noisy simulator
@@ -78,7 +78,7 @@ def propose(
 
     Source:
         Trust regions and Thompson draws: Eriksson et al. (2019), TuRBO, arXiv 1910.01739; the mixture, the niches
-        and the deflation were measured, see docs/falsification.md.
+        and the deflation were measured, see docs/measured/falsification.md.
     """
     seen, d = search_data(search, u, y, batch, rng), u.shape[1]
     again = _repeats(search, seen, u, y, n) if repeats else ()

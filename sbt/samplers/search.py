@@ -33,11 +33,11 @@ __all__ = [
 ]  # fmt: skip
 
 DEFLATION = 0.22
-"""Half the side of the box around a critical run that the search leaves alone (unit cube); see docs/falsification.md."""
+"""Half the side of the box around a critical run that the search leaves alone (unit cube); see docs/measured/falsification.md."""
 _LEAST_FREE = 0.05  # of the space that deflation must leave: below, too few of the uniform candidates are admissible
 _FLANK = 0.15  # beyond a deflated box: runs there are near-critical for what is known already
 _PROBES = 512  # points that the free share is estimated from, to a hundredth
-_CANDIDATES = 1500  # uniform ones; with them a proposal of ten takes 0.06 s at 50 runs, 0.5 s at 500 (docs/falsification.md)
+_CANDIDATES = 1500  # uniform ones: a proposal of ten takes 0.06 s at 50 runs, 0.5 s at 500 (docs/measured/falsification.md)
 _STEPS = (0.1, 0.03)  # standard deviations of the steps from the best candidates, in the unit cube, round by round
 _BEST, _CHILDREN = 30, 10  # candidates that are refined in a round, steps from each
 _MOVED = 0.3  # share of the coordinates that a step changes: others stay, which pays where few inputs matter
