@@ -58,7 +58,7 @@ class GaussianProcess:
         input_noise: let the noise depend on the input (from 10 rows on).
         fit_rows: most rows that hyperparameters are fitted on, >= 2; chosen by the rng.
         most_rows: most rows that the process is conditioned on, >= 2; chosen by the rng, which beats a choice by y
-            (docs/metamodels.md). Its memory grows with their square.
+            (docs/measured/metamodels.md). Its memory grows with their square.
         student_t: predict a Student-t, from the leave-one-out residuals, instead of a Gaussian.
         priors: fit under priors by L-BFGS; otherwise by Adam with early stopping.
         learning_rate: step of Adam, > 0.

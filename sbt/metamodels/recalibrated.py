@@ -1,7 +1,7 @@
 """Recalibration: sigma of any metamodel scaled by its errors on held-out rows.
 
 Off by default: measured to help the likelihood of all runs a little and to hurt that of critical ones
-where sigma was wide on purpose (see docs/metamodels.md).
+where sigma was wide on purpose (see docs/measured/metamodels.md).
 """
 
 from __future__ import annotations
