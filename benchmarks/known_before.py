@@ -25,7 +25,7 @@ from sklearn.metrics import average_precision_score
 from sbt.errors import RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.bootstrap import out_of_bag
-from sbt.metamodels.risk_forest import fit_risk
+from sbt.metamodels.risk import fit_risk
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.covariates import Covariates
 from sbt.problem.scenario import LogicalScenario
@@ -118,7 +118,7 @@ def predicted(scenario: LogicalScenario, folder: Path, learned: int, splits: int
         row, known = [], []
         for columns in (inputs, both):
             near = scores(np.nan_to_num(score[here], nan=np.inf))
-            risk = fit_risk(columns[here], near, critical[here], stream(split, "fit"))
+            risk = fit_risk(columns[here], near, score[here], critical[here], stream(split, "fit"))
             row.append(average_precision_score(critical[there], risk(columns[there])[0]))
             finite = here[np.isfinite(y[here])]
             known.append(out_of_bag(columns[finite], y[finite], stream(split, "bag")))

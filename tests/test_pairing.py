@@ -9,8 +9,13 @@ import pytest
 from scipy.special import ndtr
 
 import sbt
-from sbt.metamodels.risk_forest import fit_risk
+from sbt.metamodels import risk as risk_module
+from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.risk import fit_risk
+from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.noise import scores
+from sbt.samplers.pairs import _picked, propose_pairs
+from sbt.samplers.search import Search
 from sbt.seeds import stream
 
 
@@ -86,13 +91,53 @@ def test_a_risk_ranks_pairs_and_has_the_mean_of_the_runs(hits: int) -> None:
     u = rng.random((300, 3))
     margin = u[:, 0] + 0.1 * rng.standard_normal(300)
     critical = margin <= (np.sort(margin)[hits - 1] if hits else -np.inf)
-    risk = fit_risk(u, scores(margin), critical, rng)
+    risk = fit_risk(u, scores(margin), margin, critical, rng)
     fresh = rng.random((2000, 3))
     log_p, log_rest = risk(fresh)
     assert np.allclose(np.exp(log_p) + np.exp(log_rest), 1.0)
     assert np.exp(risk(u)[0]).mean() < 3.0 * (hits + 0.5) / 301
     near, far = (np.exp(log_p[side]).mean() for side in (fresh[:, 0] < 0.1, fresh[:, 0] > 0.6))
     assert near > 3.0 * far
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_process_takes_part_in_a_risk_where_it_tells_more(smooth: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a smooth margin P is much sharper than by forests; of one that hides in noise nothing changes."""
+    rng = stream(1, "smooth", str(smooth))
+
+    def labelled(n: int):
+        u = rng.random((n, 8))
+        margin = (u[:, :4] ** 2).sum(axis=1) - 0.55 + (0.02 if smooth else 1.0) * rng.standard_normal(n)
+        return 100.0 * u, margin, margin <= (0.0 if smooth else -1.2)  # inputs in any units
+
+    (u, margin, critical), (fresh, _, truth) = labelled(500), labelled(4000)
+
+    def loss() -> float:
+        log_p, log_rest = fit_risk(u, scores(margin), margin, critical, stream(2, "fit"))(fresh)
+        return -float(np.where(truth, log_p, log_rest).mean())
+
+    both = loss()
+    monkeypatch.setattr(risk_module, "fit_process", lambda *_: None)
+    assert both < 0.7 * loss() if smooth else both <= 1.02 * loss()
+
+
+def test_a_fifth_of_the_pairs_leaves_a_trap() -> None:
+    """Whatever promises more near the runs there are, two of ten pairs are the best of those that lie far from all of them."""
+    value = np.arange(100.0)
+    picked = _picked(np.zeros((100, 2)), np.arange(100), np.tile(value, (60, 1)), None, value >= 50.0, 10, stream(5, "trap"))
+    assert sorted(picked.seeds) == [*range(8), 50, 51]
+
+
+def test_pairs_have_traffic_of_their_own_and_the_process_chooses_in_turn() -> None:
+    rng = stream(4, "turn")
+    u, seeds, y = rng.random((30, 2)), np.arange(30), rng.random(30)
+    search = Search(CriticalInterval(high=0.1), ExtraTrees(trees=5))
+    found = propose_pairs(search, lambda points, _: points[:, :1], u, seeds, y, 10, stream(5, "turn"))
+    assert len(set(found.seeds) - set(seeds.tolist())) == 10
+    value = np.arange(100.0)
+    picked = _picked(np.zeros((100, 2)), np.arange(100), np.tile(value, (60, 1)), -value, value >= 0.0, 10, stream(5, "turn"))
+    assert {95, 96, 97, 98, 99} <= set(picked.seeds)
+    assert {0, 1, 2, 3} <= set(picked.seeds)
 
 
 def test_a_boundary_says_what_of_the_doubt_is_the_traffics(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import percent
-from sbt.metamodels.risk_forest import fit_risk
+from sbt.metamodels.risk import fit_risk
 from sbt.problem.arrays import Points
 from sbt.samplers.noise import scores
 from sbt.samplers.search import fill_uniformly
@@ -67,7 +67,7 @@ def traffic_doubt(settings: Settings, history: History) -> TrafficDoubt | None:
     u = fill_uniformly(lambda v: space.feasible(space.from_unit(v)), _POINTS, space.dimension, rng)
     x, seeds = np.repeat(space.from_unit(u), _SEEDS, axis=0), rng.integers(0, SEED_END, _POINTS * _SEEDS).tolist()
     with threadpool_limits(1):
-        risk = fit_risk(inputs(runs.x, covariates.at(runs.x, runs.seed.tolist())), scores(margin), critical, rng)
+        risk = fit_risk(inputs(runs.x, covariates.at(runs.x, runs.seed.tolist())), scores(margin), margin, critical, rng)
         p = np.exp(risk(inputs(x, covariates.at(x, seeds, keep=False)))[0]).reshape(_POINTS, _SEEDS)
     traffic, rest = float(p.var(axis=1, ddof=1).mean()), float((p * (1.0 - p)).mean())
     between = max(float(p.mean(axis=1).var(ddof=1)) - traffic / _SEEDS, 0.0)

@@ -25,7 +25,7 @@ from sbt.errors import InputError
 from sbt.estimators.importance import draw_systematic, plan_batch, stated
 from sbt.loop.stages import Batch, Log
 from sbt.metamodels.joint import LogPair
-from sbt.metamodels.risk_forest import Risk, fit_risk
+from sbt.metamodels.risk import Risk, fit_risk
 from sbt.problem.arrays import Points
 from sbt.problem.covariates import Covariates
 from sbt.problem.requirement import Requirement
@@ -182,8 +182,8 @@ class PairStage:
         inputs = self._inputs(known.x, self._covariates.at(known.x, known.seed.tolist()))
 
         def learn(part: Requirement) -> Risk:
-            margin = np.where(known.ok, part.margins(known), np.inf)
-            return fit_risk(inputs, scores(np.nan_to_num(margin, nan=np.inf, posinf=np.inf)), part.critical_runs(known), rng)
+            margin = np.where(known.ok, np.nan_to_num(part.margins(known), nan=np.inf, posinf=np.inf), np.inf)
+            return fit_risk(inputs, scores(margin), margin, part.critical_runs(known), rng)
 
         whole = learn(requirement)
         return whole, tuple(learn(part) for part in requirement.parts) if requirement.combined else ()
