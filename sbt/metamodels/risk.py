@@ -26,7 +26,7 @@ _TREES = 60  # of each forest
 _SCORE_LEAF, _LABEL_LEAF = 3, 2  # runs in a leaf of the two forests
 _FEWEST, _EVENT = 10, 5  # runs to learn from; critical and safe ones among them, below which labels alone teach nothing
 _PENALTY = 0.3  # on squared slopes of standardised scores
-_PROCESS_ROWS = 1000  # that the process is conditioned on
+_PROCESS_ROWS, _FITTED_ROWS = 1000, 300  # that the process is conditioned on, and that its length scales are fitted to
 _SURELY = 2.0  # standard errors by which the process makes the events likelier, from which on it takes part
 _WIDEST = 3.0  # standard deviations of a column, beyond which the process takes it for as far
 _SURE = 12.0  # log odds of the process, beyond which a Gaussian tail tells nothing
@@ -116,7 +116,7 @@ def fit_process(inputs: Points, margin: Vector, rng: np.random.Generator) -> tup
         return log_odds(found.mean[0], found.std[0])
 
     u, t = placed(inputs[known]), np.arcsinh(margin[known] / scale)
-    fitted = GaussianProcess(kernels=1, input_noise=False, most_rows=_PROCESS_ROWS).fit(u, t, rng)
+    fitted = GaussianProcess(kernels=1, input_noise=False, most_rows=_PROCESS_ROWS, fit_rows=_FITTED_ROWS).fit(u, t, rng)
     unseen, left_out = np.empty(len(margin)), fitted.leave_one_out(u, t)
     unseen[known] = log_odds(left_out.mean[0], left_out.std[0])
     if not known.all():
