@@ -24,6 +24,7 @@ SMALLEST = {
     "screening.py": "--rows 50 --inputs 4 --samples 4 --kinds gp",
     "slice_teeth.py": "--scenario following --points 2 --values 4",
     "step_length.py": "--scenario cut_in --points 16 --seeds 2 --reference 0.025",
+    "transfer_region.py": "--seeds 1 --table {folder}/table.jsonl",
     "transfer.py": "--seeds 1 --cases cut_in --budget 60 --crude 50 --table {folder}/table.jsonl",
     "throughput.py": "--scenario cut_in --runs 4 --repeats 1 --no-campaign",
     "watcher.py": "--repeats 1 --vehicles 20",

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 import sbt
+from sbt.campaigns.clustering import clustered_interval
 from sbt.estimators.binomial import interval
 from sbt.estimators.clusters import clustered_error, effective_runs, reach
 from sbt.loop.stages import Log
 from sbt.store.database import Store
+from sbt.workflows.paired import Pairs
 from sbt.workflows.study import Study
 
 
@@ -40,6 +42,20 @@ def test_independent_runs_in_clusters_lose_little():
 def test_a_single_cluster_tells_nothing_of_others():
     assert clustered_error(np.array([0.1, -0.1]), np.array([3, 3])) is None
     assert effective_runs(np.array([1.0, 0.0, 0.0]), np.zeros(3)) == 3.0
+
+
+def test_failed_runs_of_one_cluster_are_no_independent_ones():
+    """All 23 failed runs began with one of four warm-ups: the upper end counts them as critical, and as a cluster."""
+    hits, warm_up = np.zeros(120, dtype=bool), np.arange(120) % 4
+    failed = (warm_up == 3) & (np.arange(120) < 92)
+    assert failed.sum() == 23
+    alone, clustered = clustered_interval(failed), clustered_interval(failed, warm_up.astype(float))
+    assert alone == pytest.approx(tuple(float(end) for end in interval(23, 120)))
+    assert clustered[1] > 0.6 > alone[1]
+    none = np.zeros(120, dtype=bool)
+    apart, together = (Pairs(hits, failed, none, none, cluster).difference() for cluster in (None, warm_up.astype(float)))
+    assert together[0] < apart[0]
+    assert together[1] > apart[1]
 
 
 def test_the_error_of_sums_is_that_of_their_clusters():

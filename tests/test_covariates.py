@@ -252,3 +252,24 @@ def test_the_general_set_knows_when_a_person_crosses_the_way_of_ego() -> None:
     told = np.where(lane <= 0.0, -past, coming)
     assert np.median(np.abs(told - lane)) < 1.5, "the time between ego and the pedestrian at the lane"
     assert np.corrcoef(told, lane)[0, 1] > 0.8
+
+
+class Counting:
+    """Its covariates depend on how often they were computed."""
+
+    calls = 0
+
+    def __call__(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        return {"y": values["a"] + stream(seed, "y").random()}
+
+    def known_before(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        self.calls += 1
+        return {"late": stream(seed, "y").random() + 0.01 * self.calls}
+
+
+def test_covariates_that_change_stop_the_campaign(tmp_path: Path) -> None:
+    scenario = sbt.Scenario("counting", [sbt.Parameter("a", 0, 1)], sbt.Requirement("y", high=0.1), evaluate=Counting())
+    with pytest.raises(InputError, match="the same whenever they are computed, but late of seed"):
+        sbt.run(
+            campaign="falsification", scenario=scenario, budget=40, seed=1, executor="serial", report=False, store=tmp_path / "s"
+        )

@@ -147,6 +147,19 @@ def test_what_names_something_that_varies_varies(tmp_path):
         simulation(town(tmp_path, warm_up="warm_up: {until: 42}", more=more)).isolation.warm  # noqa: B018
 
 
+@pytest.mark.parametrize(
+    ("default", "traffic"),
+    [
+        ("DEFAULT_VEHTYPE", '<trip id="x" from="A1B1" to="C1D1" depart="9"/>'),
+        ("DEFAULT_PEDTYPE", '<person id="x" depart="9"><walk edges="A1B1"/></person>'),
+    ],
+)
+def test_traffic_without_a_type_has_the_default_one_which_may_vary(tmp_path, default, traffic):
+    more = f'<vType id="{default}" maxSpeed="${{tau * 5}}"/>{traffic}'
+    with pytest.raises(InputError, match=r"departs at [0-9]+ s, before the warm-up ends"):
+        simulation(town(tmp_path, warm_up="warm_up: {until: 42}", more=more)).isolation.warm  # noqa: B018
+
+
 def test_a_libsumo_that_was_not_tested_loads_every_run(tmp_path, monkeypatch):
     monkeypatch.setattr(snapshot, "version", lambda _: "9.9.9")
     with pytest.raises(InputError, match=r"tested with libsumo 1.28.0, but this is 9.9.9"):
@@ -306,8 +319,9 @@ def test_a_run_that_leaks_costs_itself(tmp_path):
 
 
 @pytest.mark.sumo
-def test_plain_sumo_drives_an_export_as_the_run(tmp_path):
-    found = simulation(town(tmp_path / "town", warm_up="warm_up: {seeds: 1}"))
+@pytest.mark.parametrize("options", ["", "begin: 0"])
+def test_plain_sumo_drives_an_export_as_the_run(tmp_path, options):
+    found = simulation(town(tmp_path / "town", warm_up="warm_up: {seeds: 1}", options=options))
     trace = found(CENTRE, 4).actor("ego")
     found.write_files(CENTRE, 4, tmp_path / "export")
     end = str(T0 + 10)

@@ -47,6 +47,13 @@ def test_another_version_needs_few_runs_and_none_of_the_old_ones(old, tmp_path):
     assert warm.conclusion.low <= norm.sf(LATER) <= warm.conclusion.high
     assert (warm.summary["stopped"], warm.summary["runs"] <= 80) == ("cov", True)  # from scratch 104 at least; three repeats
     assert set(warm.frame["stage"]) <= {"learn", "estimation", "hunt", "repeat"}  # no even start
+    assert warm.conclusion.undetected_mass_bound <= 0.19  # 15 draws from the inputs' distribution before it may end
+
+
+def test_a_gate_searches_for_what_the_earlier_setup_did_not_have(old, tmp_path):
+    warm = {"store": str(old), "transfer": True}
+    asked = run(tmp_path / "gate", scenario("after", LATER), warm_start=warm, budget=30, gate={"probability": 0.01})
+    assert asked.frame.stage.iloc[0] == "initial"
 
 
 def test_a_trend_that_misleads_is_dropped():

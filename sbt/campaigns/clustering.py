@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from sbt.campaigns.counting import DRAWN, counted_iterations
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.wording import plural
-from sbt.estimators.clusters import clustered_error, reach
+from sbt.estimators import binomial
+from sbt.estimators.clusters import clustered_error, effective_runs, reach
 from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Vector
 from sbt.store.history import History
 
-__all__ = ["Spread", "spread_of_draws", "spread_of_share"]
+__all__ = ["Spread", "clustered_interval", "spread_of_draws", "spread_of_share"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,10 @@ class Spread:
         spread = "the interval has the spread between them" if known else "how others would change it is not in the interval"
         return f"The result is conditional on the traffic of {plural(self.warm_ups, 'warm-up')}; {spread}."
 
+    def decides(self, cov: float | None, value: float | None) -> bool:
+        """Return whether the coefficient of variation of an estimate is that by the spread, as the draws' own is smaller."""
+        return cov is not None and self.std_error is not None and bool(value and self.std_error / value >= cov)
+
     def exceeds(self, cov: float, value: float) -> bool:
         """Return whether the coefficient of variation is above a limit by the spread alone."""
         return self.std_error is not None and self.std_error > cov * value
@@ -69,6 +74,24 @@ def spread_of_share(history: History, among: Mask, critical: Mask) -> Spread | N
     rows = np.flatnonzero(among)
     hits = critical[rows].astype(np.float64)
     return _spread(history, rows, (hits - hits.mean()) / len(rows)) if len(rows) else None
+
+
+def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the exact interval of the share of hits (n,), that of fewer runs where they share warm-ups.
+
+    Args:
+        hits: of the runs.
+        warm_up: (n,) that each began with, -1 without one; None: there are none.
+        confidence: of the two-sided interval.
+
+    Source:
+        Korn and Graubard (1998), see `sbt.estimators.clusters`.
+    """
+    n, independent = len(hits), 1.0
+    if n and warm_up is not None and (warm_up >= 0).all():
+        independent = effective_runs(hits.astype(np.float64), warm_up, confidence) / n
+    low, high = binomial.interval(float(hits.sum()) * independent, n * independent, confidence)
+    return float(low), float(high)
 
 
 def _spread(history: History, rows: NDArray[np.intp], terms: Vector) -> Spread | None:

@@ -10,12 +10,12 @@ from itertools import pairwise
 import numpy as np
 
 from sbt.campaigns.choices import ChoiceRule, evenly
+from sbt.campaigns.clustering import clustered_interval
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import percent, plural
 from sbt.estimators.binomial import interval
-from sbt.estimators.clusters import effective_runs
 from sbt.loop.learner import changed_share
 from sbt.loop.stages import Batch, Facts, Log
 from sbt.problem.arrays import Points, Vector
@@ -185,19 +185,13 @@ def share_of(history: History, requirement: Requirement) -> CriticalShare:
     For Sobol points the interval is that of random ones, which is wider than it needs to be. Runs that began with the same
     warmed traffic say less than independent ones: the interval is that of so many fewer.
     """
-    critical = requirement.critical_runs(history)
-    hits, n, failed = int(critical.sum()), len(history), int((~history.ok).sum())
-    ok, independent = n - failed, 1.0
-    if n and (history.columns["warm_up"] >= 0).all():
-        independent = effective_runs(critical.astype(np.float64), history.columns["warm_up"]) / n
-    least, most, runs = hits * independent, (hits + failed) * independent, n * independent
-    low, high = float(interval(least, runs)[0]), float(interval(most, runs)[1])
+    critical, n = requirement.critical_runs(history), len(history)
+    hits, failed = int(critical.sum()), int((~history.ok).sum())
+    perhaps, ok = critical | ~history.ok, n - failed
+    low, high = (clustered_interval(each, history.columns["warm_up"])[side] for side, each in enumerate((critical, perhaps)))
     return CriticalShare(hits / ok if ok else None, low, high, 0.95, n, failed or None)
 
 
 def share_among_held_out(facts: Facts) -> CriticalShare:
     """Return the critical share among the held-out runs, which are uniform in the ranges."""
-    held_out = facts.history.where(facts.history.stage == VALIDATION)
-    hits, n, ok = int(facts.requirement.critical_runs(held_out).sum()), len(held_out), int(held_out.ok.sum())
-    low, high = float(interval(hits, n)[0]), float(interval(hits + n - ok, n)[1])
-    return CriticalShare(hits / ok if ok else None, low, high, 0.95, n, n - ok or None)
+    return share_of(facts.history.where(facts.history.stage == VALIDATION), facts.requirement)

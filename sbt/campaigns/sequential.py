@@ -58,6 +58,10 @@ _SEARCH_BLIND = 0.4
 _BLIND = (0.0, 0.75, 0.1, 0.15)
 """Shares of the draws (`SHARES`) until then; they only teach: what would count then is rarely met, and weighs much if it is."""
 
+_TRANSFERRED = (0.48, 0.35, 0.05, 0.12)
+"""Shares of a campaign that knows another setup's: it is short, and its draws from the inputs' distribution alone meet what the
+other one did not have."""
+
 _GAIN = 4.0
 _MANY_HITS, _ENOUGH = 5.0, 0.2  # expected of crude Monte Carlo; share of the budget before fewer leave the estimation to it
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""
@@ -95,6 +99,11 @@ class SequentialStage:
         return Frame(self._wide, self._choices)
 
     @property
+    def _spares_search(self) -> bool:
+        """Whether another setup's campaign tells where to draw at once. A gate wants the search for what it did not have."""
+        return self.settings.transfer is not None and self.settings.gate is None
+
+    @property
     def ahead(self) -> int:
         """Number of batches in flight that a proposal does not wait for; weights are those of the proposal that drew."""
         return self.settings.ahead
@@ -119,7 +128,7 @@ class SequentialStage:
 
     def _proposed(self, log: Log, size: int) -> Batch:
         s = self.settings
-        if log.iteration == 0 and s.transfer is None and (s.prior_runs is None or len(s.prior_runs.training) < 2):
+        if log.iteration == 0 and not self._spares_search and (s.prior_runs is None or len(s.prior_runs.training) < 2):
             return self._initial(min(s.initial, s.budget))
         known = Known.of(log.history, self._coordinates, s)
         log_probability = known.learn(stream(s.seed, "fit", log.iteration))
@@ -170,9 +179,9 @@ class SequentialStage:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
         It ends with a quarter of the budget, after three batches without a new mode, and where failures are common:
-        draws from the inputs' distribution meet every region that counts. An earlier campaign tells where to draw at once.
+        draws from the inputs' distribution meet every region that counts.
         """
-        if self.settings.transfer is not None and not known.one_sided:
+        if self._spares_search and not known.one_sided:
             return None
         proposals = [batch.read(EstimationProposal) for batch in log.iterations]
         if len(log.planned) >= _SEARCH_BUDGET * self.settings.budget or any(p.phase in (LEARN, COUNT) for p in proposals):
@@ -218,7 +227,7 @@ class SequentialStage:
         """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         one_sided = known.one_sided
-        shares = _BLIND if one_sided else SHARES
+        shares = _BLIND if one_sided else SHARES if s.transfer is None else _TRANSFERRED
         proposal = self._proposal(log_probability, known, shares, rng)
         fallback = self._fallback(log, known, relative_error(proposal.pilot.anticipated, proposal.pilot.predicted))
         if fallback is not None:

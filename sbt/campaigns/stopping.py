@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from sbt.campaigns.clustering import spread_of_draws
-from sbt.campaigns.counting import counted_batches
+from sbt.campaigns.counting import Seen, counted_batches
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
@@ -30,6 +30,8 @@ _VALUES_IN_NOISE = 2
 does not take away, and a run that does not count is missing later."""
 _TARGET = 0.02
 """Anticipated coefficient of variation that is good enough where `stop.cov` sets none."""
+_FEWEST_NOMINAL = 15
+"""Draws from the inputs' distribution before a campaign by transfer may end early: from scratch there are more by then."""
 FEWEST_BATCHES = 4
 """Batches that must count before their spread is taken for a measure of the error."""
 _LOST, _MEMORY, _EXACT = 10.0, 4, 0.01
@@ -82,6 +84,8 @@ def is_precise(log: Log, settings: Settings) -> bool:
     half = 0.5 * (found.limit(0.975, side=1) - found.limit(0.975, side=-1))
     between = spread_of_draws(log, counted)
     if between is not None and between.exceeds(target, found.value):  # more warm-ups would narrow it, more runs do not
+        return False
+    if settings.transfer is not None and Seen.of(log, settings).draws < _FEWEST_NOMINAL:
         return False
     return hits >= FEWEST_HITS and found.std_error <= target * found.value and half <= WIDEST * target * found.value
 

@@ -304,6 +304,12 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     if found.gate is not None and found.gate.verdict == "undecided":
         return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
     wide, counted = _too_wide(found), found.counted or n
+    traffic = found.warmed_traffic
+    if wide > 1.0 and traffic is not None and traffic.decides(found.cov, found.probability):
+        return (
+            f"more warm-ups than {traffic.warm_ups} (warm_up.seeds), in a campaign of their own: how traffic differs between them"
+            " decides the width of the interval, and more runs hardly narrow it"
+        )
     if wide > 1.0 and counted:
         return _runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
     unseen = 3.0 / max(found.probability, 1e-300)

@@ -56,7 +56,10 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
         found = result[name]
         shown = ", ".join(str(f["run"]) for f in found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
         lines.append(f"  {len(found)} {name}" + (f": runs {shown}" if found else ""))
-    return [*lines, f"  {result['still']} critical with both", f"page: {result['page']}"]
+    lines.append(f"  {result['still']} critical with both")
+    if "warm_ups" in result:
+        lines.append(f"  conditional on the traffic of {result['warm_ups']} warm-ups; runs that share one count for fewer")
+    return [*lines, f"page: {result['page']}"]
 
 
 def _rare_lines(result: Mapping[str, Any]) -> list[str]:

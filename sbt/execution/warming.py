@@ -36,9 +36,13 @@ def warm_up(spec: ScenarioSpec, workers: int, tell: Callable[[str], None] = lamb
             missing += [(level, k) for k in range(isolation.seeds) if not simulate.warmed_up(k)]
     if missing:
         tell(f"warming up the traffic, {isolation.seeds} times until t = {isolation.until:g} s")
-    for (_, k), problem in each(_warm_up, missing, min(workers, max(len(missing), 1))):
-        if problem is not None:
-            raise InputError(f"traffic must warm up until t = {isolation.until:g} s, but warm-up {k} failed: {problem}")
+    for last in (False, True):  # a process that dies costs a second attempt
+        failed = []
+        for task, problem in each(_warm_up, missing, min(workers, max(len(missing), 1))):
+            if problem is not None and last:
+                raise InputError(f"traffic must warm up until t = {isolation.until:g} s, but warm-up {task[1]} failed: {problem}")
+            failed += [task] if problem is not None else []
+        missing = failed
 
 
 @contextmanager

@@ -80,8 +80,9 @@ class Covariates:
             keep: remember what was computed; not worth the memory for pools, of which few pairs are met again.
 
         Raises:
-            InputError: they are not finite, or have other names than elsewhere in the space.
+            InputError: they are not finite, have other names than elsewhere in the space, or are not what they were before.
         """
+        self._check_unchanged()
         rows = np.empty((len(x), len(self.names)))
         for k, (row, seed) in enumerate(zip(x, seeds, strict=True)):
             key = row.tobytes(), int(seed)
@@ -90,6 +91,18 @@ class Covariates:
             if keep and known is None:
                 self._known[key] = rows[k].copy()
         return rows
+
+    def _check_unchanged(self) -> None:
+        """Compute the covariates of the first pair again: runs since then must not have changed them."""
+        if self._known:
+            (row, seed), known = next(iter(self._known.items()))
+            again = self._drawn(np.frombuffer(row), seed)
+            if not np.array_equal(again, known):
+                name, old, new = next(each for each in zip(self.names, known, again, strict=True) if each[1] != each[2])
+                raise InputError(
+                    f"covariates must be known before the run, the same whenever they are computed, but {name} of seed {seed} was"
+                    f" {old:g} and is now {new:g}"
+                )
 
     def _drawn(self, row: Vector, seed: int) -> Vector:
         values = self.scenario.space.named(row)

@@ -34,6 +34,7 @@ from sbt.samplers.search import (
 __all__ = ["Region", "propose", "regions"]
 
 _BENEATH = 0.55  # share of the picks that look beneath a plateau, where there is one
+_PATIENT, _HALVED = 30, 30  # guided runs on it without a new failure, from which on the share falls, by half after so many more
 _HOPELESS = 1e-4  # largest inflated P(critical) in a region that is given up, and below which all candidates are alike
 _INFLATION = 2.0  # on sigma, where P(critical) decides what to look at: a fit to few runs is too sure; measured
 _THOMPSON = 0.6  # share of the picks; 75 % and 30 % were measured, see docs/measured/falsification.md
@@ -99,12 +100,17 @@ def propose(
     hopeful = _hopeful(model, found, seen.admissible, rng, search.cube)
     stagnant = not seen.noisy and seen.runs_since(margin) >= _STAGNANT  # noise hides what is better
     pending = np.empty((0, d)) if pending is None else pending
-    under = beneath_plateaus(search, seen, u, y, round(_BENEATH * n), rng, pending, beside=around_floors)
-    flat = plateau(search.margins(y))[seen.rows] & around_floors
+    floor = plateau(search.margins(y))
+    beneath = _share_beneath(search.margins(y), floor if filling is None else floor & ~filling)
+    under = beneath_plateaus(search, seen, u, y, round(beneath * n), rng, pending, beside=around_floors)
+    flat = floor[seen.rows] & around_floors
     small = _in_niches(model, seen, flat, margin, [region for region, _ in hopeful], n - max(2, len(under)), rng, search.cube)
-    filled = round(_FILLING_LATE * (n - len(small))) if stagnant and len(under) == 0 else 0
+    filled = round(_FILLING_LATE * (n - len(small))) if stagnant else 0
     if around_floors and len(under):  # P(critical) is alike all over a plateau
-        filled = (n - len(small) - len(under)) // 2
+        filled = max(filled, (n - len(small) - len(under)) // 2)
+    if floor.any():  # what the share has lost fills space
+        filled = max(filled, round(_BENEATH * n) - round(beneath * n))
+    filled = min(filled, n - len(small) - len(under))
     thompson = min(round((_THOMPSON_LATE if stagnant else _THOMPSON) * n), n - len(small) - filled)
     thompson = thompson if len(small) == 0 else min(thompson, (n - len(small)) // 2)
     drawn = _thompson(model, hopeful, max(thompson - len(under), 0), d, rng)
@@ -115,6 +121,13 @@ def propose(
     picks = _globally(model, picks, n, u, pending, hopeful, seen.admissible, rng, search.cube)
     order = np.argsort(-model.log_probability(picks), kind="stable")
     return Picks(picks[order], tuple(why[k] for k in order), again)
+
+
+def _share_beneath(margin: Vector, on_floor: Mask) -> float:
+    """Return the share of the picks that look beneath a plateau, by how many runs on it (n,) came since the newest failure."""
+    hits = np.flatnonzero(margin <= 0)
+    fruitless = int(on_floor[hits[-1] if len(hits) else 0 :].sum())
+    return float(_BENEATH * 0.5 ** (max(fruitless - _PATIENT, 0) / _HALVED))
 
 
 def _repeats(search: Search, seen: SearchData, u: Points, y: Vector, n: int) -> tuple[int, ...]:

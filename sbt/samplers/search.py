@@ -45,7 +45,7 @@ _MOST_TRIES, _MOST_AT_ONCE = 2**18, 2**14  # to find admissible points: 260 wher
 _PRIOR_RUNS = 2.0  # what the metamodel's P(critical) weighs beside repetitions of a run
 _MOST_SEEDS, _CERTAIN, _DOUBTFUL = 0.5, 0.9, 0.3  # failure rates: deflated from, without repetition from, left alone below
 _MOST_REPEATED = 3  # runs of the same inputs, after which their basin is left as it is
-_FARTHEST_OF = 30  # uniform points, the farthest of which fills a gap
+_FARTHEST_OF, _FARTHEST_OF_FEW = 30, 3  # uniform points, the farthest of which fills a gap: around the edges, and plainly
 
 
 @dataclass(frozen=True)
@@ -327,17 +327,19 @@ def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np
 def spread_out(
     admissible: Callable[[Points], Mask], others: Points, n: int, rng: np.random.Generator, cube: Cube = CONTINUOUS
 ) -> Points:
-    """Return (n, d) points that fill the gaps among the others (m, d): each the farthest of 30 uniform admissible ones.
+    """Return (n, d) points that fill the gaps among the others (m, d): each the farthest of some uniform admissible ones.
 
-    Distances go around the edges of the cube: without that the farthest points are corners.
+    Of 30 points distances go around the edges of the cube: without that the farthest ones are corners. A crowd at one edge then
+    keeps them from the opposite one, too, so that every second point is the farthest of three by plain distances.
     """
     d = others.shape[1]
     found = np.empty((0, d))
-    for _ in range(n):
-        candidates = fill_uniformly(admissible, _FARTHEST_OF, d, rng)
+    for k in range(n):
+        plain = k % 2 == 1 if n > 1 else bool(rng.integers(2))
+        candidates = fill_uniformly(admissible, _FARTHEST_OF_FEW if plain else _FARTHEST_OF, d, rng)
         there = cube.embedded(np.vstack([others, found]))
         apart = np.abs(cube.embedded(candidates)[:, None, :] - there[None])
-        nearest = (np.minimum(apart, 1.0 - apart) ** 2).sum(axis=2).min(axis=1)
+        nearest = ((apart if plain else np.minimum(apart, 1.0 - apart)) ** 2).sum(axis=2).min(axis=1)
         found = np.vstack([found, candidates[int(np.argmax(nearest))]])
     return found
 

@@ -25,6 +25,11 @@ DEPARTING: Mapping[str, str] = {
     "flow": "begin", "personFlow": "begin", "containerFlow": "begin",
 }  # fmt: skip
 """Elements of traffic, and their attribute for the departure."""
+DEFAULT_TYPES: Mapping[str, str] = {
+    "vehicle": "DEFAULT_VEHTYPE", "trip": "DEFAULT_VEHTYPE", "flow": "DEFAULT_VEHTYPE", "person": "DEFAULT_PEDTYPE",
+    "personFlow": "DEFAULT_PEDTYPE", "container": "DEFAULT_CONTAINERTYPE", "containerFlow": "DEFAULT_CONTAINERTYPE",
+}  # fmt: skip
+"""Types of traffic that names none; files may define them."""
 DEFINITIONS = ("vType", "vTypeDistribution", "route", "routeDistribution")
 """Elements that traffic names."""
 _NAMING = ("type", "route", "vTypes", "routes", "refId")
@@ -49,7 +54,7 @@ class Piece:
         place: `file:line:column`.
         varies: a placeholder is in it.
         departs: text of its departure; None of a definition, and of traffic without one.
-        names: the types and routes that it names.
+        names: the types and routes that it names; where it names no type, SUMO's default one.
         defines: the types and routes that it defines.
         rate: departures a second of a flow, 0 where it states none.
     """
@@ -127,6 +132,8 @@ def pieces_of(file: Template) -> tuple[tuple[Piece, ...], tuple[Equipment, ...]]
             begun = (parser.CurrentByteIndex, tag, attributes, place)
         if depth >= 1:
             names.update(name for key in _NAMING if key in attributes for name in (attributes[key], *attributes[key].split()))
+            if "type" not in attributes and tag in DEFAULT_TYPES:
+                names.add(DEFAULT_TYPES[tag])
             if tag in DEFINITIONS and "id" in attributes:
                 defines.add(attributes["id"])
         depth += 1

@@ -121,8 +121,10 @@ class WarmedFiles:
                 (folder / path.name).write_bytes(path.read_bytes().replace(here.encode(), there.encode()))
         written = [word.replace(here, there) for word in words]
         time = re.search(rb'<snapshot\b[^>]*? time="([^"]+)"', state.read_bytes())  # without it SUMO warns that it begins at 0
-        begin = () if time is None or "--begin" in written else ("--begin", time[1].decode())
-        Launch((*written, *begin, "--load-state", str(folder / state.name))).write(0, folder / "run.sumocfg")
+        if time is not None:
+            at = written.index("--begin") if "--begin" in written else len(written)  # the user's is that of the warm-up
+            written = [*written[:at], *written[at + 2 :], "--begin", time[1].decode()]
+        Launch((*written, "--load-state", str(folder / state.name))).write(0, folder / "run.sumocfg")
 
     def state(self, number: int, states: str) -> State:
         """Return the state of a warm-up, which is made where it is not there yet.

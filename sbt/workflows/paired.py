@@ -17,13 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from sbt.campaigns.clustering import clustered_interval
 from sbt.campaigns.wording import number
 from sbt.config.load import load
 from sbt.errors import InputError
-from sbt.estimators.binomial import interval
-from sbt.estimators.monte_carlo import Proportion
 from sbt.loop.stages import Progress
-from sbt.problem.arrays import Mask
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Json
 from sbt.report.versus import write_versus
 from sbt.store.database import Store
@@ -50,12 +49,14 @@ class Pairs:
     Args:
         before, after: critical with the first and with the second ego.
         failed_before, failed_after: the run failed.
+        warm_up: (n,) that both runs began with; None, or negative: traffic was not warmed up.
     """
 
     before: Mask
     after: Mask
     failed_before: Mask
     failed_after: Mask
+    warm_up: Vector | None = None
 
     @property
     def fixed(self) -> Mask:
@@ -71,14 +72,24 @@ class Pairs:
         """Return an interval of P(critical) after minus before that holds at least with this confidence.
 
         Exact binomial limits of the shares of new and of fixed failures, each with half of the error
-        (Bonferroni); a failed run counts as whatever is worse for the end in question.
+        (Bonferroni), those of fewer pairs where they share warm-ups; a failed run counts as whatever is worse for the end in
+        question.
         """
         perhaps_new = (self.after | self.failed_after) & (~self.before | self.failed_before)
         perhaps_fixed = (self.before | self.failed_before) & (~self.after | self.failed_after)
-        n, each = len(self.before), 0.5 * (1.0 + confidence)
-        new, fixed = interval([self.new.sum(), self.fixed.sum()], n, each)[0]
-        most_new, most_fixed = interval([perhaps_new.sum(), perhaps_fixed.sum()], n, each)[1]
-        return float(new - most_fixed), float(most_new - fixed)
+        each = 0.5 * (1.0 + confidence)
+        new, fixed = (clustered_interval(hits, self.warm_up, each)[0] for hits in (self.new, self.fixed))
+        most_new, most_fixed = (clustered_interval(hits, self.warm_up, each)[1] for hits in (perhaps_new, perhaps_fixed))
+        return new - most_fixed, most_new - fixed
+
+    def share(self, *, after: bool, confidence: float = _CONFIDENCE) -> Json:
+        """Return the critical share with one of the egos and its interval, failed runs as safe below and as critical above."""
+        critical, failed = (self.after, self.failed_after) if after else (self.before, self.failed_before)
+        low, high = (
+            clustered_interval(hits, self.warm_up, confidence)[side] for side, hits in enumerate((critical, critical | failed))
+        )
+        value = float(critical.mean()) if len(critical) else 0.0
+        return {"probability": value, "low": low, "high": high, "critical": int(critical.sum()), "failed": int(failed.sum())}
 
 
 def compare_egos(
@@ -224,17 +235,14 @@ def _result(first: History, second: History, requirement: Any) -> Json:
     if not same:
         raise InputError("compare-ego needs the same draws in both stores, but they differ: give another --store")
     critical = [requirement.critical_runs(h) for h in (first, second)]
-    pairs = Pairs(critical[0], critical[1], ~first.ok, ~second.ok)
+    pairs = Pairs(critical[0], critical[1], ~first.ok, ~second.ok, first.columns["warm_up"])
     low, high = pairs.difference()
-    shares = [Proportion(len(h), int(c.sum()), int((~h.ok).sum())) for h, c in zip((first, second), critical, strict=True)]
-    tail = 0.5 * (1.0 + _CONFIDENCE)
+    before, after = (pairs.share(after=later) for later in (False, True))
+    warm_up = first.columns["warm_up"]
+    warmed = {"warm_ups": len(np.unique(warm_up))} if len(first) and (warm_up >= 0).all() else {}
     return {
-        "pairs": len(first), "confidence": _CONFIDENCE,
-        **{
-            name: {"probability": s.value, "low": s.lower(tail), "high": s.upper(tail), "critical": s.hits, "failed": s.failed}
-            for name, s in zip(("before", "after"), shares, strict=True)
-        },
-        "difference": shares[1].value - shares[0].value, "low": low, "high": high,
+        "pairs": len(first), "confidence": _CONFIDENCE, **warmed, "before": before, "after": after,
+        "difference": after["probability"] - before["probability"], "low": low, "high": high,
         "verdict": _verdict(low, high),
         "fixed": _listed(first, pairs.fixed), "new": _listed(first, pairs.new),
         "still": int((pairs.before & pairs.after).sum()),
