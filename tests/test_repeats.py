@@ -48,7 +48,7 @@ def test_noise_in_another_metric_is_noise():
     assert simulator_noise(rows, Y).noisy
     assert simulator_noise(rows, Y).std == 0.0
     rows.columns["y.y"][1] += 1e-14
-    assert simulator_noise(rows, Y) == SimulatorNoise(1, True, 0.0), "the last digit of a sum is no noise"
+    assert simulator_noise(rows, Y) == SimulatorNoise(1, True, 0.0, inputs=1), "the last digit of a sum is no noise"
 
 
 def test_the_smallest_margins_are_repeated_once_and_plateaus_last():
@@ -86,7 +86,15 @@ def test_every_guided_campaign_learns_and_says_whether_the_simulator_is_noisy(
     assert (rows.stage != "confirm").sum() <= budget
     said = " ".join(result.conclusion.sentences(Facts(rows, scenario.requirement, unit="m")))
     assert ("The simulator is noisy: where" in said) == (noise > 0)
-    assert ("No noise was met: metrics were equal in" in said) == (noise == 0)
+    assert ("No noise was met: metrics were equal at both inputs that were repeated" in said) == (noise == 0)
+
+
+def test_repetitions_of_one_input_are_no_independent_looks():
+    """The inputs, not the runs, are what may be noisy elsewhere: twelve runs at three inputs bound as three do."""
+    found = simulator_noise(history([(a, a) for a in (0.1, 0.2, 0.3) for _ in range(5)]), Y)
+    assert (found.repeats, found.inputs, found.noisy) == (12, 3, False)
+    assert "all 3 inputs that were repeated" in found.sentences("y")[0]
+    assert "less than 63.2" in found.sentences("y")[0]
 
 
 def test_noise_of_other_metrics_is_not_called_a_deviation_of_zero():

@@ -49,12 +49,14 @@ class SimulatorNoise:
         noisy: some metric differed; False: none did; None: nothing was repeated.
         std: pooled standard deviation of the requirement's metric at equal inputs; None: nothing was repeated.
         lost: inputs at which a run gave a metric and another one, with another seed, gave none; None: there are none.
+        inputs: different inputs that were repeated; None: nothing was.
     """
 
     repeats: int
     noisy: bool | None
     std: float | None
     lost: int | None = optional()
+    inputs: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -74,11 +76,11 @@ class SimulatorNoise:
             return []
         again = f"{plural(self.repeats, 'run')} repeated inputs with other seeds"
         if not self.noisy:
-            missed = percent(1.0 - _DOUBT ** (1.0 / self.repeats))
-            pairs = {1: "in the only pair", 2: "in both pairs"}.get(self.repeats, f"in all {self.repeats} pairs")
-            said = f"No noise was met: metrics were equal {pairs} of runs with the same inputs and other seeds"
-            sure = percent(1.0 - _DOUBT)
-            return [f"{said}; with {sure} confidence, noise shows in less than {missed} of such pairs."]
+            n = self.inputs or self.repeats  # repetitions of one input are no independent looks
+            missed, sure = percent(1.0 - _DOUBT ** (1.0 / n)), percent(1.0 - _DOUBT)
+            at = "the only input that was" if n == 1 else "both inputs that were" if n == 2 else f"all {n} inputs that were"
+            said = f"No noise was met: metrics were equal at {at} repeated with other seeds, near the critical interval or in it"
+            return [f"{said}; with {sure} confidence, noise shows at less than {missed} of such inputs. Others were not repeated."]
         if self.std == 0.0:
             return [f"The simulator is noisy: where {again}, other metrics differed; {metric} did not."]
         spread = f"{number(self.std, 3)} {unit}".rstrip()
@@ -102,13 +104,15 @@ def simulator_noise(history: History, requirement: Requirement) -> SimulatorNois
         return SimulatorNoise(0, None, None)
     noisy = any(_differs(runs.y(name), group) for name in runs.metrics)
     y = np.nan_to_num(requirement.told(runs), posinf=np.nan, neginf=np.nan)
+    inputs = int((size > 1).sum())
     if not _differs(y, group):
-        return SimulatorNoise(repeats, noisy, 0.0)
+        return SimulatorNoise(repeats, noisy, 0.0, inputs=inputs)
     finite = np.isfinite(y)
     count = np.bincount(group[finite], minlength=len(size))
     mean = np.bincount(group[finite], y[finite], len(size)) / np.maximum(count, 1)
     squares = float(((y[finite] - mean[group[finite]]) ** 2).sum())
-    return SimulatorNoise(repeats, noisy, float(np.sqrt(squares / max(int((count - 1).clip(0).sum()), 1))))
+    std = float(np.sqrt(squares / max(int((count - 1).clip(0).sum()), 1)))
+    return SimulatorNoise(repeats, noisy, std, inputs=inputs)
 
 
 def stated_noise(history: History, scenario: LogicalScenario) -> SimulatorNoise | None:
