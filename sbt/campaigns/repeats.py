@@ -80,7 +80,7 @@ class SimulatorNoise:
             missed, sure = percent(1.0 - _DOUBT ** (1.0 / n)), percent(1.0 - _DOUBT)
             at = "the only input that was" if n == 1 else "both inputs that were" if n == 2 else f"all {n} inputs that were"
             said = f"No noise was met: metrics were equal at {at} repeated with other seeds, near the critical interval or in it"
-            return [f"{said}; with {sure} confidence, noise shows at less than {missed} of such inputs. Others were not repeated."]
+            return [f"{said}; with {sure} confidence noise shows at less than {missed} of such inputs. Others were not repeated."]
         if self.std == 0.0:
             return [f"The simulator is noisy: where {again}, other metrics differed; {metric} did not."]
         spread = f"{number(self.std, 3)} {unit}".rstrip()
