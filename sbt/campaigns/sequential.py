@@ -65,6 +65,8 @@ other one did not have."""
 _GAIN = 4.0
 _MANY_HITS, _ENOUGH = 5.0, 0.2  # expected of crude Monte Carlo; share of the budget before fewer leave the estimation to it
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former."""
+_MET, _NO_GAIN = 2, 1.5
+"""Critical runs with which it is whatever P the metamodel expects, where it gains next to nothing: it may deny what was met."""
 _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
 _SURPRISE = 0.01
@@ -154,8 +156,9 @@ class SequentialStage:
         pi = np.exp(log_probability(z)[0])
         p, spread = float(pi.mean()), float(np.sqrt(pi * (1.0 - pi)).mean())
         hits = p * (s.budget - len(log.planned))
-        known = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget
-        return known and hits >= 1.0 and p * (1.0 - p) * SHARES[0] < _GAIN * spread**2
+        known, gain = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget, p * (1.0 - p) * SHARES[0]
+        met = int(s.scenario.requirement.critical_runs(log.history).sum())
+        return known and ((hits >= 1.0 and gain < _GAIN * spread**2) or (met >= _MET and gain < _NO_GAIN * spread**2))
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""
