@@ -156,9 +156,9 @@ class SequentialStage:
         pi = np.exp(log_probability(z)[0])
         p, spread = float(pi.mean()), float(np.sqrt(pi * (1.0 - pi)).mean())
         hits = p * (s.budget - len(log.planned))
-        known, gain = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget, p * (1.0 - p) * SHARES[0]
+        known, variance = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget, p * (1.0 - p) * SHARES[0]
         met = int(s.scenario.requirement.critical_runs(log.history).sum())
-        return known and ((hits >= 1.0 and gain < _GAIN * spread**2) or (met >= _MET and gain < _NO_GAIN * spread**2))
+        return known and ((hits >= 1.0 and variance < _GAIN * spread**2) or (met >= _MET and variance < _NO_GAIN * spread**2))
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""
