@@ -37,6 +37,7 @@ from sbt.report.projection import influence_from_runs, most_influential_pairs, p
 from sbt.report.style import figure_style, new_figure, to_svg
 from sbt.report.tables import critical_table, iteration_table
 from sbt.report.words import Findings, requirement_words, warnings_for
+from sbt.samplers.sobol import SobolSequence
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import VALIDATION
 from sbt.store.records import FitRecord, Validation
@@ -323,6 +324,9 @@ def test_influence_finds_what_matters(tmp_path):
     assert (influence.low <= influence.total).all()
     assert (influence.total <= influence.high).all()
     assert influence_of(lambda u: predict(u * 0 + 0.5), CRITICAL, 4) is None
+    peak = SobolSequence(8, seed=0).points(0, 1)[0, :4]  # P(critical) is not 0 at one of the points alone
+    alone = influence_of(lambda u: predict(np.where((u == peak).all(axis=1)[:, None], 0.1, 0.99)), CRITICAL, 4)
+    assert alone is None or all(np.isfinite(values).all() for values in (alone.total, alone.low, alone.high))
     scenario = scenario_of(4)
     with fill(tmp_path, scenario, 400, 0) as store:
         order = influence_from_runs(store.history(), scenario.requirement)

@@ -14,6 +14,8 @@ from sbt.samplers.sobol import SobolSequence
 __all__ = ["Influence", "influence_of"]
 
 _POINTS = 512
+_MOST = 2.0
+"""Of an index without one of the points; beyond 1 it is an error of the sampling."""
 _Z = 1.96
 """Of the 95 % intervals, in standard errors."""
 
@@ -54,7 +56,7 @@ def influence_of(predict: Predict, critical: CriticalInterval, dimension: int) -
 
     total = 0.5 * changes.mean(axis=1) / np.var(here)
     variance = _means_without_each(here**2) - _means_without_each(here) ** 2
-    without = 0.5 * _means_without_each(changes) / np.maximum(variance, 1e-300)
+    without = np.minimum(0.5 * _means_without_each(changes) / np.maximum(variance, 1e-300), _MOST)  # one point may have it all
     error = np.sqrt((_POINTS - 1) * np.var(without, axis=1))
     return Influence(*(np.clip(total + z * error, 0.0, 1.0) for z in (0.0, -_Z, _Z)))
 
