@@ -324,8 +324,14 @@ def test_influence_finds_what_matters(tmp_path):
     assert (influence.low <= influence.total).all()
     assert (influence.total <= influence.high).all()
     assert influence_of(lambda u: predict(u * 0 + 0.5), CRITICAL, 4) is None
-    peak = SobolSequence(8, seed=0).points(0, 1)[0, :4]  # P(critical) is not 0 at one of the points alone
-    alone = influence_of(lambda u: predict(np.where((u == peak).all(axis=1)[:, None], 0.1, 0.99)), CRITICAL, 4)
+    drawn = SobolSequence(8, seed=0).points(0, 2)
+    here, moved = drawn[0, :4], np.concatenate([drawn[1, 4:5], drawn[1, 1:4]])
+
+    def sharp(u):  # critical at one of the points, and where one input of another one is changed
+        mean = np.where((u == here).all(axis=1) | (u == moved).all(axis=1), 0.0, 100.0)
+        return Prediction.gaussian(mu=mean, sigma=np.full(len(u), 0.01))
+
+    alone = influence_of(sharp, CRITICAL, 4)
     assert alone is None or all(np.isfinite(values).all() for values in (alone.total, alone.low, alone.high))
     scenario = scenario_of(4)
     with fill(tmp_path, scenario, 400, 0) as store:
