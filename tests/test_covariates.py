@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -187,6 +188,11 @@ def test_check_finds_covariates_that_depend_on_what_was_run() -> None:
         (finding,) = again()
         assert finding.ok is ok
     assert "late of the same pairs differ" in finding.detail
+    seen.known_before = lambda values, seed: {"late": math.nan if seed == 150 else 1.0}  # type: ignore[method-assign]
+    (finding,) = covariates_first(scenario_of(seen), jobs)()
+    assert not finding.ok
+    assert "must be finite, but is nan" in finding.detail
+    assert "seed 150" in finding.detail
 
 
 def test_a_coverage_states_what_inputs_and_traffic_explain(tmp_path: Path) -> None:

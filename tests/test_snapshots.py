@@ -126,6 +126,7 @@ def test_check_proves_it(tmp_path):
         ({"depart": "triggered"}, r'departs at "triggered", which is no time'),
         ({"options": "time-to-teleport: '${tau}'"}, "the option time-to-teleport depends on an input"),
         ({"options": "threads: 2"}, "the option threads 2"),
+        ({"options": "end: 40"}, "go on after the warm-up, which ends at 42 s, but the option end is 40 s"),
         ({"more": '<poi id="x" x="${tau}" y="1"/>'}, r"stops.add.xml:3:\d+: <poi> depends on an input"),
         ({"more": '<rerouter id="r" edges="A1B1"/>'}, r"stops.add.xml:3:\d+: a saved state does not hold"),
         ({"more": '<route id="r" edges="A1B1"/><flow id="f" begin="2" period="${tau}" route="r"/>'}, "'f' departs at 2 s"),
@@ -219,6 +220,7 @@ def test_vehicles_are_inserted_beside_warmed_traffic(tmp_path):
     ("change", "reason"),
     [
         ({"warm": "{until: auto}"}, "insert.ego: a vehicle must have a time"),
+        ({"warm": "{until: 42.05}"}, r"warm_up.until must be whole steps of 0\.\d+ s after 0 s, but is 42.05 s"),
         ({"more": ", to: C3D3"}, "insert.other: a vehicle must have to or route, but got both"),
         ({"more": ", at: '${v}'"}, r"scenario\.yaml:6:10: insert\.other: 'other' departs at 5 s, before the warm-up ends"),
     ],

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sbt.campaigns.counting import DRAWN, LEARNED
 from sbt.campaigns.records import CONFIRM, EstimationProposal, SearchProposal
+from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import number, plural
 from sbt.loop.stages import Log
@@ -139,6 +140,7 @@ class LevelsTold:
         pairs: number of these.
         pays: whether coarse runs are worth their cost, as it was last judged; None: there was no round.
         two_levels, one_level: variance times cost as it was last judged, with coarse runs and without.
+        noisy: whether repeats of inputs differ; None: too few tell.
     """
 
     coarse: int
@@ -149,6 +151,7 @@ class LevelsTold:
     pays: bool | None
     two_levels: float | None = None
     one_level: float | None = None
+    noisy: bool | None = None
 
     def sentence(self) -> str:
         """Return it in words."""
@@ -156,7 +159,8 @@ class LevelsTold:
         taught = f"{plural(self.coarse, 'coarse run')} taught {plural(self.fine, 'run')}"
         told = f"{taught}: a coarse run costs {number(self.cost, 2)} of a run{alike}"
         if self.pays is None:
-            return f"{told}. They were not used further: equal inputs give equal metrics, or the budget was used up."
+            why = "equal inputs give equal metrics" if self.noisy is False else "the budget was used up"
+            return f"{told}. They were not used further: {why}."
         if self.two_levels is None or self.one_level is None or self.two_levels <= 0.0:
             return f"{told}."
         times = self.one_level / self.two_levels
@@ -179,7 +183,8 @@ def levels_told(log: Log, settings: Settings) -> LevelsTold | None:
     judged: tuple[bool | None, float | None, float | None] = (None, None, None)
     if last is not None:
         judged = (last.coarse if last.pays is None else last.pays, last.two_levels, last.one_level)
-    return LevelsTold(len(coarse), len(log.history), settings.coarse_cost, rank_correlation(*both.T), len(both), *judged)
+    noisy, alike = simulator_noise(log.history, settings.scenario.requirement).noisy, rank_correlation(*both.T)
+    return LevelsTold(len(coarse), len(log.history), settings.coarse_cost, alike, len(both), *judged, noisy)
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,12 @@ def snapshot_of(
     if not adding and not any(piece.is_traffic for piece in varying):
         raise NoSnapshot("the ego is not in the files")
     end = _end_of_warm_up(varying, space, begin, step, asked) if until is None else until
+    over = seconds_of(files.options.get("end", "-1"))
+    if over is not None and 0.0 <= over <= end:
+        place = files.places.get("end", "options")
+        raise NoSnapshot(
+            f"{place}: the simulation must go on after the warm-up, which ends at {end:g} s, but the option end is {over:g} s"
+        )
     moving = [(_constant_departure(piece, begin), piece) for piece in constant if piece.is_traffic]
     moving.sort(key=lambda each: each[0])
     before = tuple(piece for time, piece in moving if time < end)
@@ -152,6 +158,8 @@ def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: fl
     first, earliest = _earliest(varying, _points(space, varying), begin)
     wanted = None if asked is None else asked.until
     end = _in_steps(earliest - _SETTLING if wanted is None else wanted, begin, step)
+    if wanted is not None and abs(end - wanted) > 1e-6:
+        raise NoSnapshot(f"warm_up.until must be whole steps of {step:g} s after {begin:g} s, but is {wanted:g} s")
     if end <= begin and wanted is not None:
         raise NoSnapshot(f"the simulation begins at {begin:g} s, and the warm-up ends at {wanted:g} s")
     if first is None:  # a loop adds what depends on inputs, from the end of the warm-up on
@@ -252,4 +260,3 @@ def _in_steps(time: float, begin: float, step: float) -> float:
     """Return the last instant of the simulation that is not after a time (s)."""
     milliseconds = round(step * 1000)
     return begin + math.floor(round((time - begin) * 1000) / milliseconds) * milliseconds / 1000
-
