@@ -141,6 +141,15 @@ def test_a_snapshot_that_cannot_be_says_why_and_where(tmp_path, change, reason):
     assert without.why
 
 
+def test_a_route_file_that_is_not_sorted_is_refused_as_sumo_leaves_out_a_part_of_it(tmp_path):
+    path = town(tmp_path, warm_up="warm_up: {until: 42}")
+    buses = tmp_path / "buses.rou.xml"
+    text, behind = buses.read_text(), '<trip id="behind" depart="30" from="A1B1" to="C1D1"/></routes>'
+    buses.write_text(text.replace("</routes>", behind))
+    with pytest.raises(InputError, match=r"buses.rou.xml:\d+:\d+: .*'behind' \(30 s\) stands behind 'late' \(45 s\)"):
+        simulation(path).isolation.warm  # noqa: B018
+
+
 def test_what_names_something_that_varies_varies(tmp_path):
     more = '<vTypeDistribution id="both" vTypes="av car"/><route id="r" edges="A1B1"/>'
     more += '<vehicle id="x" type="both" route="r" depart="9"/>'

@@ -70,7 +70,6 @@ def write_report(
     drawings = draw(found, scenario.space, fits, predict, order)
     for drawing in drawings:
         write_atomically(target / "figures" / f"{drawing.name}.svg", drawing.svg)
-    reference = str(found.configuration.get("scenario", scenario.name))
     page = render("template.html", {
         "title": _title(scenario),
         "description": "\n".join(scenario.description.strip().splitlines()[1:]).strip(),
@@ -83,9 +82,9 @@ def write_report(
         "sensitivity": sensitivity_table(sensitivity),
         "inputs": input_table(scenario, influence),
         "iterations": iteration_table(store.iterations(), fits, found.history, scenario.requirement, coarse),
-        "critical": critical_table(found.history, scenario.requirement, reference, store.judgements),
+        "critical": critical_table(found.history, scenario.requirement, commands["replay"], store.judgements),
         "contacts": contact_table(found.history, scenario.requirement, commands["film"]),
-        "failed": failed_table(found.history, reference),
+        "failed": failed_table(found.history, commands["replay"]),
         "ego": found.configuration.get("ego"),
         "several": found.requirement.combined,
         "commands": commands,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,6 @@ from sbt.campaigns.asking import Sensitivity
 from sbt.campaigns.modes import worst_first
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent, written_unit
-from sbt.plugins import OBJECT
 from sbt.problem.outcome import doubts
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
@@ -33,7 +31,6 @@ __all__ = [
     "input_table",
     "iteration_table",
     "sensitivity_table",
-    "simulate_command",
 ]
 
 _MOST, _LEAST_ERROR = 200, 0.001
@@ -175,15 +172,7 @@ def _listed(proposal: JsonMapping) -> str:
     return ", ".join(f"{key.replace('_', ' ')}{'' if value is True else f' {number(value)}'}" for key, value in given.items())
 
 
-def simulate_command(scenario: str, record: Record) -> str:
-    """Return the command that runs a concrete scenario again, to the last digit; in Python where it was defined there."""
-    if scenario.startswith(OBJECT):
-        return f"sbt.simulate({scenario.removeprefix(OBJECT)}, {dict(record.inputs)!r}, seed={record.seed})"
-    inputs = (f"{name}={value if isinstance(value, str) else repr(value)}" for name, value in record.inputs.items())
-    return shlex.join(["sumo-sbt", "simulate", scenario, *inputs, "--seed", str(record.seed)])
-
-
-def critical_table(history: History, requirement: Requirement, reference: str, judgements: Sequence[Judgement] = ()) -> Table:
+def critical_table(history: History, requirement: Requirement, replay: str, judgements: Sequence[Judgement] = ()) -> Table:
     """Return the critical runs, the deepest in the critical interval first, at most 200, with who would have avoided them."""
     judged: dict[int, list[Judgement]] = {}
     for each in judgements:
@@ -200,7 +189,7 @@ def critical_table(history: History, requirement: Requirement, reference: str, j
             *(Cell.of(record.inputs[name]) for name in history.names),
             *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
             *((Cell(describe_judgements(judged.get(record.index, ())) or NOTHING),) if judged else ()),
-            Cell("command", code=simulate_command(reference, record)),
+            Cell("command", code=replay.replace("RUN", str(record.index))),
         ))  # fmt: skip
     rest = len(found) - len(rows)
     note = f"{rest:,} more critical runs are in the store: sumo-sbt export lists all." if rest else ""
@@ -230,12 +219,12 @@ def contact_table(history: History, requirement: Requirement, replay: str) -> Ta
     return Table(("run", "verdict", "doubt", "what differs", "see it"), rows, note)
 
 
-def failed_table(history: History, reference: str) -> Table:
+def failed_table(history: History, replay: str) -> Table:
     """Return the failed runs in order, at most 200, each with its reason."""
     failed = history.where(~history.ok).records
     rows = tuple(
         (Cell.of(record.index), Cell(record.stage), Cell(record.status), Cell(record.reason),
-         Cell.of(record.seconds), Cell("command", code=simulate_command(reference, record)))
+         Cell.of(record.seconds), Cell("command", code=replay.replace("RUN", str(record.index))))
         for record in failed[:_MOST]
     )  # fmt: skip
     rest = len(failed) - len(rows)

@@ -11,8 +11,10 @@ import itertools
 import math
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 import numpy as np
 
@@ -133,6 +135,7 @@ def snapshot_of(
     varies = _varying(pieces, moved)
     constant = [piece for piece, changes in zip(pieces, varies, strict=True) if not changes]
     varying = tuple(piece for piece, changes in zip(pieces, varies, strict=True) if changes)
+    _check_sorted(files, constant, begin)
     if not adding and not any(piece.is_traffic for piece in varying):
         raise NoSnapshot("the ego is not in the files")
     end = _end_of_warm_up(varying, space, begin, step, asked) if until is None else until
@@ -245,6 +248,19 @@ def _departure(piece: Piece, values: Values) -> float:
 def _constant_departure(piece: Piece, begin: float) -> float:
     """Return when traffic that no input changes departs (s); a flow without a beginning begins with the simulation."""
     return begin if piece.departs is None and piece.tag.lower().endswith("flow") else _departure(piece, {})
+
+
+def _check_sorted(files: SumoFiles, constant: Sequence[Piece], begin: float) -> None:
+    """Refuse route files of which SUMO would leave out a part, as it is not sorted: a warm-up would have that traffic."""
+    last: dict[Path, tuple[float, Piece]] = {}
+    for piece in constant:
+        if piece.is_traffic and piece.file.path in files.routes:
+            time = _constant_departure(piece, begin)
+            latest, before = last.get(piece.file.path, (time, piece))
+            if time < latest:
+                rule = "a route file must be sorted by departure, as SUMO leaves out what is not"
+                raise NoSnapshot(f"{piece.place}: {rule}: '{piece.id}' ({time:g} s) stands behind '{before.id}' ({latest:g} s)")
+            last[piece.file.path] = time, piece
 
 
 def _check_worth(duration: float, before: tuple[Piece, ...]) -> None:
