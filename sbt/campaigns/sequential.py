@@ -65,7 +65,7 @@ other one did not have."""
 
 _GAIN = 4.0
 _LEARNED = 0.125
-"""Share of the budget before which that is not decided: nine of 50 campaigns with a gain of five were left to it after 30 of 500."""
+"""Share of the budget before which that is not decided: nine of 50 campaigns with a gain of five were left to it at 30 of 500."""
 _MANY_HITS, _ENOUGH = 5.0, 0.2  # expected of crude Monte Carlo; share of the budget before fewer leave the estimation to it
 """Variance of crude Monte Carlo over what the metamodel anticipates, below which a noisy simulator is left to the former: the
 geometric mean of this and the last batch, as what few runs let expect varies by a factor of three, and there is no way back."""

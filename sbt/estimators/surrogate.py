@@ -22,6 +22,7 @@ from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import opened
 from sbt.metamodels.stacking import cell_shares
+from sbt.metamodels.tails import student_mixture
 from sbt.metamodels.warp import Warp
 from sbt.metamodels.warped import better_warp
 from sbt.problem.arrays import Points, Vector
@@ -142,22 +143,38 @@ class _Learned:
         form: what is learned.
         predictor: of what the trend leaves.
         metamodel, n: what was fitted, and to how many runs; errors name them.
+        tails: factors on the standard deviation, and their probabilities; None: errors are Gaussian.
     """
 
     form: _Form
     predictor: Predictor
     metamodel: Metamodel
     n: int
+    tails: tuple[Vector, Vector] | None = None
 
     def __call__(self, inputs: Points) -> Prediction:
         """Return the prediction of the values at the metamodel's inputs (n, d)."""
         with named_errors(self.metamodel, self.n):
-            p = check_prediction(self.predictor(inputs), len(inputs))
-        form = self.form
-        if form.noise > 0.0:
-            lacking = np.maximum(form.noise - p.noise**2, 0.0)
-            p = Prediction(p.mean, np.sqrt(p.std**2 + lacking), p.weight, np.sqrt(p.noise**2 + lacking))
-        return p if form.trend is None else Prediction(p.mean + form.trend(inputs), p.std, p.weight, p.noise)
+            p = self._noisy(check_prediction(self.predictor(inputs), len(inputs)))
+        p = p if self.tails is None else p.with_tails(*self.tails)
+        trend = self.form.trend
+        return p if trend is None else Prediction(p.mean + trend(inputs), p.std, p.weight, p.noise)
+
+    def _noisy(self, p: Prediction) -> Prediction:
+        """Return the prediction with at least the noise among repeats."""
+        if self.form.noise <= 0.0:
+            return p
+        lacking = np.maximum(self.form.noise - p.noise**2, 0.0)
+        return Prediction(p.mean, np.sqrt(p.std**2 + lacking), p.weight, np.sqrt(p.noise**2 + lacking))
+
+    def with_tails(self, u: Points) -> _Learned:
+        """Return the same with tails as heavy as left-out runs at u (n, d) show, where the predictor tells these."""
+        left_out = getattr(self.predictor, "leave_one_out", None)
+        if left_out is None:
+            return self
+        values = self.form.values if self.form.trend is None else self.form.values - self.form.trend(u)
+        p = self._noisy(left_out(u, values))
+        return replace(self, tails=student_mixture((values - p.mu) / p.sigma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +263,8 @@ def fit_log_probability(
         best = int(np.argmax(gain))
         sure = forms[best].trend is None or gain[best] > _SURE
         chosen = [forms[best]] if sure else [whole, forms[best]]
-    return _Largest(coordinates, tuple(form.fit(metamodel, u, every, rng) for form in chosen))
+    learned = (form.fit(metamodel, u, every, rng) for form in chosen)
+    return _Largest(coordinates, tuple(each.with_tails(u) if least > 0.0 and len(every) == len(y) else each for each in learned))
 
 
 def _better_warp(metamodel: Metamodel, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:

@@ -115,6 +115,17 @@ class Prediction:
         """Return the prediction with every standard deviation of a component multiplied."""
         return Prediction(self.mean, factor * self.std, self.weight, self.noise)
 
+    def with_tails(self, factor: Vector, probability: Vector) -> Prediction:
+        """Return the prediction with every component in several widths: its standard deviation times each factor (m,).
+
+        Args:
+            factor: > 0.
+            probability: (m,) of each factor, sum 1.
+        """
+        std = (factor[:, None, None] * self.std).reshape(-1, len(self))
+        weight = (probability[:, None] * self.weight).ravel()
+        return Prediction(np.tile(self.mean, (len(factor), 1)), std, weight / weight.sum(), self.noise)
+
     def joined(self, others: Sequence[Prediction]) -> Prediction:
         """Return the prediction at these points and, behind them, at those of the others, which have the same weights."""
         every = (self, *others)
