@@ -221,6 +221,10 @@ def test_a_gate_does_not_pass_on_a_metamodel_that_was_refuted():
     assert refuted.verdict == "undecided"
     assert "1 draw was critical where the metamodel denied it" in refuted.statement
     assert gate_verdict(limits, Gate(0.02), 0.01, 1).verdict == "pass", "few enough of them by these draws alone"
+    unknown = gate_verdict(limits, Gate(0.02), 0.12, 0, 78.0)
+    assert unknown.verdict == "undecided"
+    assert "coefficient of variation of 78" in unknown.statement
+    assert "failures that few seeds show" in gate_verdict(limits, Gate(0.02), 0.12, 0, 0.1).statement
     assert gate_verdict(Limits(lambda _: 0.03, lambda _: 0.05), Gate(0.02), 0.12, 1).verdict == "fail"
 
 

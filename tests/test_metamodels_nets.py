@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import torch
 from pretended_cuda import pretended_cuda
+from scipy.stats import norm
+from scipy.stats import t as student_t
 
 from sbt.errors import InputError
 from sbt.metamodels.automatic import Auto
@@ -29,7 +31,7 @@ from sbt.metamodels.scores import scores
 from sbt.metamodels.sigma_point import DeepSigmaPointProcess
 from sbt.metamodels.sparse_gp import SparseGaussianProcess
 from sbt.metamodels.stacking import Bins, stacking_weights
-from sbt.metamodels.tails import student_widths
+from sbt.metamodels.tails import student_mixture, student_widths
 from sbt.metamodels.torch_tools import device_of, minibatches
 from sbt.plugins import load, names
 from sbt.problem.requirement import CriticalInterval
@@ -341,6 +343,21 @@ def test_students_widths_follow_the_tails():
     heavy = student_widths(rng.standard_t(3, size=2000))
     assert len(heavy) == 7
     assert heavy.max() > 1.5 > 1.0 > heavy.min()
+
+
+@pytest.mark.parametrize("degrees", [1.5, 3.0])
+def test_a_mixture_has_the_tail_of_a_student_t_far_beyond_the_data(degrees):
+    rng = np.random.default_rng(0)
+    errors = 0.5 * rng.standard_t(degrees, size=4000)
+    factor, probability = student_mixture(errors)
+    for far in (2.0, 10.0, 100.0):
+        truth = float(student_t.sf(far / 0.5, degrees))
+        assert probability @ norm.sf(far / factor) == pytest.approx(truth, rel=0.5)
+    prediction = Prediction.gaussian(np.array([0.0, 3.0]), np.array([1.0, 2.0])).with_tails(factor, probability)
+    np.testing.assert_allclose(prediction.cdf(np.array([-10.0, -17.0]))[0], probability @ norm.sf(10.0 / factor), rtol=1e-9)
+    np.testing.assert_allclose(*prediction.cdf(np.array([-10.0, -17.0])), rtol=1e-9)  # 10 standard deviations below both
+    for few in (rng.normal(size=500), rng.standard_t(2, size=10)):
+        assert student_mixture(few) is None
 
 
 def test_weights_are_those_of_largest_likelihood():

@@ -65,7 +65,7 @@ class EstimationConclusion:
         effective_sample_size: of the weighted draws.
         hits: critical runs that count.
         failed_as_safe, failed_as_critical: the estimate, by how failed runs are read.
-        undetected_mass_bound: what a critical region that no run has met may hold at most.
+        undetected_mass_bound: what critical regions that no run has met, or failures that few seeds show, may hold at most.
         warnings: what limits the estimate.
         largest_weight_share: of one draw.
         convergence: the estimate after each counted batch but the first.
@@ -179,7 +179,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
             found, limits = _on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
         asked, unseen, met = settings.gate, found.undetected_mass_bound, Seen.of(log, settings).surprises
-        gate = None if asked is None else gate_verdict(limits, asked, unseen, met)
+        gate = None if asked is None else gate_verdict(limits, asked, unseen, met, found.cov)
         each = each_estimate(log, settings)
         return replace(
             found, gate=gate, simulator_noise=noise, requirements=each, warmed_traffic=traffic,

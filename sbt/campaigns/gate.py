@@ -9,6 +9,9 @@ from sbt.campaigns.settings import Gate
 
 __all__ = ["GateVerdict", "Limits", "gate_verdict"]
 
+_KNOWN = 1.0
+"""Coefficient of variation above which an estimate is no number to rely on: a few draws of very unequal weight decide it."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -41,19 +44,23 @@ class GateVerdict:
     statement: str
 
 
-def gate_verdict(limits: Limits, gate: Gate, undetected: float = 0.0, surprises: int = 0) -> GateVerdict:
+def gate_verdict(
+    limits: Limits, gate: Gate, undetected: float = 0.0, surprises: int = 0, cov: float | None = None
+) -> GateVerdict:
     """Return the verdict: `pass`, `fail` or `undecided`, with the limits it rests on and a sentence.
 
     `pass`: the one-sided upper limit (failed runs as critical) is at most the threshold. `fail`: the one-sided
     lower limit (failed runs as safe) is above it. Each is wrong with probability 1 - confidence at most,
     as far as the interval is right. Otherwise nothing is decided, and a larger budget may help. Neither is it where draws met
-    critical runs that the metamodel denied, of which there may be more than is allowed: the interval rests on that metamodel.
+    critical runs that the metamodel denied, of which there may be more than is allowed: the interval rests on that metamodel; nor
+    where the estimate is less than its standard error.
 
     Args:
         limits: of the probability.
         gate: what was asked.
-        undetected: what a critical region that no run has met may hold: a `pass` says so where it is more than is allowed.
+        undetected: what no run has met may hold: a `pass` says so where it is more than is allowed.
         surprises: draws from the inputs' distribution that were critical where the metamodel denied it.
+        cov: coefficient of variation of the estimate; None: there is no estimate, or the limits are exact.
     """
     low, high = limits.lower(gate.confidence), limits.upper(gate.confidence)
     sure, allowed = f"with {gate.confidence:.3g} confidence", f"{gate.probability:.3g}"
@@ -63,10 +70,16 @@ def gate_verdict(limits: Limits, gate: Gate, undetected: float = 0.0, surprises:
             f"{surprises} {were} critical where the metamodel denied it: by these draws alone such runs may hold up to"
             f" {undetected:.2g}, and the upper limit of {high:.3g} cannot be relied on; whether it is within {allowed} is open"
         )
+    elif high <= gate.probability < undetected and cov is not None and cov > _KNOWN:
+        verdict, statement = "undecided", (
+            f"the estimate has a coefficient of variation of {cov:.2g}, and the upper limit of {high:.3g} cannot be relied on;"
+            f" whether it is within {allowed} is open"
+        )
     elif high <= gate.probability:
         verdict, statement = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {allowed}"
         if undetected > gate.probability:
-            statement += f"; it trusts the search: a critical region that no run has met could hold up to {undetected:.2g}"
+            unmet = f"a critical region that no run has met, or failures that few seeds show, could hold up to {undetected:.2g}"
+            statement += f"; it trusts the search: {unmet}"
     elif low > gate.probability:
         verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:

@@ -162,7 +162,7 @@ class SequentialStage:
         hits = p * (s.budget - len(log.planned))
         known, variance = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget, p * (1.0 - p) * SHARES[0]
         met = int(s.scenario.requirement.critical_runs(log.history).sum())
-        gain = variance / max(spread, 1e-300) ** 2
+        gain = variance / spread**2 if spread > 1e-100 else math.inf
         before = [(1.0 - pool.probability) / pool.probability / relative_error_of(pool) ** 2 for _, pool in pools_of(log)
                   if 0.0 < pool.probability < 1.0 and pool.anticipated > 0.0]  # fmt: skip
         mean = math.sqrt(gain * before[-1]) if before else gain

@@ -27,6 +27,7 @@ from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
 from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
+from sbt.estimators import binomial
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 from sbt.loop.stages import Facts
@@ -44,6 +45,7 @@ _PRECISE = 0.1  # coefficient of variation that is asked for by default
 _FAR = 100.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"
+_NO_BETTER = 1.5  # factor by which an interval is wider than by as many random draws, from which on that is said
 _SMALL_SHARE = 0.01  # bound of the critical share that a coverage of 300 runs without a critical one gives
 
 
@@ -62,6 +64,8 @@ def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
         further = _WIDEN
     elif decides_share(lost, share.counted, share.low, share.high):
         further = f"failed runs decide the width of this interval, and more runs never halve it: {why_they_fail()}"
+    elif (warm_ups := _deciding_warm_ups(share, facts)) is not None:
+        further = _more_warm_ups(warm_ups)
     else:
         further = (
             f"campaign: boundary says where critical runs lie, campaign: estimation how probable they are; about"
@@ -73,6 +77,22 @@ def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
         " they lie.",
         f"Next: {further}.",
     ]
+
+
+def _deciding_warm_ups(share: CriticalShare, facts: Facts) -> int | None:
+    """Return the number of warm-ups where the spread between them, more than that of runs, makes a share's interval wide."""
+    warm_up, n = facts.history.columns["warm_up"], share.counted
+    if share.critical_fraction is None or n == 0 or not (warm_up >= 0).any():
+        return None
+    low, high = interval(round(share.critical_fraction * n), n, share.confidence)
+    return len(np.unique(warm_up)) if share.high - share.low > _NO_BETTER * float(high - low) else None
+
+
+def _more_warm_ups(number: int) -> str:
+    return (
+        f"more warm-ups than {number} (warm_up.seeds), in a campaign of their own: how traffic differs between them decides the"
+        " width of the interval, and more runs hardly narrow it"
+    )
 
 
 def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, facts: Facts) -> list[str]:
@@ -261,8 +281,9 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         said = f"The probability of {subject} is {number(found.probability, 3)} ({ends})"
         missed = min(found.undetected_mass_bound, 1.0 - found.probability)
         silent = (
-            f"This does not tell of critical regions that no run has met: with {confidence} confidence they hold at most"
-            f" {number(missed, 3)} more, which bounds the unseen and is no second estimate"
+            "This does not tell of critical regions that no run has met, nor of failures that few seeds show wherever: with"
+            f" {confidence} confidence they hold at most {number(missed, 3)} more, which bounds the unseen and is no second"
+            " estimate"
         )
         if missed <= 0.0:
             silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"
@@ -306,12 +327,10 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     wide, counted = _too_wide(found), found.counted or n
     traffic = found.warmed_traffic
     if wide > 1.0 and traffic is not None and traffic.decides(found.cov, found.probability):
-        return (
-            f"more warm-ups than {traffic.warm_ups} (warm_up.seeds), in a campaign of their own: how traffic differs between them"
-            " decides the width of the interval, and more runs hardly narrow it"
-        )
+        return _more_warm_ups(traffic.warm_ups)
     if wide > 1.0 and counted:
-        return _runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
+        more = _runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
+        return more + _as_many_draws(found, n)
     unseen = 3.0 / max(found.probability, 1e-300)
     if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
         return (
@@ -319,6 +338,15 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
             " distribution (acquisition: {kind: monte_carlo})"
         )
     return f"it is as narrow as asked{'; look at the critical runs in the report' if found.hits else ''}"
+
+
+def _as_many_draws(found: EstimationConclusion, n: int) -> str:
+    """Return the advice to draw from the inputs' distribution alone, where the upper end would be much lower by as many runs."""
+    if n == 0 or not found.probability or found.probability >= 1.0:
+        return ""
+    crude = float(binomial.upper(math.ceil(n * found.probability), n, 0.5 * (1.0 + found.confidence)))
+    better = "; as many draws from the inputs' distribution would bound it better (acquisition: {kind: monte_carlo})"
+    return better if found.high > _NO_BETTER * crude else ""
 
 
 def _runs_for_precision(more: float, made: int, *, known: bool) -> str:
