@@ -196,6 +196,15 @@ def test_check_reports_warnings_of_sumo_and_units_that_it_does_not_take(study):
     assert re.search(r"rou\.xml:5:5: SUMO takes departSpeed in m/s, but the input v_lead has the unit km/h: \$\{v_lead / 3\.6\}", output)
 
 
+@pytest.mark.sumo
+def test_check_fails_where_sumo_leaves_out_traffic_that_is_not_sorted(study):
+    behind = '    <person id="late" depart="9"><walk edges="road" arrivalPos="400"/></person>\n'
+    behind += '    <person id="early" depart="2"><walk edges="road" arrivalPos="400"/></person>\n</routes>'
+    code, output = check(study({CARS: [("</routes>", behind)]}))
+    assert code != 0
+    assert "SUMO leaves out 'early': a route file must be sorted by departure" in re.sub(r"\s+", " ", output)
+
+
 def test_all_mistakes_are_reported_at_once(study):
     path = study({YAML: [("ego: ego", "ego: egon"), ("- ttc_min", "- ttc_mim")], CARS: [("${105 + gap}", "150")]})
     with pytest.raises(InputError) as raised:

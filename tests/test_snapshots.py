@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sbt
@@ -22,7 +25,7 @@ from sbt.sumo.departures import requested_departures
 from sbt.sumo.template import template
 from sbt.sumo.user_simulation import UserSimulation
 from sbt.sumo.warming import _read
-from tests.own_networks import run_program
+from tests.own_networks import program, run_program
 from tests.warm_networks import T0, town
 
 CENTRE = {"accel": 2.0, "tau": 1.25}
@@ -45,6 +48,7 @@ def test_a_forked_run_is_that_of_a_process_of_its_own(tmp_path):
     path = town(tmp_path)
     found = simulation(path)
     assert (found.isolation.level, found.isolation.until, found.isolation.seeds) == ("snapshot", T0, 2)
+    assert ("the warm-up", T0) in found.periods, "a coarse step has to divide it"
     forked = [found(CENTRE, seed) for seed in (4, 6, 5)]
     assert forked[0].identical(found(CENTRE, 4))  # also after others
     loaded = found.isolated(replace(found.isolation, forking=False))
@@ -153,7 +157,7 @@ def test_a_route_file_that_is_not_sorted_is_refused_as_sumo_leaves_out_a_part_of
 def test_what_names_something_that_varies_varies(tmp_path):
     more = '<vTypeDistribution id="both" vTypes="av car"/><route id="r" edges="A1B1"/>'
     more += '<vehicle id="x" type="both" route="r" depart="9"/>'
-    with pytest.raises(InputError, match="'x' departs at 9 s"):
+    with pytest.raises(InputError, match=r"'x' departs at 9 s, .*: it depends on an input by 'both' \(.*stops.add.xml:3"):
         simulation(town(tmp_path, warm_up="warm_up: {until: 42}", more=more)).isolation.warm  # noqa: B018
 
 
@@ -343,6 +347,30 @@ def test_plain_sumo_drives_an_export_as_the_run(tmp_path, options):
     assert speeds == pytest.approx(list(trace.speed), abs=1e-9)
 
 
+@pytest.mark.sumo
+def test_the_script_of_an_export_drives_all_traffic_as_the_run(tmp_path):
+    path = town(tmp_path / "town", warm_up="warm_up: {seeds: 1}")
+    path.write_text(path.read_text().replace("duration: 3", "duration: 15"))
+    found = simulation(path)
+    trace = found(CENTRE, 4)
+    found.write_files(CENTRE, 4, tmp_path / "export")
+    words = [sys.executable, "run.py", program("sumo"), "--fcd-output", "fcd.xml", "--precision", "9"]
+    subprocess.run(words, cwd=tmp_path / "export", check=True, capture_output=True)
+    seen: dict[str, dict[float, float]] = {}
+    for step in ET.parse(tmp_path / "export" / "fcd.xml").getroot().iter("timestep"):
+        for one in step:
+            seen.setdefault(one.get("id", ""), {})[float(step.get("time", "nan"))] = float(one.get("speed", "nan"))
+    begin = min(seen["ego"])
+    late = 0
+    for name in trace.actors:
+        actor = trace.actor(name)
+        here = np.flatnonzero(np.isfinite(actor.speed))
+        late += begin + trace.time[here[0]] == min(seen[name])
+        for k in here:
+            assert seen[name][round(begin + trace.time[k], 3)] == pytest.approx(actor.speed[k], abs=1e-6), name
+    assert late > 1, "the ego, and others that departed after the warm-up"
+
+
 def guiding(folder: Path, departs: float) -> Path:
     """Write a scenario that guides another vehicle, which departs at some time (s)."""
     inputs = ", a: {profile: {knots: [0, 2]}, min: -2, max: 2}"
@@ -350,6 +378,18 @@ def guiding(folder: Path, departs: float) -> Path:
     routes, lead = folder / "ego.rou.xml", f'<trip id="lead" type="car" depart="{departs}" from="A0B0" to="C0D0"/></routes>'
     routes.write_text(routes.read_text().replace("</routes>", lead))
     return path
+
+
+@pytest.mark.sumo
+def test_an_ego_departs_where_only_a_waiting_person_is_left_of_the_warm_up(tmp_path):
+    path = town(tmp_path, warm_up="warm_up: {until: 42, seeds: 1}")
+    waiting = '<person id="p" depart="20"><ride from="A1B1" to="C1D1" lines="taken"/></person>'
+    taken = '<vehicle id="taken" depart="${43 + tau}"><route edges="A1B1 B1C1 C1D1"/></vehicle>'
+    for name, text in {"cars": '<vType id="car"/>', "buses": waiting + taken}.items():
+        (tmp_path / f"{name}.rou.xml").write_text(f"<routes>{text}</routes>")
+    routes = tmp_path / "ego.rou.xml"
+    routes.write_text(routes.read_text().replace('depart="44"', 'depart="47"'))
+    assert simulation(path)(CENTRE, 1).ended == "duration"
 
 
 @pytest.mark.sumo

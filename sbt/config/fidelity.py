@@ -64,7 +64,7 @@ def _check_steps(fine: float, coarse: float, scenario: LogicalScenario) -> None:
     if abs(own - fine) > 1e-9:
         raise InputError(f"the smaller of fidelity.step_length must be the scenario's own step, {own:g} s, but got {fine:g} s")
     for told, period in getattr(simulate, "periods", ()):
-        rule = "the coarse step must divide every time in which a driver acts"
+        rule = "the coarse step must divide a warm-up and every time in which a driver acts"
         if math.isnan(period):
             raise InputError(f"{rule}, but {told} depends on an input")
         if round(period / coarse) < 1 or abs(period / coarse - round(period / coarse)) > 1e-9:

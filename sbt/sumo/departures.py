@@ -176,11 +176,12 @@ class DepartureMonitor:
             RunError: it cannot depart any more, or has waited too long.
         """
         name, now = self._ego.id, float(self._sumo.simulation.getTime())
-        if self._in_files and self._sumo.simulation.getMinExpectedNumber() == 0:
+        requested, limit = self._requested.get(name), self._ego.wait if self._ego.delay is None else self._ego.delay
+        due = requested is None or requested.depart is None or requested.depart < now  # a state does not count what is to come
+        if self._in_files and due and self._sumo.simulation.getMinExpectedNumber() == 0:
             self._refuse(name)
         if self._deadline(name) < math.inf:
             return
-        requested, limit = self._requested.get(name), self._ego.wait if self._ego.delay is None else self._ego.delay
         waited = self._delay(name)
         if waited is not None and waited > limit:
             self._refuse(name)

@@ -94,6 +94,15 @@ class Snapshot:
     after: tuple[Piece, ...]
     varying: tuple[Piece, ...]
 
+    @property
+    def lasts(self) -> float:
+        """Simulated time of a warm-up (s)."""
+        return self.until - self.begin
+
+    def last_departure(self, values: Values) -> float:
+        """Return when the last one departs of what varies (s); the end of the warm-up where nothing does."""
+        return max([self.until, *(piece.departure(values) or 0.0 for piece in self.varying if piece.is_traffic)])
+
     def departing(self, values: Values) -> list[Piece]:
         """Return what varies as a run needs it: definitions, then traffic by departure.
 
@@ -171,9 +180,16 @@ def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: fl
         least = begin + _SETTLING + step
         raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s; before {least:g} s there is nothing to warm up")
     if end > earliest:
-        remedy = "let it depart later, or warm_up.until be smaller or auto"
+        remedy = f"{_because(first, varying)}let it depart later, or warm_up.until be smaller or auto"
         raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s, before the warm-up ends ({end:g} s): {remedy}")
     return end
+
+
+def _because(piece: Piece, varying: tuple[Piece, ...]) -> str:
+    """Return by which type or route traffic without a placeholder depends on an input; "" where it has one."""
+    defined = {name: other.place for other in varying for name in other.defines}
+    found = [] if piece.varies else sorted(piece.names.intersection(defined))
+    return f"it depends on an input by '{found[0]}' ({defined[found[0]]}); " if found else ""
 
 
 def _check_surroundings(files: SumoFiles) -> None:

@@ -118,7 +118,8 @@ class UserSimulation:
     @property
     def periods(self) -> tuple[Period, ...]:
         """In which times drivers act, where that is not every step."""
-        return periods_of([one.driver for one in (self.recording.ego, *self.recording.further)], self.files)
+        found = periods_of([one.driver for one in (self.recording.ego, *self.recording.further)], self.files)
+        return (*found, ("the warm-up", self._warmed.snapshot.lasts)) if self.isolation.warm else found
 
     def configured(
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
@@ -347,16 +348,16 @@ class UserSimulation:
     def write_files(self, values: Values, seed: int, folder: Path) -> None:
         """Write the SUMO files of a run, placeholders filled, and a `run.sumocfg` that any SUMO reads.
 
-        What a controller or a loop does in the run is not in them; files without placeholders are named where they are.
+        With warmed traffic a `run.py` drives it as it was. Controllers and loops are not in them; files without placeholders
+        are named where they are.
         """
-        files = self.files_of_run(values, seed)
+        files, values = self.files_of_run(values, seed), plain_values(values)
         if not self.isolation.warm:
-            files.launch(plain_values(values), folder, self.step).write(seed, folder / "run.sumocfg")
+            files.launch(values, folder, self.step).write(seed, folder / "run.sumocfg")
             return
-        state = self._state(seed)
-        own = files.additional[len(self.files.additional) if self.files is not None else 0 :]
-        self._warmed.begin(plain_values(values), own)
-        self._warmed.write(state, folder)
+        warmed = self._warmed
+        warmed.begin(values, files.additional[len(self.files.additional) if self.files is not None else 0 :])
+        warmed.write(self._state(seed), folder, warmed.snapshot.last_departure(values) + self.recording.duration)
 
     def files_of_run(self, values: Values, seed: int) -> SumoFiles:
         """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.

@@ -49,6 +49,21 @@ _KEPT = 8
 _LONGEST = 3600.0
 """Wall-clock limit of a warm-up (s)."""
 
+_SCRIPT = """# Drives the run in sumo-gui, or another program: python run.py [PROGRAM [OPTION ...]]
+import os
+import sys
+
+import traci
+
+os.chdir(os.path.dirname(os.path.abspath(__file__)))
+program, *options = sys.argv[1:] or ["sumo-gui"]
+traci.start([program, {arguments}, *options])
+traci.simulation.loadState({state!r})
+while traci.simulation.getTime() <= {end!r}:
+    traci.simulationStep()
+traci.close()
+"""
+
 
 @dataclass(frozen=True)
 class State:
@@ -108,8 +123,16 @@ class WarmedFiles:
                     os.dup2(nowhere, int(number))
                     os.close(nowhere)
 
-    def write(self, state: Path, folder: Path) -> None:
-        """Write what the run that has begun is loaded from into a folder, with a `run.sumocfg`."""
+    def write(self, state: Path, folder: Path, end: float) -> None:
+        """Write what the run that has begun is loaded from into a folder, with a `run.py` that drives it by traci.
+
+        A `run.sumocfg` is there too, but SUMO, given a state as an option, draws types and speeds of later traffic anew.
+
+        Args:
+            state: of the run.
+            folder: to write to.
+            end: simulated time at which `run.py` ends (s).
+        """
         folder.mkdir(parents=True, exist_ok=True)
         for place in (self.folder / "outputs").rglob("*"):
             if place.is_dir():
@@ -120,6 +143,8 @@ class WarmedFiles:
             if path.is_file():
                 (folder / path.name).write_bytes(path.read_bytes().replace(here.encode(), there.encode()))
         written = [word.replace(here, there) for word in words]
+        arguments = ", ".join(repr(word.replace(f"{there}{os.sep}", "")) for word in Launch(tuple(written)).command(0))
+        (folder / "run.py").write_text(_SCRIPT.format(arguments=arguments, state=state.name, end=end), encoding="utf-8")
         time = re.search(rb'<snapshot\b[^>]*? time="([^"]+)"', state.read_bytes())  # without it SUMO warns that it begins at 0
         if time is not None:
             at = written.index("--begin") if "--begin" in written else len(written)  # the user's is that of the warm-up

@@ -41,9 +41,11 @@ _CORNERS_UP_TO = 4
 _FEW_INVALID = 0.25
 """Largest share of the centre and corners that may be invalid."""
 _INSTANTLY = "; SUMO changes lanes within a step unless its option lanechange.duration is set (such as 3 s)"
+_MOVED = "; SUMO moves walkers, and who parks or rides, from one place to another within a step"
 _STEP = 1.0
 """How much shorter than a formula's horizon a run may be (s): a step of SUMO at most."""
-_WARNINGS = 3
+_DROPPED = "should be sorted by departure time, ignoring"
+_WARNINGS = 8
 """Most warnings of the simulator that are shown."""
 _RUN_DEADLINE = 60.0
 """Longest run (s), where the scenario looks at the clock."""
@@ -193,7 +195,7 @@ def _all_ok(runs: list[_Run], points: Sequence[Values]) -> Finding:
     bad = [f"at {written(p)}: {r.problem}" for r, p in zip(runs, points, strict=True) if r.problem]
     invalid = [r for r in runs if r.problem.startswith(str(Status.INVALID))]
     fine = bool(runs) and not runs[0].problem and len(bad) == len(invalid) <= _FEW_INVALID * len(runs)
-    how = "failed" if not fine else "invalid"
+    how = "invalid" if len(bad) == len(invalid) else "gave no metric"
     return Finding("centre and corners run", fine, f"{len(bad)} of {len(runs)} {how}; {bad[0]}" if bad else f"{len(runs)} runs")
 
 
@@ -252,7 +254,14 @@ def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: 
 def _warned(spec: ScenarioSpec) -> list[Finding]:
     """Return what the simulator warned of in the last run, where the scenario passes it on (a user's own SUMO files)."""
     said = getattr(spec.resolve().simulate, "warnings", None)
-    lines = () if said is None else said()
+    every = () if said is None else said()
+    dropped = [line.rpartition("ignoring ")[2].rstrip("!") for line in every if _DROPPED in line]
+    detail = f"SUMO leaves out {', '.join(dropped)}: a route file must be sorted by departure"
+    complete = [Finding("all traffic of the files is there", ok=False, detail=detail)] if dropped else []
+    return [*complete, *_warnings([line for line in every if _DROPPED not in line])]
+
+
+def _warnings(lines: Sequence[str]) -> list[Finding]:
     more = f" (and {len(lines) - _WARNINGS} more)" if len(lines) > _WARNINGS else ""
     detail = "; ".join(line.removeprefix("Warning: ") for line in lines[:_WARNINGS]) + more
     return [Finding("for information: SUMO warns", ok=True, detail=detail)] if lines else []
@@ -285,6 +294,8 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:
     detail = "; ".join(f"{breach} ({written(values)})" for breach, values in first.values())
     if any(name.startswith(("sideways", "lateral")) for name in first):
         detail += _INSTANTLY
+    if any(name.startswith("walking") for name in first):
+        detail += _MOVED
     return [Finding("for information: laws of motion are broken", ok=True, detail=f"in {share}: {detail}")]
 
 
