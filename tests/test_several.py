@@ -7,10 +7,12 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 import sbt
+from sbt.campaigns.each import independence_words
 from sbt.config.assemble import scenario_of
 from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.estimators.surrogate import fit_log_probability
+from sbt.loop.several import independence
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.joint import JointMetamodel, JointPrediction, joined_log_probability
 from sbt.metamodels.prediction import Prediction
@@ -80,6 +82,16 @@ def _joint(n: int = 6) -> tuple[JointPrediction, CombinedInterval]:
     parts = [Prediction.gaussian(rng.normal(m, 1, n), rng.uniform(0.3, 2, n)) for m in (1.5, 4.0, 0.5)]
     critical = NESTED.critical.with_leaves(NESTED.critical.leaves, (1.0, 2.0, 0.5))
     return JointPrediction.of(parts, critical), critical
+
+
+@pytest.mark.parametrize(("sign", "above", "often"), [(1, False, "likelier"), (-1, False, "less likely"), (-1, True, "likelier")])
+def test_what_metrics_share_beside_the_inputs_is_said_with_its_direction(sign, above, often):
+    noise = np.random.default_rng(0).standard_normal(60)
+    second = Requirement("b", low=0.0) if above else Requirement("b", high=0.0)
+    parts = tuple(Prediction.gaussian(np.zeros(60), np.ones(60)) for _ in range(2))
+    joint = JointPrediction.of(parts, all_of(Requirement("a", high=0.0), second).critical)
+    found = independence((Requirement("a", high=0.0), second), joint, np.column_stack([noise, sign * noise]))
+    assert f"both at once are {often} than it states" in independence_words(found)[0]
 
 
 def test_a_prediction_of_the_margin_is_that_of_independent_metrics():

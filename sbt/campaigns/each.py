@@ -191,4 +191,6 @@ def independence_words(found: Independence | None) -> list[str]:
     if abs(found.correlation) * np.sqrt(found.runs) < 2.0:
         return [f"{said}: no sign that the requirements are not independent given the inputs."]
     much = "slightly off" if abs(found.correlation) < _CORRELATED else "off"
-    return [f"{said}: P(critical) of the combination takes them as independent, and is {much} where both are unsure."]
+    told = f"{said}: P(critical) of the combination takes them as independent, and is {much} where both are unsure"
+    often = "likelier" if found.together else "less likely"
+    return [f"{told}{'' if found.together is None else f': both at once are {often} than it states'}."]

@@ -11,7 +11,7 @@ import numpy as np
 from sbt.metamodels.joint import JointPrediction, JointPredictor
 from sbt.metamodels.scores import scores
 from sbt.problem.arrays import Points, Vector
-from sbt.problem.requirement import Requirement
+from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.store.records import Independence, RequirementFit, Validation
 
 __all__ = ["each_requirement", "independence"]
@@ -60,8 +60,15 @@ def independence(parts: Sequence[Requirement], prediction: JointPrediction, y: P
         a, b = (_ranks(residuals[k][both]) for k in (i, j))
         if len(a) >= _FEWEST and a.std() > 0 and b.std() > 0:
             correlation = float(np.corrcoef(a, b)[0, 1])
-            found.append(Independence((parts[i].label, parts[j].label), correlation, len(a)))
+            sides = _side(parts[i].critical) * _side(parts[j].critical)
+            together = None if sides == 0 else correlation * sides > 0
+            found.append(Independence((parts[i].label, parts[j].label), correlation, len(a), together))
     return max(found, key=lambda one: abs(one.correlation)) if found else None
+
+
+def _side(critical: CriticalInterval) -> int:
+    """Return on which side a metric is critical: -1 below, 1 above, 0 between two ends."""
+    return int(np.isinf(critical.low)) * -1 + int(np.isinf(critical.high))
 
 
 def _ranks(values: Vector) -> Vector:

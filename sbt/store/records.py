@@ -124,11 +124,13 @@ class Independence:
         between: the two requirements whose residuals correlate most.
         correlation: of the ranks of their residuals on runs that no metamodel had seen; 0 where they are independent.
         runs: of which it was taken.
+        together: whether both are critical at once more often than it states; None: a critical interval has two ends.
     """
 
     between: tuple[str, str]
     correlation: float
     runs: int
+    together: bool | None = optional()
 
 
 @dataclass(frozen=True)
