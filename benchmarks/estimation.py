@@ -20,6 +20,7 @@ import numpy as np
 from resumed import arguments, collect, seeds
 from scipy.integrate import quad
 from scipy.stats import gamma, norm
+from scipy.stats import t as student_t
 
 import sbt
 from sbt.testbeds import truth
@@ -41,6 +42,26 @@ HARD = {
     "linear_d80@2000": 0.30,
 }  # fmt: skip
 """The same with noise, a sharp edge in ten inputs, uniform inputs, and many inputs."""
+
+
+def _line(name: str, drawn) -> sbt.Scenario:
+    """Return a line in two normal inputs, and what a seed draws beside it."""
+
+    def evaluate(values: dict, seed: int) -> dict:
+        return {"m": drawn(3.5 - values["a"] - 0.3 * values["b"], np.random.default_rng(seed))}
+
+    inputs = [sbt.Parameter(each, -6.0, 6.0, "", sbt.Normal(0, 1)) for each in "ab"]
+    return sbt.Scenario(name, inputs, sbt.Requirement("m", high=0.0), evaluate=evaluate, metrics=["m"])
+
+
+def _of_line(given: float | None = None, degrees: float = 1.5) -> float:
+    """Return P(critical): of the share of seeds that fail anywhere, or of Student-t noise of width 0.05."""
+    if given is not None:
+        return given + (1.0 - given) * norm.sf(3.5 / math.sqrt(1.09))
+    noise, edge = student_t(degrees), 3.5 / math.sqrt(1.09)
+    return quad(lambda z: norm.pdf(z) * noise.cdf((z - edge) * math.sqrt(1.09) / 0.05), -9.0, 9.0, points=[edge], limit=500)[0]
+
+
 _EXPONENTIAL = {"distribution": {"kind": "exponential", "mean": 1}, "min": 0, "max": math.inf}
 LAWS = {
     "copula@200": (
@@ -63,6 +84,9 @@ LAWS = {
         {"inputs": {"d_v": sbt.Normal(15, 12), "d_t": sbt.LogNormal(1.8, 0.9)}},
         0.00238,  # 400,000 crude runs, seeds 101 and 102: 0.00223 to 0.00254
     ),
+    "heavy_noise@200": (_line("heavy_noise", lambda m, rng: m + 0.05 * rng.standard_t(1.5)), {}, _of_line()),
+    "few_seeds@200": (_line("few_seeds", lambda m, rng: m if rng.random() > 0.003 else -2.0), {}, _of_line(0.003)),
+    "more_seeds@200": (_line("more_seeds", lambda m, rng: m if rng.random() > 0.02 else -2.0), {}, _of_line(0.02)),
     "noisy@200": ("testbed:four_branch_noisy", {}, truth("four_branch_noisy").probability),
 }  # fmt: skip
 """Name@runs: scenario, what the configuration changes of it, and the probability; the testbeds' own inputs are unbounded."""
