@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,10 @@ from sbt.problem.plain import check_table
 __all__ = ["KernelDensity", "kernel_density", "silverman"]
 
 _FEWEST = 10
+_TERMS = 2_000_000  # distances between points and values that are held at once
+_RARE = 1e-290  # mass below which its log is summed in logs
+_MOST_NODES, _STEPS = 20_000, 60  # tabulated points, and steps from them at most
+_NEAR = 1e-5  # step, in bandwidths, after which the next one would be of rounding
 
 
 def silverman(values: Vector) -> float:
@@ -49,22 +53,27 @@ class KernelDensity:
     values: Vector
     bandwidth: float
 
-    def _terms(self, x: ArrayLike) -> NDArray[np.float64]:
-        return (np.asarray(x, dtype=np.float64)[..., None] - self.values) / self.bandwidth
+    def _over(self, x: ArrayLike, of_terms: Callable[[NDArray[np.float64]], Vector]) -> Vector:
+        """Return a function of the distances to all values, in bandwidths, at each x; few at a time, for the memory."""
+        points = np.asarray(x, dtype=np.float64)
+        flat, size = points.reshape(-1), max(_TERMS // len(self.values), 1)
+        found = np.empty(len(flat))
+        for k in range(0, len(flat), size):
+            found[k : k + size] = of_terms((flat[k : k + size, None] - self.values) / self.bandwidth)
+        return found.reshape(points.shape)
 
     def cdf(self, x: ArrayLike) -> Vector:
         """Return P(X <= x)."""
-        return np.asarray(ndtr(self._terms(x)).mean(axis=-1))
+        return self._over(x, lambda terms: ndtr(terms).mean(axis=-1))
 
     def sf(self, x: ArrayLike) -> Vector:
         """Return P(X > x)."""
-        return np.asarray(ndtr(-self._terms(x)).mean(axis=-1))
+        return self._over(x, lambda terms: ndtr(-terms).mean(axis=-1))
 
     def logpdf(self, x: ArrayLike) -> Vector:
         """Return the log density."""
-        terms = -0.5 * self._terms(x) ** 2
         norm = math.log(len(self.values) * self.bandwidth * math.sqrt(2.0 * math.pi))
-        return np.asarray(logsumexp(terms, axis=-1)) - norm
+        return self._over(x, lambda terms: logsumexp(-0.5 * terms**2, axis=-1)) - norm
 
     def ppf(self, q: ArrayLike) -> Vector:
         """Return the q quantile."""
@@ -76,16 +85,63 @@ class KernelDensity:
         with np.errstate(divide="ignore"):
             return self._solved(np.log(np.asarray(q, dtype=np.float64)), -1.0)
 
+    def _log_mass(self, x: ArrayLike, side: float) -> Vector:
+        """Return log P(side X <= side x)."""
+
+        def log_mass(terms: NDArray[np.float64]) -> Vector:
+            mass = ndtr(side * terms).mean(axis=-1)
+            found, rare = np.log(np.maximum(mass, _RARE)), mass < _RARE
+            found[rare] = logsumexp(log_ndtr(side * terms[rare]), axis=-1) - math.log(len(self.values))
+            return np.asarray(found)
+
+        return self._over(x, log_mass)
+
+    @cached_property
+    def _nodes(self) -> Vector:
+        """(m,) x from 40 bandwidths below the least value to 40 above the largest, dense where values are."""
+        low, high, h = float(self.values[0]), float(self.values[-1]), self.bandwidth
+        inner = np.linspace(low - 8.0 * h, high + 8.0 * h, min(math.ceil(8.0 * ((high - low) / h + 16.0)) + 1, _MOST_NODES))
+        outer = h * np.arange(8.25, 40.25, 0.25)
+        return np.concatenate([(low - outer)[::-1], inner, high + outer])
+
+    @cached_property
+    def _tables(self) -> Mapping[float, tuple[Vector, Vector, Vector]]:
+        """For each side increasing log P(side X <= side x) at nodes, x there, and the derivative of x by it."""
+        x, found = self._nodes, {}
+        density = self.logpdf(x)
+        for side in (1.0, -1.0):
+            mass = self._log_mass(x, side)
+            order = np.flatnonzero(np.diff(side * mass, prepend=-np.inf) > 0.0)[:: int(side)]
+            found[side] = mass[order], x[order], side * np.exp(np.minimum(mass - density, 700.0))[order]
+        return found
+
     def _solved(self, log_q: Vector, side: float) -> Vector:
-        """Return x with log P(side X <= side x) = log_q by bisection; infinite at q = 0 and 1."""
-        low = np.full(log_q.shape, self.values[0] - 40.0 * self.bandwidth)
-        high = np.full(log_q.shape, self.values[-1] + 40.0 * self.bandwidth)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            mass = logsumexp(log_ndtr(side * self._terms(middle)), axis=-1) - math.log(len(self.values))
-            below = (mass < log_q) if side > 0 else (mass > log_q)
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        return np.asarray(np.where(np.isneginf(log_q), -side * np.inf, np.where(log_q >= 0.0, side * np.inf, high)))
+        """Return x with log P(side X <= side x) = log_q; infinite at q = 0 and 1.
+
+        A cubic between tabulated points, then Newton steps within their interval, halves of it where one leaves it.
+        """
+        mass, x, slope = self._tables[side]
+        k = np.clip(np.searchsorted(mass, log_q) - 1, 0, len(mass) - 2)
+        width = mass[k + 1] - mass[k]
+        t = np.clip((log_q - mass[k]) / width, 0.0, 1.0)
+        a, b = np.minimum(x[k], x[k + 1]), np.maximum(x[k], x[k + 1])
+        at = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * x[k] + t**2 * (3.0 - 2.0 * t) * x[k + 1]
+        at = np.clip(at + width * t * (1.0 - t) * ((1.0 - t) * slope[k] - t * slope[k + 1]), a, b)
+        at, a, b, flat = at.reshape(-1), a.reshape(-1).copy(), b.reshape(-1).copy(), log_q.reshape(-1)
+        left = np.flatnonzero(np.isfinite(flat) & (flat < 0.0))
+        for _ in range(_STEPS):
+            y = at[left]
+            log_mass = self._log_mass(y, side)
+            error = log_mass - flat[left]
+            above = error * side > 0.0
+            a[left], b[left] = np.where(above, a[left], y), np.where(above, y, b[left])
+            moved = y - error * np.exp(np.minimum(log_mass - self.logpdf(y), 700.0)) * side
+            at[left] = np.where((moved >= a[left]) & (moved <= b[left]), moved, 0.5 * (a[left] + b[left]))
+            left = left[np.abs(at[left] - y) > _NEAR * self.bandwidth]
+            if len(left) == 0:
+                break
+        at = at.reshape(log_q.shape)
+        return np.asarray(np.where(np.isneginf(log_q), -side * np.inf, np.where(log_q >= 0.0, side * np.inf, at)))
 
 
 def kernel_density(given: Mapping[str, float | str]) -> KernelDensity:
