@@ -350,7 +350,7 @@ def test_a_campaign_speaks_in_words_and_is_the_same_with_workers_and_after_a_sto
     mode = sbt.open(tmp_path / "a").conclusion.failure_modes[0]  # from the JSON
     assert mode.inputs["kind"] == BAD
     assert {one.history.inputs(int(run))["kind"] for run in mode.runs} == {BAD}
-    assert f"'kind': '{BAD}'" in html.unescape(one.report().read_text())  # in the command that runs it again
+    assert f">{BAD}<" in html.unescape(one.report().read_text())  # in the table of critical runs
     assert one.export("csv").read_text().splitlines()[1].split(",")[5] in KINDS
     table = one.predict({"v": 10.0, "gap": 40.0, "kind": list(KINDS)})
     assert int(table["mean"].argmin()) == KINDS.index(BAD)
@@ -522,3 +522,20 @@ def test_shards_of_a_campaign_with_choices_join_to_the_whole(tmp_path):
     merge_shards(stores[1:], tmp_path / "merged", report=False)
     rows = ["index", "x.v", "x.kind", "y.m", "seed"]
     assert sbt.open(tmp_path / "merged").frame[rows].equals(sbt.open(tmp_path / "whole").frame[rows])
+
+
+@pytest.mark.parametrize(
+    ("edge", "said"), [(-1.0, "None of all 50 combinations of the inputs"), (6.5, "every combination of the inputs was run")]
+)
+def test_a_falsification_says_where_every_combination_was_run(tmp_path, edge, said):
+    inputs = [sbt.Parameter("i", 1, 10, kind="integer"), sbt.Parameter("j", 1, 5, kind="integer")]
+
+    def evaluate(values, seed):
+        return {"m": float(3 * abs(values["i"] - 7) + values["j"] + 4)}
+
+    grid = sbt.Scenario("grid", inputs, sbt.Requirement("m", high=edge), evaluate=evaluate, metrics=["m"])
+    result = sbt.run(campaign="falsification", scenario=grid, budget=60, store=tmp_path, executor="serial", report=False)
+    told = " ".join(result.sentences())
+    assert said in told
+    assert "a larger budget" not in told
+    assert "no other mode" not in told

@@ -385,7 +385,7 @@ def test_check_prints_one_json_object(folder: Path, name: str, ok: bool, code: i
 @pytest.mark.parametrize(
     ("name", "rule"),
     [
-        ("REFUSED", "centre and corners run: 5 of 5 failed; at speed=5, gap=3: invalid: the start is not"),
+        ("REFUSED", "centre and corners run: 5 of 5 invalid; at speed=5, gap=3: invalid: the start is not"),
         ("UNSTEADY", "same seed, same trace: at speed=5, gap=3: margin 1.0 and 10.0"),
         ("ELSEWHERE", "same seed, same trace in a worker process: at speed=5, gap=3: margin "),
     ],

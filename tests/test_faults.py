@@ -477,7 +477,7 @@ def test_check_tells_what_code_raises(rude: Path):
     rude.write_text(text)
     done = CliRunner().invoke(app, ["check", f"{rude}:DEAF"])
     assert done.exit_code == 2
-    assert "failed; at a=0.5, b=0.5: failed: SystemExit: no (" in done.stdout
+    assert "gave no metric; at a=0.5, b=0.5: failed: SystemExit: no (" in done.stdout
     done = CliRunner().invoke(app, ["simulate", f"{rude}:DEAF"])
     assert (done.exit_code, "failed: SystemExit: no (" in done.stdout) == (4, True)
     other = rude.with_name("exits.py")

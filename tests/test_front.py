@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import html
 import importlib.util
 import json
 import math
+import re
 import shutil
 import statistics
 import subprocess
@@ -228,7 +230,7 @@ def test_a_store_made_with_an_object_opens_without_it(store):
         ax = getattr(result.plot, name)()
         assert ax.get_xlabel(), name
         matplotlib.pyplot.close(ax.figure)
-    assert "sbt.simulate(disc, {" in result.report().read_text()
+    assert re.search(r"sbt\.open\(.*, scenario=disc\)\.replay\(\d+\)", html.unescape(result.report().read_text()))
     again = sbt.open(store, scenario=scenario_of())
     assert again.replay(3).identical
     assert again.frame.equals(frame)

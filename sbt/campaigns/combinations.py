@@ -9,13 +9,15 @@ from scipy.spatial.distance import cdist
 
 from sbt.campaigns.repeats import repeats_wanted, simulator_noise
 from sbt.campaigns.wording import percent
+from sbt.loop.stages import Facts
 from sbt.problem.arrays import Points
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.samplers.sobol import SobolSequence
 from sbt.store.history import History
 
-__all__ = ["ALL_RUN", "EveryCombination", "all_run", "combinations_left", "every_combination", "few", "without_repetition"]
+__all__ = ["ALL_RUN", "EveryCombination", "all_run", "combinations_left", "every_combination", "few", "none_left",
+           "without_repetition"]  # fmt: skip
 
 ALL_RUN = "all combinations"
 """Why a campaign stops that has run every combination of its inputs."""
@@ -84,6 +86,14 @@ def every_combination(scenario: LogicalScenario, history: History) -> EveryCombi
         return None
     first = np.unique(history.x, axis=0, return_index=True)[1]
     return EveryCombination(len(first), int(scenario.requirement.critical_runs(history)[first].sum()))
+
+
+def none_left(facts: Facts) -> bool:
+    """Return whether every combination was run and gave a metric, the same wherever it was repeated."""
+    history, n = facts.history, facts.combinations
+    if n is None or len(history) < n or len(np.unique(history.x, axis=0)) < n or not history.ok.all():
+        return False
+    return simulator_noise(history, facts.requirement).noisy is False
 
 
 def without_repetition(scenario: LogicalScenario, history: History, x: Points, *, continuous: bool = True) -> Points:

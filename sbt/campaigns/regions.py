@@ -101,7 +101,7 @@ def regions_words(regions: tuple[CriticalRegion, ...], inputs: tuple[str, ...], 
     for region in large[:_TOLD]:
         ends = [(name, region.extent[name].low, region.extent[name].high) for name in inputs]
         along = [f"{name} {number(low, 3)} to {measured('', high, units.get(name, '')).strip()}" for name, low, high in ends]
-        told.append(f"{percent(region.share)} of the parameter space with {' and '.join(along)}")
+        told.append(f"{percent(region.share)} of the parameter space, nine tenths of it with {' and '.join(along)}")
     small = "" if len(large) == len(regions) else f" ({plural(len(regions) - len(large), 'smaller one')} aside)"
     largest = "" if len(large) <= _TOLD else f", the {_TOLD} largest of them"
     return f"it lies in one of {len(large)} separate regions{small}{largest}: {'; '.join(told)} (by the metamodel)"

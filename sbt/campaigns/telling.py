@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sbt.campaigns.combinations import none_left
 from sbt.campaigns.lost import (
     decides_bound,
     decides_share,
@@ -178,16 +179,18 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         f" {'was' if found.critical_runs == 1 else 'were'} critical ({_condition(facts)}), the first after"
         f" {plural(found.runs_to_first or 0, 'run')}, in {most}{plural(len(modes), 'distinct failure mode')}{worst}."
     )
-    silent = "This does not tell how probable a failure is, since results chose the runs, nor that there is no other mode"
+    other = "" if none_left(facts) else ", nor that there is no other mode"
+    silent = f"This does not tell how probable a failure is, since results chose the runs{other}"
     if random.critical_fraction is not None:
         few = "too few to meet what is rare" if random.critical_fraction == 0.0 else "all that may be read as a share"
         silent += (
             f"; the {plural(random.counted, 'run')} among them drawn at random say {percent(random.critical_fraction)} of the"
             f" parameter space ({ends(random)}), {few}"
         )
-    never = "" if often is None or often.confirmed != 0.0 else ", with its own seed, as no repetition failed"
+    never = ", with its own seed, as no repetition failed" if often is not None and often.confirmed == 0.0 else ""
     look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "
-    more = f"{look}campaign: estimation says how probable failures are, a larger budget looks for more modes"
+    rest = "every combination of the inputs was run" if none_left(facts) else "a larger budget looks for more modes"
+    more = f"{look}campaign: estimation says how probable failures are, {rest}"
     return [said, f"{silent}.", f"Next: {more}."]
 
 
@@ -224,6 +227,9 @@ def _worst(mode: FailureMode, facts: Facts) -> str:
 
 def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
     bound = found.bound
+    if none_left(facts):
+        said = f"None of all {facts.combinations:,} combinations of the inputs{_of(facts)} is critical ({_condition(facts)})"
+        return [f"{said}; all were run.", "This does not tell of other values.", "Next: wider ranges, if other values matter."]
     searched = plural(len(facts.history), "run")
     said = f"The requirement{_of(facts)} was not falsified: none of {searched} was critical ({_condition(facts)})"
     silent = "This does not tell that there is no failure: guided runs bound nothing"
@@ -242,8 +248,8 @@ def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
     closest = found.closest
     if closest is not None:
         further += f"; {nearest_words(closest.run, measured(facts.requirement.told_as, closest.metric, facts.unit), facts)}"
-    silent += ", and a failure in a small part of the space may be there"
-    return [f"{said}.", f"{silent}.", f"Next: {_every_combination(facts)}{further}."]
+    silent += ", and a failure in a small part of the space may be there."
+    return [f"{said}.", silent, f"Next: {_every_combination(facts)}{further}."]
 
 
 def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:

@@ -11,14 +11,15 @@ from sbt.problem.arrays import Points
 from sbt.problem.covariates import Covariates
 from sbt.problem.plain import Values
 from sbt.problem.scenario import LogicalScenario
-from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import stream
 from sbt.workflows.findings import Finding
 
 __all__ = ["covariates_first"]
 
 _RULE = "covariates are known before the run"
 _SPREAD = 200
-"""Further pairs, spread over the space, of which they must be finite: what only few seeds draw would stop a campaign."""
+"""Further pairs, drawn from the inputs' distribution, of which they must be finite: what few seeds draw would stop a
+campaign."""
 
 
 def covariates_first(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> Callable[[], list[Finding]]:
@@ -53,9 +54,7 @@ def _computed(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> 
         if found is None:
             return None, (), ""
         x = np.array([[p.number(values[p.name]) for p in scenario.space.parameters] for values, _ in jobs])
-        spread = scenario.space.from_unit(SobolSequence(scenario.space.dimension, 0).points(0, _SPREAD))
-        spread = spread[scenario.space.feasible(spread)]
-        found.at(spread, range(len(spread)), keep=False)
+        found.at(scenario.space.sample(_SPREAD, stream(0, "covariates")), range(_SPREAD), keep=False)
         return found.at(x, [seed for _, seed in jobs]), found.names, ""
     except SbtError as error:
         return None, (), str(error)
