@@ -86,7 +86,8 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
         told.append(f"and {len(inputs) - _MOST_INPUTS} more inputs")
     said = [f"run {mode['representative']}, {measured(metric, mode['metric'])}, at {', '.join(told)}"]
     said += [str(mode["conflict"])] if mode.get("conflict") else []
-    said.append(f"{mode['size']} critical run{'' if mode['size'] == 1 else 's'}")
+    violating = ", ".join(name if n == mode["size"] else f"{name} in {n}" for name, n in (mode.get("violates") or {}).items())
+    said.append(f"{mode['size']} critical run{'' if mode['size'] == 1 else 's'}{violating and f', violating {violating}'}")
     if mode.get("confirmed") is not None:
         n = mode["confirmation_runs"]
         from sbt.campaigns.lost import repetitions
