@@ -198,8 +198,8 @@ def test_failure_modes_are_told_by_names_and_units_and_what_to_try_next():
         "confirmed": 0.5, "confirmation_runs": 4, "unconfirmed": 1, "violates": {"near": 3, "fast": 1},
     }  # fmt: skip
     found = conclusion_lines({**RESULT, "store": "a b", "conclusion": {"failure_modes": [mode], "warnings": ["few runs"]}})
-    told = "run 7, margin -0.5, at gap 1.23 m, kind bus; rear end; 3 critical runs, violating near, fast in 1; critical again in 2 of 4"
-    told += " repetitions; 1 with"
+    told = "run 7, margin -0.5, at gap 1.23 m, kind bus; rear end; 3 critical runs, violating near, fast in 1;"
+    told += " critical again in 2 of 4 repetitions; 1 with"
     assert found[3:] == [
         f"  mode 1: {told} a contact that SUMO does not list", "  warning: few runs", "store: a b",
         "next: sumo-sbt replay 'a b' 7",
