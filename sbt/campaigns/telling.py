@@ -179,8 +179,8 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         f" {'was' if found.critical_runs == 1 else 'were'} critical ({_condition(facts)}), the first after"
         f" {plural(found.runs_to_first or 0, 'run')}, in {most}{plural(len(modes), 'distinct failure mode')}{worst}."
     )
-    other = "" if none_left(facts) else ", nor that there is no other mode"
-    silent = f"This does not tell how probable a failure is, since results chose the runs{other}"
+    exhausted, silent = none_left(facts), "This does not tell how probable a failure is, since results chose the runs"
+    silent += "" if exhausted else ", nor that there is no other mode"
     if random.critical_fraction is not None:
         few = "too few to meet what is rare" if random.critical_fraction == 0.0 else "all that may be read as a share"
         silent += (
@@ -189,7 +189,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         )
     never = ", with its own seed, as no repetition failed" if often is not None and often.confirmed == 0.0 else ""
     look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "
-    rest = "every combination of the inputs was run" if none_left(facts) else "a larger budget looks for more modes"
+    rest = "every combination of the inputs was run" if exhausted else "a larger budget looks for more modes"
     more = f"{look}campaign: estimation says how probable failures are, {rest}"
     return [said, f"{silent}.", f"Next: {more}."]
 

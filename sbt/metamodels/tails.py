@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import gammaincinv
 
@@ -33,18 +36,10 @@ def student_widths(residual: Vector) -> Vector:
     Source:
         Geweke (1993): a Student-t is a scale mixture of Gaussians; here at 7 quantiles of the scale.
     """
-    best = np.ones(1)
-    if len(residual) < _FEWEST:
-        return best
-    best_value = _log_likelihood(residual, best) + _PRICE
     level = (np.arange(_COMPONENTS) + 0.5) / _COMPONENTS
-    for degrees in _DEGREES:
-        shape = 1.0 / np.sqrt(gammaincinv(0.5 * degrees, level) / (0.5 * degrees))
-        for width in np.geomspace(0.3, 1.5, 25):
-            value = _log_likelihood(residual, width * shape)
-            if value > best_value:
-                best, best_value = width * shape, value
-    return best
+    weight = np.full(_COMPONENTS, 1.0 / _COMPONENTS)
+    found = _likeliest(residual, _DEGREES, np.geomspace(0.3, 1.5, 25), level, weight, _PRICE)
+    return np.ones(1) if found is None else found
 
 
 def student_mixture(residual: Vector) -> tuple[Vector, Vector] | None:
@@ -60,22 +55,33 @@ def student_mixture(residual: Vector) -> tuple[Vector, Vector] | None:
         Geweke (1993); degrees of freedom and width of largest likelihood; more likely than the Gaussian by Schwarz's criterion,
         as a wrong tail costs an estimation more than no tail gains where it is light.
     """
-    if len(residual) < _FEWEST:
-        return None
     edges = np.array(_LEVELS)
     weight, level = np.diff(edges), np.sqrt(np.maximum(edges[:-1], 0.1 * edges[1:]) * edges[1:])
-    best, best_value = None, _log_likelihood(residual, np.ones(1)) + np.log(len(residual))
-    for degrees in (*_HEAVIEST, *_DEGREES):
-        shape = 1.0 / np.sqrt(gammaincinv(0.5 * degrees, level) / (0.5 * degrees))
-        for width in np.geomspace(0.1, 1.5, 40):
+    price = math.log(max(len(residual), 1))
+    found = _likeliest(residual, (*_HEAVIEST, *_DEGREES), np.geomspace(0.1, 1.5, 40), level, weight, price)
+    return None if found is None else (found, weight)
+
+
+def _likeliest(
+    residual: Vector, degrees: Sequence[float], widths: Vector, level: Vector, weight: Vector, price: float
+) -> Vector | None:
+    """Return the factors of largest likelihood among Student-t of these degrees of freedom and widths.
+
+    None where the Gaussian is as likely but for a price, or residuals are few.
+    """
+    if len(residual) < _FEWEST:
+        return None
+    best, most = None, _log_likelihood(residual, np.ones(1), np.ones(1)) + price
+    for each in degrees:
+        shape = 1.0 / np.sqrt(gammaincinv(0.5 * each, level) / (0.5 * each))
+        for width in widths:
             value = _log_likelihood(residual, width * shape, weight)
-            if value > best_value:
-                best, best_value = width * shape, value
-    return None if best is None else (best, weight)
+            if value > most:
+                best, most = width * shape, value
+    return best
 
 
-def _log_likelihood(residual: Vector, widths: Vector, weight: Vector | None = None) -> float:
-    """Return the log likelihood of Gaussians with mean 0, equally likely or with (k,) probabilities, but for a constant."""
-    shares = np.full(len(widths), 1.0 / len(widths)) if weight is None else weight
-    terms = -0.5 * (residual / widths[:, None]) ** 2 - np.log(widths)[:, None] + np.log(shares)[:, None]
+def _log_likelihood(residual: Vector, widths: Vector, weight: Vector) -> float:
+    """Return the log likelihood of Gaussians with mean 0 and (k,) probabilities, but for a constant."""
+    terms = -0.5 * (residual / widths[:, None]) ** 2 - np.log(widths)[:, None] + np.log(weight)[:, None]
     return float(np.logaddexp.reduce(terms, axis=0).sum())

@@ -144,7 +144,6 @@ def snapshot_of(
     varies = _varying(pieces, moved)
     constant = [piece for piece, changes in zip(pieces, varies, strict=True) if not changes]
     varying = tuple(piece for piece, changes in zip(pieces, varies, strict=True) if changes)
-    _check_sorted(files, constant, begin)
     if not adding and not any(piece.is_traffic for piece in varying):
         raise NoSnapshot("the ego is not in the files")
     end = _end_of_warm_up(varying, space, begin, step, asked) if until is None else until
@@ -155,6 +154,7 @@ def snapshot_of(
             f"{place}: the simulation must go on after the warm-up, which ends at {end:g} s, but the option end is {over:g} s"
         )
     moving = [(_constant_departure(piece, begin), piece) for piece in constant if piece.is_traffic]
+    _check_sorted(files, moving)
     moving.sort(key=lambda each: each[0])
     before = tuple(piece for time, piece in moving if time < end)
     if asked is None and until is None:
@@ -266,12 +266,11 @@ def _constant_departure(piece: Piece, begin: float) -> float:
     return begin if piece.departs is None and piece.tag.lower().endswith("flow") else _departure(piece, {})
 
 
-def _check_sorted(files: SumoFiles, constant: Sequence[Piece], begin: float) -> None:
+def _check_sorted(files: SumoFiles, moving: Sequence[tuple[float, Piece]]) -> None:
     """Refuse route files of which SUMO would leave out a part, as it is not sorted: a warm-up would have that traffic."""
     last: dict[Path, tuple[float, Piece]] = {}
-    for piece in constant:
-        if piece.is_traffic and piece.file.path in files.routes:
-            time = _constant_departure(piece, begin)
+    for time, piece in moving:
+        if piece.file.path in files.routes:
             latest, before = last.get(piece.file.path, (time, piece))
             if time < latest:
                 rule = "a route file must be sorted by departure, as SUMO leaves out what is not"

@@ -119,7 +119,7 @@ class UserSimulation:
     def periods(self) -> tuple[Period, ...]:
         """In which times drivers act, where that is not every step."""
         found = periods_of([one.driver for one in (self.recording.ego, *self.recording.further)], self.files)
-        return (*found, ("the warm-up", self._warmed.snapshot.lasts)) if self.isolation.warm else found
+        return (*found, ("the warm-up", self._divided(self.space, self.isolation.until).lasts)) if self.isolation.warm else found
 
     def configured(
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
