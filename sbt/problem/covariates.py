@@ -133,6 +133,6 @@ def _told(source: DrawsAhead, values: Values, seed: int) -> Mapping[str, float] 
     if found is not None and not isinstance(found, Mapping):
         raise InputError(f"known_before must return numbers by name, or None, but is {found!r} {where}")
     for name, value in (found or {}).items():
-        if not isinstance(value, Real):
+        if not isinstance(value, float | Real):
             raise InputError(f"covariate {name} must be a number, but is {value!r} {where}")
     return found

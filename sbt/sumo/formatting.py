@@ -35,4 +35,4 @@ def format_number(value: SupportsFloat) -> str:
     >>> format_number(0.1), format_number(np.float64(0.1)), format_number(np.int64(2)), format_number(2.0)
     ('0.1', '0.1', '2', '2.0')
     """
-    return str(int(value)) if isinstance(value, Integral) else repr(float(value))
+    return repr(float(value)) if isinstance(value, float) or not isinstance(value, Integral) else str(int(value))

@@ -114,14 +114,13 @@ def gaps(
 def first_gap(arrivals: Arrivals, ready: float, length: float) -> dict[str, float]:
     """Return when the first gap longer than this begins (`wait`), how long it is (`gap`) and who ends it (`closing`); s, m/s."""
     relative = arrivals.time - ready
-    coming, speed = relative[relative > 0.0], arrivals.speed[relative > 0.0]
-    begin = np.concatenate([[0.0], coming])
-    end = np.concatenate([coming, [begin[-1] + FAR + max(length, 0.0)]])
-    k = int(np.argmax(end - begin > length))
-    return {
-        "wait": min(float(begin[k]), FAR), "gap": min(float(end[k] - begin[k]), _LONG),
-        "closing": float(speed[k]) if k < len(speed) else 0.0,
-    }  # fmt: skip
+    ahead = relative > 0.0
+    begin, speed = 0.0, arrivals.speed[ahead].tolist()
+    for end, closing in zip(relative[ahead].tolist(), speed, strict=True):
+        if end - begin > length:
+            return {"wait": min(begin, FAR), "gap": min(end - begin, _LONG), "closing": closing}
+        begin = end
+    return {"wait": min(begin, FAR), "gap": min(begin + FAR + max(length, 0.0) - begin, _LONG), "closing": 0.0}
 
 
 def taken_gap(arrivals: Arrivals, ready: float, need: Vector, into: float, out_of: float) -> dict[str, float]:
