@@ -35,7 +35,7 @@ from sbt.report.influence import influence_of
 from sbt.report.modes import _change
 from sbt.report.projection import influence_from_runs, most_influential_pairs, probability_plane
 from sbt.report.style import figure_style, new_figure, to_svg
-from sbt.report.tables import critical_table, iteration_table
+from sbt.report.tables import critical_table, iteration_table, of_run
 from sbt.report.words import Findings, requirement_words, warnings_for
 from sbt.samplers.sobol import SobolSequence
 from sbt.store.database import PlannedRun, Store
@@ -462,3 +462,15 @@ def test_where_every_run_failed_the_first_sentence_says_so(tmp_path):
         text = page_of(store, scenario, None, CoverageConclusion(None, 0.0, 1.0)).text
     assert "Nothing is known of wedge: none of 10 runs gave a metric." in text
     assert 'id="figure-progress"' not in text
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("sumo-sbt replay 'RUN 1/RUN' RUN", "sumo-sbt replay 'RUN 1/RUN' 7"),
+        ("sumo-sbt replay runs/RUNS RUN --gif RUN.gif", "sumo-sbt replay runs/RUNS 7 --gif 7.gif"),
+        ("sbt.open('RUN', scenario=s).replay(RUN)", "sbt.open('RUN', scenario=s).replay(7)"),
+    ],
+)
+def test_a_command_of_a_run_leaves_the_name_of_the_folder_alone(command, expected):
+    assert of_run(command, 7) == expected

@@ -146,7 +146,7 @@ class Explorer {
   }
   command(row) {
     const { data } = this, { film, replay } = data.commands, command = data.verdict[row] === 2 || !data.traced ? replay : film;
-    return command ? [make("pre", { tabindex: "0", "aria-label": "command that opens this run" }, command.replaceAll("RUN", String(data.index[row])))] : [];
+    return command ? [make("pre", { tabindex: "0", "aria-label": "command that opens this run" }, command.replaceAll(/(?<=[ (])RUN(?=$|\)$| --gif RUN\.gif$|\.gif$)/g, String(data.index[row])))] : [];
   }
   film(row) {
     const { data } = this, place = this.part("film"), run = data.index[row], raw = data.filmOf.get(run);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -30,10 +31,12 @@ __all__ = [
     "failed_table",
     "input_table",
     "iteration_table",
+    "of_run",
     "sensitivity_table",
 ]
 
 _MOST, _LEAST_ERROR = 200, 0.001
+_RUN = re.compile(r"(?<=[ (])RUN(?=$|\)$| --gif RUN\.gif$|\.gif$)")  # as in explorer.js: not what a folder is called
 _LIST_SCORES = ("log_likelihood", "rmse", "average_precision", "precision_at_recall_90", "calibration_error")
 
 
@@ -69,6 +72,11 @@ class Table:
     def numeric(self) -> tuple[bool, ...]:
         """Which columns hold numbers, in some row at least."""
         return tuple(any(cell.numeric for cell in column) for column in zip(*self.rows, strict=True))
+
+
+def of_run(command: str, index: int) -> str:
+    """Return a command with the index of a run in place of RUN, which the folder's name may have, too."""
+    return _RUN.sub(str(index), command)
 
 
 def input_table(scenario: LogicalScenario, influence: Influence | None) -> Table:
@@ -189,7 +197,7 @@ def critical_table(history: History, requirement: Requirement, replay: str, judg
             *(Cell.of(record.inputs[name]) for name in history.names),
             *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
             *((Cell(describe_judgements(judged.get(record.index, ())) or NOTHING),) if judged else ()),
-            Cell("command", code=replay.replace("RUN", str(record.index))),
+            Cell("command", code=of_run(replay, record.index)),
         ))  # fmt: skip
     rest = len(found) - len(rows)
     note = f"{rest:,} more critical runs are in the store: sumo-sbt export lists all." if rest else ""
@@ -211,7 +219,7 @@ def contact_table(history: History, requirement: Requirement, replay: str) -> Ta
     rows = tuple(
         (Cell.of(int(history.index[k])), Cell("critical" if critical[k] else "not critical"),
          Cell(", ".join(doubts(str(texts[k])))),
-         Cell(str(texts[k])), Cell("film", code=replay.replace("RUN", str(history.index[k]))))
+         Cell(str(texts[k])), Cell("film", code=of_run(replay, int(history.index[k]))))
         for k in found[:_MOST]
     )  # fmt: skip
     rest = len(found) - len(rows)
@@ -224,7 +232,7 @@ def failed_table(history: History, replay: str) -> Table:
     failed = history.where(~history.ok).records
     rows = tuple(
         (Cell.of(record.index), Cell(record.stage), Cell(record.status), Cell(record.reason),
-         Cell.of(record.seconds), Cell("command", code=replay.replace("RUN", str(record.index))))
+         Cell.of(record.seconds), Cell("command", code=of_run(replay, record.index)))
         for record in failed[:_MOST]
     )  # fmt: skip
     rest = len(failed) - len(rows)
