@@ -78,6 +78,22 @@ def test_sensitivities_are_derivatives(estimated):
     assert found.loc[("x1", "std")]["raised"] == pytest.approx(linear(std=1.1), rel=0.2)
 
 
+def test_the_correlation_of_truncated_inputs_is_raised_and_lowered(tmp_path):
+    """Far points of a pool are rounded to the end of a range, where a ratio of densities told P = 1."""
+    inputs = [sbt.Parameter("gap", 2, 40, "m", sbt.Normal(22, 6)), sbt.Parameter("v", 0, 20, "m/s", sbt.Normal(10, 4))]
+    scenario = sbt.Scenario(
+        "follow", inputs, sbt.Requirement("m", high=5.0), evaluate=lambda x, _: {"m": x["gap"] - 0.65 * x["v"]}, metrics=["m"]
+    )
+    found = sbt.run(
+        campaign="estimation", scenario=scenario, correlation=[{"inputs": ["gap", "v"], "value": -0.6}], budget=120, seed=0,
+        stop={"cov": None}, executor="serial", store=tmp_path / "store", report=False,
+    )  # fmt: skip
+    row = found.sensitivity().set_index("parameter").loc["correlation"]
+    assert row["raised"] == pytest.approx(0.0847, rel=0.03)  # four million draws
+    assert row["lowered"] == pytest.approx(0.0917, rel=0.03)
+    assert found.estimate(critical=(-np.inf, 1e6)).probability == 1.0
+
+
 def test_draws_from_the_distribution_itself(crude):
     found = crude.estimate({"x": sbt.Normal(0.5, 1.0), "kind": {"choices": {"car": 0.2, "truck": 0.8}}})
     truth = 0.8 * norm.sf(0.5) + 0.2 * norm.sf(4.0)  # x > 1 of a truck, x > 4.5 of a car

@@ -185,6 +185,16 @@ def _mass_above(space: ParameterSpace, a: float, b: float) -> float:
     return float(stats.multivariate_normal([0, 0], space.correlation).cdf([-za, -zb]))
 
 
+@pytest.mark.parametrize("law", [each for each in LAWS if each not in ("none", "uniform")])
+def test_values_at_the_ends_of_a_range_have_scores_that_they_can_tell(law):
+    """Far scores are rounded to an end: what is told of it is no farther than the least of them."""
+    space = ParameterSpace((LAWS[law],))
+    z = np.linspace(-12.0, 12.0, 97)[:, None]
+    back = space.to_normal(space.from_normal(z))
+    assert (np.abs(back) <= np.abs(z) + 1.0).all()
+    assert (np.abs(back) >= np.minimum(np.abs(z), 8.0) - 0.5).all()
+
+
 def test_density_is_minus_infinity_outside_only():
     inside = np.array([[0.0, 15.0], [-1.0, 10.0], [3.0, 20.0]])
     outside = np.array([[-1.1, 15.0], [3.1, 15.0], [0.0, 9.9], [0.0, 20.1]])

@@ -80,6 +80,7 @@ def _from_batches(found: Reused) -> EstimationConclusion:
         exact = limits.upper(_CONFIDENCE)
         warnings.append("nothing critical was met: the probability is only bounded from above")
     elif not found.safe or misses == 0:
+        value = value if found.safe else 1.0
         limits = Limits(lambda c: 1.0 - bound(misses, c), lambda _: 1.0)
         warnings.append("no counted draw was safe: only a lower bound is given")
     elif hits == 0:
@@ -143,7 +144,7 @@ def _sensitivity(found: Reused, parameter: SpaceParameter, p: float) -> Sensitiv
 
 
 def _changed(found: Reused, parameter: SpaceParameter, value: float) -> float | None:
-    """Return P with another value of a parameter; None where the draws are worth too few with it."""
+    """Return P with another value of a parameter; None where the draws are worth too few with it, or the error exceeds it."""
     ratio = parameter.ratio(_points(found), value)
     if ratio is None:
         return None
@@ -151,7 +152,8 @@ def _changed(found: Reused, parameter: SpaceParameter, value: float) -> float | 
     weight = np.concatenate([b.coefficient for b in batches])
     if not weight.any() or effective_size(weight) < found.least:
         return None
-    return min(max(_combined(found, batches)[0], 0.0), 1.0)
+    p, std_error = _combined(found, batches)
+    return min(p, 1.0) if std_error <= p else None
 
 
 def _points(found: Reused) -> Points:

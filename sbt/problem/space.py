@@ -23,8 +23,8 @@ Formula = Callable[[Mapping[str, Any]], Any]
 _MASS_POINTS, _MOST_MASS_POINTS = 2**15, 2**22
 _ADMISSIBLE = 20_000  # points that a mass is told by: its error is below 1 %
 _MIN_FEASIBLE = 1e-3
-_FARTHEST = 38.0
-"""Normal score from which on float64 knows no probability."""
+_FAR_SCORES, _TOLD = np.arange(5.0, 38.01, 0.05), 0.5
+"""Normal scores up to that from which on float64 knows no probability, and by how much a value may miss its own."""
 
 
 @dataclass(frozen=True)
@@ -193,9 +193,23 @@ class ParameterSpace:
         return np.ascontiguousarray(solve_triangular(self._factor, scores.T, lower=True).T)
 
     def _scores(self, x: Points) -> Points:
-        """Return the (n, d) normal scores of each input alone, the ends of a range at +-38."""
+        """Return the (n, d) normal scores of each input alone, none farther than values can tell.
+
+        Near an end of a range all scores from about 8 on have the same value: that of the end is infinite, and a point that
+        nothing comes near.
+        """
         scores = np.column_stack([p.to_normal(x[:, k]) for k, p in enumerate(self.parameters)])
-        return np.clip(scores, -_FARTHEST, _FARTHEST)
+        return np.clip(scores, *self._told)
+
+    @cached_property
+    def _told(self) -> tuple[Vector, Vector]:
+        """(d,) smallest and largest normal scores that an input's values tell to within a half."""
+        ends = []
+        for p in self.parameters:
+            for z in (-_FAR_SCORES, _FAR_SCORES):
+                lost = np.zeros(1) if p.discrete else np.abs(p.to_normal(p.from_normal(z)) - z) > _TOLD
+                ends.append(float(z[np.argmax(lost) - 1] if lost.any() else z[-1]))
+        return np.array(ends[::2]), np.array(ends[1::2])
 
     def log_density(self, x: Points) -> Vector:
         """Return (n,) log p(x): the marginals, the copula, the constraints.
