@@ -2,7 +2,7 @@
 
     python benchmarks/pair_estimates.py roundabout_entry --seeds 50 [--table runs/pair_estimates.jsonl]
 
-CPU seconds of everything but imports, in one process. Beside each campaign 200 runs of crude Monte Carlo tell what each
+CPU seconds of everything but imports, in one process. Beside each campaign 1,000 runs of crude Monte Carlo tell what each
 of the (1 - P) / P / 0.01 that it needs would cost on the same machine.
 """
 
@@ -23,7 +23,7 @@ from resumed import arguments, collect, seeds
 
 import sbt
 
-COV, BUDGET, PRICED = 0.1, 20_000, 200
+COV, BUDGET, PRICED = 0.1, 20_000, 1000
 
 
 def campaign(name: str, seed: int) -> dict:
