@@ -208,7 +208,7 @@ class ParameterSpace:
         for p in self.parameters:
             for z in (-_FAR_SCORES, _FAR_SCORES):
                 lost = np.zeros(1) if p.discrete else np.abs(p.to_normal(p.from_normal(z)) - z) > _TOLD
-                ends.append(float(z[np.argmax(lost) - 1] if lost.any() else z[-1]))
+                ends.append(float(z[max(np.argmax(lost) - 1, 0)] if lost.any() else z[-1]))
         return np.array(ends[::2]), np.array(ends[1::2])
 
     def log_density(self, x: Points) -> Vector:
