@@ -23,19 +23,19 @@ from resumed import arguments, collect, seeds
 
 import sbt
 
-COV, BUDGET, PRICED = 0.1, 20_000, 1000
+COV = 0.1
 
 
-def campaign(name: str, seed: int) -> dict:
+def campaign(name: str, seed: int, budget: int, priced: int) -> dict:
     """Return what both cost for one seed."""
     with tempfile.TemporaryDirectory() as folder:
         given = {"campaign": "estimation", "scenario": name, "seed": seed, "executor": "serial", "report": False}
         begun = time.process_time()
-        result = sbt.run(**given, budget=BUDGET, stop={"cov": COV}, store=Path(folder) / "pairs")
+        result = sbt.run(**given, budget=budget, stop={"cov": COV}, store=Path(folder) / "pairs")
         spent = time.process_time() - begun
         begun = time.process_time()
-        sbt.run(**given, budget=PRICED, acquisition={"kind": "monte_carlo"}, store=Path(folder) / "crude")
-        price = (time.process_time() - begun) / PRICED
+        sbt.run(**given, budget=priced, acquisition={"kind": "monte_carlo"}, store=Path(folder) / "crude")
+        price = (time.process_time() - begun) / priced
         found = result.summary["conclusion"]
     return {"runs": result.summary["runs"], "cpu": spent, "price": price} | {k: found[k] for k in ("probability", "low", "high")}
 
@@ -44,7 +44,7 @@ def show(name: str, rows: list[dict], p: float) -> None:
     """Print the medians of a scenario, by a known P or that of all campaigns."""
     p = p or statistics.mean(row["probability"] for row in rows)
     crude = (1.0 - p) / p / COV**2
-    error = [row["probability"] / p - 1.0 for row in rows]
+    error = [(row["probability"] or 0.0) / p - 1.0 for row in rows]
     covered = sum(row["low"] <= p <= row["high"] for row in rows)
     times = sorted(crude * row["price"] / row["cpu"] for row in rows)
     runs, cpu, price = (statistics.median(row[key] for row in rows) for key in ("runs", "cpu", "price"))
@@ -60,8 +60,13 @@ def main() -> None:
     parser = arguments(__doc__, "runs/pair_estimates.jsonl", 3)
     parser.add_argument("names", nargs="+")
     parser.add_argument("--probability", type=float, default=0.0, help="known P(critical) of a single scenario")
+    parser.add_argument("--budget", type=int, default=20_000, help="runs at most")
+    parser.add_argument("--priced", type=int, default=1000, help="runs of crude Monte Carlo that tell the price of one")
     args = parser.parse_args()
-    rows = collect(args, [{"name": name, "seed": seed} for name in args.names for seed in seeds(args)], campaign)
+    jobs = [
+        {"name": name, "seed": seed, "budget": args.budget, "priced": args.priced} for name in args.names for seed in seeds(args)
+    ]
+    rows = collect(args, jobs, campaign)
     head = "scenario", "P", "seeds", "runs", "crude runs", "CPU s", "a run, ms", "times (range)", "RMSE", "mean error", "covered"
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     for name in args.names:

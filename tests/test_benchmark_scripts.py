@@ -44,6 +44,9 @@ SMALLEST = {
     "jumps.py": "--problems disc_count --seeds 1 --budget 30",
     "kernels.py": "--problems metaball --runs 40 --seeds 1",
     "large.py": "--runs 200 --batch 100",
+    "pair_estimates.py": (
+        "crossing_pedestrian --seeds 1 --budget 40 --priced 20 --probability .021 --table {folder}/pairs.jsonl"
+    ),
     "pairs.py": "crossing_pedestrian --seeds 1 --runs 30",
     "report_speed.py": "--runs 20 --scenario cut_in --clicks 2 --opened 1", "serve_speed.py": "--runs 20 --opened 1",
     "run_price.py": "--runs 2 --repeats 1 --only crossing_pedestrian",
@@ -52,7 +55,7 @@ SMALLEST = {
 }
 SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py"}
 SUMO |= {"fuzz.py", "noise.py", "pairs.py", "physics.py", "run_price.py", "throughput.py", "transfer.py", "watcher.py"}
-SUMO |= {"report_speed.py"}  # and Chromium, as serve_speed.py
+SUMO |= {"pair_estimates.py", "report_speed.py"}  # and Chromium, as serve_speed.py
 LONG = {"batch_size.py", "benchmark_page.py", "known_before.py", "snapshots.py"}  # hours, or minutes
 SHARED = {"coarse_problems.py", "disturbing.py", "fuzz_values.py", "resumed.py", "street_traffic.py"}  # what scripts use
 SHARED |= {"two_discs.py"}

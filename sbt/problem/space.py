@@ -207,8 +207,9 @@ class ParameterSpace:
         ends = []
         for p in self.parameters:
             for z in (-_FAR_SCORES, _FAR_SCORES):
-                lost = np.zeros(1) if p.discrete else np.abs(p.to_normal(p.from_normal(z)) - z) > _TOLD
-                ends.append(float(z[max(np.argmax(lost) - 1, 0)] if lost.any() else z[-1]))
+                told = np.zeros_like(z) if p.discrete else p.to_normal(p.from_normal(z)) - z
+                lost = np.flatnonzero(np.abs(told) > _TOLD)
+                ends.append(float(z[max(lost[0] - 1, 0)] if len(lost) else z[-1]))
         return np.array(ends[::2]), np.array(ends[1::2])
 
     def log_density(self, x: Points) -> Vector:
