@@ -94,6 +94,20 @@ def test_the_correlation_of_truncated_inputs_is_raised_and_lowered(tmp_path):
     assert found.estimate(critical=(-np.inf, 1e6)).probability == 1.0
 
 
+def test_one_requirement_of_a_combination_is_asked_for_by_its_name(tmp_path):
+    inputs = [sbt.Parameter(name, -6, 6, "", sbt.Normal(0, 1)) for name in "xw"]
+    required = sbt.any_of(sbt.Requirement("y", low=2.0, name="late"), sbt.Requirement("z", low=3.5))
+    scenario = sbt.Scenario("two", inputs, required, evaluate=lambda v, _: {"y": v["x"], "z": v["x"] + v["w"]})
+    found = sbt.run(
+        campaign="estimation", scenario=scenario, budget=120, seed=0, stop={"cov": None}, executor="serial", report=False,
+        store=tmp_path / "store",
+    )  # fmt: skip
+    assert found.estimate(metric="late").probability == pytest.approx(norm.sf(2.0), rel=0.05)
+    assert found.estimate(metric="late", critical=(2.5, np.inf)) == found.estimate(metric="y", critical=(2.5, np.inf))
+    said = CliRunner().invoke(app, ["estimate-again", str(found.store), "--metric", "late", "--critical", "1e3,inf"])
+    assert "among 120 runs" in " ".join(said.output.split())
+
+
 def test_draws_from_the_distribution_itself(crude):
     found = crude.estimate({"x": sbt.Normal(0.5, 1.0), "kind": {"choices": {"car": 0.2, "truck": 0.8}}})
     truth = 0.8 * norm.sf(0.5) + 0.2 * norm.sf(4.0)  # x > 1 of a truck, x > 4.5 of a car

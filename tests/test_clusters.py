@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 import sbt
+from sbt.campaigns.again import reused
+from sbt.campaigns.asking import answer
 from sbt.campaigns.clustering import clustered_interval
 from sbt.estimators.binomial import interval
 from sbt.estimators.clusters import clustered_error, effective_runs, reach
 from sbt.loop.stages import Log
 from sbt.store.database import Store
+from sbt.workflows.asking import _settings
 from sbt.workflows.paired import Pairs
 from sbt.workflows.study import Study
 
@@ -80,7 +83,12 @@ def test_an_estimate_on_warm_ups_has_their_spread(tmp_path, method):
         history = store.history()
         history.columns["warm_up"][:] = history.columns["seed"] % 20
         study = Study.from_store(store, objects={("scenarios", "object:warm"): scenario}, live=True)
-        found, _ = study.campaign.conclude(Log(history, tuple(store.iterations()), ()))
+        log = Log(history, tuple(store.iterations()), ())
+        found, _ = study.campaign.conclude(log)
+    again = answer(reused(log, _settings(study, scenario.requirement), study.scenario.space))
+    assert again.warmed_traffic.warm_ups == 20
+    assert again.high - again.low > 0.8 * (found.high - found.low)
+    assert again.low < plain.low
     traffic = found.warmed_traffic
     assert traffic.warm_ups == 20
     assert found.low < plain.low

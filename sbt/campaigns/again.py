@@ -64,6 +64,7 @@ class Reused:
         ratio: (m,) new over old density at draws from the new one.
         crude: the draws come from the campaign's distribution itself.
         critical, safe: runs of the whole campaign where the new distribution has mass.
+        warm_up: (n,) that each draw began with, -1 without one.
         least: effective sample size below which the draws say nothing.
         exact: all combinations of inputs were run, and no noise was met: sums have no error.
     """
@@ -77,6 +78,7 @@ class Reused:
     crude: bool
     critical: int
     safe: int
+    warm_up: Vector
     least: float
     exact: bool = False
 
@@ -118,7 +120,7 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         space, batches, worst, int((~history.ok[every]).sum()), nominal,
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
-        least, took_sum(log) and _exact(log, settings),
+        history.columns["warm_up"][every], least, took_sum(log) and _exact(log, settings),
     )  # fmt: skip
 
 

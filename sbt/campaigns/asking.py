@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sbt.campaigns.again import Reused
-from sbt.campaigns.estimation import EstimationConclusion
+from sbt.campaigns.clustering import spread_of_batches
+from sbt.campaigns.estimation import Concluded, EstimationConclusion, on_warm_ups
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.wording import plural
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
@@ -50,7 +51,9 @@ def answer(found: Reused) -> EstimationConclusion:
     """Return the probability that the draws give, with its interval, or a bound where few are critical."""
     weight = np.concatenate([b.coefficient for b in found.batches])
     size = effective_size(weight)
-    told = _from_nominal(found) if found.crude else _from_batches(found)
+    told, limits = _from_nominal(found) if found.crude else _from_batches(found)
+    traffic = spread_of_batches(found.warm_up, [_weighted(b) for b in found.batches])
+    told = told if traffic is None else replace(on_warm_ups(told, limits, traffic)[0], warmed_traffic=traffic)
     share = float(weight.max() / weight.sum())
     warnings = list(told.warnings)
     if share > _HEAVY:
@@ -61,7 +64,7 @@ def answer(found: Reused) -> EstimationConclusion:
     return replace(told, effective_sample_size=size, largest_weight_share=share, counted=len(weight), warnings=tuple(warnings))
 
 
-def _from_batches(found: Reused) -> EstimationConclusion:
+def _from_batches(found: Reused) -> Concluded:
     """Return what batches with a control variate say."""
     safe, worst = [_weighted(b) for b in found.batches], [_weighted(b) for b in found.worst]
     low, high = combine_estimates(safe), combine_estimates(worst)
@@ -92,7 +95,7 @@ def _from_batches(found: Reused) -> EstimationConclusion:
     return _conclusion(value, limits, low.std_error, max(min(max(high.value, 0.0), 1.0), value), hits, missed, exact, warnings)
 
 
-def _from_nominal(found: Reused) -> EstimationConclusion:
+def _from_nominal(found: Reused) -> Concluded:
     """Return what draws from the campaign's distribution itself say."""
     batch, worst = found.batches[0], found.worst[0]
     low, high = (WeightedShare(b.coefficient, b.critical) for b in (batch, worst))
@@ -110,12 +113,12 @@ def _from_nominal(found: Reused) -> EstimationConclusion:
 def _conclusion(
     value: float, limits: Limits, std_error: float, worst: float, hits: int, missed: float, exact: float | None,
     warnings: list[str],
-) -> EstimationConclusion:  # fmt: skip
+) -> Concluded:  # fmt: skip
     tail = 0.5 * (1.0 + _CONFIDENCE)
     return EstimationConclusion(
         value, limits.lower(tail), limits.upper(tail), cov=std_error / value if value > 0 else None, hits=hits,
         failed_as_safe=value, failed_as_critical=worst, undetected_mass_bound=missed, exact_bound=exact, warnings=tuple(warnings),
-    )  # fmt: skip
+    ), limits  # fmt: skip
 
 
 def _weighted(batch: ReusedBatch) -> CountedBatch:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sbt.campaigns.counting import DRAWN, counted_iterations
 from sbt.campaigns.gate import Limits
@@ -18,7 +17,7 @@ from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Vector
 from sbt.store.history import History
 
-__all__ = ["Spread", "clustered_interval", "spread_of_draws", "spread_of_share"]
+__all__ = ["Spread", "clustered_interval", "spread_of_batches", "spread_of_draws", "spread_of_share"]
 
 
 @dataclass(frozen=True)
@@ -63,17 +62,21 @@ def spread_of_draws(log: Log, batches: Sequence[CountedBatch]) -> Spread | None:
     history = log.history
     drawn = history.stage == DRAWN
     rows = [np.flatnonzero(drawn & (history.iteration == number)) for number in counted_iterations(log)][: len(batches)]
+    return spread_of_batches(history.columns["warm_up"][np.concatenate(rows)], batches)
+
+
+def spread_of_batches(warm_up: Vector, batches: Sequence[CountedBatch]) -> Spread | None:
+    """Return the spread of an estimate from weighted batches, of which each draw began with a warm-up (n,), -1 without one."""
     weights = np.array([np.sqrt(t + 1.0) * len(b.critical) for t, b in enumerate(batches)])
     weights /= weights.sum()  # as `combine_estimates` has them
-    terms = np.concatenate([w * b.errors for w, b in zip(weights, batches, strict=True)])
-    return _spread(history, np.concatenate(rows), terms)
+    return _spread(warm_up, np.concatenate([w * b.errors for w, b in zip(weights, batches, strict=True)]))
 
 
 def spread_of_share(history: History, among: Mask, critical: Mask) -> Spread | None:
     """Return the spread of the critical share among some runs; None where runs simulate their traffic from the beginning."""
     rows = np.flatnonzero(among)
     hits = critical[rows].astype(np.float64)
-    return _spread(history, rows, (hits - hits.mean()) / len(rows)) if len(rows) else None
+    return _spread(history.columns["warm_up"][rows], (hits - hits.mean()) / len(rows)) if len(rows) else None
 
 
 def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: float = 0.95) -> tuple[float, float]:
@@ -94,8 +97,7 @@ def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: fl
     return float(low), float(high)
 
 
-def _spread(history: History, rows: NDArray[np.intp], terms: Vector) -> Spread | None:
-    cluster = history.columns["warm_up"][rows]
+def _spread(cluster: Vector, terms: Vector) -> Spread | None:
     if not (cluster >= 0).any():
         return None
     return Spread(len(np.unique(cluster)), clustered_error(terms, cluster))

@@ -176,7 +176,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
             found = replace(found, warnings=(warning, *found.warnings))
         traffic = warmed_traffic(log, settings)
         if traffic is not None:
-            found, limits = _on_warm_ups(found, limits, traffic)
+            found, limits = on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
         asked, unseen, met = settings.gate, found.undetected_mass_bound, Seen.of(log, settings).surprises
         gate = None if asked is None else gate_verdict(limits, asked, unseen, met, found.cov)
@@ -189,7 +189,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
     return Campaign((stage,), conclude)
 
 
-def _on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread) -> Concluded:
+def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread) -> Concluded:
     """Return the conclusion with an interval that has the spread between warm-ups."""
     value, error = found.probability, traffic.std_error
     limits, tail = traffic.widened(limits, value), 0.5 * (1.0 + _CONFIDENCE)

@@ -84,5 +84,6 @@ def gate_verdict(
         verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:
         verdict = "undecided"
-        statement = f"{sure} the probability is between {low:.3g} and {high:.3g}: whether it is within {allowed} is open"
+        ends = f"at least {low:.3g} and at most {high:.3g}"
+        statement = f"{sure} each the probability is {ends}: whether it is within {allowed} is open"
     return GateVerdict(verdict, gate.probability, gate.confidence, low, high, statement)

@@ -5,7 +5,6 @@ The first can be pasted: it names the scenario, the requirement, the interval, a
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,14 +22,13 @@ from sbt.campaigns.lost import (
     why_they_fail,
 )  # fmt: skip
 from sbt.campaigns.modes import single
+from sbt.campaigns.precision import NO_BETTER, PRECISE, as_many_draws, rounded, runs_for_precision, too_wide
 from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
 from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
-from sbt.estimators import binomial
 from sbt.estimators.binomial import interval, unmet_draws
-from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 from sbt.loop.stages import Facts
 
 if TYPE_CHECKING:
@@ -42,11 +40,8 @@ if TYPE_CHECKING:
 
 __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
-_PRECISE = 0.1  # coefficient of variation that is asked for by default
-_FAR = 100.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
 _WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"
-_NO_BETTER = 1.5  # factor by which an interval is wider than by as many random draws, from which on that is said
 _SMALL_SHARE = 0.01  # bound of the critical share that a coverage of 300 runs without a critical one gives
 
 
@@ -70,7 +65,7 @@ def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
     else:
         further = (
             f"campaign: boundary says where critical runs lie, campaign: estimation how probable they are; about"
-            f" {_round(3 * share.counted):,} more runs would halve this interval"
+            f" {rounded(3 * share.counted):,} more runs would halve this interval"
         )
     return [
         f"{said}, by {runs} spread evenly over it{f'; {lost_runs(lost, share.counted)}' if lost else ''}.",
@@ -86,7 +81,7 @@ def _deciding_warm_ups(share: CriticalShare, facts: Facts) -> int | None:
     if share.critical_fraction is None or n == 0 or not (warm_up >= 0).any():
         return None
     low, high = interval(round(share.critical_fraction * n), n, share.confidence)
-    return len(np.unique(warm_up)) if share.high - share.low > _NO_BETTER * float(high - low) else None
+    return len(np.unique(warm_up)) if share.high - share.low > NO_BETTER * float(high - low) else None
 
 
 def _more_warm_ups(number: int) -> str:
@@ -285,24 +280,36 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         if every and found.low == found.high:
             ends = "exact if the simulator is deterministic"
         said = f"The probability of {subject} is {number(found.probability, 3)} ({ends})"
-        missed = min(found.undetected_mass_bound, 1.0 - found.probability)
-        silent = (
-            "This does not tell of critical regions that no run has met, nor of failures that few seeds show wherever: with"
-            f" {confidence} confidence they hold at most {number(missed, 3)} more, which bounds the unseen and is no second"
-            " estimate"
-        )
-        if missed <= 0.0:
-            silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"
-        if every:
-            silent = "This is a sum over all combinations: none is unseen. It does not tell of noise that repeats do not show"
-        elif found.low == 0.0 and found.hits:
-            silent += (
-                f". It does not tell that the probability may be 0 either, though the interval begins there: {found.hits:,}"
-                f" critical draw{'s' if found.hits > 1 else ''} of unequal weight cannot exclude that it is far smaller"
-            )
-        elif missed > found.high:
-            silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
+        if found.counted and not found.hits and found.combinations is None:
+            guess = f"no draw that counts was critical, and {number(found.probability, 3)} is the metamodel's own guess"
+            said = f"The probability of {subject} is at most {number(found.high, 3)} ({confidence} interval from 0): {guess}"
+        silent = _not_told(found, every)
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
+
+
+def _not_told(found: EstimationConclusion, every: bool) -> str:
+    """Return what an estimate does not tell; `every` combination of the inputs was run."""
+    confidence, p = percent(found.confidence), found.probability or 0.0
+    missed = min(found.undetected_mass_bound, 1.0 - p)
+    silent = (
+        "This does not tell of critical regions that no run has met, nor of failures that few seeds show wherever: with"
+        f" {confidence} confidence they hold at most {number(missed, 3)} more, which bounds the unseen and is no second"
+        " estimate"
+    )
+    if missed <= 0.0:
+        silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"
+    if every:
+        silent = "This is a sum over all combinations: none is unseen. It does not tell of noise that repeats do not show"
+    elif found.low == 0.0 and found.hits:
+        traffic, why = found.warmed_traffic, "of unequal weight"
+        why = "of so few warm-ups" if traffic is not None and traffic.decides(found.cov, p) else why
+        silent += (
+            f". It does not tell that the probability may be 0 either, though the interval begins there: {found.hits:,}"
+            f" critical draw{'s' if found.hits > 1 else ''} {why} cannot exclude that it is far smaller"
+        )
+    elif missed > found.high:
+        silent += " (the larger figure, since only draws from the inputs' distribution rule a region out, and there were few)"
+    return silent
 
 
 def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
@@ -319,7 +326,7 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         return "campaign: falsification searches for the first critical run; ten times as many runs lower the bound tenfold"
     if found.probability is None:
         return f"a larger budget than {n:,} runs, so that after searching and learning some draws count"
-    if worst is not None and worst - found.probability > 2.0 * _PRECISE * found.probability:
+    if worst is not None and worst - found.probability > 2.0 * PRECISE * found.probability:
         return (
             f"failed runs decide the width of the interval: its upper end, {number(found.high, 3)}, counts them as critical, and"
             f" more runs never bring it much below {number(worst, 3)}; {why_they_fail()}"
@@ -330,49 +337,20 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         return _WIDEN
     if found.gate is not None and found.gate.verdict == "undecided":
         return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
-    wide, counted = _too_wide(found), found.counted or n
+    wide, counted = too_wide(found), found.counted or n
     traffic = found.warmed_traffic
     if wide > 1.0 and traffic is not None and traffic.decides(found.cov, found.probability):
         return _more_warm_ups(traffic.warm_ups)
     if wide > 1.0 and counted:
-        more = _runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
-        return more + _as_many_draws(found, n)
+        more = runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
+        return more + as_many_draws(found, n)
     unseen = 3.0 / max(found.probability, 1e-300)
     if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
         return (
-            f"it is as narrow as asked; to bound the unseen by the estimate itself, draw {_round(unseen):,} runs from the inputs'"
-            " distribution (acquisition: {kind: monte_carlo})"
+            f"it is as narrow as asked; to bound the unseen by the estimate itself, draw {rounded(unseen):,} runs from the"
+            " inputs' distribution (acquisition: {kind: monte_carlo})"
         )
     return f"it is as narrow as asked{'; look at the critical runs in the report' if found.hits else ''}"
-
-
-def _as_many_draws(found: EstimationConclusion, n: int) -> str:
-    """Return the advice to draw from the inputs' distribution alone, where the upper end would be much lower by as many runs."""
-    if n == 0 or not found.probability or found.probability >= 1.0:
-        return ""
-    crude = float(binomial.upper(math.ceil(n * found.probability), n, 0.5 * (1.0 + found.confidence)))
-    better = "; as many draws from the inputs' distribution would bound it better (acquisition: {kind: monte_carlo})"
-    return better if found.high > _NO_BETTER * crude else ""
-
-
-def _runs_for_precision(more: float, made: int, *, known: bool) -> str:
-    """Return how many more runs, beside those that were made, give the estimate its precision; `known`: it is not 0."""
-    if not known or more > _FAR * made:
-        return f"a larger budget: ten times {made:,} runs tell how many it takes, since too few critical draws count now"
-    return (
-        f"about {_round(more):,} more runs (budget: {_round(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
-        " fewer where a metamodel goes on to learn"
-    )
-
-
-def _too_wide(found: EstimationConclusion) -> float:
-    """Return how many times too large the error is, by the rule that ends a campaign; up to 1: narrow as asked."""
-    value = found.probability or 0.0
-    few = 0.0 if found.combinations is not None else math.sqrt(FEWEST_HITS / max(found.hits, 1))
-    if value <= 0.0:
-        return few
-    error, half = (found.cov or 0.0) / _PRECISE, 0.5 * (found.high - found.low) / (_PRECISE * value)
-    return max(error, few, half / 2.0 if half > WIDEST else 0.0)
 
 
 def _every_combination(facts: Facts) -> str:
@@ -389,11 +367,3 @@ def _condition(facts: Facts) -> str:
 
 def _of(facts: Facts, word: str = "of") -> str:
     return f" {word} {facts.scenario}" if facts.scenario else ""
-
-
-def _round(value: float) -> int:
-    """Return a number of runs to two digits, upwards."""
-    if value < 10:
-        return max(math.ceil(value), 1)
-    unit = 10 ** (math.floor(math.log10(value)) - 1)
-    return math.ceil(value / unit) * unit

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from sbt.campaigns.again import reused
 from sbt.campaigns.asking import Sensitivity, answer, sensitivities
-from sbt.campaigns.estimation import EstimationConclusion, conclude_sum
+from sbt.campaigns.estimation import EstimationConclusion, conclude_sum, on_warm_ups
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.summing import took_sum
+from sbt.campaigns.warmed import warmed_traffic
 from sbt.config.asked import asked_space
 from sbt.errors import InputError
 from sbt.loop.stages import Facts, Log
@@ -34,6 +35,7 @@ class Answer:
         store: the folder.
         requirement: that was asked for.
         space: the inputs as they were asked for.
+        history: the campaign's runs.
         conclusion: the probability with its interval.
         sensitivity: of the probability to every parameter of these distributions.
     """
@@ -41,12 +43,13 @@ class Answer:
     store: Path
     requirement: Requirement
     space: ParameterSpace
+    history: History
     conclusion: EstimationConclusion
     sensitivity: tuple[Sensitivity, ...]
 
     def sentences(self) -> list[str]:
         """Return the probability in plain words."""
-        return self.conclusion.sentences(Facts(History.of(self.space.names), self.requirement))
+        return self.conclusion.sentences(Facts(self.history, self.requirement))
 
     def to_dict(self) -> Json:
         """Return what `estimate-again --json` prints."""
@@ -66,7 +69,8 @@ def estimate_again(
         folder: store of an estimation.
         inputs: changes to the campaign's inputs, as the key of a configuration, or a YAML file with them; None: its own.
         critical: interval of critical values; None: the campaign's.
-        metric: one that the runs measured; None: the campaign's. Another metric needs its critical interval.
+        metric: one that the runs measured, or a requirement of the campaign's by its name; None: the campaign's. A metric that
+            it does not require needs its critical interval.
         objects: what was given in Python when the store was made.
 
     Raises:
@@ -81,10 +85,12 @@ def estimate_again(
     settings = _settings(study, requirement)
     found = reused(log, settings, space)
     if took_sum(log):
-        said, _ = conclude_sum(log, replace(settings, scenario=replace(settings.scenario, space=space)))
+        said, limits = conclude_sum(log, replace(settings, scenario=replace(settings.scenario, space=space)))
+        traffic = warmed_traffic(log, settings)
+        said = said if traffic is None else replace(on_warm_ups(said, limits, traffic)[0], warmed_traffic=traffic)
     else:
         said = answer(found)
-    return Answer(folder, requirement, space, said, sensitivities(found))
+    return Answer(folder, requirement, space, log.history, said, sensitivities(found))
 
 
 def sensitivities_in(study: Study, log: Log) -> tuple[Sensitivity, ...]:
@@ -106,6 +112,9 @@ def _settings(study: Study, requirement: Requirement) -> Settings:
 
 
 def _requirement(old: Requirement, metric: str | None, critical: tuple[float, float] | None) -> Requirement:
+    named = next((part for part in old.parts if metric == part.label), None)
+    if named is not None:
+        return named if critical is None else replace(named, low=critical[0], high=critical[1])
     if metric is not None and metric != old.metric and critical is None:
         raise InputError(f"another metric needs its critical interval (critical), but got only the metric '{metric}'")
     if critical is None:

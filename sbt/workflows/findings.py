@@ -17,7 +17,12 @@ class Finding:
     detail: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def rules(self) -> bool:
+        """Whether it can be broken; else it only informs."""
+        return not self.rule.startswith("for information")
+
     def __str__(self) -> str:
         """Return a line: whether the rule holds, or that it only informs."""
-        mark = "note" if self.rule.startswith("for information") else "ok  "
+        mark = "ok  " if self.rules else "note"
         return f"{mark if self.ok else 'FAIL'}  {self.rule}{': ' if self.detail else ''}{self.detail}"

@@ -1,0 +1,57 @@
+"""How many more runs an estimate needs, and whether as many random draws would tell more."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from sbt.estimators import binomial
+from sbt.estimators.intervals import FEWEST_HITS, WIDEST
+
+if TYPE_CHECKING:
+    from sbt.campaigns.estimation import EstimationConclusion
+
+__all__ = ["NO_BETTER", "PRECISE", "as_many_draws", "rounded", "runs_for_precision", "too_wide"]
+
+PRECISE = 0.1
+"""Coefficient of variation that is asked for by default."""
+NO_BETTER = 1.5
+"""Factor by which an interval is wider than by as many random draws, from which on that is said."""
+_FAR = 100.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
+
+
+def as_many_draws(found: EstimationConclusion, n: int) -> str:
+    """Return the advice to draw from the inputs' distribution alone, where the upper end would be much lower by as many runs."""
+    if n == 0 or not found.probability or found.probability >= 1.0:
+        return ""
+    crude = float(binomial.upper(math.ceil(n * found.probability), n, 0.5 * (1.0 + found.confidence)))
+    better = "; as many draws from the inputs' distribution would bound it better (acquisition: {kind: monte_carlo})"
+    return better if found.high > NO_BETTER * crude else ""
+
+
+def runs_for_precision(more: float, made: int, *, known: bool) -> str:
+    """Return how many more runs, beside those that were made, give the estimate its precision; `known`: it is not 0."""
+    if not known or more > _FAR * made:
+        return f"a larger budget: ten times {made:,} runs tell how many it takes, since too few critical draws count now"
+    return (
+        f"about {rounded(more):,} more runs (budget: {rounded(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
+        " fewer where a metamodel goes on to learn"
+    )
+
+
+def too_wide(found: EstimationConclusion) -> float:
+    """Return how many times too large the error is, by the rule that ends a campaign; up to 1: narrow as asked."""
+    value = found.probability or 0.0
+    few = 0.0 if found.combinations is not None else math.sqrt(FEWEST_HITS / max(found.hits, 1))
+    if value <= 0.0:
+        return few
+    error, half = (found.cov or 0.0) / PRECISE, 0.5 * (found.high - found.low) / (PRECISE * value)
+    return max(error, few, half / 2.0 if half > WIDEST else 0.0)
+
+
+def rounded(value: float) -> int:
+    """Return a number of runs to two digits, upwards."""
+    if value < 10:
+        return max(math.ceil(value), 1)
+    unit = 10 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit) * unit
