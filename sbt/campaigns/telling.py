@@ -239,7 +239,8 @@ def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
         if decided is not None:
             further = decided
         elif share > _SMALL_SHARE:
-            further += f", or campaign: coverage with 300 runs, which bounds that by {percent(_SMALL_SHARE)} if none is critical"
+            none = "if none is critical or fails" if bound.failed_runs else "if none is critical"
+            further += f", or campaign: coverage with 300 runs, which bounds that by {percent(_SMALL_SHARE)} {none}"
     closest = found.closest
     if closest is not None:
         further += f"; {nearest_words(closest.run, measured(facts.requirement.told_as, closest.metric, facts.unit), facts)}"
