@@ -52,8 +52,7 @@ def answer(found: Reused) -> EstimationConclusion:
     weight = np.concatenate([b.coefficient for b in found.batches])
     size = effective_size(weight)
     told, limits = _from_nominal(found) if found.crude else _from_batches(found)
-    traffic = spread_of_batches(found.warm_up, [_weighted(b) for b in found.batches])
-    told = told if traffic is None else replace(on_warm_ups(told, limits, traffic)[0], warmed_traffic=traffic)
+    told, _ = on_warm_ups(told, limits, spread_of_batches(found.warm_up, [_weighted(b) for b in found.batches]))
     share = float(weight.max() / weight.sum())
     warnings = list(told.warnings)
     if share > _HEAVY:

@@ -175,22 +175,23 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
             warning = f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
             found = replace(found, warnings=(warning, *found.warnings))
         traffic = warmed_traffic(log, settings)
-        if traffic is not None:
-            found, limits = on_warm_ups(found, limits, traffic)
+        found, limits = on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
         asked, unseen, met = settings.gate, found.undetected_mass_bound, Seen.of(log, settings).surprises
         gate = None if asked is None else gate_verdict(limits, asked, unseen, met, found.cov)
         each = each_estimate(log, settings)
         return replace(
-            found, gate=gate, simulator_noise=noise, requirements=each, warmed_traffic=traffic,
-            fidelity=levels_told(log, settings), pairs=pairs_of(log), explained=explained_variance(settings, log.history),
+            found, gate=gate, simulator_noise=noise, requirements=each, fidelity=levels_told(log, settings),
+            pairs=pairs_of(log), explained=explained_variance(settings, log.history),
         ), None  # fmt: skip
 
     return Campaign((stage,), conclude)
 
 
-def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread) -> Concluded:
-    """Return the conclusion with an interval that has the spread between warm-ups."""
+def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread | None) -> Concluded:
+    """Return the conclusion with an interval that has the spread between warm-ups; None: there are none."""
+    if traffic is None:
+        return found, limits
     value, error = found.probability, traffic.std_error
     limits, tail = traffic.widened(limits, value), 0.5 * (1.0 + _CONFIDENCE)
     cov = found.cov if not value or error is None else max(found.cov or 0.0, error / value)
@@ -201,7 +202,7 @@ def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread) ->
     elif error is None and traffic.warm_ups == 1:
         warnings = (*warnings, "there is one warm-up: how much others differ from it is not known")
     low, high = limits.lower(tail), limits.upper(tail)
-    return replace(found, low=low, high=high, cov=cov, warnings=warnings), limits
+    return replace(found, low=low, high=high, cov=cov, warnings=warnings, warmed_traffic=traffic), limits
 
 
 def _conclusion(probability: float | None, limits: Limits, **rest: Any) -> EstimationConclusion:

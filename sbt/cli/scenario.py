@@ -131,7 +131,7 @@ def check(
         print_json({"target": target, **checked.to_dict()})
     if not checked.ok:
         broken = sum(not finding.ok for finding in checked.findings)
-        raise fail(f"{target}: {broken} of {sum(each.rules for each in checked.findings)} rules are broken", Exit.INPUT)
+        raise fail(f"{target}: {broken} of {sum(each.is_rule for each in checked.findings)} rules are broken", Exit.INPUT)
     if not as_json:
         campaign = target.endswith((".yaml", ".yml")) and Path(target).name != "scenario.yaml"
         next_command("sumo-sbt", "run" if campaign else "simulate", target)

@@ -86,8 +86,7 @@ def estimate_again(
     found = reused(log, settings, space)
     if took_sum(log):
         said, limits = conclude_sum(log, replace(settings, scenario=replace(settings.scenario, space=space)))
-        traffic = warmed_traffic(log, settings)
-        said = said if traffic is None else replace(on_warm_ups(said, limits, traffic)[0], warmed_traffic=traffic)
+        said, _ = on_warm_ups(said, limits, warmed_traffic(log, settings))
     else:
         said = answer(found)
     return Answer(folder, requirement, space, log.history, said, sensitivities(found))

@@ -18,11 +18,11 @@ class Finding:
     numbers: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def rules(self) -> bool:
+    def is_rule(self) -> bool:
         """Whether it can be broken; else it only informs."""
         return not self.rule.startswith("for information")
 
     def __str__(self) -> str:
         """Return a line: whether the rule holds, or that it only informs."""
-        mark = "ok  " if self.rules else "note"
+        mark = "ok  " if self.is_rule else "note"
         return f"{mark if self.ok else 'FAIL'}  {self.rule}{': ' if self.detail else ''}{self.detail}"
