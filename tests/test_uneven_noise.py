@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbt.estimators.surrogate import fit_log_probability
+from sbt.estimators.surrogate import fit_log_probability, settled
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.seeds import stream
@@ -24,3 +24,20 @@ def test_noise_is_learned_as_uneven_where_it_is(uneven: bool, times: float):
     left, right = (np.exp(belief(np.column_stack([np.full(50, a), np.linspace(0, 1, 50)]))[0]).mean() for a in (0.25, 0.75))
     assert right == pytest.approx(0.07, abs=0.05)
     assert (right > times * left) == uneven
+
+
+@pytest.mark.parametrize("std", [0.001, 0.5])
+def test_what_is_left_to_chance_once_means_are_known(std: float):
+    """A wave that 30 runs do not resolve is taken for noise; repeats that hardly differ say that it is none."""
+    rng = stream(3, "settled")
+    x, at = rng.random((30, 2)), rng.random((2000, 2))
+
+    def wave(u: np.ndarray) -> np.ndarray:
+        return np.sin(40.0 * u[:, 0]) + np.sin(31.0 * u[:, 1])
+
+    y = wave(x) + std * rng.standard_normal(30)
+    belief = fit_log_probability(PROCESS, lambda z: z, CriticalInterval(high=0.0), x, y, stream(4, "fit"), [0.4 * std**2])
+    each = [np.exp(learned(at)[0]) for learned in (belief, settled(belief, 48.0))]
+    doubt, chance = (float(np.sqrt(p * (1.0 - p)).mean()) for p in each)
+    assert doubt > 0.2
+    assert chance < 0.02 if std < 0.01 else chance > 0.1

@@ -18,11 +18,11 @@ from sbt.metamodels.base import Metamodel
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.store.history import History
 
-__all__ = ["Known", "metamodel_of"]
+__all__ = ["SURE_NOISE", "Known", "metamodel_of"]
 
 _PROBES = 9
 """Points on the segment between two critical runs, at which P must stay above 0.5 for them to be one mode."""
-_SURE_NOISE = 0.4
+SURE_NOISE = 0.4
 """Part of the variance among repeats that the metamodel's noise is not allowed to be below: two repeats exaggerate."""
 
 
@@ -104,7 +104,7 @@ class Known:
         if len(self.y) < 2 and transfer is None:
             return None
         interval, earlier = self.settings.scenario.requirement.critical, () if transfer is None else transfer.trends
-        noise = [_SURE_NOISE * std**2 for std in self.noise]
+        noise = [SURE_NOISE * std**2 for std in self.noise]
         given = fit_log_probability(
             metamodel_of(self.settings), self.coordinates, interval, self.z, self.y, rng, noise, earlier=earlier
         )  # fmt: skip

@@ -12,11 +12,12 @@ from functools import cached_property
 
 import numpy as np
 from scipy.special import gammainccinv
+from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN
 from sbt.campaigns.crude import MonteCarloStage, took_monte_carlo
-from sbt.campaigns.known import Known, metamodel_of
+from sbt.campaigns.known import SURE_NOISE, Known, metamodel_of
 from sbt.campaigns.pools import SKETCH, Frame, Proposal, draw_batch, draw_pool, fit_proposal, planned
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, EstimationProposal
 from sbt.campaigns.repeats import repeats_wanted, simulator_noise
@@ -25,7 +26,7 @@ from sbt.campaigns.stopping import count_begins, is_precise, pools_of, relative_
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, to_cube
 from sbt.estimators.importance import SHARES
 from sbt.estimators.mixture import wide_scales
-from sbt.estimators.surrogate import MOST_LEARNED, Coordinates, LogProbability, sketch_of
+from sbt.estimators.surrogate import MOST_LEARNED, Coordinates, LogProbability, settled, sketch_of
 from sbt.loop.stages import Batch, Log
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import Cube
@@ -71,6 +72,9 @@ _MANY_HITS, _ENOUGH = 5.0, 0.2  # expected of crude Monte Carlo; share of the bu
 geometric mean of this and the last batch, as what few runs let expect varies by a factor of three, and there is no way back."""
 _MET, _NO_GAIN = 2, 1.5
 """Critical runs with which it is whatever P the metamodel expects, where it gains next to nothing: it may deny what was met."""
+_UNLIKELY, _WITHOUT_DOUBT = 0.05, 10.0
+"""Gain with means known, and the largest noise that repeats let expect at this level, above which it is not: a process takes for
+noise what it has not learned yet, and learns it."""
 _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
 _SURPRISE = 0.01
@@ -151,22 +155,23 @@ class SequentialStage:
 
         Then crude Monte Carlo is as precise: no proposal gains what the runs cost that learn it.
         """
-        s = self.settings
-        if len(log.planned) < _LEARNED * s.budget or not simulator_noise(log.history, s.scenario.requirement).noisy:
+        s, noise = self.settings, simulator_noise(log.history, self.settings.scenario.requirement)
+        if len(log.planned) < _LEARNED * s.budget or not noise.noisy:
             return False
         if any(batch.read(EstimationProposal).counted is not None for batch in log.iterations):
             return False
         z = stream(s.seed, "noise", log.iteration).standard_normal((2000, len(self._wide)))
         pi = np.exp(log_probability(z)[0])
-        p, spread = float(pi.mean()), float(np.sqrt(pi * (1.0 - pi)).mean())
-        hits = p * (s.budget - len(log.planned))
-        known, variance = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget, p * (1.0 - p) * SHARES[0]
+        hits = float(pi.mean()) * (s.budget - len(log.planned))
+        known, gain = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget, _gain(pi)
         met = int(s.scenario.requirement.critical_runs(log.history).sum())
-        gain = variance / spread**2 if spread > 1e-100 else math.inf
         before = [(1.0 - pool.probability) / pool.probability / relative_error_of(pool) ** 2 for _, pool in pools_of(log)
                   if 0.0 < pool.probability < 1.0 and pool.anticipated > 0.0]  # fmt: skip
         mean = math.sqrt(gain * before[-1]) if before else gain
-        return known and ((hits >= 1.0 and mean < _GAIN) or (met >= _MET and gain < _NO_GAIN))
+        if not (known and ((hits >= 1.0 and mean < _GAIN) or (met >= _MET and gain < _NO_GAIN))):
+            return False
+        most = noise.repeats / (SURE_NOISE * float(chi2.ppf(_UNLIKELY, noise.repeats)))
+        return _gain(np.exp(settled(log_probability, most)(z)[0])) < _WITHOUT_DOUBT
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""
@@ -279,3 +284,9 @@ class SequentialStage:
         met = known.z[since & known.critical]
         surprised = len(met) > 0 and bool((np.exp(log_probability(met)[0]) < _SURPRISE).any())
         return None if surprised else log_probability
+
+
+def _gain(pi: Vector) -> float:
+    """Return the variance of crude Monte Carlo over that of the best draws with P(critical) pi (n,) at random inputs."""
+    p, spread = float(pi.mean()), float(np.sqrt(pi * (1.0 - pi)).mean())
+    return p * (1.0 - p) * SHARES[0] / spread**2 if spread > 1e-100 else math.inf

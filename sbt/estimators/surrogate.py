@@ -31,7 +31,7 @@ from sbt.problem.cube import Cube
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["MOST_LEARNED", "Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability", "sketch_of"]
+__all__ = ["MOST_LEARNED", "Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability", "settled", "sketch_of"]
 
 LogProbability = Callable[[Points], tuple[Vector, Vector]]
 """(n, d) normal scores to (n,) log P(critical) and (n,) log P(uncritical)."""
@@ -102,6 +102,19 @@ class JointLogProbability:
         """Return about the same, learned from fewer runs."""
         return replace(self, parts=tuple(sketch_of(part, rows) for part in self.parts))
 
+    def settled(self, most: float) -> JointLogProbability:
+        """Return what would be left to chance if the metrics' means were known."""
+        return replace(self, parts=tuple(settled(part, most) for part in self.parts))
+
+
+def settled(log_probability: LogProbability, most: float) -> LogProbability:
+    """Return what would be left to chance if means were known: noise alone, at most so many times the variance that it must have.
+
+    It is itself where nothing tells them apart.
+    """
+    known: Any = getattr(log_probability, "settled", None)
+    return log_probability if known is None else known(most)
+
 
 def sketch_of(log_probability: LogProbability, rows: int) -> LogProbability:
     """Return about the same, learned from so many runs and many times quicker; itself where that would gain nothing."""
@@ -167,6 +180,17 @@ class _Learned:
         lacking = np.maximum(self.form.noise - p.noise**2, 0.0)
         return Prediction(p.mean, np.sqrt(p.std**2 + lacking), p.weight, np.sqrt(p.noise**2 + lacking))
 
+    def settled(self, most: float) -> _Learned:
+        """Return the same without doubt about the mean, and with noise of at most so many times the form's variance."""
+        largest = math.sqrt(most * self.form.noise)
+
+        def predict(inputs: Points) -> Prediction:
+            p = self._noisy(check_prediction(self.predictor(inputs), len(inputs)))
+            noise = np.maximum(np.minimum(p.noise, largest), 1e-12 * p.sigma)
+            return Prediction.gaussian(p.mu, noise, noise)
+
+        return replace(self, predictor=predict, form=replace(self.form, noise=0.0))
+
     def with_tails(self, u: Points) -> _Learned:
         """Return the same with tails as heavy as left-out runs at u (n, d) show, where the predictor tells these."""
         left_out = getattr(self.predictor, "leave_one_out", None)
@@ -202,6 +226,10 @@ class _Largest:
     def sketch(self, rows: int) -> _Largest:
         """Return about the same, learned from fewer runs."""
         return replace(self, learned=tuple(replace(each, predictor=sketched(each.predictor, rows)) for each in self.learned))
+
+    def settled(self, most: float) -> _Largest:
+        """Return what would be left to chance if the means were known."""
+        return replace(self, learned=tuple(each.settled(most) for each in self.learned))
 
 
 def fit_log_probability(
