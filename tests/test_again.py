@@ -193,4 +193,10 @@ def test_weighted_shares_cover():
         share = WeightedShare(norm.pdf(x, 1.0) / norm.pdf(x), (x > 1.0).astype(float))
         covered += share.lower(0.975) <= 0.5 <= share.upper(0.975)
     assert covered >= 376
-    assert WeightedShare(np.ones(100), np.zeros(100)).upper(0.95) == pytest.approx(-np.log(0.05) / 100)
+    assert WeightedShare(np.full(100, 2.0), np.zeros(100)).upper(0.95) == pytest.approx(-2.0 * np.log(0.05) / 100)
+
+
+def test_an_unchanged_question_to_random_draws_has_their_exact_interval(crude):
+    assert (found := crude.estimate()).probability > 0.0
+    told = crude.conclusion
+    assert (found.probability, found.low, found.high) == pytest.approx((told.probability, told.low, told.high), rel=1e-9)

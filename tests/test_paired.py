@@ -82,6 +82,32 @@ RARE, BETTER = scenario(rare), scenario(better)
     assert found["low"] <= truth[1] - truth[0] <= found["high"] < 0
     assert found["verdict"] == "fell"
     assert max(found[k]["runs"] for k in ("before", "after")) <= 150
+    assert all(found[k]["precise"] for k in ("before", "after"))
+
+
+def test_more_pairs_go_on_where_fewer_stopped(configured, tmp_path):
+    a, b = configured("a", budget=300), configured("b")
+
+    def compared(store, runs):
+        done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / store), "--runs", runs, "--json"])
+        assert done.exit_code == 0, done.output
+        return json.loads(done.stdout)
+
+    assert (compared("grown", "60")["pairs"], compared("grown", "150")["pairs"]) == (60, 150)
+    again = compared("grown", "150")
+    assert (again["pairs"], again["difference"]) == (150, 0.0)
+
+
+def test_a_rare_comparison_says_what_it_rests_on():
+    from sbt.cli.compare_ego import _rare_lines
+
+    told = {"probability": 0.1, "low": 0.0, "high": 0.5, "runs": 60, "failed": 0}
+    result = {"before": told | {"precise": False, "warm_ups": 4}, "after": told | {"precise": True}, "difference": 0.0,
+              "low": -0.5, "high": 0.5, "verdict": "undecided", "confidence": 0.95}  # fmt: skip
+    first, before, after, change, conditional = _rare_lines(result)
+    assert "10 % is not reached: more --runs" in before
+    assert "reached" not in after
+    assert conditional.strip() == "conditional on the traffic of 4 warm-ups"
 
 
 def test_different_questions_are_refused(configured, tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,10 +97,16 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
     if mode.get("unconfirmed"):
         said.append(f"{mode['unconfirmed']} with a contact that SUMO does not list")
     if mode.get("preventable"):
-        from sbt.workflows.judging import in_words
-
-        said.append(f"avoided {in_words(mode['preventable'])}")
+        said.append(_avoided(mode["preventable"]))
     return "; ".join(said)
+
+
+def _avoided(judgements: Sequence[Mapping[str, Any]]) -> str:
+    """Return which reference drivers avoid it, or why none was judged."""
+    from sbt.workflows.judging import in_words
+
+    said = in_words(judgements)
+    return f"reference drivers {said}" if said.startswith("not applicable") else f"avoided {said}"
 
 
 def _unit(unit: str) -> str:
@@ -135,9 +141,7 @@ def _record(item: Mapping[str, Any]) -> str:
     values = {k: v for k, v in item.items() if isinstance(v, (int, float, str))} | dict(item.get("inputs", {}))
     found = [f"{name} {shown(value)}" for name, value in values.items()]
     if item.get("preventable"):
-        from sbt.workflows.judging import in_words
-
-        found.append(f"avoided {in_words(item['preventable'])}")
+        found.append(_avoided(item["preventable"]))
     return ", ".join(found)
 
 

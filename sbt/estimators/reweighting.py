@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincinv
 
+from sbt.estimators import binomial
 from sbt.estimators.importance import stratified_variance
 from sbt.estimators.intervals import CountedBatch
 from sbt.problem.arrays import Points, Vector
@@ -23,6 +24,7 @@ from sbt.problem.arrays import Points, Vector
 __all__ = ["Predicted", "ReusedBatch", "WeightedShare", "defended_bound", "effective_size", "few_hits_bound"]
 
 _TAIL = 1e-300
+_ROUNDING = 1e-9  # of a weight of 1
 _BISECTIONS = 60  # of [0, 1]: to the last bit
 
 
@@ -107,16 +109,25 @@ class WeightedShare:
         return float((self.weight * self.critical).std(ddof=1)) / n**0.5 if n > 1 else float("inf")
 
     def lower(self, confidence: float) -> float:
-        """Return the one-sided lower limit of a weighted sum of Poisson counts."""
+        """Return the one-sided lower limit of a weighted sum of Poisson counts; with weights of 1 the exact one of a share."""
+        if self._plain:
+            return float(binomial.lower(int(self.critical.sum()), len(self.weight), confidence))
         y, v = self._moments()
         return 0.0 if y == 0.0 else min(v / y * float(gammaincinv(y * y / v, 1.0 - confidence)), 1.0)
 
     def upper(self, confidence: float) -> float:
-        """Return the one-sided upper limit; with equal weights that of a Poisson count."""
+        """Return the one-sided upper limit; with equal weights that of a Poisson count, with weights of 1 the exact one."""
+        if self._plain:
+            return float(binomial.upper(int(self.critical.sum()), len(self.weight), confidence))
         y, v = self._moments()
         top = float(self.weight.max()) / len(self.weight)
         y, v = y + top, v + top * top
         return min(v / max(y, _TAIL) * float(gammaincinv(y * y / max(v, _TAIL), confidence)), 1.0)
+
+    @property
+    def _plain(self) -> bool:
+        """Whether draws follow the distribution that is asked for."""
+        return bool(np.allclose(self.weight, 1.0, rtol=0.0, atol=_ROUNDING))
 
     def _moments(self) -> tuple[float, float]:
         terms = self.weight * self.critical / len(self.weight)

@@ -25,7 +25,7 @@ from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Json
 from sbt.report.versus import write_versus
-from sbt.store.database import Store
+from sbt.store.database import DATABASE, Store
 from sbt.store.history import History
 from sbt.workflows.filming import film_runs
 from sbt.workflows.running import Summary, run_study
@@ -38,6 +38,8 @@ _FILMED = 6
 """Films are made of so many fixed and so many new failures ..."""
 _SECONDS = 20.0
 """... whose runs took at most so long together when they were recorded (s)."""
+_BATCH = 200
+"""Runs of a batch of pairs."""
 _PRECISE = 0.1
 """Coefficient of variation with which the estimations of rare critical runs end."""
 
@@ -113,7 +115,7 @@ def compare_egos(
     """
     config = load(first).config
     budget = config.budget if runs is None else runs
-    size = min(budget, 200)
+    size = _first_batch(store / "a", budget)
     common = {
         "campaign": "estimation", "acquisition": {"kind": "monte_carlo"}, "metamodel": {"kind": "gp"}, "stop": {"cov": None},
         "gate": None, "warm_start": None, "seed": config.seed, "budget": budget, "initial": size, "batch": size,
@@ -125,6 +127,14 @@ def compare_egos(
     histories = [_history(store / name) for name in ("a", "b")]
     result = _result(histories[0], histories[1], one.scenario.requirement)
     return {**result, "page": str(_page(store, (one, other), histories, result, f"{first.stem} and {second.stem}"))}
+
+
+def _first_batch(folder: Path, budget: int) -> int:
+    """Return the number of runs in each batch: that of the campaign which goes on, since the draws depend on it."""
+    if (folder / DATABASE).is_file():
+        with Store.read(folder) as kept:
+            return min(int(kept.configuration.get("initial", _BATCH)), budget)
+    return min(budget, _BATCH)
 
 
 def _page(store: Path, studies: Sequence[Study], histories: Sequence[History], result: Json, names: str) -> Path:
@@ -168,7 +178,7 @@ def compare_rare(
         runs: of each estimation at most; None: the budget of the first. They end at a coefficient of variation of 10 %.
 
     Returns:
-        Probabilities with intervals, runs, their difference with its interval, and a verdict (`fell`, `rose`, `undecided`).
+        Probabilities with intervals, runs, whether each is as precise, their difference with its interval, and a verdict (`fell`, `rose`, `undecided`).
 
     Raises:
         InputError: as `compare_egos` does.
@@ -217,7 +227,10 @@ def _estimated(summary: Summary, folder: Path) -> Json:
     """Return what an estimation found."""
     found, history = summary.to_dict()["conclusion"], _history(folder)
     kept = {key: found[key] for key in ("probability", "low", "high", "undetected_mass_bound")}
-    return {**kept, "runs": len(history), "critical": found["hits"], "failed": int((~history.ok).sum())}
+    traffic = found.get("warmed_traffic")
+    warmed = {} if traffic is None else {"warm_ups": traffic["warm_ups"]}
+    precise = found["cov"] is not None and found["cov"] <= _PRECISE
+    return {**kept, **warmed, "precise": precise, "runs": len(history), "critical": found["hits"], "failed": int((~history.ok).sum())}
 
 
 def _verdict(low: float, high: float) -> str:
