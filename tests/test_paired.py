@@ -89,7 +89,8 @@ def test_more_pairs_go_on_where_fewer_stopped(configured, tmp_path):
     a, b = configured("a", budget=300), configured("b")
 
     def compared(store, runs):
-        done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / store), "--runs", runs, "--json"])
+        common = ["compare-ego", str(a), str(b), "--json"]
+        done = CliRunner().invoke(app, [*common, "--store", str(tmp_path / store), "--runs", runs])
         assert done.exit_code == 0, done.output
         return json.loads(done.stdout)
 
@@ -104,7 +105,7 @@ def test_a_rare_comparison_says_what_it_rests_on():
     told = {"probability": 0.1, "low": 0.0, "high": 0.5, "runs": 60, "failed": 0}
     result = {"before": told | {"precise": False, "warm_ups": 4}, "after": told | {"precise": True}, "difference": 0.0,
               "low": -0.5, "high": 0.5, "verdict": "undecided", "confidence": 0.95}  # fmt: skip
-    first, before, after, change, conditional = _rare_lines(result)
+    _, before, after, _, conditional = _rare_lines(result)
     assert "10 % is not reached: more --runs" in before
     assert "reached" not in after
     assert conditional.strip() == "conditional on the traffic of 4 warm-ups"

@@ -227,6 +227,11 @@ def test_vehicles_are_inserted_beside_warmed_traffic(tmp_path):
     fast.write_text(fast.read_text().replace("speed: 5,", "speed: 99,"))
     with pytest.raises(RunError, match=r"scenario\.yaml:6:10: insert\.other: .*Departure speed for vehicle 'other' is too high"):
         simulation(fast)({"v": 8.0, "gap": 40.0}, 5)
+    taken = inserting(tmp_path / "taken")
+    beside = "edge: A1B1, lane: 1, position: 25, speed: 5, route: [A1B1, B1C1]"
+    taken.write_text(taken.read_text().replace(beside, "edge: A2B2, lane: 1, position: 39, speed: 5"))
+    with pytest.raises(RunError, match=r"insert\.ego: 'ego' must start clear .* 'other' .*: change its position or at"):
+        simulation(taken)({"v": 8.0, "gap": 40.0}, 5)
 
 
 @pytest.mark.parametrize(

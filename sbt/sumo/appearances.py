@@ -15,6 +15,7 @@ from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import State
 from sbt.sumo.overlaps import deepest_overlap, instant, required_braking
+from sbt.sumo.places import said_at
 
 __all__ = ["AppearanceMonitor", "refuse_overlap_at_start"]
 
@@ -63,7 +64,7 @@ def _refuse_start(ego: str, found: tuple[str, float] | None, remedy: str, place:
         raise RunError(
             Status.INVALID,
             f"{place}'{ego}' must start clear of all others, but its place is taken by '{found[0]}' (they overlap by "
-            f"{found[1]:.2g} m), which is no collision: {remedy}",
+            f"{found[1]:.2g} m), which is no collision: {said_at(place, remedy)}",
         )
 
 

@@ -20,7 +20,7 @@ from sbt.problem.plain import Values
 from sbt.sumo.absence import why_absent
 from sbt.sumo.elements import person
 from sbt.sumo.files import SumoFiles
-from sbt.sumo.places import place_in
+from sbt.sumo.places import place_in, said_at
 from sbt.sumo.template import fill
 from sbt.sumo.waiting import why_held_back
 
@@ -222,7 +222,7 @@ class DepartureMonitor:
         gap, why, remedy = why_held_back(self._sumo, name, requested, self._files)
         longer = " longer" if self._ego.delay or requested.of_flow else ""
         tolerance = f", or let it wait{longer}: ego: {{delay: SECONDS}}" if is_ego else ""
-        held = f"but SUMO holds it back, as {why}: {remedy}{tolerance}"
+        held = f"but SUMO holds it back, as {why}: {said_at(requested.place, remedy)}{tolerance}"
         raise RunError(Status.INVALID, f"{rule}{f', {gap}' if gap else ''}, {held}")
 
     def _left_out(self, requested: RequestedDeparture) -> bool:
@@ -258,10 +258,10 @@ class DepartureMonitor:
         )
         for attribute, expected, actual, unit, remedy in compared:
             if expected is not None and abs(expected - actual) > _TOLERANCE:
+                rule = f"must depart with {said_at(requested.place, attribute)} {expected:g}{unit}"
                 raise RunError(
                     Status.INVALID,
-                    f"{requested.place}'{name}' must depart with {attribute} {expected:g}{unit}, "
-                    f"but SUMO inserted it with {actual:g}{unit}: {remedy}",
+                    f"{requested.place}'{name}' {rule}, but SUMO inserted it with {actual:g}{unit}: {remedy}",
                 )
 
     @staticmethod

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["place_in", "stands_for"]
+__all__ = ["place_in", "said_at", "stands_for"]
 
 _ELSEWHERE: dict[str, Mapping[int, str]] = {}
 """Of files of this process: line to where the user wrote what is there."""
+
+_KEYS = {"departPos": "position", "departLane": "lane", "departSpeed": "speed", "depart": "at"}
+"""Of `insert`, for SUMO's attributes."""
 
 
 def place_in(path: Path | str, line: int, column: int) -> str:
@@ -19,3 +23,14 @@ def place_in(path: Path | str, line: int, column: int) -> str:
 def stands_for(path: Path, places: Mapping[int, str]) -> None:
     """Let the lines of a file be named by the places at which the user wrote them."""
     _ELSEWHERE[str(path)] = places
+
+
+def said_at(place: str, text: str) -> str:
+    """Return a text about a departure in the words of its place: SUMO's attributes, or the keys of `insert`.
+
+    >>> said_at("mine/scenario.yaml: insert.ego: ", "move its departPos")
+    'move its position'
+    """
+    if "insert." not in place:
+        return text
+    return re.sub(rf"\b({'|'.join(_KEYS)})\b", lambda found: _KEYS[found[1]], text)

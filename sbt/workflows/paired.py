@@ -178,7 +178,8 @@ def compare_rare(
         runs: of each estimation at most; None: the budget of the first. They end at a coefficient of variation of 10 %.
 
     Returns:
-        Probabilities with intervals, runs, whether each is as precise, their difference with its interval, and a verdict (`fell`, `rose`, `undecided`).
+        Probabilities with intervals, runs, whether each is as precise, their difference with its interval, and a verdict
+        (`fell`, `rose`, `undecided`).
 
     Raises:
         InputError: as `compare_egos` does.
@@ -230,7 +231,8 @@ def _estimated(summary: Summary, folder: Path) -> Json:
     traffic = found.get("warmed_traffic")
     warmed = {} if traffic is None else {"warm_ups": traffic["warm_ups"]}
     precise = found["cov"] is not None and found["cov"] <= _PRECISE
-    return {**kept, **warmed, "precise": precise, "runs": len(history), "critical": found["hits"], "failed": int((~history.ok).sum())}
+    failed = int((~history.ok).sum())
+    return {**kept, **warmed, "precise": precise, "runs": len(history), "critical": found["hits"], "failed": failed}
 
 
 def _verdict(low: float, high: float) -> str:
