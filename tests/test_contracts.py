@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,3 +102,26 @@ def test_the_scenario_contract_finds_a_scenario_that_is_never_the_same(analytic)
     good, bad = (check_scenario(ScenarioSpec(f"analytic.py:{n}", str(analytic.parent))) for n in ("SCENARIO", "DRIFTING"))
     assert all(finding.ok for finding in good)
     assert "same seed, same trace" in [finding.rule for finding in bad if not finding.ok]
+
+
+_HANGS = """
+import os
+import time
+import sbt
+
+def evaluate(values, seed):
+    while values["a"] > 0.7:
+        LEAVES
+    return {"m": values["a"]}
+
+SCENARIO = sbt.Scenario("s", [sbt.Parameter("a", 0, 1)], sbt.Requirement("m", high=0.5), evaluate=evaluate, metrics=["m"])
+"""
+
+
+@pytest.mark.parametrize(("how", "said"), [("time.sleep(0.1)", "no answer within 3 s: a run must end"), ("os._exit(3)", "process died")])
+def test_a_run_that_hangs_or_kills_its_process_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, said: str):
+    monkeypatch.setattr("sbt.workflows.checking._WORKER_DEADLINE", 3.0)
+    (tmp_path / "s.py").write_text(_HANGS.replace("LEAVES", how))
+    (finding,) = (found for found in check_scenario(ScenarioSpec(f"{tmp_path / 's.py'}:SCENARIO")) if not found.ok)
+    assert finding.rule == "centre and corners run"
+    assert said in finding.detail

@@ -11,11 +11,15 @@ from sbt.errors import SbtError, described
 from sbt.execution.pool import broken, close_pool, open_pool
 from sbt.processes import scratch
 
-__all__ = ["each", "elsewhere"]
+__all__ = ["DiedError", "each", "elsewhere"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
+
+
+class DiedError(SbtError):
+    """A worker process died."""
 
 
 def each(function: Callable[[T], None], items: Sequence[T], workers: int) -> Iterator[tuple[T, str | None]]:
@@ -53,7 +57,7 @@ def elsewhere(seconds: float, function: Callable[P, R], *args: P.args, **kwargs:
         **kwargs: plain data.
 
     Raises:
-        SbtError: the process died.
+        DiedError: the process died.
         TimeoutError: it took too long.
     """
     with scratch("tasks") as folder:
@@ -61,7 +65,7 @@ def elsewhere(seconds: float, function: Callable[P, R], *args: P.args, **kwargs:
         try:
             result: R = pool.submit(function, *args, **kwargs).result(seconds)
         except broken():
-            raise SbtError("the worker process died") from None
+            raise DiedError("the worker process died") from None
         finally:
             close_pool(pool)
     return result

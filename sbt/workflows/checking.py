@@ -14,7 +14,7 @@ import numpy as np
 from sbt import interruption
 from sbt.errors import RunError, SbtError, described
 from sbt.execution.spec import ScenarioSpec
-from sbt.execution.tasks import elsewhere
+from sbt.execution.tasks import DiedError, elsewhere
 from sbt.execution.warming import keeping_states
 from sbt.metrics.physics import breaches
 from sbt.metrics.stl import FORMULA
@@ -36,6 +36,7 @@ from sbt.workflows.snapshots import snapshot_findings, which_isolation
 
 __all__ = ["Finding", "check_scenario", "findings_of"]
 
+_ALL_RUN = "centre and corners run"
 _CORNERS_UP_TO = 4
 """With more inputs than this, every input goes to its ends alone instead of all 2^d corners."""
 _FEW_INVALID = 0.25
@@ -62,6 +63,14 @@ class _Run:
     breaches: tuple[str, ...] = ()
     problem: str = ""
     length: float = math.inf
+
+
+@dataclass(frozen=True)
+class _Lost:
+    """Why a worker process gave no runs, and whether this process would hang or die of them, too."""
+
+    why: str
+    for_good: bool = False
 
 
 def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | None = None) -> tuple[Finding, ...]:
@@ -94,6 +103,10 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     points = list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
     drawn = covariates_first(asked, jobs)
+    other = _elsewhere(spec, jobs)
+    if isinstance(other, _Lost) and other.for_good:
+        yield Finding(_ALL_RUN, ok=False, detail=other.why)
+        return
     first = _runs(spec, jobs)
     run = _all_ok(first, points)
     yield run
@@ -107,7 +120,8 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     again = _runs(spec, jobs[::-1])[::-1]
     yield _equal("same seed, same trace", first, again, points)
     yield from drawn()
-    yield _in_worker(spec, jobs, first, points)
+    same = "same seed, same trace in a worker process"
+    yield Finding(same, ok=False, detail=other.why) if isinstance(other, _Lost) else _equal(same, first, other, points)
     yield from _isolations(spec, jobs, points)
     yield from snapshot_findings(spec, points, seed, _digest)
     yield from fidelity_findings(spec, asked, seed)
@@ -196,7 +210,7 @@ def _all_ok(runs: list[_Run], points: Sequence[Values]) -> Finding:
     invalid = [r for r in runs if r.problem.startswith(str(Status.INVALID))]
     fine = bool(runs) and not runs[0].problem and len(bad) == len(invalid) <= _FEW_INVALID * len(runs)
     how = "invalid" if len(bad) == len(invalid) else "gave no metric"
-    return Finding("centre and corners run", fine, f"{len(bad)} of {len(runs)} {how}; {bad[0]}" if bad else f"{len(runs)} runs")
+    return Finding(_ALL_RUN, fine, f"{len(bad)} of {len(runs)} {how}; {bad[0]}" if bad else f"{len(runs)} runs")
 
 
 def _finite(runs: list[_Run], scenario: LogicalScenario) -> Finding:
@@ -221,15 +235,17 @@ def _equal(rule: str, first: list[_Run], second: list[_Run], points: Sequence[Va
     return Finding(rule, ok=True, detail=f"{len(first)} runs bit-equal")
 
 
-def _in_worker(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], first: list[_Run], points: Sequence[Values]) -> Finding:
-    """Return whether a spawned process, which gets plain data only, gives the same."""
-    rule = "same seed, same trace in a worker process"
+def _elsewhere(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run] | _Lost:
+    """Return the runs of a spawned process, which gets plain data only; it is first, since one that hangs or dies can be ended."""
     try:
-        return _equal(rule, first, elsewhere(_WORKER_DEADLINE, _runs, spec, jobs), points)
+        return elsewhere(_WORKER_DEADLINE, _runs, spec, jobs)
     except TimeoutError:
-        return Finding(rule, ok=False, detail=f"the worker process gave no answer within {_WORKER_DEADLINE:g} s")
+        why = f"the worker process gave no answer within {_WORKER_DEADLINE:g} s"
+        return _Lost(f"{why}: a run must end, and a loop must step the simulation", for_good=True)
+    except DiedError as error:
+        return _Lost(f"{error} while it ran them", for_good=True)
     except (SbtError, OSError) as error:
-        return Finding(rule, ok=False, detail=str(error))
+        return _Lost(str(error))
 
 
 def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: Sequence[Values]) -> list[Finding]:
