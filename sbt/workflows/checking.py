@@ -236,7 +236,7 @@ def _equal(rule: str, first: list[_Run], second: list[_Run], points: Sequence[Va
 
 
 def _elsewhere(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run] | _Lost:
-    """Return the runs of a spawned process, which gets plain data only; it is first, since one that hangs or dies can be ended."""
+    """Return the runs of a spawned process, which gets plain data only; it is first, as one that hangs can be ended."""
     try:
         return elsewhere(_WORKER_DEADLINE, _runs, spec, jobs)
     except TimeoutError:
