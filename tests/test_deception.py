@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from sbt.campaigns.modes import FailureRate, connected, representative_of
+from sbt.campaigns.linking import connected
+from sbt.campaigns.modes import FailureRate, representative_of
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers import portfolio

@@ -13,10 +13,10 @@ from scipy.special import ndtr
 
 import sbt
 from sbt.campaigns.confirming import shares
-from sbt.campaigns.failures import races, search_runs
+from sbt.campaigns.failures import batches_by, search_runs
 from sbt.campaigns.modes import FailureRate
 from sbt.campaigns.rates import LocalRates, local_rates, next_repetitions
-from sbt.campaigns.records import CONFIRM
+from sbt.campaigns.records import CONFIRM, RACE
 from sbt.loop.stages import Facts, Log
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.arrays import Points, Vector
@@ -135,7 +135,7 @@ def test_a_campaign_races_then_tells_and_each_batch_follows_from_the_log(tmp_pat
         log = Log(store.history(), tuple(store.iterations()), tuple(store.fits()))
     history, modes, stage = log.history, result.conclusion.failure_modes, result.study.campaign.stages[-1]
     racing, told = shares(len(modes))
-    raced = np.isin(history.iteration, races(log))
+    raced = np.isin(history.iteration, batches_by(log, RACE))
     assert len(modes) > 1
     assert DISCS["rates"](np.array([list(modes[0].inputs.values())]))[0] == 0.9
     assert modes[0].metric > min(mode.metric for mode in modes)  # the deepest is not the first

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.campaigns.failures import FailureSearch, confirmations, races, search_runs
+from sbt.campaigns.failures import FailureSearch, batches_by, confirmations, with_links
 from sbt.campaigns.modes import Mode
+from sbt.campaigns.parts import named_inputs
 from sbt.campaigns.rates import next_repetitions
-from sbt.campaigns.records import CONFIRM, RACE, SearchProposal
+from sbt.campaigns.records import CONFIRM, LINK, RACE, SearchProposal
 from sbt.loop.stages import Batch, Log, Stage
 from sbt.store.database import PlannedRun
 from sbt.store.history import History
@@ -19,6 +20,8 @@ __all__ = ["ROUNDS", "ConfirmStage", "shares"]
 _REPEATS = 3  # confirmation runs of a mode: enough to tell a failure of the scenario from that of one seed
 _MOST_REPEATS, _REPEATS_IN_ALL = 10, 30  # of a noisy simulator, whose modes have a failure rate
 _MOST_CONFIRMED = 10  # modes, the first ones
+_LINK_SHARE, _FEWEST_LINKS, _MOST_LINKS = 0.1, 5, 20  # of the search's runs, and runs: those between critical ones
+_LINK_ROUNDS, _LINK_BATCH = 6, 4  # batches of these at most, and how many of them would ask all
 _RACING = 0.3  # share of the repetitions that decide the order
 ROUNDS = 3
 """Batches of repetitions that decide the order."""
@@ -52,7 +55,10 @@ class ConfirmStage:
         search, history = self.failure_search, log.history
         if search.settings.scenario.pool is not None:
             return _TOLD, []  # a recorded row cannot be repeated
-        runs, race = search_runs(history), races(log)
+        links = self._links(log)
+        if links:
+            return LINK, links
+        runs, aside, race = with_links(log), batches_by(log, RACE, LINK), batches_by(log, RACE)
         raced = np.isin(history.iteration, race)
         modes = search.modes(runs, history.where(raced))[:_MOST_CONFIRMED]
         wanted = [_REPEATS] * len(modes)
@@ -64,9 +70,25 @@ class ConfirmStage:
                 return RACE, [PlannedRun(CONFIRM, runs.inputs(row)) for row in rows[:left]]
         planned = []
         for mode, n in zip(modes, wanted, strict=True):
-            done = int(confirmations(history, runs.x[mode.representative], race).sum())
+            done = int(confirmations(history, runs.x[mode.representative], aside).sum())
             planned += [PlannedRun(CONFIRM, runs.inputs(mode.representative))] * (n - done)
         return _TOLD, planned
+
+    def _links(self, log: Log) -> list[PlannedRun]:
+        """Return runs between critical ones, where it is in doubt whether they are of one mode; none after repetitions."""
+        rounds, search = len(batches_by(log, LINK)), self.failure_search
+        scenario, runs = search.settings.scenario, with_links(log)
+        if rounds >= _LINK_ROUNDS or batches_by(log, RACE, _TOLD) or search.noisy(runs):
+            return []
+        asked = int((runs.stage == CONFIRM).sum())
+        most = min(max(int(_LINK_SHARE * (len(runs) - asked)), _FEWEST_LINKS), _MOST_LINKS)
+        at = [way.at for way in search.doubtful_ways(runs)]
+        u = np.array(at).reshape(-1, scenario.space.dimension)
+        x = scenario.space.from_unit(u[scenario.space.feasible(scenario.space.from_unit(u))]) if len(u) else u
+        known = {tuple(row) for row in runs.x}  # whole numbers: the way may lead through a run
+        new = [row for row in dict.fromkeys(map(tuple, x.tolist())) if row not in known]
+        batch = new[: min(most - asked, -(-most // _LINK_BATCH))]
+        return [PlannedRun(CONFIRM, named_inputs(scenario, np.array(row))) for row in batch]
 
 
 def shares(modes: int) -> tuple[int, list[int]]:

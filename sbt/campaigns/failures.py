@@ -11,12 +11,13 @@ import numpy as np
 from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.levels import ScreeningTold
+from sbt.campaigns.linking import LinksTold, Way, doubtful, ways_between
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
-from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, single, violations
+from sbt.campaigns.modes import FailureMode, Mode, critical_groups, describe, modes_of, single, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.rates import LocalRates, local_rates
-from sbt.campaigns.records import CONFIRM, RACE, SearchProposal
+from sbt.campaigns.records import CONFIRM, LINK, RACE, SearchProposal
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.telling import tell_failures
@@ -28,14 +29,14 @@ from sbt.loop.stages import Facts, Log
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Json, Value
 from sbt.problem.requirement import Requirement
-from sbt.samplers.search import Search, fit_warped
+from sbt.samplers.search import Search, WarpedModel, fit_warped
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord, Independence, Validation, optional, to_json
 
 __all__ = [
-    "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "confirmations", "races",
-    "search_runs",
+    "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "batches_by", "confirmations",
+    "search_runs", "with_links",
 ]  # fmt: skip
 
 _TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
@@ -104,6 +105,7 @@ class FalsificationConclusion:
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
         fidelity: what coarse runs did for it, where there are some.
         raced: repetitions that helped to order the modes and count in no rate; None: there are none.
+        links: runs that asked whether critical runs are of one mode; None: there are none.
     """
 
     first_critical_run: int | None
@@ -120,6 +122,7 @@ class FalsificationConclusion:
     explained: ExplainedVariance | None = optional()
     fidelity: ScreeningTold | None = optional()
     raced: int | None = optional()
+    links: LinksTold | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -135,6 +138,7 @@ class FalsificationConclusion:
         if self.simulator_noise is not None:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         said += [*violations_words(self.violates), *independence_words(self.independence)]
+        said += [] if self.links is None else [self.links.sentence()]
         said += _rates(self)
         said += [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
         said += [] if self.fidelity is None else [self.fidelity.sentence()]
@@ -153,7 +157,7 @@ class FailureSearch:
 
     def __init__(self, settings: Settings):
         self.settings = settings
-        self._last: tuple[tuple[tuple[int, ...], tuple[int, ...]], list[Mode], LocalRates] | None = None
+        self._last: tuple[tuple[tuple[int, ...], tuple[int, ...]], _Learned] | None = None
 
     @cached_property
     def search(self) -> Search:
@@ -173,36 +177,45 @@ class FailureSearch:
 
     def modes(self, history: History, raced: History | None = None) -> list[Mode]:
         """Return the failure modes among these runs; of a noisy simulator `raced` repetitions help to order them."""
-        return self._learned(history, raced)[0]
+        return self._learned(history, raced).modes
 
     def rates(self, history: History, raced: History) -> LocalRates:
         """Return the failure rates at these runs of a noisy simulator, some of them critical; NaN where there is no metric."""
-        return self._learned(history, raced)[1]
+        return self._learned(history, raced).rates
 
-    def _learned(self, history: History, raced: History | None) -> tuple[list[Mode], LocalRates]:
+    def doubtful_ways(self, history: History) -> list[Way]:
+        """Return the ways between critical runs on which a run would tell whether they are of one mode; none with noise."""
+        fitted, scenario = self._learned(history, None).fitted, self.settings.scenario
+        if fitted is None:
+            return []
+        chosen, kind = critical_groups(history, scenario)
+        u = scenario.space.to_unit(history.x[chosen])
+        return doubtful(ways_between(fitted, u, kind[chosen], history.stage[chosen] == CONFIRM))
+
+    def _learned(self, history: History, raced: History | None) -> _Learned:
         runs = tuple(history.index.tolist()), () if raced is None else tuple(raced.index.tolist())
         if self._last is None or runs != self._last[0]:
-            self._last = runs, *self._learn(history, raced)
-        return self._last[1:]
+            self._last = runs, self._learn(history, raced)
+        return self._last[1]
 
-    def _learn(self, history: History, raced: History | None) -> tuple[list[Mode], LocalRates]:
+    def _learn(self, history: History, raced: History | None) -> _Learned:
         scenario = self.settings.scenario
         ok, rates = np.flatnonzero(history.ok), LocalRates(*np.full((2, len(history)), np.nan))
         if not (self.margin(history) <= 0).any():
-            return [], rates
+            return _Learned([], rates)
         if len(ok) < 2:
             only = int(ok[0])
-            return [Mode((only,), only, only, None)], rates
+            return _Learned([Mode((only,), only, only, None)], rates)
         u, y = scenario.space.to_unit(history.x[ok]), scenario.requirement.values(history)[ok]
         rng = stream(self.settings.seed, "modes", len(history))
         fitted = fit_warped(self.search.for_noise(u, y), u, y, rng)
         if not self.noisy(history):
-            return modes_of(fitted, history, scenario), rates
+            return _Learned(modes_of(fitted, history, scenario), rates, fitted)
         again = history.where(np.zeros(len(history), dtype=bool)) if raced is None else raced.where(raced.ok)
         critical = scenario.requirement.critical_runs(again)
         found = local_rates(self.search, u, y, history.drawn[ok], scenario.space.to_unit(again.x), critical, rng)
         rates.mean[ok], rates.std[ok] = found.mean, found.std
-        return modes_of(fitted, history, scenario, rates=rates.mean), rates
+        return _Learned(modes_of(fitted, history, scenario, rates=rates.mean), rates)
 
     def noisy(self, history: History) -> bool:
         """Say whether the requirement's metric differed among runs of equal inputs: then failing is a matter of rates."""
@@ -210,14 +223,15 @@ class FailureSearch:
 
     def conclusion(self, log: Log, fit: FitRecord | None) -> FalsificationConclusion:
         """Return what was found."""
-        history, race = log.history, races(log)
-        searched, scenario, raced = search_runs(history), self.settings.scenario, history.where(np.isin(history.iteration, race))
+        history, aside = log.history, batches_by(log, RACE, LINK)
+        searched, scenario, known = search_runs(history), self.settings.scenario, with_links(log)
+        raced = history.where(np.isin(history.iteration, batches_by(log, RACE)))
         margin = self.margin(searched)
         hits = np.flatnonzero(margin <= 0)
         modes = []
-        for mode in self.modes(searched, raced):
-            again = history.where(confirmations(history, searched.x[mode.representative], race))
-            modes.append(describe(mode, searched, scenario, again, noisy=self.noisy(history)))
+        for mode in self.modes(known, raced):
+            again = history.where(confirmations(history, known.x[mode.representative], aside))
+            modes.append(describe(mode, known, scenario, again, noisy=self.noisy(history)))
         first = int(hits[0]) if len(hits) else None
         bound = None if len(hits) else SearchBound.of(searched)
         return FalsificationConclusion(
@@ -226,8 +240,25 @@ class FailureSearch:
             _statement(searched, len(hits), modes, bound), None if fit is None else fit.validation,
             stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
             None if fit is None else fit.independence, explained_variance(self.settings, history),
-            raced=len(raced) or None,
+            raced=len(raced) or None, links=self._links_told(log),
         )  # fmt: skip
+
+    def _links_told(self, log: Log) -> LinksTold | None:
+        """Return what runs between critical ones told; None where there was none."""
+        asked = log.history.where(np.isin(log.history.iteration, batches_by(log, LINK)))
+        if not len(asked):
+            return None
+        critical = int(self.settings.scenario.requirement.critical_runs(asked).sum())
+        return LinksTold(len(asked), critical, len(self.doubtful_ways(with_links(log))))
+
+
+@dataclass(frozen=True)
+class _Learned:
+    """What runs say: failure modes, rates of failing where the simulator is noisy, and the metamodel where it is not."""
+
+    modes: list[Mode]
+    rates: LocalRates
+    fitted: WarpedModel | None = None
 
 
 def search_runs(history: History) -> History:
@@ -235,14 +266,21 @@ def search_runs(history: History) -> History:
     return history.where(history.stage != CONFIRM)
 
 
-def races(log: Log) -> tuple[int, ...]:
-    """Return the numbers of the batches whose repetitions decided which failure modes come first."""
-    return tuple(batch.number for batch in log.iterations if batch.stage == CONFIRM and batch.read(SearchProposal).method == RACE)
+def with_links(log: Log) -> History:
+    """Return the runs of the search, and those between critical ones."""
+    history = log.history
+    return history.where((history.stage != CONFIRM) | np.isin(history.iteration, batches_by(log, LINK)))
 
 
-def confirmations(history: History, x: Vector, race: tuple[int, ...]) -> Mask:
-    """Return (n,) booleans: the run repeated the inputs x (d,) to confirm a failure mode, and decided nothing in a race."""
-    return (history.stage == CONFIRM) & (history.x == x).all(axis=1) & ~np.isin(history.iteration, race)
+def batches_by(log: Log, *methods: str) -> tuple[int, ...]:
+    """Return the numbers of the batches beside the budget that are by one of these methods."""
+    beside = (batch for batch in log.iterations if batch.stage == CONFIRM)
+    return tuple(batch.number for batch in beside if batch.read(SearchProposal).method in methods)
+
+
+def confirmations(history: History, x: Vector, aside: tuple[int, ...]) -> Mask:
+    """Return (n,) booleans: the run repeated the inputs x (d,) to confirm a failure mode, in no batch of those set aside."""
+    return (history.stage == CONFIRM) & (history.x == x).all(axis=1) & ~np.isin(history.iteration, aside)
 
 
 def _rates(found: FalsificationConclusion) -> list[str]:

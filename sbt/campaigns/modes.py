@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from sbt.campaigns.linking import connected
+from sbt.campaigns.records import CONFIRM
 from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type, without_standing
@@ -21,13 +23,11 @@ from sbt.store.history import History
 from sbt.store.records import Judgement, optional
 
 __all__ = [
-    "FailureMode", "FailureRate", "Mode", "NearestSafe", "RunPoint", "connected", "describe", "modes_of",
+    "FailureMode", "FailureRate", "Mode", "NearestSafe", "RunPoint", "critical_groups", "describe", "modes_of",
     "representative_of", "single", "violations",
 ]  # fmt: skip
 
-_PROBES = 9  # on the segment between two runs
 _MOST = 200  # critical runs that are compared with each other; further ones join the nearest
-_CHUNK = 100  # segments asked for at once
 _UNMEASURED = -2.0
 _FAR = 1e6  # beyond any distance in the unit cube
 _NOT_WITHIN = 1e-9
@@ -149,43 +149,6 @@ def worst_first(history: History, margins: Vector) -> NDArray[np.int64]:
     return np.lexsort((-severity(history), margins))
 
 
-def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False) -> NDArray[np.int64]:
-    """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes.
-
-    With a noisy simulator P(critical) is small even where runs fail most: there it must exceed half of the smaller P at the two
-    ends.
-
-    Args:
-        fitted: of the metamodel.
-        u: (n, d) critical runs in the unit cube.
-        kind: (n,) only runs of the same kind are joined.
-        noisy: see above.
-    """
-    n = len(u)
-    level = 0.5 * fitted.probability(u) if noisy else np.full(n, 0.5)
-    group = np.arange(n, dtype=np.int64)
-    distance = cdist(u, u)
-    first, second = np.triu_indices(n, 1)
-    alike = kind[first] == kind[second]
-    first, second = first[alike], second[alike]
-    order = np.argsort(distance[first, second], kind="stable")
-    first, second = first[order], second[order]
-    steps = np.linspace(0.0, 1.0, _PROBES + 2)[1:-1, None]
-    while len(first):
-        apart = group[first] != group[second]
-        first, second = first[apart], second[apart]
-        a, b = first[:_CHUNK], second[:_CHUNK]
-        first, second = first[_CHUNK:], second[_CHUNK:]
-        if len(a) == 0:
-            break
-        probes = u[a][:, None, :] * (1.0 - steps) + u[b][:, None, :] * steps  # (pairs, 9, d)
-        least = np.minimum(level[a], level[b])[:, None]
-        inside = (fitted.probability(probes.reshape(-1, u.shape[1])).reshape(len(a), _PROBES) > least).all(axis=1)
-        for i, j in zip(a[inside], b[inside], strict=True):
-            group[group == group[j]] = group[i]
-    return group
-
-
 def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *, rates: Vector | None = None) -> list[Mode]:
     """Return the failure modes, the one with the deepest run first; of a noisy simulator the likeliest to fail again first.
 
@@ -194,20 +157,19 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
 
     Args:
         fitted: learned from these runs.
-        history: runs; only finished ones count.
+        history: runs; only finished ones count. Those between critical ones (stage `confirm`) join modes, and are in none.
         scenario: with the campaign's space and requirement.
         rates: (n,) failure rates at these runs, where the simulator is noisy, see `connected` and `Mode`; None: it is not.
     """
     critical = scenario.requirement.critical
     y = scenario.requirement.values(history)
-    hits = np.flatnonzero(scenario.requirement.critical_runs(history))
+    chosen, kind = critical_groups(history, scenario)
+    hits = np.flatnonzero(scenario.requirement.critical_runs(history) & (history.stage != CONFIRM))
     if len(hits) == 0:
         return []
     u, cube = scenario.space.to_unit(history.x), scenario.space.cube
     at = cube.embedded(u)
     depth, worse = critical.margin(y), severity(history)
-    chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
-    kind = _kind(history, cube.choices(u))
     group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None)
     log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
     apart = kind[hits][:, None] != kind[chosen][None, :]
@@ -223,6 +185,14 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
         found.append(Mode(tuple(int(k) for k in rows), representative, likely, safe))
     rank = (-np.round(_RATE_STEPS * log_rate), depth, -worse, np.arange(len(history)))
     return sorted(found, key=lambda mode: tuple(by[mode.representative] for by in rank))
+
+
+def critical_groups(history: History, scenario: LogicalScenario) -> tuple[NDArray[np.intp], Vector]:
+    """Return the rows of the critical runs that are compared with each other, and (n,) the kind of each run of the history."""
+    hits = np.flatnonzero(scenario.requirement.critical_runs(history))
+    depth = scenario.requirement.critical.margin(scenario.requirement.values(history))
+    chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
+    return chosen, _kind(history, scenario.space.cube.choices(scenario.space.to_unit(history.x)))
 
 
 def representative_of(log_rate: Vector, depth: Vector, worse: Vector) -> int:

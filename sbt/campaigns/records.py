@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from sbt.store.records import optional
 
 __all__ = [
-    "CONFIRM", "COUNT", "EXPLORE", "LEARN", "RACE", "BatchProposal", "CoarseDraws", "CountedDraws", "EstimationProposal",
+    "CONFIRM", "COUNT", "EXPLORE", "LEARN", "LINK", "RACE", "BatchProposal", "CoarseDraws", "CountedDraws", "EstimationProposal",
     "EventDraws", "LevelsRecord", "NominalDraws", "PoolSummary", "ScreenRecord", "SearchProposal",
 ]  # fmt: skip
 
@@ -16,8 +16,9 @@ EXPLORE, LEARN, COUNT = "explore", "learn", "count"
 """Phases of an estimation: a search for modes, draws that only teach, draws that count."""
 CONFIRM = "confirm"
 """Stage of the runs that repeat a failure mode's representative with fresh seeds; they come beside the budget."""
-RACE = "race"
-"""Method of a batch of that stage whose repetitions decide which of several modes comes first."""
+RACE, LINK = "race", "link"
+"""Methods of a batch of that stage: repetitions that decide which of several modes comes first; runs between critical ones, that
+tell whether these are of one mode."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class SearchProposal:
     """How a batch of a falsification was chosen.
 
     Attributes:
-        method: portfolio, another criterion, an acquisition, even (the first batch), race or repeat (confirmations).
+        method: portfolio, another criterion, an acquisition, even (the first batch), link, race or repeat (confirmations).
         next_position: in the campaign's Sobol sequence.
         criteria: how many runs each criterion of the method chose.
         even: runs that fill the space.

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammainccinv
-from scipy.stats import chi2
+from scipy.special import gammainccinv, gammaincinv
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN
@@ -170,7 +169,8 @@ class SequentialStage:
         mean = math.sqrt(gain * before[-1]) if before else gain
         if not (known and ((hits >= 1.0 and mean < _GAIN) or (met >= _MET and gain < _NO_GAIN))):
             return False
-        most = noise.repeats / (SURE_NOISE * float(chi2.ppf(_UNLIKELY, noise.repeats)))
+        chi2 = 2.0 * float(gammaincinv(0.5 * noise.repeats, _UNLIKELY))
+        most = noise.repeats / (SURE_NOISE * chi2)
         return _gain(np.exp(settled(log_probability, most)(z)[0])) < _WITHOUT_DOUBT
 
     def _initial(self, n: int) -> Batch:

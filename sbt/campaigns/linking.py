@@ -1,0 +1,169 @@
+"""Are two critical runs of one failure mode? The metamodel says how surely the way between them is critical; runs on it tell."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from sbt.campaigns.wording import plural
+from sbt.problem.arrays import Mask, Points, Vector
+from sbt.samplers.search import WarpedModel
+from sbt.seeds import stream
+
+__all__ = ["LinksTold", "Way", "connected", "doubtful", "ways_between"]
+
+_PROBES = 9  # on the segment between two runs
+_CHUNK = 100  # segments asked for at once
+_DOUBT = (0.02, 0.9995)
+"""Least P(critical) on a way, between which a run on it is worth its price."""
+_SURE = 1.0 - 1e-9  # P(critical) that tells no point of a way from the others
+_LONG = 0.2
+"""Length of a way, in the unit cube, from which on a metamodel is too sure of it: a run on it tells, once."""
+_JOINED = 0.5  # least P(critical) of a way within a mode
+_GROUPS, _APART = 12, 24  # modes that are compared, and ways between two of them, the shortest
+_BENDS, _REACH = 128, 0.5  # points over which such a way may lead, and how far from its middle, in its length
+
+
+@dataclass(frozen=True)
+class Way:
+    """The segment between two critical runs that decides whether they are of one mode.
+
+    Attributes:
+        least: smallest P(critical) on it.
+        at: (d,) where that is, in the unit cube; of a way between two modes, the point over which it leads.
+        untested: the metamodel is sure of it, but no run was made on it: it is long, or bends.
+    """
+
+    least: float
+    at: Vector
+    untested: bool
+
+
+@dataclass(frozen=True)
+class LinksTold:
+    """Runs between critical runs, which asked whether these are of one failure mode.
+
+    Attributes:
+        runs: how many.
+        critical: of them.
+        left: ways in doubt that were not asked about.
+    """
+
+    runs: int
+    critical: int
+    left: int
+
+    def sentence(self) -> str:
+        """Return in words what was asked, and what remains open."""
+        asked = f"{plural(self.runs, 'run')} between critical ones tested whether they are of one failure mode"
+        found = f"{self.critical} {'was' if self.critical == 1 else 'were'} critical"
+        still = f"; {plural(self.left, 'way')} between them {'is' if self.left == 1 else 'are'} still in doubt"
+        return f"{asked}: {found}{still if self.left else ''}."
+
+
+def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False) -> NDArray[np.int64]:
+    """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes; equal inputs are one.
+
+    With a noisy simulator P(critical) is small even where runs fail most: there it must exceed half of the smaller P at the two
+    ends.
+
+    Args:
+        fitted: of the metamodel.
+        u: (n, d) critical runs in the unit cube.
+        kind: (n,) only runs of the same kind are joined.
+        noisy: see above.
+    """
+    return _linked(fitted, u, kind, noisy=noisy)[0]
+
+
+def ways_between(fitted: WarpedModel, u: Points, kind: Vector, link: Mask) -> list[Way]:
+    """Return the ways that decide which of n critical runs are of one mode, of a simulator without noise.
+
+    They are those that join the runs of a mode, and between modes that could be one the likeliest that bends once.
+
+    Args:
+        fitted: of the metamodel.
+        u: (n, d) critical runs in the unit cube.
+        kind: (n,) only runs of the same kind can be of one mode.
+        link: (n,) the run was between others.
+    """
+    group, joined = _linked(fitted, u, kind)
+    distance = cdist(u, u)
+    apart = sorted(_between_groups(group, kind, distance), key=lambda pair: float(distance[pair]))[:_APART]
+    first, second = np.array([pair for pair in joined if distance[pair] > 0.0], dtype=np.intp).reshape(-1, 2).T
+    probes, p = _probed(fitted, u[first], u[second])
+    at = np.where(p.min(axis=1) < _SURE, p.argmin(axis=1), _PROBES // 2)
+    untested = (distance[first, second] > _LONG) & ~link[first] & ~link[second]
+    straight = [Way(float(p[k].min()), probes[k, i], bool(untested[k])) for k, i in enumerate(at)]
+    return [*straight, *(_bent(fitted, u[i], u[j]) for i, j in apart)]
+
+
+def _between_groups(group: NDArray[np.int64], kind: Vector, distance: Points) -> Iterator[tuple[int, int]]:
+    """Yield the nearest runs of each two groups of one kind."""
+    for one, other in itertools.combinations(list(dict.fromkeys(group.tolist()))[:_GROUPS], 2):
+        a, b = np.flatnonzero(group == one), np.flatnonzero(group == other)
+        if kind[a[0]] == kind[b[0]]:
+            i, j = np.unravel_index(int(distance[np.ix_(a, b)].argmin()), (len(a), len(b)))
+            yield int(a[i]), int(b[j])
+
+
+def _bent(fitted: WarpedModel, a: Vector, b: Vector) -> Way:
+    """Return the way from a to b (d,) over one more point, of many, on which the least P(critical) is largest.
+
+    Coordinates that are the same at both ends, such as choices, stay.
+    """
+    rng, middle = stream(0, "ways"), 0.5 * (a + b)
+    steps = rng.standard_normal((_BENDS, len(a)))
+    steps *= rng.random((_BENDS, 1)) ** (1.0 / len(a)) / np.linalg.norm(steps, axis=1, keepdims=True)  # uniform in a ball
+    over = np.clip(np.vstack([middle, middle + _REACH * np.linalg.norm(b - a) * (a != b) * steps]), 0.0, 1.0)
+    least = np.minimum(*(_probed(fitted, np.broadcast_to(end, over.shape), over)[1].min(axis=1) for end in (a, b)))
+    least = np.minimum(least, fitted.probability(over))
+    best = int(least.argmax())
+    return Way(float(least[best]), over[best], untested=bool(least[best] > _JOINED))
+
+
+def doubtful(ways: list[Way]) -> list[Way]:
+    """Return the ways on which a run would tell something, those that are most in doubt first."""
+    found = [way for way in ways if _DOUBT[0] < way.least and (way.least < _DOUBT[1] or way.untested)]
+    return sorted(found, key=lambda way: abs(way.least - 0.5))
+
+
+def _linked(
+    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False
+) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    """Return (n,) group numbers, and the pairs that join them."""
+    n, pairs = len(u), []
+    level = _JOINED * fitted.probability(u) if noisy else np.full(n, _JOINED)
+    group = np.arange(n, dtype=np.int64)
+    distance = cdist(u, u)
+    first, second = np.triu_indices(n, 1)
+    alike = kind[first] == kind[second]
+    first, second = first[alike], second[alike]
+    order = np.argsort(distance[first, second], kind="stable")
+    first, second = first[order], second[order]
+    while len(first):
+        apart = group[first] != group[second]
+        first, second = first[apart], second[apart]
+        a, b = first[:_CHUNK], second[:_CHUNK]
+        first, second = first[_CHUNK:], second[_CHUNK:]
+        if len(a) == 0:
+            break
+        least = np.minimum(level[a], level[b])[:, None]
+        inside: Mask = (_probed(fitted, u[a], u[b])[1] > least).all(axis=1) | (distance[a, b] == 0.0)
+        for i, j in zip(a[inside], b[inside], strict=True):
+            if group[i] != group[j]:
+                pairs.append((int(i), int(j)))
+                group[group == group[j]] = group[i]
+    return group, pairs
+
+
+def _probed(fitted: WarpedModel, a: Points, b: Points) -> tuple[NDArray[np.float64], Points]:
+    """Return (m, 9, d) points on the segments from a to b (m, d), and (m, 9) P(critical) there."""
+    steps = np.linspace(0.0, 1.0, _PROBES + 2)[1:-1, None]
+    probes = a[:, None, :] * (1.0 - steps) + b[:, None, :] * steps
+    return probes, fitted.probability(probes.reshape(-1, a.shape[1])).reshape(len(a), _PROBES)
