@@ -71,9 +71,9 @@ _MANY_HITS, _ENOUGH = 5.0, 0.2  # expected of crude Monte Carlo; share of the bu
 geometric mean of this and the last batch, as what few runs let expect varies by a factor of three, and there is no way back."""
 _MET, _NO_GAIN = 2, 1.5
 """Critical runs with which it is whatever P the metamodel expects, where it gains next to nothing: it may deny what was met."""
-_UNLIKELY, _WITHOUT_DOUBT = 0.05, 10.0
-"""Gain with means known, and the largest noise that repeats let expect at this level, above which it is not: a process takes for
-noise what it has not learned yet, and learns it."""
+_UNLIKELY = 0.05
+"""Level of the largest noise that repeats let expect. Were the gain `_GAIN` with that noise and with means known, it is not left:
+a process takes for noise what it has not learned yet, and learns it."""
 _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
 _SURPRISE = 0.01
@@ -171,7 +171,7 @@ class SequentialStage:
             return False
         chi2 = 2.0 * float(gammaincinv(0.5 * noise.repeats, _UNLIKELY))
         most = noise.repeats / (SURE_NOISE * chi2)
-        return _gain(np.exp(settled(log_probability, most)(z)[0])) < _WITHOUT_DOUBT
+        return _gain(np.exp(settled(log_probability, most)(z)[0])) < _GAIN
 
     def _initial(self, n: int) -> Batch:
         """Return an even design over the wide distribution."""
