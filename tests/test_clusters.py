@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ import pytest
 import sbt
 from sbt.campaigns.again import reused
 from sbt.campaigns.asking import answer
-from sbt.campaigns.clustering import clustered_interval
+from sbt.campaigns.clustering import clustered_interval, spread_of_batches
+from sbt.campaigns.gate import Limits
 from sbt.estimators.binomial import interval
 from sbt.estimators.clusters import clustered_error, effective_runs, reach
+from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.store.database import Store
 from sbt.workflows.asking import _settings
@@ -119,3 +122,20 @@ def test_requirements_and_the_rule_of_precision_know_of_the_spread_between_warm_
     for before, after in zip(plain.conclusion.requirements, found.requirements, strict=True):
         assert after.probability == before.probability
         assert after.high - after.low > 1.2 * (before.high - before.low)
+
+
+def test_the_upper_end_has_the_spread_of_failed_runs_too():
+    """Five critical draws in as many warm-ups, and four that fail in one: failed as critical that one stands out."""
+    n, warm_up = 160, np.arange(160) % 20
+    critical, failed = np.isin(np.arange(n), [0, 1, 2, 3, 4]), np.isin(np.arange(n), [7, 27, 47, 67])
+    even = [CountedBatch(0.0, 0.0, 0.0, np.ones(n), np.zeros(n), hits.astype(float)) for hits in (critical, critical | failed)]
+    found = spread_of_batches(warm_up, [even[0]], [even[1]])
+    sums = np.bincount(warm_up, weights=(critical | failed) - (critical | failed).mean()) / n
+    assert found.std_error_failed == pytest.approx(math.sqrt(20 / 19 * (sums**2).sum()), rel=0.01)
+    assert found.std_error_failed > 2.0 * found.std_error
+    none = Limits(lambda _: 0.03, lambda _: 0.03)
+    assert found.widened(none, 5 / n, 9 / n).upper(0.975) == pytest.approx(9 / n + reach(found.std_error_failed, 20, 0.975))
+    assert found.widened(none, 5 / n, 9 / n).lower(0.975) == max(5 / n - reach(found.std_error, 20, 0.975), 0.0)
+    assert spread_of_batches(warm_up, [even[0]], [even[0]]).std_error_failed is None
+    nothing = CountedBatch(0.0, 0.0, 0.0, np.ones(n), np.zeros(n), np.zeros(n))
+    assert "is not in the interval" in spread_of_batches(warm_up, [nothing]).sentence()

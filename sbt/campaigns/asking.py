@@ -52,7 +52,8 @@ def answer(found: Reused) -> EstimationConclusion:
     weight = np.concatenate([b.coefficient for b in found.batches])
     size = effective_size(weight)
     told, limits = _from_nominal(found) if found.crude else _from_batches(found)
-    told, _ = on_warm_ups(told, limits, spread_of_batches(found.warm_up, [_weighted(b) for b in found.batches]))
+    batches, worst = ([_weighted(b) for b in each] for each in (found.batches, found.worst))
+    told, _ = on_warm_ups(told, limits, spread_of_batches(found.warm_up, batches, worst))
     share = float(weight.max() / weight.sum())
     warnings = list(told.warnings)
     if share > _HEAVY:

@@ -16,8 +16,11 @@ from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Vector
 from sbt.store.history import History
+from sbt.store.records import optional
 
 __all__ = ["Spread", "clustered_interval", "spread_of_batches", "spread_of_draws", "spread_of_share"]
+
+Batches = Sequence[CountedBatch]
 
 
 @dataclass(frozen=True)
@@ -27,24 +30,27 @@ class Spread:
     Attributes:
         warm_ups: number of those that counted runs began with.
         std_error: of the estimate, from the spread between warm-ups; None: it is not known from one, or from repeats.
+        std_error_failed: of that with failed runs as critical; None: no run failed.
     """
 
     warm_ups: int
     std_error: float | None
+    std_error_failed: float | None = optional()
 
-    def widened(self, limits: Limits, value: float | None) -> Limits:
-        """Return limits that are at least as far from the estimate as the spread says."""
+    def widened(self, limits: Limits, value: float | None, worst: float | None = None) -> Limits:
+        """Return limits that are at least as far from the estimate as the spread says; `worst` has failed runs as critical."""
         error, k = self.std_error, self.warm_ups
         if error is None or value is None:
             return limits
+        most, failed = max(value, worst or 0.0), max(error, self.std_error_failed or 0.0)
         return Limits(
             lambda c: max(min(limits.lower(c), value - reach(error, k, c)), 0.0),
-            lambda c: min(max(limits.upper(c), value + reach(error, k, c)), 1.0),
+            lambda c: min(max(limits.upper(c), most + reach(failed, k, c)), 1.0),
         )
 
     def sentence(self) -> str:
         """Return what the result is conditional on."""
-        known = self.std_error is not None
+        known = bool(self.std_error) or bool(self.std_error_failed)  # 0: nothing, or all, was critical
         spread = "the interval has the spread between them" if known else "how others would change it is not in the interval"
         return f"The result is conditional on the traffic of {plural(self.warm_ups, 'warm-up')}; {spread}."
 
@@ -57,26 +63,43 @@ class Spread:
         return self.std_error is not None and self.std_error > cov * value
 
 
-def spread_of_draws(log: Log, batches: Sequence[CountedBatch]) -> Spread | None:
-    """Return the spread of an estimate from weighted batches; None where runs simulate their traffic from the beginning."""
+def spread_of_draws(log: Log, batches: Batches, worst: Batches | None = None) -> Spread | None:
+    """Return the spread of an estimate from weighted batches; None where runs simulate their traffic from the beginning.
+
+    Args:
+        log: of the campaign.
+        batches: failed runs as safe.
+        worst: the same, failed runs as critical.
+    """
     history = log.history
     drawn = history.stage == DRAWN
     rows = [np.flatnonzero(drawn & (history.iteration == number)) for number in counted_iterations(log)][: len(batches)]
-    return spread_of_batches(history.columns["warm_up"][np.concatenate(rows)], batches)
+    return spread_of_batches(history.columns["warm_up"][np.concatenate(rows)], batches, worst)
 
 
-def spread_of_batches(warm_up: Vector, batches: Sequence[CountedBatch]) -> Spread | None:
-    """Return the spread of an estimate from weighted batches, of which each draw began with a warm-up (n,), -1 without one."""
-    weights = np.array([np.sqrt(t + 1.0) * len(b.critical) for t, b in enumerate(batches)])
-    weights /= weights.sum()  # as `combine_estimates` has them
-    return _spread(warm_up, np.concatenate([w * b.errors for w, b in zip(weights, batches, strict=True)]))
+def spread_of_batches(warm_up: Vector, batches: Batches, worst: Batches | None = None) -> Spread | None:
+    """Return the spread of an estimate from weighted batches, of which each draw began with a warm-up (n,), -1 without one.
+
+    `worst` are the same batches with failed runs as critical.
+    """
+
+    def terms(those: Batches) -> Vector:
+        weights = np.array([np.sqrt(t + 1.0) * len(b.critical) for t, b in enumerate(those)])
+        weights /= weights.sum()  # as `combine_estimates` has them
+        return np.concatenate([w * b.errors for w, b in zip(weights, those, strict=True)])
+
+    differ = worst is not None and any((a.critical != b.critical).any() for a, b in zip(batches, worst, strict=True))
+    return _spread(warm_up, terms(batches), terms(worst) if worst is not None and differ else None)
 
 
 def spread_of_share(history: History, among: Mask, critical: Mask) -> Spread | None:
     """Return the spread of the critical share among some runs; None where runs simulate their traffic from the beginning."""
     rows = np.flatnonzero(among)
-    hits = critical[rows].astype(np.float64)
-    return _spread(history.columns["warm_up"][rows], (hits - hits.mean()) / len(rows)) if len(rows) else None
+    if not len(rows):
+        return None
+    readings = (each[rows].astype(np.float64) for each in (critical, critical | ~history.ok))
+    safe, worst = ((hits - hits.mean()) / len(rows) for hits in readings)
+    return _spread(history.columns["warm_up"][rows], safe, None if history.ok[rows].all() else worst)
 
 
 def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: float = 0.95) -> tuple[float, float]:
@@ -97,7 +120,8 @@ def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: fl
     return float(low), float(high)
 
 
-def _spread(cluster: Vector, terms: Vector) -> Spread | None:
+def _spread(cluster: Vector, terms: Vector, failed: Vector | None) -> Spread | None:
     if not (cluster >= 0).any():
         return None
-    return Spread(len(np.unique(cluster)), clustered_error(terms, cluster))
+    worst = None if failed is None else clustered_error(failed, cluster)
+    return Spread(len(np.unique(cluster)), clustered_error(terms, cluster), worst)

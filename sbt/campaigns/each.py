@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.campaigns.clustering import spread_of_draws, spread_of_share
+from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
 from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations, with_event
 from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion
 from sbt.campaigns.gate import Limits
@@ -80,8 +80,8 @@ def _from_nominal(log: Log, settings: Settings, stage: str, confidence: float) -
     for part in settings.scenario.requirement.parts:
         share = nominal_proportion(log, settings, stage, part)
         between = spread_of_share(log.history, log.history.stage == stage, part.critical_runs(log.history))
-        limits = Limits(share.lower, share.upper)
-        limits = limits if between is None else between.widened(limits, share.value)
+        limits, worst = Limits(share.lower, share.upper), (share.hits + share.failed) / max(share.n, 1)
+        limits = limits if between is None else between.widened(limits, share.value, worst)
         found.append(RequirementEstimate(part.label, share.value, limits.lower(tail), limits.upper(tail), share.hits))
     return tuple(found)
 
@@ -99,19 +99,17 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
         if min(hits, misses) == 0:  # no variance is known: the draws from the inputs' distribution bound it
             ends = _bounds(part, log, settings, tail)
         else:
-            ends = _ends(log, safe, value, low, high, few=few, confidence=tail)
+            ends = _ends(spread_of_draws(log, safe, critical), value, low, high, few=few, confidence=tail)
         found.append(RequirementEstimate(part.label, value, min(ends[0], value), max(ends[1], value), hits))
     return tuple(found)
 
 
 def _ends(
-    log: Log, batches: list[CountedBatch], value: float, low: CombinedEstimate, high: CombinedEstimate, *, few: bool,
-    confidence: float,
-) -> tuple[float, float]:  # fmt: skip
+    between: Spread | None, value: float, low: CombinedEstimate, high: CombinedEstimate, *, few: bool, confidence: float
+) -> tuple[float, float]:
     """Return the ends of an interval, at least as wide as the spread between warm-ups says."""
-    between = spread_of_draws(log, batches)
     limits = Limits(lambda c: low.limit(c, side=-1, few=few), lambda c: high.limit(c, side=1, few=few))
-    limits = limits if between is None else between.widened(limits, value)
+    limits = limits if between is None else between.widened(limits, value, high.value)
     return limits.lower(confidence), limits.upper(confidence)
 
 

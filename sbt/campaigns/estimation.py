@@ -193,7 +193,7 @@ def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread | N
     if traffic is None:
         return found, limits
     value, error = found.probability, traffic.std_error
-    limits, tail = traffic.widened(limits, value), 0.5 * (1.0 + _CONFIDENCE)
+    limits, tail = traffic.widened(limits, value, found.failed_as_critical), 0.5 * (1.0 + _CONFIDENCE)
     cov = found.cov if not value or error is None else max(found.cov or 0.0, error / value)
     warnings = found.warnings
     if value and error is not None and error / value > (found.cov or 0.0):

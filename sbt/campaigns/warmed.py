@@ -30,7 +30,7 @@ def warmed_traffic(log: Log, settings: Settings) -> Spread | None:
     history = log.history
     batches = counted_batches(log, settings)
     if batches:
-        return spread_of_draws(log, batches)
+        return spread_of_draws(log, batches, counted_batches(log, settings, failed_critical=True))
     if (history.stage == NOMINAL).any():
         return spread_of_share(history, history.stage == NOMINAL, settings.scenario.requirement.critical_runs(history))
     numbers = history.columns["warm_up"]
