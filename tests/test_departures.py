@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from sbt.errors import RunError
 from sbt.metrics.geometry import overlap_depth, rectangle_distance
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace
-from sbt.sumo.actors import Action, Actor, Obstacle, Scene, VehicleType
+from sbt.sumo.actors import Action, Actor, Obstacle, Scene, State, VehicleType
+from sbt.sumo.appearances import AppearanceMonitor
+from sbt.sumo.overlaps import instant
 from sbt.sumo.simulation import SumoSimulation
 
 Case = Callable[..., tuple[str, str]]
@@ -278,3 +281,33 @@ def test_the_depth_of_an_overlap_is_the_shortest_move_that_parts():
         step = np.maximum(depth, 0) * 0.999
         moved = ActorTrace(b.x + step * np.cos(angle), b.y + step * np.sin(angle), b.heading, b.speed, b.acceleration, b.length, b.width)
         assert (overlap_depth(a, moved)[depth > 1e-6] > 0).all()
+
+
+@pytest.mark.parametrize(("place", "refused"), [("s.yaml:5:8: insert.ego: ", True), ("town.rou.xml:5:8: ", False)])
+def test_an_ego_that_the_scenario_inserts_right_before_traffic_is_no_run(place: str, refused: bool):
+    """The other is .33 m behind and 7 m/s faster: nobody could brake. Who places vehicles in own files means it."""
+    ego, behind = State("ego", 5.0, 1.8), State("c", 5.0, 1.8)
+    ego.x, ego.speed, behind.x, behind.speed = 5.33, 5.0, 0.0, 12.0
+    states = {"ego": ego, "c": behind}
+
+    class Near:
+        def __init__(self):
+            self.states = states
+
+        def __len__(self):
+            return 1
+
+        def newcomers(self):
+            return ["c"]
+
+        def body(self, name):
+            return instant(states[name])
+
+    departures = SimpleNamespace(asked={"ego"}, place_of=lambda name: place)
+    sumo = SimpleNamespace(simulation=SimpleNamespace(getParkingEndingVehiclesNumber=lambda: 0, getTime=lambda: 100.1))
+    monitor = AppearanceMonitor(sumo, "ego", departures)
+    if refused:
+        with pytest.raises(RunError, match=r"so close to 'c' that only 74\.2 m/s\^2 .*: change its position or at"):
+            monitor.after_step(Near(), frozenset())
+    else:
+        monitor.after_step(Near(), frozenset())

@@ -137,3 +137,14 @@ def test_egos_of_sumo(tmp_path):
     for pair in pairs:
         assert [said.split(",")[0] for said in pair["said"]] == ["not critical", "critical"]
         assert pair["films"][0]["actors"][0]["v"] != pair["films"][1]["actors"][0]["v"], "the films are of two egos"
+
+
+def test_the_page_of_a_comparison_says_what_it_is_conditional_on():
+    from sbt.report.versus import _sentences
+
+    none = {"failed": 0}
+    result = {"before": none, "after": none, "fixed": [], "new": [], "still": 2, "pairs": 60}
+    assert "is exact and paired" in " ".join(_sentences(result))
+    told = " ".join(_sentences(result | {"warm_ups": 4}))
+    assert "conditional on the traffic of 4 warm-ups" in told
+    assert "exact" not in told

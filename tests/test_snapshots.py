@@ -25,6 +25,7 @@ from sbt.sumo.departures import requested_departures
 from sbt.sumo.template import template
 from sbt.sumo.user_simulation import UserSimulation
 from sbt.sumo.warming import _read
+from sbt.workflows.pinning import pin_runs
 from tests.own_networks import program, run_program
 from tests.warm_networks import T0, town
 
@@ -414,3 +415,15 @@ def test_an_element_ends_before_the_end_of_a_file_of_almost_its_name(tmp_path):
 
 def test_times_are_read_as_sumo_reads_them():
     assert [seconds_of(text) for text in ("12.5", "1:00:02", "1:0:0:1", "triggered")] == [12.5, 3602.0, 86401.0, None]
+
+
+@pytest.mark.sumo
+def test_a_pin_begins_with_the_warm_up_of_the_campaign(tmp_path, monkeypatch):
+    """Their number follows from the budget: eight runs share one, five hundred eight."""
+    monkeypatch.chdir(tmp_path)
+    scenario = inserting(tmp_path / "town", warm="{until: 42}")
+    result = sbt.run(campaign="coverage", scenario=str(scenario), budget=8, seed=1, executor="serial", store="s", report=False)
+    assert set(result.frame["warm_up"]) == {0}
+    runs = result.frame[(result.frame["status"] == "ok") & (result.frame["seed"] % 8 != 0)]
+    path = pin_runs(tmp_path / "s", [str(runs["index"].iloc[0])], tmp_path / "pins")
+    assert "warm_ups=1" in path.read_text()

@@ -70,11 +70,15 @@ def _interval(result: Mapping[str, Any], confidence: float) -> str:
 
 def _sentences(result: Mapping[str, Any]) -> list[str]:
     failed, fixed = result["before"]["failed"] + result["after"]["failed"], plural(len(result["fixed"]), "failure")
+    lost = f" {failed:,} failed runs count as whatever is worse for the end in question." if failed else ""
+    of, conditional = "exact and paired", []
+    if "warm_ups" in result:
+        of = "paired, and that of fewer pairs, since some share a warm-up"
+        conditional = [f"The comparison is conditional on the traffic of {plural(result['warm_ups'], 'warm-up')}."]
     return [
         f"{fixed} {'was' if len(result['fixed']) == 1 else 'were'} fixed, {len(result['new']):,} are new,"
         f" {result['still']:,} runs are critical with both, of {result['pairs']:,} pairs of runs with common draws and seeds.",
-        "The interval of the change is exact and paired: only runs with different verdicts tell the egos apart."
-        + (f" {failed:,} failed runs count as whatever is worse for the end in question." if failed else ""),
+        f"The interval of the change is {of}: only runs with different verdicts tell the egos apart.{lost}", *conditional,
     ]
 
 

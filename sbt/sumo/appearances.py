@@ -15,7 +15,7 @@ from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import State
 from sbt.sumo.overlaps import deepest_overlap, instant, required_braking
-from sbt.sumo.places import said_at
+from sbt.sumo.places import inserted_at, said_at
 
 __all__ = ["AppearanceMonitor", "refuse_overlap_at_start"]
 
@@ -100,7 +100,10 @@ class AppearanceMonitor:
         if len(near) == 1:
             found = deepest_overlap(near.body(self._ego), {name: near.body(name) for name in new})
             remedy = "change its departPos or depart, or keep the inputs apart by constraints"
-            _refuse_start(self._ego, found, remedy, self._departures.place_of(self._ego))
+            place = self._departures.place_of(self._ego)
+            _refuse_start(self._ego, found, remedy, place)
+            if inserted_at(place):  # a place among traffic, which is drawn: not the scenario that anybody meant
+                self._refuse_close(near, [name for name in new if name not in self._departures.asked], place, remedy)
         elif new:
             persons = frozenset(simulation.getDepartedPersonIDList())
             appeared = departed | persons | frozenset(simulation.getEndingTeleportIDList())
@@ -130,13 +133,18 @@ class AppearanceMonitor:
                 f"{self._departures.place_of(found[0])}'{found[0]}' must appear clear of the ego, but overlaps it by "
                 f"{found[1]:.2g} m at {self._now()}, which is no collision: {_REMEDY}",
             )
-        for name in appeared:
-            asked = name in self._departures.asked
-            braking = 0.0 if asked else required_braking(near.states[self._ego], near.states[name])
+        drawn = [name for name in appeared if name not in self._departures.asked]
+        self._refuse_close(near, drawn, "", _REMEDY)
+
+    def _refuse_close(self, near: _Surroundings, names: Sequence[str], place: str, remedy: str) -> None:
+        """Refuse others so close to the ego that nobody could react; `place`: of the ego, where it is the one who appears."""
+        for name in names:
+            braking = required_braking(near.states[self._ego], near.states[name])
             if braking > _MAX_BRAKING:
+                who, whom = (self._ego, f"'{name}'") if place else (name, "the ego")
                 limit = f"{braking:.3g} m/s^2 of braking would keep them apart (tyres allow about {_MAX_BRAKING:g})"
                 raise RunError(
                     Status.INVALID,
-                    f"'{name}' must appear where drivers can react, but at {self._now()} it is so close to the ego "
-                    f"that only {limit}: {_REMEDY}",
+                    f"{place}'{who}' must appear where drivers can react, but at {self._now()} it is so close to {whom} "
+                    f"that only {limit}: {said_at(place, remedy)}",
                 )

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["place_in", "said_at", "stands_for"]
+__all__ = ["inserted_at", "place_in", "said_at", "stands_for"]
 
 _ELSEWHERE: dict[str, Mapping[int, str]] = {}
 """Of files of this process: line to where the user wrote what is there."""
@@ -25,12 +25,17 @@ def stands_for(path: Path, places: Mapping[int, str]) -> None:
     _ELSEWHERE[str(path)] = places
 
 
+def inserted_at(place: str) -> bool:
+    """Return whether a place is that of a vehicle that the scenario inserts."""
+    return "insert." in place
+
+
 def said_at(place: str, text: str) -> str:
     """Return a text about a departure in the words of its place: SUMO's attributes, or the keys of `insert`.
 
     >>> said_at("mine/scenario.yaml: insert.ego: ", "move its departPos")
     'move its position'
     """
-    if "insert." not in place:
+    if not inserted_at(place):
         return text
     return re.sub(rf"\b({'|'.join(_KEYS)})\b", lambda found: _KEYS[found[1]], text)

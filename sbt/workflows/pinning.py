@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -65,11 +65,13 @@ class Pinned:
         configuration: YAML of the campaign, as far as a run depends on it.
         folder: where its relative names start.
         ego: another AV under test, as in a configuration or as YAML; None or "": that of the campaign.
+        warm_ups: number that the campaign's runs shared, where they began with warmed traffic; 0: as it is configured.
     """
 
     configuration: str
     folder: Path
     ego: JsonMapping | str | None = None
+    warm_ups: int = 0
     _runs: dict[str, PinnedRun] = field(default_factory=dict, compare=False)
 
     def run(self, inputs: Mapping[str, Value], seed: int) -> PinnedRun:
@@ -94,7 +96,10 @@ class Pinned:
         study = self._study
         with study.loaded.scope.naming():
             scenario = study.runnable
-            outcome, trace = run_traced(study.spec.resolve(), Job(0, dict(inputs), seed))
+            spec = study.spec
+            if self.warm_ups and spec.isolated is not None:
+                spec = replace(spec, isolated=replace(spec.isolated, seeds=self.warm_ups))
+            outcome, trace = run_traced(spec.resolve(), Job(0, dict(inputs), seed))
         if outcome.status != Status.OK:
             raise RunError(outcome.status, f"a pinned run must give metrics, but it ended as {outcome.status}: {outcome.reason}")
         need = scenario.requirement
@@ -125,7 +130,8 @@ def pin_runs(folder: Path, runs: Sequence[str], into: Path) -> Path:
         _check(again, folder)
     into.mkdir(parents=True, exist_ok=True)
     configuration, place = _configuration(text), place if _names_files(study) else into
-    pinned, pins = Pinned(configuration, place), []
+    warm_ups = int((kept.get("isolation") or {}).get("seeds", 0))
+    pinned, pins = Pinned(configuration, place, warm_ups=warm_ups), []
     for again in replays:
         record = again.record
         found = pinned.run(record.inputs, record.seed)
@@ -142,7 +148,7 @@ def pin_runs(folder: Path, runs: Sequence[str], into: Path) -> Path:
     values = {
         "@SCENARIO@": study.scenario.name, "@STORE@": folder.name, "@PLACE@": repr(os.path.relpath(place, into.resolve())),
         "@CONFIGURATION@": configuration.replace("\\", "\\\\").replace('"""', '\\"\\"\\"'), "@PINS@": _written(pins),
-        "@INF@": infinite,
+        "@INF@": infinite, "@WARM_UPS@": f", warm_ups={warm_ups}" if warm_ups else "",
     }  # fmt: skip
     for key, value in values.items():
         page = page.replace(key, value)
