@@ -82,11 +82,9 @@ class ConfirmStage:
             return []
         asked = int((runs.stage == CONFIRM).sum())
         most = min(max(int(_LINK_SHARE * (len(runs) - asked)), _FEWEST_LINKS), _MOST_LINKS)
-        at = [way.at for way in search.doubtful_ways(runs)]
-        u = np.array(at).reshape(-1, scenario.space.dimension)
-        x = scenario.space.from_unit(u[scenario.space.feasible(scenario.space.from_unit(u))]) if len(u) else u
+        x = [scenario.space.from_unit(way.at[None])[0] for way in search.doubtful_ways(runs)]
         known = {tuple(row) for row in runs.x}  # whole numbers: the way may lead through a run
-        new = [row for row in dict.fromkeys(map(tuple, x.tolist())) if row not in known]
+        new = [row for row in dict.fromkeys(map(tuple, x)) if row not in known]
         batch = new[: min(most - asked, -(-most // _LINK_BATCH))]
         return [PlannedRun(CONFIRM, named_inputs(scenario, np.array(row))) for row in batch]
 

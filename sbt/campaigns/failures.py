@@ -185,12 +185,12 @@ class FailureSearch:
 
     def doubtful_ways(self, history: History) -> list[Way]:
         """Return the ways between critical runs on which a run would tell whether they are of one mode; none with noise."""
-        fitted, scenario = self._learned(history, None).fitted, self.settings.scenario
+        fitted, space = self._learned(history, None).fitted, self.settings.scenario.space
         if fitted is None:
             return []
-        chosen, kind = critical_groups(history, scenario)
-        u = scenario.space.to_unit(history.x[chosen])
-        return doubtful(ways_between(fitted, u, kind[chosen], history.stage[chosen] == CONFIRM))
+        chosen, kind = critical_groups(history, self.settings.scenario)
+        ways = doubtful(ways_between(fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM))
+        return [way for way in ways if space.feasible(space.from_unit(way.at[None]))[0]]
 
     def _learned(self, history: History, raced: History | None) -> _Learned:
         runs = tuple(history.index.tolist()), () if raced is None else tuple(raced.index.tolist())
