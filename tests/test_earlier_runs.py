@@ -88,6 +88,14 @@ def test_runs_of_the_same_scenario_are_runs_more(old, tmp_path):
         assert store.configuration["earlier"]["other"] is False
 
 
+@pytest.mark.parametrize("campaign", ["boundary", "estimation"])
+def test_runs_of_other_code_are_none_of_the_same_scenario(old, tmp_path, campaign):
+    """They would be learned as this scenario's: an estimation had an error of .58 with 500 runs for .003 with 165."""
+    with pytest.raises(sbt.InputError, match=r"of what is run now, but its run \d+ now gives .*transfer: true"):
+        boundary(tmp_path / "new", scenario("before", later), campaign=campaign, warm_start={"store": str(old)})
+    assert not (tmp_path / "new").exists()
+
+
 def test_an_input_of_the_earlier_campaign_alone_is_integrated_or_fixed(tmp_path):
     boundary(tmp_path / "old", scenario("wet", waves, "abcd"), budget=80)
     for fixed in ({}, {"d": 0.0}):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
-from sbt.store.history import Record
+from sbt.store.history import History, Record
 from sbt.workflows.asking import sensitivities_in
 from sbt.workflows.fidelity import COARSE_COST
 from sbt.workflows.filming import film_runs
@@ -105,6 +105,7 @@ def run_study(
         campaign = study.campaign
         if shard is not None:
             check_shard(campaign)
+        _check_earlier(study)
     with Store.open(Path(study.config.store)) as store:
         study = study.stored_in(store)
         campaign, snapshot = study.campaign, study.snapshot(shard)
@@ -148,19 +149,49 @@ def _check_code(store: Store, study: Study, executor: Executor) -> None:
 
     The first and the last with metrics are tried, and the first that could not be: code may change just what is invalid.
     """
-    config, history = study.config, store.history()
-    code = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
-    if not any(name.startswith(OBJECT) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code):
+    history = store.history()
+    if not _own_code(study):
         return
     ok, invalid = np.flatnonzero(history.ok), np.flatnonzero(history.status == str(Status.INVALID))
-    records = [history.record(int(row)) for row in dict.fromkeys([*ok[:1], *ok[-1:], *invalid[:1]])]
-    for outcome in executor.run([Job(record.index, record.inputs, record.seed) for record in records]):
-        record = next(each for each in records if each.index == outcome.index)
+    for record, outcome in _again(history, [*ok[:1], *ok[-1:], *invalid[:1]], executor):
         if dict(outcome.metrics) != dict(record.metrics):
             now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics) or record.reason
             rule = f"code and files must give the runs of {store.folder} again to go on, but run {record.index} now gives {now}"
             remedy = "choose another store for what has changed"
             raise InputError(f"{rule}, not {stored}{changed_since(store.folder)}; {remedy}")
+
+
+def _check_earlier(study: Study) -> None:
+    """Refuse to learn from an earlier campaign as from this one where code has changed: its first and last run are tried.
+
+    With warmed traffic they are not, since another number of warm-ups is another beginning.
+    """
+    choice = study.config.warm_start
+    if choice is None or choice.transfer or not _own_code(study) or (study.isolation is not None and study.isolation.warm):
+        return
+    history = study.earlier_campaign().same_runs(study.scenario)
+    ok = np.flatnonzero(history.ok & history.drawn & (history.columns["level"] == 0))
+    with study.executor() as executor:
+        for record, outcome in _again(history, [*ok[:1], *ok[-1:]], executor):
+            stored = {name: value for name, value in record.metrics.items() if name in outcome.metrics or not outcome.metrics}
+            now = {name: outcome.metrics[name] for name in stored if outcome.metrics} or outcome.reason
+            if now != stored:
+                rule = f"warm_start.store must be of what is run now, but its run {record.index} now gives {now}, not {stored}"
+                raise InputError(f"{rule}: transfer: true takes it as another setup")
+
+
+def _own_code(study: Study) -> bool:
+    """Return whether runs depend on files or objects of the user's."""
+    config = study.config
+    code = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
+    return any(name.startswith(OBJECT) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code)
+
+
+def _again(history: History, rows: Sequence[np.intp], executor: Executor) -> Iterator[tuple[Record, Outcome]]:
+    """Yield the runs in these rows, and how they go now."""
+    records = {record.index: record for record in (history.record(int(row)) for row in dict.fromkeys(rows))}
+    for outcome in executor.run([Job(record.index, record.inputs, record.seed) for record in records.values()]):
+        yield records[outcome.index], outcome
 
 
 def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> None:

@@ -258,10 +258,11 @@ class Study:
         learner = Learner(self.scenario, metamodel, config.seed, self.kind.target_aware)
         if config.warm_start is None or not self.kind.takes_earlier:
             return learner
-        known = EarlierRuns.from_json(self.kept[EARLIER]) if EARLIER in self.kept else self._before().pooled(learner, config)
+        kept = self.kept.get(EARLIER)
+        known = self.earlier_campaign().pooled(learner, config) if kept is None else EarlierRuns.from_json(kept)
         return replace(learner, earlier=known)
 
-    def _before(self) -> EarlierCampaign:
+    def earlier_campaign(self) -> EarlierCampaign:
         """Return the campaign that `warm_start` names.
 
         Raises:
@@ -291,10 +292,10 @@ class Study:
         if choice is None or self.kind.takes_earlier:
             return {}
         if not choice.transfer:
-            return {"prior_runs": self._before().same_runs(self.scenario)}
+            return {"prior_runs": self.earlier_campaign().same_runs(self.scenario)}
         if self.learner is None:
             raise InputError(f"warm_start.transfer needs a metamodel, but {self.config.acquisition.kind} uses none")
-        return {"transfer": self._before().trend(self.learner, self.config)}
+        return {"transfer": self.earlier_campaign().trend(self.learner, self.config)}
 
     @cached_property
     def settings(self) -> Settings:
