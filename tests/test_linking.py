@@ -60,7 +60,10 @@ def test_links_come_beside_the_budget_follow_from_the_log_and_are_told(tmp_path:
     assert links.critical == int((asked.y("y") <= 0.0).sum())
     assert int((history.stage != CONFIRM).sum()) == 100
     assert len(np.unique(asked.x, axis=0)) == len(asked)
-    assert {run for mode in result.conclusion.failure_modes for run in mode.runs}.isdisjoint(asked.index.tolist())
+    members = {run for mode in result.conclusion.failure_modes for run in mode.runs}
+    assert members & set(asked.index.tolist()) == set(asked.index[asked.y("y") <= 0.0].tolist())
+    worst = history.index[(history.stage != CONFIRM) | np.isin(history.index, asked.index)]
+    assert result.conclusion.failure_modes[0].representative == worst[np.argmin(history.y("y")[np.isin(history.index, worst)])]
     assert "between critical ones tested whether they are" in " ".join(
         result.conclusion.sentences(Facts(history, result.scenario.requirement))
     )

@@ -346,7 +346,7 @@ def _more(found: FalsificationConclusion, facts: Facts) -> list[str]:
     failed = int((~runs.ok).sum())
     if found.critical_runs and found.critical_runs == len(runs) - failed:
         said.append("Every run that gave a metric was critical: no boundary was met.")
-    alone = single(found.failure_modes, runs)
+    alone = single(found.failure_modes, facts.history)
     whose = f"all {alone}" if alone == len(found.failure_modes) else f"{alone} of {len(found.failure_modes)}"
     said += [f"Modes of one input each ({whose}) may be parts of one thin or bent region."] if alone > 1 else []
     unsure = [mode for mode in found.failure_modes[1:] if mode.confirmed is not None and _uncritical(mode.confirmed, mode)]

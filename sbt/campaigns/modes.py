@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from sbt.campaigns.linking import connected
-from sbt.campaigns.records import CONFIRM
 from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type, without_standing
@@ -103,7 +102,7 @@ class FailureMode:
     Attributes:
         representative: index of its run deepest in the critical interval, or most likely to fail again (see `Mode`).
         inputs, metric: of the representative.
-        size: critical runs of the search in it.
+        size: critical runs in it, of the search and between its runs.
         conflict: how ego and the nearest other met; None where it is not measured.
         runs: their indices.
         confirmed: share of the repetitions of the representative with fresh seeds that were critical; None: not repeated.
@@ -157,14 +156,14 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
 
     Args:
         fitted: learned from these runs.
-        history: runs; only finished ones count. Those between critical ones (stage `confirm`) join modes, and are in none.
+        history: runs; only finished ones count.
         scenario: with the campaign's space and requirement.
         rates: (n,) failure rates at these runs, where the simulator is noisy, see `connected` and `Mode`; None: it is not.
     """
     critical = scenario.requirement.critical
     y = scenario.requirement.values(history)
     chosen, kind = critical_groups(history, scenario)
-    hits = np.flatnonzero(scenario.requirement.critical_runs(history) & (history.stage != CONFIRM))
+    hits = np.flatnonzero(scenario.requirement.critical_runs(history))
     if len(hits) == 0:
         return []
     u, cube = scenario.space.to_unit(history.x), scenario.space.cube
