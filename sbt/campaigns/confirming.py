@@ -80,6 +80,8 @@ class ConfirmStage:
         scenario, runs = search.settings.scenario, with_links(log)
         if rounds >= _LINK_ROUNDS or batches_by(log, RACE, _TOLD) or search.noisy(runs):
             return []
+        if scenario.requirement.critical_runs(runs)[runs.ok].all():  # nothing is known to be between modes
+            return []
         asked = int((runs.stage == CONFIRM).sum())
         most = min(max(int(_LINK_SHARE * (len(runs) - asked)), _FEWEST_LINKS), _MOST_LINKS)
         x = [scenario.space.from_unit(way.at[None])[0] for way in search.doubtful_ways(runs)]
