@@ -75,3 +75,25 @@ def test_reference_drivers_judge_the_same_conflict():
         assert why_not(applicability("ego", [(ttc, CRITICAL)])(each)) == ""
     rammed = replace(trace, actors=("stopped", "ego", "passing", "far"))
     assert "from behind" in why_not(applicability("ego", [(ttc, CRITICAL)])(rammed)), "also where the ego stands"
+
+
+def test_a_failure_is_told_as_it_was_when_it_was_decided():
+    """The ego brakes hard behind one that stops, and stands 1 m behind it in the end: its TTC was smallest in motion."""
+    time = np.arange(0.0, 8.0, 0.1)
+    speed = np.maximum(13.0 - np.maximum(time - 2.0, 0.0) * 6.0, 0.0)
+    ego = np.concatenate([[0.0], np.cumsum(speed[:-1]) * 0.1])
+    x = np.stack([ego, np.full_like(ego, ego[-1] + 6.0)], axis=1)
+    v = np.stack([speed, np.zeros_like(speed)], axis=1)
+    trace = Trace(time, ("ego", "stopped"), x, np.zeros_like(x), np.zeros_like(x), v, np.zeros_like(x), *([np.full(2, 5.0)] * 2))
+    ttc = in_traffic(TTC_2D_MIN, "ego")
+    told = [describe_conflict_type(conflict_type("ego", by)(trace)) for by in ((), [(ttc, CriticalInterval(high=1.5))])]
+    assert told == ["ahead of ego, same direction, ego stands", "ahead of ego, same direction"]
+    at = conflict(trace, "ego", [(ttc, CriticalInterval(high=1.5))])[3]
+    assert speed[at] > 1.0
+    assert ttc(trace.select(slice(0, at + 1))) == ttc(trace) < ttc(trace.select(slice(0, at)))
+
+
+def test_a_metric_that_needs_more_than_one_instant_is_decided_when_it_has_its_value():
+    trace = overtaken()
+    own = Metric("own", lambda trace: float(np.diff(trace.actor("stopped").x - trace.actor("ego").x).min()) and 1.0)
+    assert conflict(trace, "ego", [(own, CRITICAL)])[0] == "stopped"

@@ -22,6 +22,7 @@ from sbt.cli import app
 from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.metrics.fcd import Recording, read_fcd
+from sbt.metrics.moments import metric_so_far
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.planar import DISTANCE_MIN
 from sbt.problem.requirement import Requirement
@@ -33,7 +34,7 @@ from sbt.report.scene import EGO, ROAD, view_of
 from sbt.report.sight import area_in_view, expected
 from sbt.report.style import CRITICAL
 from sbt.report.video import check_format, write_video
-from sbt.report.worst import metric_so_far, worst_moment
+from sbt.report.worst import worst_moment
 from sbt.sumo.gui import run_in_gui
 from sbt.sumo.occlusion import Occluders
 from sbt.workflows.running import replay_run, run_study

@@ -15,10 +15,10 @@ from sbt.cli import app
 from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.metrics.fcd import read_fcd
+from sbt.metrics.moments import metric_so_far
 from sbt.plugins import load, names
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
-from sbt.report.worst import metric_so_far
 from sbt.sumo import gui
 from sbt.sumo.nets import lanes
 from sbt.sumo.session import libsumo, session

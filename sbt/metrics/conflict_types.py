@@ -1,19 +1,21 @@
-"""The type of a conflict: on which side of the ego whom it is about was at the smallest distance, and on which course.
+"""The type of a conflict: on which side of the ego whom it is about was when it was decided, and on which course.
 
 Runs that fail in the same way have the same type; falsification distinguishes failure modes by it. In traffic whoever is
-nearest may have nothing to do with the failure, as a car that is overtaken while the ego closes in on its leader.
+nearest may have nothing to do with the failure, as a car that is overtaken while the ego closes in on its leader; and when the
+two are nearest it may be over: an ego that brakes too late for a comfortable gap stands then.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from sbt.metrics.geometry import part_pairs, rectangle_distance
 from sbt.metrics.longitudinal import FAR
+from sbt.metrics.moments import first_at_its_worst
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 from sbt.problem.scenario import Metric
@@ -43,7 +45,7 @@ Decisive = tuple[Metric, CriticalInterval]
 
 
 def conflict_type(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric:
-    """Return the metric `conflict_type`: 4 side + course at the smallest distance; -1: nobody within 1 km.
+    """Return the metric `conflict_type`: 4 side + course when it was decided; -1: nobody within 1 km.
 
     Side: 0 ahead, 1 left, 2 behind, 3 right of the ego's rectangle, by the side that the other is farther away from.
     Course: heading of the other relative to the ego's; 0 the same, 1 turned left by 45 to 135 degrees (it comes from
@@ -53,7 +55,8 @@ def conflict_type(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric
     Args:
         ego: the road user under test.
         decisive: metrics that decide whether a run is critical: in a critical one the conflict is that with the other whose
-            sole presence gives the same value. Without them, or where no single one does, it is that with the nearest.
+            sole presence gives the same value, at the instant from which on the metric has it. Without them, or where no single
+            one does, it is that with the nearest, at the smallest distance.
     """
 
     def function(trace: Trace) -> float:
@@ -62,13 +65,13 @@ def conflict_type(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric
 
     return Metric(
         METRIC_NAME, function, "", "low", _NOBODY,
-        "side of ego and course of whom a failure is about, else of the nearest other: 4 side + course, + 16 ego stands, "
-        "+ 32 recorded, behind; -1 nobody",
+        "side of ego and course of whom a failure is about when it is decided, else of the nearest: 4 side + course, "
+        "+ 16 ego stands, + 32 recorded, behind; -1 nobody",
     )  # fmt: skip
 
 
 def conflict(trace: Trace, ego: str, decisive: Sequence[Decisive] = ()) -> tuple[str, ActorTrace, ActorTrace, int] | None:
-    """Return whom a run's conflict is with, what of the two came nearest, and the index of that instant.
+    """Return whom a run's conflict is with, what of the two is nearest at the decisive instant, and the index of that instant.
 
     Args:
         trace: of the run.
@@ -80,13 +83,24 @@ def conflict(trace: Trace, ego: str, decisive: Sequence[Decisive] = ()) -> tuple
     """
     ego = ego if ego in trace.actors else trace.actors[0]
     others = _nearest_first(trace, ego)
-    if len(others) > 1 and (culprit := _decides(trace, ego, list(others), decisive)) is not None:
-        others = {culprit: others[culprit]}
+    decided = _decided(trace, ego, list(others), decisive) if others else None
+    if decided is not None:
+        others = {decided[0]: others[decided[0]]}
+        met = _nearest_of(trace, ego, others, decided[1])
+        if met is not None:
+            return met
+    return _nearest_of(trace, ego, others)
+
+
+def _nearest_of(
+    trace: Trace, ego: str, others: Mapping[str, float], instant: int | None = None
+) -> tuple[str, ActorTrace, ActorTrace, int] | None:
+    """Return who is nearest, the parts of the two that are, and when: at an instant, or ever; None: nobody is there."""
     own, best, met = trace.actor(ego), FAR, None
     for name, least in others.items():
         if least < best:
             for part, other in part_pairs(own, trace.actor(name)):
-                distance, at = _nearest(part, other)
+                distance, at = _nearest(part, other, instant)
                 if distance < best:
                     best, met = distance, (name, part, other, at)
     return met
@@ -102,30 +116,41 @@ def _nearest_first(trace: Trace, ego: str) -> dict[str, float]:
     return {trace.actors[k]: float(least[k]) for k in np.argsort(least, kind="stable").tolist() if k != own}
 
 
-def _decides(trace: Trace, ego: str, others: Sequence[str], decisive: Sequence[Decisive]) -> str | None:
-    """Return the first of the others who alone makes the first critical metric what it is; None: nobody does, or none is."""
+def _decided(trace: Trace, ego: str, others: Sequence[str], decisive: Sequence[Decisive]) -> tuple[str, int | None] | None:
+    """Return who alone makes the first critical metric what it is, the first of the others, and from which instant on.
+
+    None: nobody does, or no metric is critical. No instant: the metric compares different times of the two.
+    """
     for metric, interval in decisive:
         value = math.nan if metric.alone else metric.value(trace)
         if interval.contains(np.array([value]))[0]:
-            alike = (name for name in others if math.isclose(_with_one(metric, trace, ego, name), value, rel_tol=1e-9))
-            return next(alike, None)
+            for name in others:
+                two = _two(trace, ego, name)
+                if math.isclose(_value(metric, two), value, rel_tol=1e-9):
+                    return name, None if metric.lagged else first_at_its_worst(two, metric) or 0
+            return None
     return None
 
 
-def _with_one(metric: Metric, trace: Trace, ego: str, other: str) -> float:
-    """Return a metric of the trace without anybody but these two; NaN where it needs somebody else."""
+def _two(trace: Trace, ego: str, other: str) -> Trace:
+    """Return the trace without anybody but these two."""
     two = trace.select(slice(None), {ego: ego, other: other})
+    return replace(two, signals=trace.signals, reported=trace.reported, unreacting=trace.unreacting)
+
+
+def _value(metric: Metric, two: Trace) -> float:
+    """Return a metric of two; NaN where it needs somebody else."""
     try:
-        return metric.value(replace(two, signals=trace.signals, reported=trace.reported, unreacting=trace.unreacting))
+        return metric.value(two)
     except Exception:  # a metric of one's own that looks for another by name: it is not about this one
         return math.nan
 
 
-def _nearest(ego: ActorTrace, other: ActorTrace) -> tuple[float, int]:
-    """Return the smallest distance of the rectangles (m, inf if they are never present together) and its instant."""
+def _nearest(ego: ActorTrace, other: ActorTrace, instant: int | None) -> tuple[float, int]:
+    """Return the smallest distance of the rectangles (m, inf if they are not present together) and its instant."""
     distance = rectangle_distance(ego, other)
     distance = np.where(np.isfinite(distance), distance, np.inf)
-    k = int(distance.argmin())
+    k = int(distance.argmin()) if instant is None else instant
     return float(distance[k]), k
 
 

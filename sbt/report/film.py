@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sbt.metrics.moments import metric_so_far
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
@@ -15,7 +16,7 @@ from sbt.report.contacts import Contacts
 from sbt.report.scene import BICYCLE, EGO, FEW, OTHER, PERSON, ROAD, STANDING, Scenery, View, draw_lanes, is_wide, view_of
 from sbt.report.style import CRITICAL, MODEL, REGION, figure_style, label
 from sbt.report.video import check_format, write_video
-from sbt.report.worst import metric_so_far, worst_moment
+from sbt.report.worst import worst_moment
 
 if TYPE_CHECKING:
     from sbt.sumo.nets import Lane

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sbt.metrics.geometry import rectangle_distance, time_to_contact
+from sbt.metrics.moments import metric_so_far
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import Metric
@@ -16,7 +17,7 @@ from sbt.problem.trace import ActorTrace, Trace
 from sbt.report.contacts import contacts_of
 from sbt.report.scene import actor_kind, is_wide, view_of
 from sbt.report.sight import hiding
-from sbt.report.worst import metric_so_far, worst_moment
+from sbt.report.worst import worst_moment
 
 if TYPE_CHECKING:
     from sbt.sumo.nets import Lane
