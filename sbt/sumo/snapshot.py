@@ -167,7 +167,8 @@ def snapshot_of(
 
 def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: float, step: float, asked: WarmUp | None) -> float:
     """Return when the warm-up ends (s): as asked for, or shortly before the first departure that depends on an input."""
-    first, earliest = _earliest(varying, _points(space, varying), begin)
+    points = _points(space, varying)
+    first, earliest = _earliest(varying, points, begin)
     wanted = None if asked is None else asked.until
     end = _in_steps(earliest - _SETTLING if wanted is None else wanted, begin, step)
     if wanted is not None and abs(end - wanted) > 1e-6:
@@ -181,7 +182,9 @@ def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: fl
         raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s; before {least:g} s there is nothing to warm up")
     if end > earliest:
         remedy = f"{_because(first, varying)}let it depart later, or warm_up.until be smaller or auto"
-        raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s, before the warm-up ends ({end:g} s): {remedy}")
+        latest = max(_departure(first, values) for values in points)
+        when = f"at {earliest:g} s" if latest == earliest else f"at {earliest:g} to {latest:g} s, as the inputs have it"
+        raise NoSnapshot(f"{first.place}: '{first.id}' departs {when}, before the warm-up ends ({end:g} s): {remedy}")
     return end
 
 
