@@ -39,6 +39,11 @@ def disc(given: dict[str, float], seed: int, draw: Draw, size: float, jump: floa
     return {"y": -1.0 if rng.random() < jump else y}
 
 
+def uneven(given: dict[str, float], seed: int) -> dict[str, float]:
+    """Return the distance to a disc with noise that is .01 at the one end of b and .31 at the other."""
+    return disc(given, seed, NORMAL, 0.01 + 0.3 * given["b"], 0.0)
+
+
 def two_valued(given: dict[str, float], seed: int, outside: float, inside: float) -> dict[str, float]:
     """Return -1 at a rate of its own inside and outside of the disc, else 1."""
     rate = inside if float(beyond_disc(np.array([[given["a"], given["b"]]]))[0]) <= 0.0 else outside
@@ -52,6 +57,7 @@ OWN: dict[str, tuple[Callable[..., dict[str, float]], Callable[[Points], Vector]
     "disc, noise .1": (partial(disc, draw=NORMAL, size=0.1, jump=0.0), lambda x: ndtr(-beyond_disc(x) / 0.1)),
     "disc, noise .3": (partial(disc, draw=NORMAL, size=0.3, jump=0.0), lambda x: ndtr(-beyond_disc(x) / 0.3)),
     "disc, noise 1": (partial(disc, draw=NORMAL, size=1.0, jump=0.0), lambda x: ndtr(-beyond_disc(x))),
+    "disc, noise .01 to .31": (uneven, lambda x: ndtr(-beyond_disc(x) / (0.01 + 0.3 * x[:, 1]))),
     "disc, Student-t noise .2": (partial(disc, draw=STUDENT, size=0.2, jump=0.0), lambda x: t.cdf(-beyond_disc(x) / 0.2, df=3)),
     "disc, Cauchy noise .02": (partial(disc, draw=CAUCHY, size=0.02, jump=0.0), lambda x: cauchy.cdf(-beyond_disc(x) / 0.02)),
     "disc, collision with 3 % of seeds": (

@@ -96,6 +96,15 @@ def test_normal_scores_invert_in_both_tails(name):
     np.testing.assert_allclose(p.to_normal(x)[middle], z[middle], atol=1e-8)
 
 
+@pytest.mark.parametrize("name", LAWS)
+def test_scores_beyond_all_numbers_have_finite_values_in_the_range(name):
+    p = LAWS[name]
+    x = p.from_normal(np.array([-1e6, -38.6, 38.6, 1e6]))
+    assert np.isfinite(x).all()
+    assert p.contains(x).all()
+    assert (np.diff(x) >= 0).all()
+
+
 @pytest.mark.parametrize("name", INTEGERS)
 def test_maps_of_an_integer_input_invert_exactly(name):
     p = INTEGERS[name]

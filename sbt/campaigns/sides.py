@@ -15,6 +15,8 @@ def few_of_a_side(facts: Facts) -> str:
     critical = facts.requirement.critical_runs(facts.history.training)
     sides = {"critical": int(critical.sum()), "uncritical": int((~critical).sum())}
     side = min(sides, key=lambda name: sides[name])
+    if not sides[side]:
+        return f"no {side} run tells of it"
     return f"only {plural(sides[side], f'{side} run')} tell{'s' * (sides[side] == 1)} of it" if sides[side] < _FEW else ""
 
 

@@ -16,7 +16,7 @@ from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, samp
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
-from sbt.metamodels.noise_shape import shaped
+from sbt.metamodels.noise_shape import better_uneven, shaped
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.sided import better_sided
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
@@ -132,7 +132,8 @@ class Auto:
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
         plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
         stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
-        values = (shaped(plain, u, y, bins.critical, rng) or plain) if stepped is None else stepped
+        even = plain if stepped is not None else better_uneven(self.simplest, plain, bins.critical, u, y, shares, rng) or plain
+        values = (shaped(even, u, y, bins.critical, rng) or even) if stepped is None else stepped
         own = stepped.log_score(bins, u, y) if stepped is not None else bins.log_score(values.leave_one_out(u, y), y)
         sided = better_sided(self.simplest, values, bins.critical, u, y, shares, rng)
         process = values if sided is None else sided[0]

@@ -22,6 +22,8 @@ TAIL = 1e-6
 """An infinite range is searched between these quantiles of its distribution."""
 _APART = 1e-12
 """Least width of a range relative to its ends: below, its values are all the same to a metamodel and a figure."""
+_FARTHEST_SCORE = 37.5
+"""Normal score beyond which a probability is below the smallest number: of an infinite range the value there stands for all."""
 _SUM = 1e-6  # by which probabilities that were written with six digits may miss 1
 
 Kind = Literal["continuous", "integer", "categorical"]
@@ -244,7 +246,7 @@ class Parameter:
         return (x - low) / (high - low)
 
     def from_normal(self, z: Vector) -> Vector:
-        """Map a standard-normal score to the value of the same probability."""
+        """Map a standard-normal score to the value of the same probability, finite also of an infinite range."""
         z = np.asarray(z, dtype=np.float64)
         if self.choices:
             return np.searchsorted(self.edges, z, side="right").astype(np.float64)
@@ -252,7 +254,9 @@ class Parameter:
         if self.truncated is None:
             x = np.where(z <= 0, low + (high - low) * ndtr(z), high - (high - low) * ndtr(-z))
         else:
+            z = np.clip(z, -_FARTHEST_SCORE, _FARTHEST_SCORE)
             x = np.where(z <= 0, self.truncated.ppf(ndtr(z)), self.truncated.isf(ndtr(-z)))
+            x = np.clip(x, -FARTHEST, FARTHEST)
         if self.kind == "integer":
             return np.clip(np.floor(x + 0.5), self.low, self.high)
         return np.clip(x, self.low, self.high)
