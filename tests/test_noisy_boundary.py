@@ -13,6 +13,8 @@ from sbt.metamodels.automatic import Auto
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.noise_shape import shaped
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.rated import better_rate
+from sbt.metamodels.saturation import Opened
 from sbt.metamodels.stacking import Bins
 from sbt.metamodels.warped import better_warp
 from sbt.problem.requirement import CriticalInterval
@@ -135,3 +137,34 @@ def test_where_noise_decides_the_space_is_filled(tmp_path: Path):
             filled.append([batch.proposal.get("filling") or 0 for batch in store.iterations()])
     assert sum(filled[0]) >= 12
     assert sum(filled[1]) == 0, "the held-out tenth fills it"
+
+
+@pytest.mark.parametrize("critical", [CriticalInterval(low=1.0), CriticalInterval(high=-1.0)])
+def test_of_a_flag_that_chance_decides_the_rate_is_learned(critical: CriticalInterval):
+    """Critical with 5 to 45 % of the seeds by a whole number: without labels the share was stated as .14 for .25."""
+    sign = 1.0 if critical.high == np.inf else -1.0
+    errors, shares = [], []
+    for seed in range(5):
+        rng = stream(seed, "rate")
+        u = np.column_stack([rng.integers(0, 5, 140) / 4.0, rng.integers(0, 2, 140)])
+        y = sign * (rng.random(140) < 0.05 + 0.4 * u[:, 0])
+        at = np.array([[a, b] for a in np.linspace(0, 1, 5) for b in (0.0, 1.0)])
+        fitted = Opened(Auto().with_target(critical), critical).fit(u, y.astype(float), stream(seed, "fit"))
+        p = fitted(at).probability(critical)
+        errors.append(float(np.sqrt(((p - 0.05 - 0.4 * at[:, 0]) ** 2).mean())))
+        shares.append(float(p.mean()))
+        paths = fitted.sample_paths(at, 50, rng)
+        assert paths.shape == (50, 10)
+        assert np.isfinite(paths).all()
+    assert np.mean(errors) < 0.1
+    assert np.mean(shares) == pytest.approx(0.25, abs=0.05)
+
+
+def test_a_flag_without_noise_is_learned_by_its_sides():
+    u = repeated(1)
+    y = np.where(disc(u) <= 0.0, -1.0, 1.0)
+    assert better_rate(PROCESS, np.zeros(len(u)), LOW, u, y, stream(0, "fit")) is None
+    flipped = np.where(np.arange(len(y)) == len(y) - 1, -y, y)  # the same input, the other value
+    rated = better_rate(PROCESS, np.full(len(u), np.log(0.5)), LOW, u, flipped, stream(0, "fit"))
+    assert rated is not None
+    assert rated[1].mean() > 0.0

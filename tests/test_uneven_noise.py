@@ -1,12 +1,15 @@
-"""Noise that depends on the inputs: an estimation learns it where that surely predicts runs better."""
+"""Noise that depends on the inputs: estimations and boundaries learn it where that surely predicts runs better."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from sbt.estimators.surrogate import fit_log_probability, settled
+from sbt.metamodels.automatic import Auto
 from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.noise_shape import better_uneven
 from sbt.problem.requirement import CriticalInterval
 from sbt.seeds import stream
 
@@ -41,3 +44,25 @@ def test_what_is_left_to_chance_once_means_are_known(std: float):
     doubt, chance = (float(np.sqrt(p * (1.0 - p)).mean()) for p in each)
     assert doubt > 0.2
     assert chance < 0.02 if std < 0.01 else chance > 0.1
+
+
+@pytest.mark.parametrize("kind", ["uneven", "even", "capped", "no repeats"])
+def test_the_default_metamodel_learns_uneven_noise_where_there_is_some(kind: str):
+    """Noise of .02 to .62 along x1, the same everywhere, next to a cap, or where no equal inputs tell that it is noise."""
+    rng = stream(5, kind)
+    x = rng.random((150, 2))
+    x = x if kind == "no repeats" else np.vstack([x, x[:6]])
+    std = np.full(len(x), 0.3) if kind == "even" else 0.02 + 0.6 * x[:, 0]
+    y = x[:, 1] - 0.4 + std * rng.standard_normal(len(x))
+    y = np.minimum(y, 0.2) if kind == "capped" else y
+    critical = CriticalInterval(high=0.0)
+    process = PROCESS.fit(x, y, stream(6, "fit"))
+    found = better_uneven(PROCESS, process, critical, x, y, np.full(len(x), 1.0 / len(x)), stream(7, "fit"))
+    assert (found is not None) == (kind == "uneven")
+    if found is not None:
+        at = np.random.default_rng(8).random((2000, 2))
+        true = ndtr(-(at[:, 1] - 0.4) / (0.02 + 0.6 * at[:, 0]))
+        before, now = (float(np.sqrt(((each(at).probability(critical) - true) ** 2).mean())) for each in (process, found))
+        assert now < 0.8 * before
+        mixture = Auto().with_target(critical).fit(x, y, stream(9, "fit"))
+        assert float(np.sqrt(((mixture(at).probability(critical) - true) ** 2).mean())) < 0.8 * before

@@ -35,6 +35,7 @@ _MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to pa
 _MOST_EVEN = 2**23  # where none is scored: 8,000 runs of a space of which constraints leave a thousandth
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
 _MOST_FILLING = 0.6  # the same where noise alone decides: where P is said to be small nobody would look again
+_ALIKE = 1.0, 0.6  # the same while all runs are critical: of one value, which tells of no direction, and of several
 _PROBED = 512  # points at which the noise is taken
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
@@ -91,7 +92,8 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
 
     Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
     least uncertainty far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
-    nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. Where
+    nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. While all runs are
+    critical at least 60 % do, as uncertainty is largest in the corners then. Where
     the mean P(critical) is below 1 %, half of the batch explores first (see `explore`); beside plateaus all of it does, or
     none, which then looks about the known regions (see `exploration_share`).
     """
@@ -101,7 +103,7 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     share = exploration_share(settings, log) if exploring else 0.0
     fitted = _within(fitted, about_regions(settings, log) if exploring else None)
     looking = explore(settings, log, min(_rounded(share * n, log), n))
-    filled = max(_FILLING, _MOST_FILLING * _open_share(settings, fitted, log))
+    filled = max(_FILLING, _MOST_FILLING * _open_share(settings, fitted, log), _all_critical(settings, log))
     filling = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
@@ -117,6 +119,14 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
         filling=len(fill), representative=len(typical), greedy=len(greedy),
     )  # fmt: skip
     return Chosen(so_far, proposal)
+
+
+def _all_critical(settings: Settings, log: Log) -> float:
+    """Return the share of runs that fill the space while all are critical, and nobody knows where others are; else 0."""
+    requirement, training = settings.scenario.requirement, log.history.training
+    if not len(training) or not requirement.critical_runs(training).all():
+        return 0.0
+    return _ALIKE[int(np.ptp(requirement.margins(training)) > 0.0)]
 
 
 def _open_share(settings: Settings, fitted: FittedMetamodel, log: Log) -> float:

@@ -23,7 +23,7 @@ def nowhere_likely(found: BoundaryConclusion, where: str, condition: str, few: s
     share, wrong = found.critical_fraction or 0.0, found.expected_misclassified or 0.0
     if share < 0.5 and wrong > 0.0 and wrong >= _VAGUE * share:
         lead = f"The metamodel expects {percent(share)} of runs{where} that fill the parameter space to be critical ({condition})"
-        return f"{lead}, but knows no place where most are{f': {few}' if few else ''}"
+        return f"{lead}, but {f'not how far they reach: {few}' if few else 'knows no place where most are'}"
     lead = f"{percent(share)} of the parameter space{where} is critical ({condition})"
     return f"{lead} by the metamodel, but {few}" if few else lead
 
@@ -31,7 +31,7 @@ def nowhere_likely(found: BoundaryConclusion, where: str, condition: str, few: s
 def denial(found: BoundaryConclusion, runs: CriticalShare) -> str:
     """Return that held-out runs deny the share of the metamodel, or its certainty, or all even runs its share; else nothing."""
     share = found.critical_fraction or 0.0
-    denied = runs.critical_fraction is not None and not runs.low <= share <= runs.high
+    denied = runs.critical_fraction is not None and not runs.low <= share <= runs.high and not _agrees(found.even_fraction, share)
     whose = "held-out runs" if denied or _too_sure(found) else "runs that fill the space evenly" if _unlike_even(found) else None
     return "" if whose is None else f" The {whose} deny its figures (below): do not rely on it yet."
 
@@ -48,6 +48,11 @@ def _by_held_out(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
     if runs.critical_fraction is None:
         return [f"{said}; no held-out run checks that."]
     alone = f"the {plural(runs.counted, 'held-out run')}{told} alone say {percent(runs.critical_fraction)} ({ends(runs)})"
+    every = found.even_fraction
+    every = every if every is None or found.failing_fraction is None else every.given_a_metric
+    if not runs.low <= share <= runs.high and every is not None and _agrees(every, share):
+        agree = f"within that of all {plural(every.counted, 'run')} that fill the space evenly, these among them ({ends(every)})"
+        return [f"{said}; {alone}. It lies outside of their interval, but {agree}: run more to tell which is chance."]
     if not runs.low <= share <= runs.high:
         return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
     if runs.counted < _HARDLY:
@@ -64,10 +69,16 @@ def _unlike_even(found: BoundaryConclusion) -> list[str]:
     runs = runs if found.failing_fraction is None else runs.given_a_metric
     if runs.critical_fraction is None or runs.low <= share <= runs.high:
         return []
+    more = "critical runs lie where it does not expect them" if share < runs.low else "fewer runs are critical than it expects"
     return [
         f"All {plural(runs.counted, 'run')} that fill the space evenly say {percent(runs.critical_fraction)} ({ends(runs)}). They"
-        f" deny the metamodel's {percent(share)}: critical runs lie where it does not expect them. Trust the runs."
+        f" deny the metamodel's {percent(share)}: {more}. One such interval in twenty misses by chance; else trust the runs."
     ]
+
+
+def _agrees(every: CriticalShare | None, share: float) -> bool:
+    """Return whether all runs that fill the space evenly, held-out ones among them, do not deny a share."""
+    return every is not None and every.critical_fraction is not None and every.low <= share <= every.high
 
 
 def _too_sure(found: BoundaryConclusion) -> list[str]:

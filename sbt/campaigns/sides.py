@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sbt.campaigns.wording import plural
 from sbt.loop.stages import Facts
 
@@ -11,13 +13,16 @@ _FEW = 5  # runs of a side, below which edges are told with reserve, however sur
 
 
 def few_of_a_side(facts: Facts) -> str:
-    """Return in words that the boundary rests on few runs of one of its sides; empty where it does not."""
-    critical = facts.requirement.critical_runs(facts.history.training)
-    sides = {"critical": int(critical.sum()), "uncritical": int((~critical).sum())}
+    """Return in words that the boundary rests on few different inputs of one of its sides; empty where it does not."""
+    training = facts.history.training
+    critical = facts.requirement.critical_runs(training)
+    sides = {name: len(np.unique(training.x[rows], axis=0)) for name, rows in (("critical", critical), ("uncritical", ~critical))}
     side = min(sides, key=lambda name: sides[name])
-    if not sides[side]:
+    n = sides[side]
+    if not n:
         return f"no {side} run tells of it"
-    return f"only {plural(sides[side], f'{side} run')} tell{'s' * (sides[side] == 1)} of it" if sides[side] < _FEW else ""
+    again = " (one and its repetitions)" if n == 1 and int((critical == (side == "critical")).sum()) > 1 else ""
+    return f"only {plural(n, f'{side} run')}{again} tell{'s' * (n == 1)} of it" if n < _FEW else ""
 
 
 def all_critical(facts: Facts) -> bool:

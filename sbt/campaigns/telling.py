@@ -123,6 +123,9 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         lead = nowhere_likely(found, _of(facts), _condition(facts), few)
     if none_critical(facts):
         lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
+    elif all_critical(facts):
+        known = "the metamodel knows no place where one is likely not to be"
+        lead = f"Every run{_of(facts)} was critical ({_condition(facts)}), and {known}"
     rests = f"the metamodel learned that from {plural(learned, 'run')}{f' and {found.earlier} earlier' if found.earlier else ''}"
     missing = "an uncritical" if all_critical(facts) else "a critical"
     said = [
@@ -178,9 +181,11 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     silent += "" if exhausted else ", nor that there is no other mode"
     if random.critical_fraction is not None:
         few = "too few to meet what is rare" if random.critical_fraction == 0.0 else "all that may be read as a share"
+        told = random.given_a_metric if random.lost else random
+        gave, space = (" that gave a metric", "what gives one") if random.lost else ("", "the parameter space")
         silent += (
-            f"; the {plural(random.counted, 'run')} among them drawn at random say {percent(random.critical_fraction)} of the"
-            f" parameter space ({ends(random)}), {few}"
+            f"; the {plural(told.counted, 'run')}{gave} among those drawn at random say{'s' * (told.counted == 1)}"
+            f" {percent(told.critical_fraction or 0.0)} of {space} ({ends(told)}), {few}"
         )
     never = ", with its own seed, as no repetition failed" if often is not None and often.confirmed == 0.0 else ""
     look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "

@@ -41,6 +41,7 @@ MOST_LEARNED = 2000
 _REACH = 5.0  # normal scores from -5 to 5 are the unit interval: 6e-7 of the distribution lies beyond
 _QUANTILE = 0.5  # of the distances to the edge: the scale of the warp; a smaller one becomes a step as runs gather there
 _LEAST_R2 = 0.5  # leave-one-out R2 from which on a trend is taken: it explains more than it leaves
+_NOISE_COUNTS = 0.25  # of the usual distance to the edge: a standard deviation among repeats, beyond which it is learned in full
 _FEWEST_SCORED = 16  # runs from which on forms are compared
 _HELD_OUT, _MOST_SCORED = 3, 150  # one run in so many scores the forms, of at most so many
 _SURE = 1.0  # gain in mean log density (nats a run) of a trend from which on it is trusted alone
@@ -241,7 +242,8 @@ def fit_log_probability(
     Of a combination y is (n, q): each metric is learned by itself.
 
     Held-out runs near the boundary tell in which form the metric is predicted best: warped or as it is, whole or without a
-    trend. A trend that wins by far is trusted alone; else the larger P of two fits counts.
+    trend. A trend that wins by far is trusted alone; else the larger P of two fits counts. What an earlier campaign knows is a
+    trend; of a very noisy simulator it is one more input instead, so that noise is learned as ever.
 
     Args:
         metamodel: learns the metric.
@@ -263,12 +265,15 @@ def fit_log_probability(
             for k, leaf in enumerate(critical.leaves)
         ]
         return JointLogProbability(critical, tuple(parts))
-    if earlier:
+    least = noise[0] if noise else 0.0
+    if earlier and math.sqrt(least) > _NOISE_COUNTS * earlier[0].warp.scale and len(y) >= _FEWEST_SCORED:
+        coordinates = earlier[0].beside(coordinates)
+    elif earlier:
         warp = earlier[0].warp
         belief, edges = trended(metamodel, earlier[0], coordinates(z), z, warp.values(y), rng), warp.interval(critical)
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
-    least, u = noise[0] if noise else 0.0, coordinates(z)
+    u = coordinates(z)
     y = opened(u, y, critical, rng)
     better = _better_warp(metamodel, u, y, critical)
     warp = better or Warp.around_edge(y, critical, quantile=_QUANTILE)

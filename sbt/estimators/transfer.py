@@ -30,6 +30,8 @@ _FEWEST = 6
 """Runs from which on rho is chosen by leave-one-out; below it is 1."""
 _FOLDS = 4
 """Of the cross-validation of metamodels that cannot leave one row out in closed form."""
+_REACH = 5.0
+"""Warped value of the earlier metric at which the unit interval of its column ends: 74 times the scale of the warp."""
 _FLOOR = 0.02
 """Least standard deviation of a left-out prediction, in warped units: surer ones score by luck."""
 
@@ -45,6 +47,10 @@ class Trend:
 
     warp: Warp
     mean: Callable[[Points], Vector]
+
+    def beside(self, coordinates: Callable[[Points], Points]) -> Callable[[Points], Points]:
+        """Return the coordinates (n, e) of normal scores and the trend as one more column, in the unit interval near the edge."""
+        return lambda z: np.column_stack([coordinates(z), 0.5 + self.mean(z) / (2.0 * _REACH)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, sample_paths, sketched, without_repetitions
+from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, is_rate, sample_paths, sketched, without_repetitions
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.noise_shape import better_uneven, shaped
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.rated import better_rate
 from sbt.metamodels.sided import better_sided
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.stepped import better_stepped
@@ -130,14 +131,17 @@ class Auto:
     def _fit_at_edge(self, u: Points, y: Vector, rng: np.random.Generator, bins: Bins) -> MixturePredictor:
         """Return the process alone, or the mixture where it is better for where the runs fell, at the edge and over the space."""
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
+        bins = replace(bins, near=np.inf) if is_rate(u, y) else bins  # ranges beside the edge tell nothing of two values
         plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
         stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
         even = plain if stepped is not None else better_uneven(self.simplest, plain, bins.critical, u, y, shares, rng) or plain
         values = (shaped(even, u, y, bins.critical, rng) or even) if stepped is None else stepped
         own = stepped.log_score(bins, u, y) if stepped is not None else bins.log_score(values.leave_one_out(u, y), y)
         sided = better_sided(self.simplest, values, bins.critical, u, y, shares, rng)
-        process = values if sided is None else sided[0]
         own = own if sided is None else own + sided[1]
+        rated = better_rate(self.simplest, own, bins.critical, u, y, rng)
+        process: Predictor = rated[0] if rated is not None else values if sided is None else sided[0]
+        own = own if rated is None else own + rated[1]
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             left = f"of {n} rows, each predicted from all others, {-own.mean():.1g}: others could add no more"
             reason = f"100 % gp: it misses a mean log likelihood {left}"

@@ -38,7 +38,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
     "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "gives_different",
-    "log_ambiguity_bound", "named_errors", "sample_paths", "simplest", "sketched", "split_validation", "standardise",
+    "is_rate", "log_ambiguity_bound", "named_errors", "sample_paths", "simplest", "sketched", "split_validation", "standardise",
     "with_target", "without_repetitions",
 ]  # fmt: skip
 
@@ -318,6 +318,11 @@ def gives_different(u: Points, y: Vector) -> bool:
         return False
     _, first, group = np.unique(u, axis=0, return_index=True, return_inverse=True)
     return not np.allclose(y, y[first][group.reshape(-1)], rtol=1e-9, atol=0.0)
+
+
+def is_rate(u: Points, y: Vector) -> bool:
+    """Say whether y (n,) has two values, and both at equal rows of u (n, d): what is learned is how often it has the one."""
+    return len(np.unique(y)) == 2 and gives_different(u, y)
 
 
 def standardise(y: Vector) -> tuple[Vector, float, float]:

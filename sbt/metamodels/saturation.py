@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.base import Metamodel, Predictor, is_rate
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -56,7 +56,7 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
         return y
     margin = critical.margin(y)
     tied = margin == 0.0
-    if tied.sum() < _FEWEST or (margin < 0.0).any():
+    if tied.sum() < _FEWEST or (margin < 0.0).any() or is_rate(u, y):
         return centred(u, y, critical)
     depth = np.ones(int(tied.sum()))
     if not tied.all():

@@ -26,7 +26,7 @@ from sbt.metamodels.torch_tools import single_threaded
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["SidedPredictor", "better_sided"]
+__all__ = ["SidedPredictor", "better_sided", "placed_by"]
 
 Values = GaussianProcessPredictor | ShapedPredictor | SteppedPredictor
 
@@ -77,16 +77,27 @@ class SidedPredictor:
         return self._of_values(ratio, self.values.mu(u))[0]
 
     def _of_values(self, ratio: Points, value: Vector) -> tuple[Points, Points]:
-        """Return mean and standard deviation of y where the distance is (..., n) of its own and `values` predicts (n,).
-
-        The mean is on the likelier side, at the edge where neither is likelier.
-        """
-        upwards = math.isfinite(self.critical.high)  # uncritical values are larger
-        edge = self.critical.high if upwards else self.critical.low
+        """Return mean and standard deviation of y where the distance is (..., n) of its own and `values` predicts (n,)."""
+        edge, upwards = edge_of(self.critical)
         side = np.where(ratio < 0.0, -1.0, 1.0) * (1.0 if upwards else -1.0)
-        far = np.maximum(side * (value - edge), self.least)
-        size = np.sqrt(1.0 + ratio**2)
-        return edge + side * far * np.abs(ratio) / size, far / size
+        return placed_by(self.critical, ratio, np.maximum(side * (value - edge), self.least))
+
+
+def edge_of(critical: CriticalInterval) -> tuple[float, bool]:
+    """Return the finite end of an interval, and whether uncritical values are larger."""
+    upwards = math.isfinite(critical.high)
+    return (critical.high if upwards else critical.low), upwards
+
+
+def placed_by(critical: CriticalInterval, ratio: Points, far: Points | float) -> tuple[Points, Points]:
+    """Return mean and standard deviation of y that is critical with the probability of a Gaussian below -ratio (..., n).
+
+    The mean is on the likelier side, up to `far` from the edge, at the edge where neither is likelier.
+    """
+    edge, upwards = edge_of(critical)
+    side = np.where(ratio < 0.0, -1.0, 1.0) * (1.0 if upwards else -1.0)
+    size = np.sqrt(1.0 + ratio**2)
+    return edge + side * far * np.abs(ratio) / size, far / size
 
 
 def better_sided(
