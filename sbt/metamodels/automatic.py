@@ -33,6 +33,7 @@ __all__ = ["Auto", "MixturePredictor", "ModelComparison"]
 _FEWEST = 10  # rows from which on models are compared: with three folds each learns from at least six
 _NEARLY = 0.85  # of the rows that are compared: one fold of 360 will do for 400, as another costs another fit of all models
 _WORTH = 0.03  # nats a row, of 0.5 to 2 in all: what is left to gain below it cannot be worth other models
+_NOTHING = 1e-6  # nats, below which a number tells nothing more
 _LEAST = 0.02  # weight below which a model is left out: its predictions would cost more time than they change
 _PACED, _LEAST_PACED, _FASTEST = 1000, 200, 2.0  # rows below which the ensemble takes fewer steps; least; largest factor
 
@@ -143,7 +144,8 @@ class Auto:
         process: Predictor = rated[0] if rated is not None else values if sided is None else sided[0]
         own = own if rated is None else own + rated[1]
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
-            left = f"of {n} rows, each predicted from all others, {-own.mean():.1g}: others could add no more"
+            missed = max(-float(own.mean()), _NOTHING)
+            left = f"of {n} rows, each predicted from all others, {missed:.1g}: others could add no more"
             reason = f"100 % gp: it misses a mean log likelihood {left}"
             comparison = ModelComparison({name: float(name == "gp") for name in models}, {"gp": float(own.mean())}, reason)
             return self._mixed(models, {"gp": process}, comparison, u, y, rng)
