@@ -182,9 +182,9 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     if random.critical_fraction is not None:
         few = "too few to meet what is rare" if random.critical_fraction == 0.0 else "all that may be read as a share"
         told = random.given_a_metric if random.lost else random
-        gave, space = (" that gave a metric", "what gives one") if random.lost else ("", "the parameter space")
+        gave, space = ("that gave a metric among those", "what gives one") if random.lost else ("among them", "the parameter space")
         silent += (
-            f"; the {plural(told.counted, 'run')}{gave} among those drawn at random say{'s' * (told.counted == 1)}"
+            f"; the {plural(told.counted, 'run')} {gave} drawn at random say{'s' * (told.counted == 1)}"
             f" {percent(told.critical_fraction or 0.0)} of {space} ({ends(told)}), {few}"
         )
     never = ", with its own seed, as no repetition failed" if often is not None and often.confirmed == 0.0 else ""
