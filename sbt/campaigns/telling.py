@@ -181,8 +181,9 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     silent += "" if exhausted else ", nor that there is no other mode"
     if random.critical_fraction is not None:
         few = "too few to meet what is rare" if random.critical_fraction == 0.0 else "all that may be read as a share"
-        told = random.given_a_metric if random.lost else random
-        gave, space = ("that gave a metric among those", "what gives one") if random.lost else ("among them", "the parameter space")
+        told, gave, space = random, "among them", "the parameter space"
+        if random.lost:
+            told, gave, space = random.given_a_metric, "that gave a metric among those", "what gives one"
         silent += (
             f"; the {plural(told.counted, 'run')} {gave} drawn at random say{'s' * (told.counted == 1)}"
             f" {percent(told.critical_fraction or 0.0)} of {space} ({ends(told)}), {few}"
