@@ -30,8 +30,8 @@ def nowhere_likely(found: BoundaryConclusion, where: str, condition: str, few: s
 
 def denial(found: BoundaryConclusion, runs: CriticalShare) -> str:
     """Return that held-out runs deny the share of the metamodel, or its certainty, or all even runs its share; else nothing."""
-    share = found.critical_fraction or 0.0
-    denied = runs.critical_fraction is not None and not runs.low <= share <= runs.high and not _agrees(found.even_fraction, share)
+    share, held_out, every = found.critical_fraction or 0.0, _as_told(found, runs), _as_told(found, found.even_fraction)
+    denied = held_out is not None and not _holds(held_out, share) and not (every is not None and _holds(every, share))
     whose = "held-out runs" if denied or _too_sure(found) else "runs that fill the space evenly" if _unlike_even(found) else None
     return "" if whose is None else f" The {whose} deny its figures (below): do not rely on it yet."
 
@@ -42,43 +42,48 @@ def reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
 
 
 def _by_held_out(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
-    share, runs = found.critical_fraction or 0.0, runs if found.failing_fraction is None else runs.given_a_metric
+    share, held_out, every = found.critical_fraction or 0.0, _as_told(found, runs), _as_told(found, found.even_fraction)
     where, told = ("the parameter space", "") if found.failing_fraction is None else ("what gives a metric", " that gave one")
     said = f"The metamodel takes {percent(share)} of {where} to be critical"
-    if runs.critical_fraction is None:
+    if held_out is None:
         return [f"{said}; no held-out run checks that."]
-    alone = f"the {plural(runs.counted, 'held-out run')}{told} alone say {percent(runs.critical_fraction)} ({ends(runs)})"
-    every = found.even_fraction
-    every = every if every is None or found.failing_fraction is None else every.given_a_metric
-    if not runs.low <= share <= runs.high and every is not None and _agrees(every, share):
-        agree = f"within that of all {plural(every.counted, 'run')} that fill the space evenly, these among them ({ends(every)})"
-        return [f"{said}; {alone}. It lies outside of their interval, but {agree}: run more to tell which is chance."]
-    if not runs.low <= share <= runs.high:
-        return [f"{said}; {alone}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
-    if runs.counted < _HARDLY:
-        return [f"{said}; {alone}. So few runs hardly test it: it lies within their interval."]
-    sharper = "; the metamodel's figure, which rests on all runs, is the sharper one" if share and runs.counted < _MANY else ""
-    return [f"{said}; {alone}. They agree: it lies within that interval{sharper}."]
+    alone = f"the {plural(held_out.counted, 'held-out run')}{told} alone say {percent(held_out.critical_fraction or 0.0)}"
+    said = f"{said}; {alone} ({ends(held_out)})"
+    if not _holds(held_out, share):
+        if every is not None and _holds(every, share):
+            agree = f"all {plural(every.counted, 'run')} that fill the space evenly, these among them ({ends(every)})"
+            return [f"{said}. It lies outside of their interval, but within that of {agree}: run more to tell which is chance."]
+        return [f"{said}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
+    if held_out.counted < _HARDLY:
+        return [f"{said}. So few runs hardly test it: it lies within their interval."]
+    sharper = share and held_out.counted < _MANY
+    more = "; the metamodel's figure, which rests on all runs, is the sharper one" if sharper else ""
+    return [f"{said}. They agree: it lies within that interval{more}."]
 
 
 def _unlike_even(found: BoundaryConclusion) -> list[str]:
     """Return that the runs that fill the space deny the share of the metamodel; nothing where they do not."""
-    runs, share = found.even_fraction, found.critical_fraction or 0.0
-    if runs is None or found.every_combination is not None:
-        return []
-    runs = runs if found.failing_fraction is None else runs.given_a_metric
-    if runs.critical_fraction is None or runs.low <= share <= runs.high:
+    runs, share = _as_told(found, found.even_fraction), found.critical_fraction or 0.0
+    if runs is None or found.every_combination is not None or _holds(runs, share):
         return []
     more = "critical runs lie where it does not expect them" if share < runs.low else "fewer runs are critical than it expects"
+    measured = f"{percent(runs.critical_fraction or 0.0)} ({ends(runs)})"
     return [
-        f"All {plural(runs.counted, 'run')} that fill the space evenly say {percent(runs.critical_fraction)} ({ends(runs)}). They"
-        f" deny the metamodel's {percent(share)}: {more}. One such interval in twenty misses by chance; else trust the runs."
+        f"All {plural(runs.counted, 'run')} that fill the space evenly say {measured}. They deny the metamodel's"
+        f" {percent(share)}: {more}. One such interval in twenty misses by chance; else trust the runs."
     ]
 
 
-def _agrees(every: CriticalShare | None, share: float) -> bool:
-    """Return whether all runs that fill the space evenly, held-out ones among them, do not deny a share."""
-    return every is not None and every.critical_fraction is not None and every.low <= share <= every.high
+def _as_told(found: BoundaryConclusion, runs: CriticalShare | None) -> CriticalShare | None:
+    """Return the share of runs that compares with the metamodel's: of those that gave a metric; None where none did."""
+    if runs is None or runs.critical_fraction is None:
+        return None
+    return runs if found.failing_fraction is None else runs.given_a_metric
+
+
+def _holds(runs: CriticalShare, share: float) -> bool:
+    """Return whether the interval of the runs holds a share."""
+    return runs.low <= share <= runs.high
 
 
 def _too_sure(found: BoundaryConclusion) -> list[str]:

@@ -21,7 +21,7 @@ from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_er
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import opened
-from sbt.metamodels.stacking import cell_shares
+from sbt.metamodels.stacking import cell_shares, surely_positive
 from sbt.metamodels.tails import student_mixture
 from sbt.metamodels.warp import Warp
 from sbt.metamodels.warped import better_warp
@@ -336,8 +336,7 @@ def _for_uneven_noise(metamodel: Metamodel, u: Points, t: Vector, rng: np.random
     for each in (metamodel, uneven):
         predictor: Any = each.fit(u, t, rng)
         scores.append(predictor.leave_one_out(u, t).log_density(t))
-    gain = scores[1] - scores[0]
-    return uneven if gain.mean() > _UNEVEN * gain.std() / math.sqrt(len(t)) else metamodel
+    return uneven if surely_positive(scores[1] - scores[0], _UNEVEN) else metamodel
 
 
 def _gains(metamodel: Metamodel, forms: list[_Form], u: Points, weight: Vector, rng: np.random.Generator) -> Vector:

@@ -17,6 +17,7 @@ from sbt.metamodels.base import gives_different
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.stacking import surely_positive
 from sbt.metamodels.stepped import side_score
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -133,8 +134,7 @@ def better_uneven(
     one, other = process.leave_one_out(u, y), uneven.leave_one_out(u, y)
     gain = other.log_density(y) - one.log_density(y)
     sides = side_score(other, y, critical) - side_score(one, y, critical)
-    better = gain.mean() > _SURE * gain.std() / np.sqrt(len(y)) and sides.mean() > 0.0 and shares @ sides > 0.0
-    return uneven if better else None
+    return uneven if surely_positive(gain, _SURE) and sides.mean() > 0.0 and shares @ sides > 0.0 else None
 
 
 def _noisy(process: GaussianProcessPredictor, u: Points, y: Vector, least: float) -> bool:

@@ -6,7 +6,6 @@ and 1 have the rate as their mean, whatever the noise is.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,7 +76,7 @@ def better_rate(
         y: (n,) their metric.
         rng: the only source of randomness.
     """
-    if math.isfinite(critical.low) == math.isfinite(critical.high) or not is_rate(u, y):
+    if not critical.one_sided or not is_rate(u, y):
         return None
     hit = critical.contains(y)
     process = settings.for_noise.fit(u, hit.astype(np.float64), rng)

@@ -35,6 +35,8 @@ _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
     """Return y with the values at the edge of M_c moved into it, where no run lies beyond the edge; else `centred`.
 
+    So are two values that chance decides between: those at the edge are no deeper than they are.
+
     A Gaussian process of the uncritical margins says where each of them would lie; it is the mean of that prediction, cut off
     at the edge (one step of the expectation maximisation for censored values). Where few runs are uncritical, the depth is the
     least, over them, of slope times distance less their margin, with the median slope to the nearest critical run.
@@ -52,7 +54,7 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
     >>> opened(u, np.array([0.0, 0.0, 0.1, 0.2, 0.3]), CriticalInterval(high=0.0), None).round(2).tolist()
     [-0.2, -0.02, 0.1, 0.2, 0.3]
     """
-    if math.isfinite(critical.low) == math.isfinite(critical.high):
+    if not critical.one_sided:
         return y
     margin = critical.margin(y)
     tied = margin == 0.0
@@ -83,7 +85,7 @@ def centred(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
     """
     margin = critical.margin(y)
     inside = margin <= 0.0
-    if inside.all() or not inside.any() or math.isfinite(critical.low) == math.isfinite(critical.high):
+    if inside.all() or not inside.any() or not critical.one_sided:
         return y
     ends = float(margin[inside].max()), float(margin[~inside].min())
     steps = [margin == end for end in ends]

@@ -7,7 +7,6 @@ over the space, and is 0 where the sides meet.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from sbt.metamodels.gp_algebra import inverse_lower
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor
 from sbt.metamodels.noise_shape import ShapedPredictor
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.stacking import surely_positive
 from sbt.metamodels.stepped import SteppedPredictor, jumps, side_score
 from sbt.metamodels.torch_tools import single_threaded
 from sbt.problem.arrays import Mask, Points, Vector
@@ -78,15 +78,8 @@ class SidedPredictor:
 
     def _of_values(self, ratio: Points, value: Vector) -> tuple[Points, Points]:
         """Return mean and standard deviation of y where the distance is (..., n) of its own and `values` predicts (n,)."""
-        edge, upwards = edge_of(self.critical)
-        side = np.where(ratio < 0.0, -1.0, 1.0) * (1.0 if upwards else -1.0)
-        return placed_by(self.critical, ratio, np.maximum(side * (value - edge), self.least))
-
-
-def edge_of(critical: CriticalInterval) -> tuple[float, bool]:
-    """Return the finite end of an interval, and whether uncritical values are larger."""
-    upwards = math.isfinite(critical.high)
-    return (critical.high if upwards else critical.low), upwards
+        far = _side(self.critical, ratio) * (value - self.critical.edge)
+        return placed_by(self.critical, ratio, np.maximum(far, self.least))
 
 
 def placed_by(critical: CriticalInterval, ratio: Points, far: Points | float) -> tuple[Points, Points]:
@@ -94,10 +87,13 @@ def placed_by(critical: CriticalInterval, ratio: Points, far: Points | float) ->
 
     The mean is on the likelier side, up to `far` from the edge, at the edge where neither is likelier.
     """
-    edge, upwards = edge_of(critical)
-    side = np.where(ratio < 0.0, -1.0, 1.0) * (1.0 if upwards else -1.0)
     size = np.sqrt(1.0 + ratio**2)
-    return edge + side * far * np.abs(ratio) / size, far / size
+    return critical.edge + _side(critical, ratio) * far * np.abs(ratio) / size, far / size
+
+
+def _side(critical: CriticalInterval, ratio: Points) -> Points:
+    """Return in which direction from the edge the likelier side lies, 1 or -1."""
+    return np.where(ratio < 0.0, -1.0, 1.0) * critical.outward
 
 
 def better_sided(
@@ -133,7 +129,7 @@ def better_sided(
     scores = log_ndtr(sign * ratio / _FACTORS[:, None])
     best = int(np.argmax(scores @ (0.5 / len(y) + 0.5 * shares)))
     gain = scores[best] - side_score(values.leave_one_out(u, y), y, critical)
-    if not (gain.mean() > _SURE * gain.std() / math.sqrt(len(y)) and shares @ gain > 0.0):
+    if not (surely_positive(gain, _SURE) and shares @ gain > 0.0):
         return None
     return SidedPredictor(process, values, critical, float(_FACTORS[best]), _LEAST * float(np.std(y))), gain
 

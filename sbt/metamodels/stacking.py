@@ -16,7 +16,7 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Bins", "cell_shares", "held_out_scores", "is_surely_better", "mixture_score", "stacking_weights"]
+__all__ = ["Bins", "cell_shares", "held_out_scores", "is_surely_better", "mixture_score", "stacking_weights", "surely_positive"]
 
 _SURE = 3.0  # standard errors: with two, mixtures were taken that lost on whole campaigns (docs/measured/boundary.md)
 _PROBES = 4096  # points that tell which part of the space a row stands for
@@ -164,6 +164,11 @@ def mixture_score(log_score: Points, weights: Vector) -> Vector:
         return np.asarray(np.logaddexp.reduce(log_score + np.log(weights)[:, None], axis=0))
 
 
+def surely_positive(gain: Vector, errors: float) -> bool:
+    """Return whether the mean of gains (n,) exceeds 0 by so many of its standard errors."""
+    return float(gain.mean()) > errors * float(gain.std()) / len(gain) ** 0.5
+
+
 def is_surely_better(log_score: Points, weights: Vector, shares: Vector | None = None) -> bool:
     """Return whether the mixture is better than the first of the k models by three standard errors of (k, n) scores.
 
@@ -176,5 +181,4 @@ def is_surely_better(log_score: Points, weights: Vector, shares: Vector | None =
     True
     """
     gain = mixture_score(log_score, weights) - log_score[0]
-    surely = float(gain.mean()) > _SURE * float(gain.std()) / len(gain) ** 0.5
-    return surely and (shares is None or float(shares @ gain) > 0.0)
+    return surely_positive(gain, _SURE) and (shares is None or float(shares @ gain) > 0.0)

@@ -45,14 +45,9 @@ class Step:
     half: float
     critical: CriticalInterval
 
-    @property
-    def _sign(self) -> float:
-        """+1 where larger values are uncritical."""
-        return 1.0 if math.isfinite(self.critical.high) else -1.0
-
     def moved(self, y: Vector) -> Vector:
         """Return y (n,) moved."""
-        return y + np.where(self.critical.contains(y), -1.0, 1.0) * self._sign * self.half
+        return y + np.where(self.critical.contains(y), -1.0, 1.0) * self.critical.outward * self.half
 
     def values(self, ends: Vector) -> Vector:
         """Return ends (n,) of ranges of y, moved: one at the edge stays there."""
@@ -133,10 +128,9 @@ def better_stepped(
     """
     if not jumps(y, critical):
         return None
-    edge = critical.high if math.isfinite(critical.high) else critical.low
     plain, best, found = side_score(process.leave_one_out(u, y), y, critical), 0.0, None
     for width in _HALF_WIDTHS:
-        step = Step(edge, width * float(np.std(y)), critical)
+        step = Step(critical.edge, width * float(np.std(y)), critical)
         stepped = SteppedPredictor(settings.fit(u, step.moved(y), rng), step)
         score = side_score(stepped.leave_one_out(u, y), y, critical)
         gain = score - plain
@@ -153,7 +147,7 @@ def side_score(prediction: Prediction, y: Vector, critical: CriticalInterval) ->
 
 def jumps(y: Vector, critical: CriticalInterval) -> bool:
     """Say whether y (n,) seems to jump at the only end of the critical interval: a floor at it, or a gap."""
-    if math.isfinite(critical.low) == math.isfinite(critical.high):
+    if not critical.one_sided:
         return False
     margin, hit = critical.margin(y), critical.contains(y)
     if int(hit.sum()) < _FEWEST_HITS or hit.all():

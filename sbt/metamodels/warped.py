@@ -45,9 +45,9 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
         y: (n,) their metric.
         critical: M_c.
     """
-    if math.isfinite(critical.low) == math.isfinite(critical.high) or len(y) < _FEWEST:
+    if not critical.one_sided or len(y) < _FEWEST:
         return None
-    edge = critical.high if math.isfinite(critical.high) else critical.low
+    edge = critical.edge
     rng = np.random.Generator(np.random.PCG64(0))
     if len(y) > _MOST:
         order = np.argsort(np.abs(y - edge), kind="stable")

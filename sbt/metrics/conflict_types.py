@@ -125,7 +125,7 @@ def _decided(trace: Trace, ego: str, others: Sequence[str], decisive: Sequence[D
         value = math.nan if metric.alone else metric.value(trace)
         if interval.contains(np.array([value]))[0]:
             for name in others:
-                two = _two(trace, ego, name)
+                two = trace if len(trace.actors) == 2 else _two(trace, ego, name)
                 if math.isclose(_value(metric, two), value, rel_tol=1e-9):
                     return name, None if metric.lagged else first_at_its_worst(two, metric) or 0
             return None

@@ -53,6 +53,21 @@ class CriticalInterval:
             rule = f"finite ends of a critical interval must be within {FARTHEST:g} (an end may be infinite)"
             raise InputError(f"{rule}, but got [{self.low}, {self.high}]")
 
+    @property
+    def one_sided(self) -> bool:
+        """Whether one end alone is finite."""
+        return math.isfinite(self.low) != math.isfinite(self.high)
+
+    @property
+    def edge(self) -> float:
+        """The finite end; of two, the upper one."""
+        return self.high if math.isfinite(self.high) else self.low
+
+    @property
+    def outward(self) -> float:
+        """Direction in which values beyond `edge` are uncritical: 1 or -1."""
+        return 1.0 if math.isfinite(self.high) else -1.0
+
     def known(self, y: Vector) -> Mask:
         """Return (n,) booleans: y tells whether the run is critical, and how far from it."""
         return np.isfinite(y)
