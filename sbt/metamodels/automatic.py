@@ -53,7 +53,8 @@ class Auto:
     needed to hold as many as are). The first model, `gp` with nu 2.5 and one noise, is taken alone unless the mixture is better
     by three standard errors, and better over the space, too (rows crowd at the edge, where a mixture that hedges looks better
     than it is). Where the metric jumps at the edge, `gp` learns a widened jump if that predicts the sides better (see
-    `stepped`). Where it leaves next to nothing to gain, the others are not even tried.
+    `stepped`); of a noisy one, noise that depends on the inputs (`noise_shape`), or the rate of two values (`rated`). Where it
+    leaves next to nothing to gain, the others are not even tried.
 
     Args:
         folds: of the cross-validation, >= 2.
