@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,46 @@ def test_a_process_takes_part_in_a_risk_where_it_tells_more(smooth: bool, monkey
     both = loss()
     monkeypatch.setattr(risk_module, "fit_process", lambda *_: None)
     assert both < 0.7 * loss() if smooth else both <= 1.02 * loss()
+
+
+def test_a_skewed_covariate_tells_what_its_logarithm_tells() -> None:
+    """The unit of a covariate does not decide how well it is learned: its exponential serves as well as itself."""
+    rng = stream(6, "skewed")
+    w, fresh = (rng.standard_normal((n, 2)) for n in (300, 4000))
+    margin = w[:, 0] + 0.5 * w[:, 1] + 0.1 * rng.standard_normal(300) + 1.5
+    truth = fresh[:, 0] + 0.5 * fresh[:, 1] + 0.1 * rng.standard_normal(4000) + 1.5 <= 0.0
+
+    def loss(told: Callable[[np.ndarray], np.ndarray]) -> float:
+        risk = fit_risk(told(w), scores(margin), margin, margin <= 0.0, stream(7, "fit"))
+        log_p, log_rest = risk(told(fresh))
+        return -float(np.where(truth, log_p, log_rest).mean())
+
+    assert loss(lambda v: np.exp(4.0 * v)) < 1.25 * loss(lambda v: v)
+
+
+class RareCar(Crossing):
+    """Critical for one seed in 500 by what the seed draws alone, which the covariate tells."""
+
+    def __call__(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        noise = 0.001 * stream(seed, "driver").standard_normal()
+        return {"gap": stream(seed, "car").random() + 0.001 * values["a"] - 0.0025 + noise}
+
+
+def test_pairs_go_on_where_the_traffic_decides_and_nothing_critical_was_met(tmp_path: Path) -> None:
+    """A search among few pairs met fewer than three critical ones; pools of thousands meet them, inputs alone do not."""
+    truth, found = 0.002, []
+    for seed in range(3):
+        scenario = sbt.Scenario(
+            "rare", [sbt.Parameter("a", 0, 1)], sbt.Requirement("gap", high=0.0), evaluate=RareCar(), metric_names=("gap",)
+        )
+        result = sbt.run(
+            campaign="estimation", scenario=scenario, budget=200, seed=seed, covariates=True, store=tmp_path / str(seed),
+            executor="serial", report=False,
+        )  # fmt: skip
+        assert result.conclusion.pairs
+        assert result.conclusion.low <= truth <= result.conclusion.high
+        found.append(result.conclusion.probability)
+    assert 0.5 * truth < np.mean(found) < 1.5 * truth
 
 
 def test_a_fifth_of_the_pairs_leaves_a_trap() -> None:

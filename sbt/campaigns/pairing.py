@@ -24,6 +24,7 @@ from sbt.campaigns.stopping import is_precise
 from sbt.errors import InputError
 from sbt.estimators.importance import draw_systematic, plan_batch, stated
 from sbt.loop.stages import Batch, Log
+from sbt.metamodels.bootstrap import out_of_bag
 from sbt.metamodels.joint import LogPair
 from sbt.metamodels.risk import Risk, fit_risk
 from sbt.problem.arrays import Points
@@ -54,7 +55,10 @@ _CHEAPER = 50.0
 _ENOUGH = 3
 """Critical runs with which the search for the first ones ends."""
 _SEARCH_BUDGET, _SEARCHED_SHARE = 0.2, 0.5
-"""Largest share of the budget that it takes, and of its batches that is searched; the others are drawn."""
+"""Largest share of the budget that it takes, and of its batches that is searched; the others are drawn. Later, larger pools
+go on where traffic decides more than the inputs."""
+_FEWEST, _TELLS = 20, 0.25
+"""Runs from which on that is asked, and the least share of the variance of their scores that traffic explains then."""
 _PILOT, _RARE = 2_000, 2e-4
 """Pairs by which P(critical) is guessed before the count begins; below the value, pools that follow the inputs' distribution meet
 too few critical pairs, and the inputs alone are searched instead."""
@@ -124,7 +128,10 @@ class PairStage:
         counts = _counts(log)
         hits = int(s.scenario.requirement.critical_runs(history).sum())
         if not counts and hits < _ENOUGH:
-            return self._searched(log, size, hits) if len(log.planned) < _SEARCH_BUDGET * s.budget else None
+            if len(log.planned) < _SEARCH_BUDGET * s.budget:
+                return self._searched(log, size, hits)
+            if not self._traffic_decides(history):
+                return None  # by the inputs
         rng = stream(s.seed, "pairs", log.iteration)
         risk, parts = self._newest(log)
         if not counts:
@@ -132,6 +139,18 @@ class PairStage:
             if float(np.exp(risk(pilot.inputs)[0]).mean()) < _RARE:
                 return None
         return self._counted(risk, parts, size, self._ratio(log), rng)
+
+    def _traffic_decides(self, history: History) -> bool:
+        """Return whether the drawn traffic explains more of how near runs come than the inputs do: these are searched in vain."""
+        s, runs = self.settings, _to_learn(history)
+        runs = runs.where(runs.ok)
+        score = scores(s.scenario.requirement.margins(runs))
+        if len(runs) < _FEWEST or np.ptp(score) == 0.0:
+            return False
+        inputs = s.scenario.space.metamodel_inputs_at(runs.x)
+        both = self._inputs(runs.x, self._covariates.at(runs.x, runs.seed.tolist()))
+        alone, together = (out_of_bag(u, score, stream(s.seed, "pairs explain")) for u in (inputs, both))
+        return together - alone > max(alone, _TELLS)
 
     def _nominal(self, n: int) -> Batch:
         """Return the first runs, drawn as crude Monte Carlo draws them."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import expit, log_expit, log_ndtr
+from scipy.special import expit, log_expit, log_ndtr, ndtri
 
 from sbt.metamodels.joint import LogPair
 from sbt.problem.arrays import Mask, Points, Vector
@@ -29,6 +29,7 @@ _PENALTY = 0.3  # on squared slopes of standardised scores
 _PROCESS_ROWS, _FITTED_ROWS = 1000, 300  # that the process is conditioned on, and that its length scales are fitted to
 _SURELY = 2.0  # standard errors by which the process makes the events likelier, from which on it takes part
 _WIDEST = 3.0  # standard deviations of a column, beyond which the process takes it for as far
+_SKEWED = 2.0  # skewness of a column from which on only the order of its values counts
 _SURE = 12.0  # log odds of the process, beyond which a Gaussian tail tells nothing
 
 
@@ -39,6 +40,7 @@ def fit_risk(inputs: Points, score: Vector, margin: Vector, critical: Mask, rng:
     critical; a Gaussian process learns the margin, which is better where little of it is noise. What they say of rows that
     they had not seen is turned into P by a logistic regression (stacking); the process takes part where critical runs surely
     become likelier by it. With few critical (or safe) runs the forest of labels is left out, and the mean P is that of the runs.
+    Of a skewed column only the order of its values counts.
 
     Args:
         inputs: (n, m) of the runs.
@@ -55,7 +57,8 @@ def fit_risk(inputs: Points, score: Vector, margin: Vector, critical: Mask, rng:
     base = float(np.log((hits + 0.5) / (n - hits + 0.5)))
     if n < _FEWEST or np.ptp(score) == 0.0:
         return lambda points: _pair(np.full(len(points), base))
-    states = rng.integers(2**31, size=2)
+    placed = _placement(inputs)
+    inputs, states = placed(inputs), rng.integers(2**31, size=2)
     few = min(hits, n - hits) < _EVENT
     event = score <= np.partition(score, _clipped(hits, n) - 1)[_clipped(hits, n) - 1] if few else critical
     learners, unseen = _forests(inputs, score, None if few else critical, states.tolist())
@@ -68,7 +71,33 @@ def fit_risk(inputs: Points, score: Vector, margin: Vector, critical: Mask, rng:
         if gain.sum() > _SURELY * np.sqrt(n) * gain.std():
             learners, unseen, weight = (*learners, process[0]), both, with_process
     weight[-1] += _intercept(_linear(unseen, weight), hits + 0.5, n + 1.0)
-    return lambda points: _pair(_linear(np.column_stack([learner(points) for learner in learners]), weight))
+
+    def risk(points: Points) -> LogPair:
+        at = placed(points)
+        return _pair(_linear(np.column_stack([learner(at) for learner in learners]), weight))
+
+    return risk
+
+
+def _placement(inputs: Points) -> Callable[[Points], Points]:
+    """Return what replaces values of skewed columns by normal scores of their ranks among these rows (n, m).
+
+    Trees split a column anywhere between its ends, and a process measures distances along it: most of a skewed one is one place.
+    """
+    centred = inputs - inputs.mean(axis=0)
+    skewness = np.abs((centred**3).mean(axis=0)) / np.maximum(centred.std(axis=0), 1e-100) ** 3
+    steps = {}
+    for column in np.flatnonzero(skewness > _SKEWED):
+        values, count = np.unique(inputs[:, column], return_counts=True)
+        steps[column] = values, ndtri((np.cumsum(count) - 0.5 * count) / len(inputs))
+
+    def placed(points: Points) -> Points:
+        found = np.array(points, dtype=np.float64)
+        for column, (values, place) in steps.items():
+            found[:, column] = np.interp(found[:, column], values, place)
+        return found
+
+    return placed
 
 
 def _forests(inputs: Points, score: Vector, critical: Mask | None, states: list[int]) -> tuple[tuple[Learner, ...], Points]:
