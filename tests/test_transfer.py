@@ -47,6 +47,11 @@ def test_another_version_needs_few_runs_and_none_of_the_old_ones(old, tmp_path):
     assert warm.conclusion.low <= norm.sf(LATER) <= warm.conclusion.high
     assert (warm.summary["stopped"], warm.summary["runs"] <= 80) == ("cov", True)  # from scratch 104 at least; three repeats
     assert set(warm.frame["stage"]) <= {"learn", "estimation", "hunt", "repeat"}  # no even start
+    assert warm.conclusion.earlier.correlations["y"] > 0.95
+    from_old = {"store": str(old), "transfer": True}
+    mirrored = run(tmp_path / "m", scenario("mirrored", LATER, sign=-1.0), warm_start=from_old, budget=60)
+    assert mirrored.conclusion.earlier.correlations["y"] < 0.0
+    assert any("rank correlation of y -" in said for said in mirrored.sentences())
     assert warm.conclusion.undetected_mass_bound <= 0.19  # 15 draws from the inputs' distribution before it may end
 
 
@@ -105,5 +110,7 @@ def test_a_falsification_begins_with_the_old_failures(old, tmp_path):
     first = found.frame[found.frame["stage"] == "transfer"]
     assert len(first) == 5
     assert first["critical"].mean() > 0.5  # old failures with a distance above 3, an edge at 3.2 now
+    assert (found.conclusion.earlier.again, found.conclusion.earlier.critical) == (5, first["critical"].sum())
+    assert sbt.open(tmp_path / "f", scenario=scenario("after", LATER)).conclusion.earlier == found.conclusion.earlier
     with pytest.raises(ConfigError, match="a campaign falsification does not take it without transfer"):
         run(tmp_path / "g", scenario("after", LATER), campaign="falsification", warm_start={"store": str(old)})

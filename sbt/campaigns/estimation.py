@@ -13,6 +13,7 @@ from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_wor
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
 from sbt.campaigns.levels import LevelsTold, is_two_level, left_two_levels, levels_told
+from sbt.campaigns.likeness import EarlierTold, earlier_told
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
 from sbt.campaigns.pairing import PairStage, pairs_of, pairs_words
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
@@ -79,6 +80,7 @@ class EstimationConclusion:
         fidelity: what coarse runs did for it, where there are some.
         pairs: of inputs and seed, from which counted runs were drawn by what the seed draws; None: seeds were not looked at.
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
+        earlier: what a campaign of another setup told; None: there is none.
     """
 
     probability: float | None
@@ -104,6 +106,7 @@ class EstimationConclusion:
     fidelity: LevelsTold | None = optional()
     pairs: int | None = optional()
     explained: ExplainedVariance | None = optional()
+    earlier: EarlierTold | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -116,6 +119,7 @@ class EstimationConclusion:
         noise = [*estimates_words(self.requirements, self.confidence), *noise]
         noise += [] if self.warmed_traffic is None else [self.warmed_traffic.sentence()]
         noise += [] if self.fidelity is None else [self.fidelity.sentence()]
+        noise += [] if self.earlier is None else self.earlier.sentences()
         details = {"coefficient of variation": self.cov, "effective sample size": self.effective_sample_size}
         behind = [f"Behind it: {', '.join(f'{k} {number(v, 3)}' for k, v in details.items() if v is not None)}."]
         behind = behind if self.probability is not None and self.exact_bound is None else []
@@ -182,7 +186,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         each = each_estimate(log, settings)
         return replace(
             found, gate=gate, simulator_noise=noise, requirements=each, fidelity=levels_told(log, settings),
-            pairs=pairs_of(log), explained=explained_variance(settings, log.history),
+            pairs=pairs_of(log), explained=explained_variance(settings, log.history), earlier=earlier_told(log, settings),
         ), None  # fmt: skip
 
     return Campaign((stage,), conclude)

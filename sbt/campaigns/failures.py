@@ -11,6 +11,7 @@ import numpy as np
 from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.levels import ScreeningTold
+from sbt.campaigns.likeness import EarlierTold
 from sbt.campaigns.linking import LinksTold, Way, doubtful, ways_between
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.modes import FailureMode, Mode, critical_groups, describe, modes_of, single, violations
@@ -106,6 +107,7 @@ class FalsificationConclusion:
         fidelity: what coarse runs did for it, where there are some.
         raced: repetitions that helped to order the modes and count in no rate; None: there are none.
         links: runs that asked whether critical runs are of one mode; None: there are none.
+        earlier: what a campaign of another setup told; None: there is none.
     """
 
     first_critical_run: int | None
@@ -123,6 +125,7 @@ class FalsificationConclusion:
     fidelity: ScreeningTold | None = optional()
     raced: int | None = optional()
     links: LinksTold | None = optional()
+    earlier: EarlierTold | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -142,6 +145,7 @@ class FalsificationConclusion:
         said += _rates(self)
         said += [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
         said += [] if self.fidelity is None else [self.fidelity.sentence()]
+        said += [] if self.earlier is None else self.earlier.sentences()
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
         return [*said, *count_avoided(judged), *conditional_on(facts.history)]
 

@@ -15,6 +15,7 @@ from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.confirming import ConfirmStage
 from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, search_runs
 from sbt.campaigns.levels import coarse_runs, screening_told
+from sbt.campaigns.likeness import TRANSFERRED, earlier_told
 from sbt.campaigns.parts import held_out_runs, named_inputs
 from sbt.campaigns.records import SearchProposal
 from sbt.campaigns.repeats import REPEAT, repeats_wanted
@@ -42,8 +43,6 @@ METHODS = ("portfolio", *CRITERIA, "cma_es")
 """Ways to choose a batch, as in `acquisition.kind`; any acquisition function is one more."""
 
 _INITIAL, _SEARCH, _EVEN = "initial", "search", "even"
-_TRANSFER = "transfer"
-"""Stage of runs that were critical in an earlier campaign of another setup."""
 _FILL_SHARE = 0.1  # of every batch that fills space, held-out runs included: what it finds is independent of the metamodel
 _SCREENED = "screened"
 """Criterion of the runs that coarse runs chose."""
@@ -67,7 +66,7 @@ def recipe(settings: Settings) -> Campaign:
     def conclude(log: Log) -> tuple[FalsificationConclusion, FittedMetamodel | None]:
         fitted = learner.fit(log.history)
         found = failures.conclusion(log, None if fitted is None else fitted.record)
-        return replace(found, fidelity=screening_told(log, settings)), fitted
+        return replace(found, fidelity=screening_told(log, settings), earlier=earlier_told(log, settings)), fitted
 
     search: Stage = SearchStage(failures)
     if settings.coarse_cost is not None:
@@ -128,7 +127,7 @@ class SearchStage:
         if first:
             known = self._known_elsewhere(size // 2)
             filled, at = self._even(size - len(known), start)
-            chosen = self._snapped([(_TRANSFER, known), (_INITIAL, filled)], runs)
+            chosen = self._snapped([(TRANSFERRED, known), (_INITIAL, filled)], runs)
             return Batch((*chosen, *held_out_runs(s, 0, s.reference)), SearchProposal("even", at))
         none = s.scenario.pool is not None or few(s.scenario, asked, s.budget)
         held_out = 0 if none else min(_share_of(s.holdout_fraction, spent, size), size - 1)

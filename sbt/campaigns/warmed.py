@@ -19,7 +19,8 @@ def conditional_on(history: History) -> list[str]:
     """Return the sentence on the warm-ups of a campaign that searches; none where runs simulate their traffic."""
     numbers = history.columns["warm_up"]
     found = len(np.unique(numbers[numbers >= 0]))
-    return [f"Runs began with the traffic of {plural(found, 'warm-up')}: the result is conditional on it."] if found else []
+    said = f"Runs began with the traffic of {plural(found, 'warm-up')}: the result is conditional on it"
+    return [f"{said}{', and other traffic (warm_up.seeds) may give another' if found == 1 else ''}."] if found else []
 
 
 def warmed_traffic(log: Log, settings: Settings) -> Spread | None:
