@@ -48,6 +48,7 @@ SMALLEST = {
     "pair_estimates.py": (
         "crossing_pedestrian --seeds 1 --budget 40 --priced 20 --probability .021 --table {folder}/pairs.jsonl"
     ),
+    "pair_problems.py": "--seeds 1 --budget 40 --only skewed --table {folder}/problems.jsonl",
     "pairs.py": "crossing_pedestrian --seeds 1 --runs 30",
     "report_speed.py": "--runs 20 --scenario cut_in --clicks 2 --opened 1", "serve_speed.py": "--runs 20 --opened 1",
     "run_price.py": "--runs 2 --repeats 1 --only crossing_pedestrian",
