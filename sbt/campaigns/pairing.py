@@ -45,6 +45,8 @@ Seeds = NDArray[np.int64]
 _SHARES = (0.8, 0.2, 0.0, 0.0)
 """Of the draws: in proportion to the metamodel's uncertainty, and to the pool. No draw counts for more than five, whatever the
 metamodel denies."""
+_BLIND = (0.5, 0.5, 0.0, 0.0)
+"""The same until enough critical runs are known: where there are none, only draws in proportion to the pool bound P."""
 _BATCH, _GROWTH = 1.0 / 16.0, 0.25
 """Runs of a batch over those before it, at least; and by how much runs grow from one fit to the next: a fit for every few runs
 would cost more than the runs."""
@@ -138,7 +140,7 @@ class PairStage:
             pilot = self._drawn(_PILOT, rng)
             if float(np.exp(risk(pilot.inputs)[0]).mean()) < _RARE:
                 return None
-        return self._counted(risk, parts, size, self._ratio(log), rng)
+        return self._counted(risk, parts, size, self._ratio(log), _SHARES if hits >= _ENOUGH else _BLIND, rng)
 
     def _traffic_decides(self, history: History) -> bool:
         """Return whether the drawn traffic explains more of how near runs come than the inputs do: these are searched in vain."""
@@ -227,14 +229,16 @@ class PairStage:
                 return min(max(best, _RATIO), _MOST_RATIO)
         return _RATIO
 
-    def _counted(self, risk: Risk, parts: tuple[Risk, ...], n: int, ratio: float, rng: np.random.Generator) -> Batch:
+    def _counted(
+        self, risk: Risk, parts: tuple[Risk, ...], n: int, ratio: float, shares: tuple[float, ...], rng: np.random.Generator
+    ) -> Batch:
         """Return n pairs of a fresh pool, drawn with known probabilities."""
         space = self.settings.scenario.space
         pool = self._drawn(math.ceil(ratio * n), rng)
         size = len(pool.seeds)
         event, of_parts = risk(pool.inputs), tuple(part(pool.inputs) for part in parts)
         flat, stratum = np.zeros(size), np.zeros(size)
-        plan = plan_batch(*event, flat, flat, stratum, _SHARES, "difference", others=of_parts)
+        plan = plan_batch(*event, flat, flat, stratum, shares, "difference", others=of_parts)
         draws = draw_systematic(plan, n, event[0] - event[1], rng)
         plan, rows = draws.plan, draws.rows
         log_q = space.log_density(pool.x[rows]) - np.log(draws.coefficient)
