@@ -51,7 +51,7 @@ def test_another_version_needs_few_runs_and_none_of_the_old_ones(old, tmp_path):
     from_old = {"store": str(old), "transfer": True}
     mirrored = run(tmp_path / "m", scenario("mirrored", LATER, sign=-1.0), warm_start=from_old, budget=60)
     assert mirrored.conclusion.earlier.correlations["y"] < 0.0
-    assert any("rank correlation of y -" in said for said in mirrored.sentences())
+    assert any("rank correlation of -" in said for said in mirrored.sentences())
     assert warm.conclusion.undetected_mass_bound <= 0.19  # 15 draws from the inputs' distribution before it may end
 
 

@@ -40,7 +40,7 @@ class EarlierTold:
         """Return in words how like the two setups are."""
         said = []
         if self.correlations:
-            each = ", ".join(f"{name} {number(value, 2)}" for name, value in self.correlations.items())
+            each = ", ".join(f"{number(value, 2)} ({name})" for name, value in self.correlations.items())
             here = plural(self.runs, "run")
             said.append(
                 f"What the earlier campaign lets expect has a rank correlation of {each} with {here} of this one; it is used as"

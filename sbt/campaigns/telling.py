@@ -146,10 +146,9 @@ def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) ->
         return "test it: validation.reference: 300 scores the metamodel on 300 more runs drawn at random"
     scores, unsure = found.validation, found.ambiguous_volume or 0.0
     if scores is not None and scores.n_critical < 10:
-        few = "no critical run" if not scores.n_critical else f"only {plural(scores.n_critical, 'critical run')}"
         return (
-            f"a larger budget, or validation.reference: 300, since {few} among the {scores.n} held-out ones cannot tell whether"
-            " a critical region is missing"
+            "a larger budget, or validation.reference: 300, since held-out runs with so few critical ones among them"
+            f" ({scores.n_critical} of {scores.n}) cannot tell whether a critical region is missing"
         )
     if found.place is None:
         return "campaign: falsification searches for the rare critical run"
