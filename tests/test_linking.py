@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sbt
-from sbt.campaigns.linking import Way, connected, doubtful
+from sbt.campaigns.linking import Link, Way, connected, doubtful, pairs_joined
 from sbt.campaigns.records import CONFIRM, LINK, SearchProposal
 from sbt.loop.stages import Facts, Log
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -90,5 +90,27 @@ def test_equal_inputs_are_one_mode_whatever_the_metamodel_says_there():
 
 def test_what_is_most_in_doubt_is_asked_first_and_what_is_sure_is_not():
     given = (0.001, False), (0.9, False), (1.0, True), (0.4, False), (1.0, False)
-    ways = [Way(p, np.zeros(1), untested) for p, untested in given]
+    ways = [Way((0, 1), p, np.zeros(1), untested) for p, untested in given]
     assert [way.least for way in doubtful(ways)] == [0.4, 0.9, 1.0]
+
+
+def test_a_critical_run_between_two_joins_them_until_one_between_it_and_them_is_uncritical():
+    links = [Link(7, (2, 5)), Link(8, (5, 7)), Link(9, (2, 7))]
+    assert pairs_joined(links[:1], [2, 5]) == []
+    assert pairs_joined(links[:1], [5, 2, 7]) == [(1, 2), (0, 2)]
+    assert pairs_joined(links[:2], [2, 5, 7]) == [(0, 2)]
+    assert pairs_joined(links, [2, 5, 7, 9]) == [(0, 3), (2, 3)]
+
+
+@pytest.mark.parametrize(("shift", "groups"), [(1.0, [0, 0, 2]), (9.0, [0, 1, 2])])
+def test_runs_that_one_between_them_has_joined_are_of_one_mode_unless_the_metamodel_excludes_it(shift: float, groups: list):
+    rng = stream(1, "joined")
+    u = rng.random((30, 2))
+    search = Search(CriticalInterval(high=0.0), GaussianProcess(nu=2.5), lambda v: v, lambda v: np.ones(len(v), dtype=bool))
+    fitted = fit_warped(search, u, rng.standard_normal(30) + shift, rng)  # nothing to learn: alike everywhere
+    p = fitted.probability(rng.random((200, 2)))
+    assert (p.min() > 0.02) == (groups[1] == 0)
+    assert p.max() < 0.5
+    assert connected(fitted, u[:3], np.zeros(3)).tolist() == [0, 1, 2]
+    assert connected(fitted, u[:3], np.zeros(3), tested=[(0, 1)]).tolist() == groups
+    assert connected(fitted, u[:3], np.arange(3.0), tested=[(0, 1)]).tolist() == [0, 1, 2]  # other conflict types

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.campaigns.failures import FailureSearch, batches_by, confirmations, with_links
+from sbt.campaigns.failures import FailureSearch, batches_by, confirmations, links_of, with_links
+from sbt.campaigns.linking import Way
 from sbt.campaigns.modes import Mode
 from sbt.campaigns.parts import named_inputs
 from sbt.campaigns.rates import next_repetitions
@@ -42,25 +43,27 @@ class ConfirmStage:
 
     def stop(self, log: Log) -> str | None:
         """Return why the search was over, once the first ten modes are repeated."""
-        return None if self._missing(log)[1] else self.search.stop(log)
+        return None if self._links(log) or self._missing(log)[1] else self.search.stop(log)
 
     def propose(self, log: Log) -> Batch:
         """Return three runs a mode, of a noisy simulator up to ten, or a round of the race before these, beside the budget."""
-        last = log.last(SearchProposal)
+        last, scenario = log.last(SearchProposal), self.failure_search.settings.scenario
+        position = 0 if last is None else last.next_position
+        if links := self._links(log):
+            at = scenario.space.from_unit(np.array([way.at for way in links]))
+            runs = tuple(PlannedRun(CONFIRM, named_inputs(scenario, row)) for row in at)
+            return Batch(runs, SearchProposal(LINK, position, ends=tuple(way.ends for way in links)))
         method, planned = self._missing(log)
-        return Batch(tuple(planned), SearchProposal(method, 0 if last is None else last.next_position))
+        return Batch(tuple(planned), SearchProposal(method, position))
 
     def _missing(self, log: Log) -> tuple[str, list[PlannedRun]]:
-        """Return the runs of the next batch, and what they are for."""
+        """Return the repetitions of the next batch, and what they are for."""
         search, history = self.failure_search, log.history
         if search.settings.scenario.pool is not None:
             return _TOLD, []  # a recorded row cannot be repeated
-        links = self._links(log)
-        if links:
-            return LINK, links
         runs, aside, race = with_links(log), batches_by(log, RACE, LINK), batches_by(log, RACE)
         raced = np.isin(history.iteration, race)
-        modes = search.modes(runs, history.where(raced))[:_MOST_CONFIRMED]
+        modes = search.modes(runs, history.where(raced), links_of(log))[:_MOST_CONFIRMED]
         wanted = [_REPEATS] * len(modes)
         if modes and search.noisy(runs):
             racing, wanted = shares(len(modes))
@@ -74,21 +77,21 @@ class ConfirmStage:
             planned += [PlannedRun(CONFIRM, runs.inputs(mode.representative))] * (n - done)
         return _TOLD, planned
 
-    def _links(self, log: Log) -> list[PlannedRun]:
-        """Return runs between critical ones, where it is in doubt whether they are of one mode; none after repetitions."""
+    def _links(self, log: Log) -> list[Way]:
+        """Return ways between critical runs on which a run tells whether they are of one mode; none after repetitions."""
         rounds, search = len(batches_by(log, LINK)), self.failure_search
         scenario, runs = search.settings.scenario, with_links(log)
-        if rounds >= _LINK_ROUNDS or batches_by(log, RACE, _TOLD) or search.noisy(runs):
+        if scenario.pool is not None or rounds >= _LINK_ROUNDS or batches_by(log, RACE, _TOLD) or search.noisy(runs):
             return []
         if scenario.requirement.critical_runs(runs)[runs.ok].all():  # nothing is known to be between modes
             return []
         asked = int((runs.stage == CONFIRM).sum())
         most = min(max(int(_LINK_SHARE * (len(runs) - asked)), _FEWEST_LINKS), _MOST_LINKS)
-        x = [scenario.space.from_unit(way.at[None])[0] for way in search.doubtful_ways(runs)]
         known = {tuple(row) for row in runs.x}  # whole numbers: the way may lead through a run
-        new = [row for row in dict.fromkeys(map(tuple, x)) if row not in known]
-        batch = new[: min(most - asked, -(-most // _LINK_BATCH))]
-        return [PlannedRun(CONFIRM, named_inputs(scenario, np.array(row))) for row in batch]
+        new: dict[tuple[float, ...], Way] = {}
+        for way in search.doubtful_ways(log):
+            new.setdefault(tuple(scenario.space.from_unit(way.at[None])[0]), way)
+        return [way for row, way in new.items() if row not in known][: min(most - asked, -(-most // _LINK_BATCH))]
 
 
 def shares(modes: int) -> tuple[int, list[int]]:

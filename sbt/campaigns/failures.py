@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.levels import ScreeningTold
 from sbt.campaigns.likeness import EarlierTold
-from sbt.campaigns.linking import LinksTold, Way, doubtful, ways_between
+from sbt.campaigns.linking import Link, LinksTold, Way, doubtful, pairs_joined, ways_between
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.modes import FailureMode, Mode, critical_groups, describe, modes_of, single, violations
 from sbt.campaigns.parts import share_among_held_out
@@ -37,10 +37,12 @@ from sbt.store.records import FitRecord, Independence, Validation, optional, to_
 
 __all__ = [
     "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "batches_by", "confirmations",
-    "search_runs", "with_links",
+    "links_of", "search_runs", "with_links",
 ]  # fmt: skip
 
 _TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
+Links = tuple[Link, ...]
+
 FILLING = ("initial", "even", VALIDATION)
 """Stages of runs that fill the space, whatever the results."""
 
@@ -161,7 +163,7 @@ class FailureSearch:
 
     def __init__(self, settings: Settings):
         self.settings = settings
-        self._last: tuple[tuple[tuple[int, ...], tuple[int, ...]], _Learned] | None = None
+        self._last: tuple[tuple[tuple[int, ...], tuple[int, ...], Links], _Learned] | None = None
 
     @cached_property
     def search(self) -> Search:
@@ -179,30 +181,41 @@ class FailureSearch:
         """Return (n,) distance to M_c in the metric's unit, NaN where a run failed."""
         return self.settings.scenario.requirement.margins(history)
 
-    def modes(self, history: History, raced: History | None = None) -> list[Mode]:
-        """Return the failure modes among these runs; of a noisy simulator `raced` repetitions help to order them."""
-        return self._learned(history, raced).modes
+    def modes(self, history: History, raced: History | None = None, links: Links = ()) -> list[Mode]:
+        """Return the failure modes among these runs, some of them `links`; with noise `raced` repetitions help to order them."""
+        return self._learned(history, raced, links).modes
 
     def rates(self, history: History, raced: History) -> LocalRates:
         """Return the failure rates at these runs of a noisy simulator, some of them critical; NaN where there is no metric."""
         return self._learned(history, raced).rates
 
-    def doubtful_ways(self, history: History) -> list[Way]:
-        """Return the ways between critical runs on which a run would tell whether they are of one mode; none with noise."""
-        fitted, space = self._learned(history, None).fitted, self.settings.scenario.space
+    def doubtful_ways(self, log: Log) -> list[Way]:
+        """Return the ways between critical runs on which a run would tell whether they are of one mode; none with noise.
+
+        Their ends are indices of runs.
+        """
+        history, links, space = with_links(log), links_of(log), self.settings.scenario.space
+        fitted = self._learned(history, None, links).fitted
         if fitted is None:
             return []
         chosen, kind = critical_groups(history, self.settings.scenario)
-        ways = doubtful(ways_between(fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM))
-        return [way for way in ways if space.feasible(space.from_unit(way.at[None]))[0]]
+        runs = history.index[chosen].tolist()
+        ways = doubtful(ways_between(
+            fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM, pairs_joined(links, runs)
+        ))  # fmt: skip
+        return [
+            replace(way, ends=(min(ends), max(ends)))
+            for way in ways if space.feasible(space.from_unit(way.at[None]))[0]
+            for ends in [[runs[k] for k in way.ends]]
+        ]  # fmt: skip
 
-    def _learned(self, history: History, raced: History | None) -> _Learned:
-        runs = tuple(history.index.tolist()), () if raced is None else tuple(raced.index.tolist())
+    def _learned(self, history: History, raced: History | None, links: Links = ()) -> _Learned:
+        runs = tuple(history.index.tolist()), () if raced is None else tuple(raced.index.tolist()), links
         if self._last is None or runs != self._last[0]:
-            self._last = runs, self._learn(history, raced)
+            self._last = runs, self._learn(history, raced, links)
         return self._last[1]
 
-    def _learn(self, history: History, raced: History | None) -> _Learned:
+    def _learn(self, history: History, raced: History | None, links: Links) -> _Learned:
         scenario = self.settings.scenario
         ok, rates = np.flatnonzero(history.ok), LocalRates(*np.full((2, len(history)), np.nan))
         if not (self.margin(history) <= 0).any():
@@ -214,7 +227,7 @@ class FailureSearch:
         rng = stream(self.settings.seed, "modes", len(history))
         fitted = fit_warped(self.search.for_noise(u, y), u, y, rng)
         if not self.noisy(history):
-            return _Learned(modes_of(fitted, history, scenario), rates, fitted)
+            return _Learned(modes_of(fitted, history, scenario, links=links), rates, fitted)
         again = history.where(np.zeros(len(history), dtype=bool)) if raced is None else raced.where(raced.ok)
         critical = scenario.requirement.critical_runs(again)
         found = local_rates(self.search, u, y, history.drawn[ok], scenario.space.to_unit(again.x), critical, rng)
@@ -233,7 +246,7 @@ class FailureSearch:
         margin = self.margin(searched)
         hits = np.flatnonzero(margin <= 0)
         modes = []
-        for mode in self.modes(known, raced):
+        for mode in self.modes(known, raced, links_of(log)):
             again = history.where(confirmations(history, known.x[mode.representative], aside))
             modes.append(describe(mode, known, scenario, again, noisy=self.noisy(history)))
         first = int(hits[0]) if len(hits) else None
@@ -253,7 +266,7 @@ class FailureSearch:
         if not len(asked):
             return None
         critical = int(self.settings.scenario.requirement.critical_runs(asked).sum())
-        return LinksTold(len(asked), critical, len(self.doubtful_ways(with_links(log))))
+        return LinksTold(len(asked), critical, len(self.doubtful_ways(log)))
 
 
 @dataclass(frozen=True)
@@ -274,6 +287,17 @@ def with_links(log: Log) -> History:
     """Return the runs of the search, and those between critical ones."""
     history = log.history
     return history.where((history.stage != CONFIRM) | np.isin(history.iteration, batches_by(log, LINK)))
+
+
+def links_of(log: Log) -> Links:
+    """Return the runs between critical ones, and between which."""
+    found = []
+    for batch in log.iterations:
+        ends = batch.read(SearchProposal).ends if batch.stage == CONFIRM else None
+        if ends is not None:
+            runs = np.sort(log.history.index[log.history.iteration == batch.number]).tolist()
+            found += [Link(run, pair) for run, pair in zip(runs, ends, strict=True)]
+    return tuple(found)
 
 
 def batches_by(log: Log, *methods: str) -> tuple[int, ...]:

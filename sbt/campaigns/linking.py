@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.search import WarpedModel
 from sbt.seeds import stream
 
-__all__ = ["LinksTold", "Way", "connected", "doubtful", "ways_between"]
+__all__ = ["Link", "LinksTold", "Way", "connected", "doubtful", "pairs_joined", "ways_between"]
 
 _PROBES = 9  # on the segment between two runs
 _CHUNK = 100  # segments asked for at once
@@ -30,15 +30,25 @@ _BENDS, _REACH = 128, 0.5  # points over which such a way may lead, and how far 
 
 
 @dataclass(frozen=True)
+class Link:
+    """A run between two critical ones; all are indices of runs."""
+
+    run: int
+    ends: tuple[int, int]
+
+
+@dataclass(frozen=True)
 class Way:
     """The segment between two critical runs that decides whether they are of one mode.
 
     Attributes:
+        ends: these two, of n.
         least: smallest P(critical) on it.
         at: (d,) where that is, in the unit cube; of a way between two modes, the point over which it leads.
         untested: the metamodel is sure of it, but no run was made on it: it is long, or bends.
     """
 
+    ends: tuple[int, int]
     least: float
     at: Vector
     untested: bool
@@ -66,22 +76,42 @@ class LinksTold:
         return f"{asked}: {found}{still if self.left else ''}."
 
 
-def connected(fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False) -> NDArray[np.int64]:
+Pairs = Sequence[tuple[int, int]]
+"""Of n critical runs, two that are joined."""
+
+
+def pairs_joined(links: Sequence[Link], runs: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the pairs of critical runs, as places in `runs` (n,), that runs between them tell: a critical one and its ends.
+
+    Those between which a run was made later are no pair any more: that run decides.
+    """
+    place, pairs = {run: k for k, run in enumerate(runs)}, dict[tuple[int, int], None]()
+    for link in links:
+        pairs.pop(link.ends, None)
+        if link.run in place:
+            pairs |= {(min(end, link.run), max(end, link.run)): None for end in link.ends}
+    return [(place[a], place[b]) for a, b in pairs if a in place and b in place]
+
+
+def connected(
+    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False, tested: Pairs = ()
+) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes; equal inputs are one.
 
     With a noisy simulator P(critical) is small even where runs fail most: there it must exceed half of the smaller P at the two
-    ends.
+    ends. Of two runs that a run between critical ones has joined it is enough that the metamodel does not exclude it.
 
     Args:
         fitted: of the metamodel.
         u: (n, d) critical runs in the unit cube.
         kind: (n,) only runs of the same kind are joined.
         noisy: see above.
+        tested: of `pairs_joined`.
     """
-    return _linked(fitted, u, kind, noisy=noisy)[0]
+    return _linked(fitted, u, kind, noisy=noisy, tested=tested)[0]
 
 
-def ways_between(fitted: WarpedModel, u: Points, kind: Vector, link: Mask) -> list[Way]:
+def ways_between(fitted: WarpedModel, u: Points, kind: Vector, link: Mask, tested: Pairs = ()) -> list[Way]:
     """Return the ways that decide which of n critical runs are of one mode, of a simulator without noise.
 
     They are those that join the runs of a mode, and between modes that could be one the likeliest that bends once.
@@ -91,16 +121,18 @@ def ways_between(fitted: WarpedModel, u: Points, kind: Vector, link: Mask) -> li
         u: (n, d) critical runs in the unit cube.
         kind: (n,) only runs of the same kind can be of one mode.
         link: (n,) the run was between others.
+        tested: of `pairs_joined`.
     """
-    group, joined = _linked(fitted, u, kind)
+    group, joined = _linked(fitted, u, kind, tested=tested)
     distance = cdist(u, u)
     apart = sorted(_between_groups(group, kind, distance), key=lambda pair: float(distance[pair]))[:_APART]
     first, second = np.array([pair for pair in joined if distance[pair] > 0.0], dtype=np.intp).reshape(-1, 2).T
     probes, p = _probed(fitted, u[first], u[second])
     at = np.where(p.min(axis=1) < _SURE, p.argmin(axis=1), _PROBES // 2)
     untested = (distance[first, second] > _LONG) & ~link[first] & ~link[second]
-    straight = [Way(float(p[k].min()), probes[k, i], bool(untested[k])) for k, i in enumerate(at)]
-    return [*straight, *(_bent(fitted, u[i], u[j]) for i, j in apart)]
+    ends = list(zip(first.tolist(), second.tolist(), strict=True))
+    straight = [Way(ends[k], float(p[k].min()), probes[k, i], bool(untested[k])) for k, i in enumerate(at)]
+    return [*straight, *(Way((i, j), *_bent(fitted, u[i], u[j])) for i, j in apart)]
 
 
 def _between_groups(group: NDArray[np.int64], kind: Vector, distance: Points) -> Iterator[tuple[int, int]]:
@@ -112,7 +144,7 @@ def _between_groups(group: NDArray[np.int64], kind: Vector, distance: Points) ->
             yield int(a[i]), int(b[j])
 
 
-def _bent(fitted: WarpedModel, a: Vector, b: Vector) -> Way:
+def _bent(fitted: WarpedModel, a: Vector, b: Vector) -> tuple[float, Vector, bool]:
     """Return the way from a to b (d,) over one more point, of many, on which the least P(critical) is largest.
 
     Coordinates that are the same at both ends, such as choices, stay.
@@ -124,7 +156,7 @@ def _bent(fitted: WarpedModel, a: Vector, b: Vector) -> Way:
     least = np.minimum(*(_probed(fitted, np.broadcast_to(end, over.shape), over)[1].min(axis=1) for end in (a, b)))
     least = np.minimum(least, fitted.probability(over))
     best = int(least.argmax())
-    return Way(float(least[best]), over[best], untested=bool(least[best] > _JOINED))
+    return float(least[best]), over[best], bool(least[best] > _JOINED)
 
 
 def doubtful(ways: list[Way]) -> list[Way]:
@@ -134,13 +166,22 @@ def doubtful(ways: list[Way]) -> list[Way]:
 
 
 def _linked(
-    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False
+    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False, tested: Pairs = ()
 ) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
     """Return (n,) group numbers, and the pairs that join them."""
-    n, pairs = len(u), []
+    n, pairs = len(u), list[tuple[int, int]]()
     level = _JOINED * fitted.probability(u) if noisy else np.full(n, _JOINED)
     group = np.arange(n, dtype=np.int64)
     distance = cdist(u, u)
+
+    def join(i: int, j: int) -> None:
+        if group[i] != group[j]:
+            pairs.append((i, j))
+            group[group == group[j]] = group[i]
+
+    for i, j in tested:
+        if kind[i] == kind[j] and _probed(fitted, u[[i]], u[[j]])[1].min() > _DOUBT[0]:
+            join(i, j)
     first, second = np.triu_indices(n, 1)
     alike = kind[first] == kind[second]
     first, second = first[alike], second[alike]
@@ -155,10 +196,8 @@ def _linked(
             break
         least = np.minimum(level[a], level[b])[:, None]
         inside: Mask = (_probed(fitted, u[a], u[b])[1] > least).all(axis=1) | (distance[a, b] == 0.0)
-        for i, j in zip(a[inside], b[inside], strict=True):
-            if group[i] != group[j]:
-                pairs.append((int(i), int(j)))
-                group[group == group[j]] = group[i]
+        for i, j in zip(a[inside].tolist(), b[inside].tolist(), strict=True):
+            join(i, j)
     return group, pairs
 
 

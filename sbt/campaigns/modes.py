@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sbt.campaigns.linking import connected
+from sbt.campaigns.linking import Link, connected, pairs_joined
 from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type, without_standing
@@ -148,7 +148,9 @@ def worst_first(history: History, margins: Vector) -> NDArray[np.int64]:
     return np.lexsort((-severity(history), margins))
 
 
-def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *, rates: Vector | None = None) -> list[Mode]:
+def modes_of(
+    fitted: WarpedModel, history: History, scenario: LogicalScenario, *, rates: Vector | None = None, links: Sequence[Link] = ()
+) -> list[Mode]:
     """Return the failure modes, the one with the deepest run first; of a noisy simulator the likeliest to fail again first.
 
     Repetitions that are told do not decide the order: the rate of the one that failed most often in them would be stated
@@ -159,6 +161,7 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
         history: runs; only finished ones count.
         scenario: with the campaign's space and requirement.
         rates: (n,) failure rates at these runs, where the simulator is noisy, see `connected` and `Mode`; None: it is not.
+        links: runs among them that were made between critical ones.
     """
     critical = scenario.requirement.critical
     y = scenario.requirement.values(history)
@@ -169,7 +172,8 @@ def modes_of(fitted: WarpedModel, history: History, scenario: LogicalScenario, *
     u, cube = scenario.space.to_unit(history.x), scenario.space.cube
     at = cube.embedded(u)
     depth, worse = critical.margin(y), severity(history)
-    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None)
+    tested = pairs_joined(links, history.index[chosen].tolist())
+    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested)
     log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]

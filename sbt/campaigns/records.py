@@ -85,6 +85,7 @@ class SearchProposal:
         held_out: random runs that only score the metamodel.
         repeats: runs that repeat inputs with other seeds.
         coarse: with two levels of fidelity, what coarse runs were worth.
+        ends: of each run of a batch by link, the indices of the two critical runs that it is between.
     """
 
     method: str
@@ -94,6 +95,7 @@ class SearchProposal:
     held_out: int = 0
     repeats: int | None = optional()
     coarse: ScreenRecord | None = optional()
+    ends: tuple[tuple[int, int], ...] | None = optional()
 
 
 @dataclass(frozen=True)

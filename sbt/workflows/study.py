@@ -13,7 +13,7 @@ from sbt.config.assemble import Assembly, assemble, metamodel_of, scenario_of, s
 from sbt.config.load import Loaded, dump, fingerprint, from_mapping, load, parse, read_text, resumed
 from sbt.config.model import Configuration
 from sbt.config.source import ConfigError
-from sbt.errors import InputError, PluginError
+from sbt.errors import InputError, PluginError, StoreError
 from sbt.execution.dask import DaskExecutor
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
@@ -272,8 +272,11 @@ class Study:
         if choice is None:
             raise InputError("there is no earlier campaign: warm_start names none")
         folder = self.loaded.folder / Path(choice.store).expanduser()
-        with Store.read(folder) as store:
-            before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
+        try:
+            with Store.read(folder) as store:
+                before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
+        except StoreError as error:
+            raise InputError(f"warm_start.store: {error}") from None
         if not finished:
             raise InputError(f"warm_start.store must be a finished campaign, but the one in {folder} has not concluded")
         if not choice.transfer and before._simulator != self._simulator:
