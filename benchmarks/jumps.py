@@ -1,4 +1,5 @@
-"""Metrics that jump at the critical edge, as collisions, counts and sentinels do: are boundaries sharp, and do intervals cover?
+"""Metrics that jump or end at the critical edge, as collisions, counts, sentinels and speeds of impact do: are boundaries sharp,
+and do intervals cover?
 
     python benchmarks/jumps.py [--campaign boundary|estimation] [--problems a,b] [--seeds 6] [--first-seed 0] [--budget 100]
 
@@ -61,6 +62,16 @@ def sentinel(d: Vector, x: Points) -> Vector:
     return np.where(d < 0.013, 3.0 * d, 10.0)
 
 
+def depth(d: Vector, x: Points) -> Vector:
+    """A depth in mm, 0 where nothing touches; from .1 on it is critical."""
+    return 0.1 - 1000.0 * np.maximum(-d, 0.0)
+
+
+def speed(d: Vector, x: Points) -> Vector:
+    """A speed of impact, 0 where nothing touches; from .01 on it is critical."""
+    return 0.01 - 15.0 * np.sqrt(np.maximum(-d, 0.0))
+
+
 Metric = Callable[[Vector, Points], Vector]
 PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "disc_01": (2, disc, two_values), "wave_01": (2, wave, two_values),
@@ -68,6 +79,8 @@ PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "disc_three_values": (2, disc, three_values), "disc_count": (2, disc, count), "disc_contact": (2, disc, contact),
     "disc6_01": (6, disc, two_values), "ball_01": (3, ball, two_values),
     "ball_sentinel": (3, ball, sentinel),
+    "disc_depth": (2, disc, depth), "disc_speed": (2, disc, speed), "wave_depth": (2, wave, depth),
+    "ball_speed": (3, ball, speed),
 }  # fmt: skip
 
 

@@ -51,6 +51,44 @@ def test_of_a_run_at_the_edge_its_side_is_scored():
     assert scored(np.array([0.0, -1.0]), mu[:2], CRITICAL).tolist() == [0.0, -1.0]
 
 
+@pytest.mark.parametrize("edge", [-1e-9, -0.02])
+@pytest.mark.parametrize("critical_runs", [18, 1])
+def test_runs_that_nothing_happens_in_go_away_from_the_edge(edge: float, critical_runs: int):
+    """A speed of impact is 0 in all of them; those farther from a critical run go farther, also where one alone is known."""
+    rng = np.random.default_rng(1)
+    u = rng.random((300, 3))
+    distance = np.linalg.norm(u - 0.5, axis=1) - 0.3
+    order = np.argsort(distance)
+    left_out = order[critical_runs : (distance < 0.0).sum()]
+    u, distance = np.delete(u, left_out, axis=0), np.delete(distance, left_out)
+    y, critical = np.minimum(distance, 0.0), CriticalInterval(high=edge)
+    found = opened(u, y, critical, np.random.default_rng(0))
+    nothing = y == 0.0
+    assert np.array_equal(found[~nothing], y[~nothing])
+    assert (found[nothing] > 0.0).all()
+    assert np.corrcoef(found[nothing], distance[nothing])[0, 1] > 0.6
+    other = opened(u, -y, CriticalInterval(low=-edge), np.random.default_rng(0))
+    assert np.array_equal(other, -found), "the other direction likewise"
+    held_out = scored(y, np.where(nothing, 0.2, y - 0.1), critical)
+    assert held_out.tolist() == np.where(nothing, 0.2, y).tolist()
+
+
+@pytest.mark.parametrize(
+    ("y", "critical"),
+    [
+        ([0.0, 0.0, 0.0, -1.0, -1.0], CriticalInterval(high=-0.5)),  # a flag has no depth
+        ([0.0, 0.0, 0.0, -1.0, -2.0], CriticalInterval(high=-0.9)),  # it ends far from the edge
+        ([0.0, 0.1, 0.2, 0.3, -2.0], CriticalInterval(high=-0.1)),  # it goes on
+        ([0.0, 0.0, 0.0, 0.0, 0.0], CriticalInterval(high=-0.1)),  # nothing is critical
+        ([0.0, 0.0, 0.0, -1.0, -2.0], CriticalInterval(-1.5, -0.001)),
+    ],
+)
+def test_a_metric_that_does_not_end_near_the_edge_is_left_alone(y, critical):
+    values = np.array(y)
+    found = opened(np.linspace(0, 1, 5)[:, None], values, critical, np.random.default_rng(0))
+    assert found.tolist() == y
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_edge_of_a_metric_in_steps_lies_midway_between_two_of_them(sign):
     u = np.arange(7.0)[:, None]

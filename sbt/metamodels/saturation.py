@@ -2,7 +2,8 @@
 
 Where critical is "at most 0", all critical runs have the value of the edge, so that a metamodel of the metric is as unsure inside
 the critical region as on its boundary. What is learned in their place goes on beyond the edge, as deep as the nearest uncritical
-runs are far. Of a count, or a rounded number, whole regions have the value of the edge: the boundary lies midway to the next one.
+runs are far. A speed of impact ends on the other side of the edge: it is 0 wherever nothing touches. Of a count, or a rounded
+number, whole regions have the value of the edge: the boundary lies midway to the next one.
 """
 
 from __future__ import annotations
@@ -15,13 +16,18 @@ from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
 from sbt.metamodels.base import Metamodel, Predictor, is_rate
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["Opened", "centred", "opened", "scored"]
 
 _FEWEST = 2
 """Critical runs with the value of the edge: one may be there by chance."""
+_MANY, _NEAR = 0.25, 0.25
+"""Least share of the uncritical runs that have the last value, where a metric ends with it; its largest margin over the depth of
+the deepest run."""
+_OUTWARDS = 0.5
+"""Least of these moves, in that by the usual slope."""
 _LEAST = 0.25
 """Least depth beyond the edge, in the median margin of the uncritical runs that are nearest to critical ones."""
 _ENOUGH, _MOST = 8, 400
@@ -35,7 +41,8 @@ _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
     """Return y with the values at the edge of M_c moved into it, where no run lies beyond the edge; else `centred`.
 
-    So are two values that chance decides between: those at the edge are no deeper than they are.
+    So are two values that chance decides between: those at the edge are no deeper than they are. Where instead many
+    uncritical runs have the same, last value, much nearer to the edge than the deepest run, these are moved away from it.
 
     A Gaussian process of the uncritical margins says where each of them would lie; it is the mean of that prediction, cut off
     at the edge (one step of the expectation maximisation for censored values). Where few runs are uncritical, the depth is the
@@ -59,13 +66,43 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
     margin = critical.margin(y)
     tied = margin == 0.0
     if tied.sum() < _FEWEST or (margin < 0.0).any() or is_rate(u, y):
-        return centred(u, y, critical)
+        return _opened_outside(u, centred(u, y, critical), critical, rng)
+    return _moved(u, y, tied, margin, critical, rng)
+
+
+def _opened_outside(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
+    """Return y with the last uncritical value moved away from M_c where the metric ends with it."""
+    margin = critical.margin(y)
+    tied = _ends_outside(margin, len(np.unique(u[margin <= 0.0], axis=0)))
+    return _moved(u, y, tied, margin.max() - margin, critical, rng, outwards=True) if tied.any() else y
+
+
+def _ends_outside(margin: Vector, inputs: int) -> Mask:
+    """Return (n,) which margins are the last one, where a metric ends with it; all False where it goes on.
+
+    Critical runs, which are at so many inputs, must differ: a flag has no depth.
+    """
+    outside = margin > 0.0
+    tied, depth = margin == margin.max(initial=-np.inf), -margin[~outside]
+    if tied.sum() < max(_FEWEST, _MANY * outside.sum()) or not len(depth):
+        return np.zeros(len(margin), dtype=bool)
+    differ = len(np.unique(depth)) > 1 or inputs == 1
+    return np.asarray(tied & outside & bool(differ and margin.max() <= _NEAR * depth.max()))
+
+
+def _moved(
+    u: Points, y: Vector, tied: Mask, left: Vector, critical: CriticalInterval, rng: np.random.Generator, *,
+    outwards: bool = False,
+) -> Vector:  # fmt: skip
+    """Return y with the tied values (n,) moved into M_c, or away from it; `left` (n,) is how far others are from that value."""
     depth = np.ones(int(tied.sum()))
     if not tied.all():
         told = _extrapolated if (~tied).sum() >= _ENOUGH else _by_slope
-        depth = told(u[tied], u[~tied], margin[~tied], rng)
+        depth = told(u[tied], u[~tied], left[~tied], rng)
+        if outwards:  # a process that knows critical runs alone expects more of them where it knows nothing
+            depth = np.maximum(depth, _OUTWARDS * _by_slope(u[tied], u[~tied], left[~tied], rng))
     moved = np.array(y, dtype=np.float64)
-    moved[tied] += depth if math.isfinite(critical.low) else -depth
+    moved[tied] += depth if math.isfinite(critical.low) != outwards else -depth
     return moved
 
 
@@ -124,11 +161,12 @@ def _by_slope(at: Points, u: Points, margin: Vector, rng: np.random.Generator) -
 
 
 def scored(y: Vector, mu: Vector, critical: CriticalInterval) -> Vector:
-    """Return the values that predictions mu (n,) are scored by: of a run at the edge, where none lies beyond, its side alone."""
+    """Return the values that predictions mu (n,) are scored by: of a run where a metric ends, its side alone."""
     margin = critical.margin(y)
     at_edge = margin == 0.0
     if not at_edge.any() or (margin < 0.0).any():
-        return y
+        ends = _ends_outside(margin, int((margin <= 0.0).sum()))
+        return np.where(ends & (critical.margin(mu) > margin), mu, y) if critical.one_sided else y
     return np.where(at_edge & critical.contains(mu), mu, y)
 
 
