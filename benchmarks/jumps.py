@@ -72,6 +72,19 @@ def speed(d: Vector, x: Points) -> Vector:
     return 0.01 - 15.0 * np.sqrt(np.maximum(-d, 0.0))
 
 
+def slope(x: Points) -> Vector:
+    return x[:, :4] @ np.array([1.0, 0.7, -0.5, 0.3]) - 0.35
+
+
+def time_to_collision(d: Vector, x: Points) -> Vector:
+    """A time that is 0 in a collision, and critical from 0 to 1.5."""
+    return np.maximum(1.5 + 10.0 * d, 0.0)
+
+
+def flag(d: Vector, x: Points) -> Vector:
+    return np.where(d <= 0.0, 1.0, 0.0)
+
+
 Metric = Callable[[Vector, Points], Vector]
 PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "disc_01": (2, disc, two_values), "wave_01": (2, wave, two_values),
@@ -80,8 +93,10 @@ PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "disc6_01": (6, disc, two_values), "ball_01": (3, ball, two_values),
     "ball_sentinel": (3, ball, sentinel),
     "disc_depth": (2, disc, depth), "disc_speed": (2, disc, speed), "wave_depth": (2, wave, depth),
-    "ball_speed": (3, ball, speed),
+    "ball_speed": (3, ball, speed), "slope_ttc": (4, slope, time_to_collision), "disc_flag": (2, disc, flag),
 }  # fmt: skip
+CRITICAL = {"slope_ttc": (0.0, 1.5), "disc_flag": (1.0, 1.0)}
+"""M_c of those that are not critical at 0 and below."""
 
 
 def evaluate(given: dict[str, float], seed: int, problem: str) -> dict[str, float]:
@@ -92,7 +107,8 @@ def evaluate(given: dict[str, float], seed: int, problem: str) -> dict[str, floa
 
 def campaign(kind: str, problem: str, seed: int, budget: int, folder: Path) -> sbt.Result:
     inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abcdef"[: PROBLEMS[problem][0]]]
-    scenario = sbt.Scenario("jumps", inputs, sbt.Requirement("y", high=0.0), evaluate=partial(evaluate, problem=problem))
+    need = sbt.Requirement("y", *CRITICAL.get(problem, (-math.inf, 0.0)))
+    scenario = sbt.Scenario("jumps", inputs, need, evaluate=partial(evaluate, problem=problem))
     stop = {"stop": {"cov": None}} if kind == "estimation" else {}
     return sbt.run(
         campaign=kind, scenario=scenario, budget=budget, seed=seed, store=folder / "store", executor="serial", report=False,

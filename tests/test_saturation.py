@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import sbt
-from sbt.metamodels.saturation import centred, opened, scored
+from sbt.estimators.surrogate import fit_log_probability
+from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.saturation import Opened, centred, opened, scored
 from sbt.problem.requirement import CriticalInterval
+from sbt.samplers.search import Search, fit_warped
 
 CRITICAL = CriticalInterval(high=0.0)
 
@@ -41,6 +45,54 @@ def test_a_metric_that_goes_on_is_left_alone(y, critical):
     assert opened(np.linspace(0, 1, 4)[:, None], values, critical, np.random.default_rng(0)) is values
 
 
+@pytest.mark.parametrize(
+    ("shape", "two_ends", "one_end"),
+    [
+        (lambda d: np.maximum(6.0 * d + 1.5, 0.0), CriticalInterval(0.0, 1.5), CriticalInterval(high=1.5)),  # a TTC
+        (lambda d: 1.0 * (d <= 0.0), CriticalInterval(1.0, 1.0), CriticalInterval(low=1.0)),  # a flag
+    ],
+)
+def test_an_end_that_the_metric_ends_at_makes_no_difference(shape, two_ends, one_end):
+    """To boundaries, estimations and searches; before, P(critical) was about a half wherever the metric is 0, and 0 of a flag."""
+    rng = np.random.default_rng(2)
+    u, at = rng.random((50, 2)), rng.random((200, 2))
+    y = shape(np.linalg.norm(u - 0.5, axis=1) - 0.4)
+
+    def answers(critical):
+        learned = Opened(GaussianProcess(nu=2.5), critical).fit(u, y, np.random.default_rng(0))
+        search = fit_warped(Search(critical, GaussianProcess(nu=2.5)), u, y, np.random.default_rng(0))
+        belief = fit_log_probability(GaussianProcess(nu=2.5), lambda z: z, critical, u, y, np.random.default_rng(0))
+        return learned(at).probability(critical), np.exp(search.log_probability(at)), np.exp(belief(at)[0])
+
+    for found, expected in zip(answers(two_ends), answers(one_end), strict=True):
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        assert found.max() > 0.9 > 0.1 > found.min()
+
+
+def test_an_end_that_the_metric_ends_at_does_not_rank_runs():
+    """Of times to collision in [0, 1.5] the collision is the worst, not the run in the middle."""
+    need, runs = sbt.Requirement("ttc", 0.0, 1.5), Runs(np.array([0.7, 0.0, 0.0, 1.4, 3.0]))
+    assert need.margins(runs).tolist() == pytest.approx([-0.7, 0.0, 0.0, -0.1, 1.5])
+    assert need.depths(runs).tolist() == pytest.approx([-0.8, -1.5, -1.5, -0.1, 1.5])
+    assert sbt.Requirement("ttc", 0.5, 1.5).depths(runs).tolist() == pytest.approx([-0.2, 0.5, 0.5, -0.1, 1.5])
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Values of one metric."""
+
+    values: np.ndarray
+
+    def y(self, metric: str) -> np.ndarray:
+        return self.values
+
+
+def test_of_a_metric_that_ends_its_values_are_scored():
+    y, mu, critical = np.array([0.0, 0.0, 1.0, 3.0]), np.array([-0.7, 0.2, 0.9, 2.8]), CriticalInterval(0.0, 1.5)
+    assert scored(y, mu, critical).tolist() == [-0.7, 0.0, 1.0, 3.0]
+    assert scored(y, mu, CriticalInterval(0.5, 1.5)).tolist() == y.tolist()
+
+
 def test_where_all_runs_are_at_the_edge_all_is_critical():
     assert (opened(np.random.default_rng(0).random((5, 2)), np.zeros(5), CRITICAL, np.random.default_rng(0)) < 0).all()
 
@@ -69,6 +121,8 @@ def test_runs_that_nothing_happens_in_go_away_from_the_edge(edge: float, critica
     assert np.corrcoef(found[nothing], distance[nothing])[0, 1] > 0.6
     other = opened(u, -y, CriticalInterval(low=-edge), np.random.default_rng(0))
     assert np.array_equal(other, -found), "the other direction likewise"
+    two_ends = opened(u, y, CriticalInterval(-0.2, edge), np.random.default_rng(0))
+    assert np.array_equal(two_ends, found), "the other end does not matter"
     held_out = scored(y, np.where(nothing, 0.2, y - 0.1), critical)
     assert held_out.tolist() == np.where(nothing, 0.2, y).tolist()
 
@@ -80,7 +134,6 @@ def test_runs_that_nothing_happens_in_go_away_from_the_edge(edge: float, critica
         ([0.0, 0.0, 0.0, -1.0, -2.0], CriticalInterval(high=-0.9)),  # it ends far from the edge
         ([0.0, 0.1, 0.2, 0.3, -2.0], CriticalInterval(high=-0.1)),  # it goes on
         ([0.0, 0.0, 0.0, 0.0, 0.0], CriticalInterval(high=-0.1)),  # nothing is critical
-        ([0.0, 0.0, 0.0, -1.0, -2.0], CriticalInterval(-1.5, -0.001)),
     ],
 )
 def test_a_metric_that_does_not_end_near_the_edge_is_left_alone(y, critical):

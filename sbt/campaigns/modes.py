@@ -171,7 +171,7 @@ def modes_of(
         return []
     u, cube = scenario.space.to_unit(history.x), scenario.space.cube
     at = cube.embedded(u)
-    depth, worse = critical.margin(y), severity(history)
+    depth, worse = scenario.requirement.depths(history), severity(history)
     tested = pairs_joined(links, history.index[chosen].tolist())
     group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested)
     log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
@@ -193,7 +193,7 @@ def modes_of(
 def critical_groups(history: History, scenario: LogicalScenario) -> tuple[NDArray[np.intp], Vector]:
     """Return the rows of the critical runs that are compared with each other, and (n,) the kind of each run of the history."""
     hits = np.flatnonzero(scenario.requirement.critical_runs(history))
-    depth = scenario.requirement.critical.margin(scenario.requirement.values(history))
+    depth = scenario.requirement.depths(history)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
     return chosen, _kind(history, scenario.space.cube.choices(scenario.space.to_unit(history.x)))
 

@@ -78,8 +78,6 @@ def check(loaded: Loaded) -> tuple[Metamodel | None, Acquisition | None, Logical
         scenario = _scenario(loaded, problems)
         for k, driver in enumerate(loaded.config.judges or ()):
             problems.attempt(("judges", k), partial(loaded.scope.load, "controllers", driver))
-        if loaded.config.judges and scenario.simulate is None:
-            problems.add(("judges",), "must have a scenario that is simulated, but this one gives its metrics directly")
     problems.check()
     return metamodel, acquisition, scenario
 

@@ -28,7 +28,7 @@ from sbt.metamodels.warped import better_warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.cube import Cube
-from sbt.problem.requirement import CriticalInterval
+from sbt.problem.requirement import CriticalInterval, as_reached
 from sbt.problem.space import ParameterSpace
 
 __all__ = ["MOST_LEARNED", "Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability", "settled", "sketch_of"]
@@ -265,7 +265,7 @@ def fit_log_probability(
             for k, leaf in enumerate(critical.leaves)
         ]
         return JointLogProbability(critical, tuple(parts))
-    least = noise[0] if noise else 0.0
+    critical, least = as_reached(critical, y), noise[0] if noise else 0.0
     if earlier and math.sqrt(least) > _NOISE_COUNTS * earlier[0].warp.scale and len(y) >= _FEWEST_SCORED:
         coordinates = earlier[0].beside(coordinates)
     elif earlier:

@@ -34,6 +34,7 @@ _FEWEST = 10  # rows from which on models are compared: with three folds each le
 _NEARLY = 0.85  # of the rows that are compared: one fold of 360 will do for 400, as another costs another fit of all models
 _WORTH = 0.03  # nats a row, of 0.5 to 2 in all: what is left to gain below it cannot be worth other models
 _NOTHING = 1e-6  # nats, below which a number tells nothing more
+_LOWEST_TOLD = -99.0  # mean log likelihood of a row, below which nothing but that is told
 _LEAST = 0.02  # weight below which a model is left out: its predictions would cost more time than they change
 _PACED, _LEAST_PACED, _FASTEST = 1000, 200, 2.0  # rows below which the ensemble takes fewer steps; least; largest factor
 
@@ -283,7 +284,7 @@ def _explain(
         return ModelComparison(by_name, {}, reason)
     scores = {name: float(row.mean()) for name, row in zip(names, held, strict=True)}
     scores["mixture"] = float(mixture_score(held, mixture).mean())
-    listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
+    listed = ", ".join(f"{name} {_told(score)}" for name, score in scores.items())
     what = "" if bins is None else f" to fall where they did, of the ranges cut at {bins.told}"
     how = f"other rows ({settings.folds} folds)" if shares is None else "nearly all others"
     reason = f"{mixed}: mean log likelihood of {n} rows{what}, each predicted from {how}: {listed}"
@@ -294,3 +295,7 @@ def _explain(
     if "gp" not in names:
         reason += f"; the gp takes part up to {settings.gp_rows} rows"
     return ModelComparison(by_name, scores, reason)
+
+
+def _told(score: float) -> str:
+    return f"{score:.2f}" if score >= _LOWEST_TOLD else f"below {_LOWEST_TOLD:g}"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, check_rows, sample_paths, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_prediction, check_rows, sample_paths
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import Opened
 from sbt.problem.arrays import Points, Vector
@@ -33,7 +33,7 @@ def metamodel_for(metamodel: Metamodel, critical: CriticalInterval, *, target_aw
     """Return the metamodel that learns what `critical` is asked of: itself, or one of each metric of a combination."""
     if isinstance(critical, CombinedInterval):
         return JointMetamodel(metamodel, critical, target_aware)
-    return Opened(with_target(metamodel, critical) if target_aware else metamodel, critical, target_aware)
+    return Opened(metamodel, critical, target_aware)
 
 
 def joined_log_probability(critical: CombinedInterval, pairs: Sequence[LogPair]) -> LogPair:
@@ -124,7 +124,7 @@ class JointPrediction(Prediction):
         for part, leaf, unit in zip(parts, critical.leaves, critical.scale or (1.0,) * len(parts), strict=True):
             margins.append((leaf.margin(part.mu) / unit, part.sigma / unit))
         mean, std = critical.fold(margins, lambda a, b: _negated(_clark(_negated(a), _negated(b))), _clark)
-        return cls(mean[None], std[None], np.ones(1), np.zeros(len(mean)), tuple(parts), critical)
+        return cls(mean[None], std[None], np.ones(1), np.zeros(len(mean)), parts=tuple(parts), critical=critical)
 
     @cached_property
     def _whole(self) -> CombinedInterval:

@@ -7,7 +7,7 @@ is vectorised over points and computed in logs, so that the tails stay finite.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ class Prediction:
         std: (k, n) standard deviations > 0.
         weight: (k,) weights >= 0 that sum to 1, the same at all points.
         noise: (n,) the irreducible (aleatoric) part of `sigma`, a standard deviation >= 0.
+        lowest, highest: where the metric ends: what is predicted beyond is that value, of which P(y in M_c) knows.
 
     Raises:
         InputError: wrong shapes, a mean that is not finite, std <= 0, or weights that do not sum to 1.
@@ -47,6 +48,8 @@ class Prediction:
     std: _Matrix
     weight: Vector
     noise: Vector
+    lowest: float = -np.inf
+    highest: float = np.inf
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 2 or self.mean.shape[0] == 0:
@@ -109,11 +112,11 @@ class Prediction:
 
     def take(self, index: NDArray[Any] | slice) -> Prediction:
         """Return the prediction at the points that `index` (integers, mask or slice) selects."""
-        return Prediction(self.mean[:, index], self.std[:, index], self.weight, self.noise[index])
+        return replace(self, mean=self.mean[:, index], std=self.std[:, index], noise=self.noise[index])
 
     def widened(self, factor: float) -> Prediction:
         """Return the prediction with every standard deviation of a component multiplied."""
-        return Prediction(self.mean, factor * self.std, self.weight, self.noise)
+        return replace(self, std=factor * self.std)
 
     def with_tails(self, factor: Vector, probability: Vector) -> Prediction:
         """Return the prediction with every component in several widths: its standard deviation times each factor (m,).
@@ -124,13 +127,13 @@ class Prediction:
         """
         std = (factor[:, None, None] * self.std).reshape(-1, len(self))
         weight = (probability[:, None] * self.weight).ravel()
-        return Prediction(np.tile(self.mean, (len(factor), 1)), std, weight / weight.sum(), self.noise)
+        return replace(self, mean=np.tile(self.mean, (len(factor), 1)), std=std, weight=weight / weight.sum())
 
     def joined(self, others: Sequence[Prediction]) -> Prediction:
         """Return the prediction at these points and, behind them, at those of the others, which have the same weights."""
         every = (self, *others)
         mean, std = (np.concatenate([getattr(p, name) for p in every], axis=1) for name in ("mean", "std"))
-        return Prediction(mean, std, self.weight, np.concatenate([p.noise for p in every]))
+        return replace(self, mean=mean, std=std, noise=np.concatenate([p.noise for p in every]))
 
     def log_density(self, y: Vector) -> Vector:
         """Return (n,) log density of the mixture at y (n,)."""
@@ -155,7 +158,9 @@ class Prediction:
         Source:
             Winkelmann et al. (2022), section V-A: P from the cumulative distribution function.
         """
-        inside, outside = _log_interval(self.mean, self.std, critical)
+        low = -np.inf if critical.low <= self.lowest else critical.low
+        high = np.inf if critical.high >= self.highest else critical.high
+        inside, outside = _log_interval(self.mean, self.std, CriticalInterval(low, high))
         return np.minimum(self._mix(inside), 0.0), np.minimum(self._mix(outside), 0.0)
 
     def probability(self, critical: CriticalInterval) -> Vector:

@@ -9,15 +9,16 @@ number, whole regions have the value of the edge: the boundary lies midway to th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Metamodel, Predictor, is_rate
+from sbt.metamodels.base import Metamodel, Predictor, is_rate, sample_paths, sketched, with_target
+from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.problem.requirement import CriticalInterval
+from sbt.problem.requirement import CriticalInterval, as_reached
 
 __all__ = ["Opened", "centred", "opened", "scored"]
 
@@ -51,7 +52,7 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
     Args:
         u: (n, d) metamodel inputs.
         y: (n,) finite values of the metric, in any unit in which `critical` is given.
-        critical: M_c; with two finite ends nothing is moved.
+        critical: M_c; with two finite ends only values beyond one of them are moved.
         rng: the only source of randomness, used where something is moved.
 
     Source:
@@ -62,6 +63,8 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
     [-0.2, -0.02, 0.1, 0.2, 0.3]
     """
     if not critical.one_sided:
+        for end in (CriticalInterval(high=critical.high), CriticalInterval(low=critical.low)):
+            y = _opened_outside(u, y, end, rng)
         return y
     margin = critical.margin(y)
     tied = margin == 0.0
@@ -162,6 +165,10 @@ def _by_slope(at: Points, u: Points, margin: Vector, rng: np.random.Generator) -
 
 def scored(y: Vector, mu: Vector, critical: CriticalInterval) -> Vector:
     """Return the values that predictions mu (n,) are scored by: of a run where a metric ends, its side alone."""
+    reached = as_reached(critical, y)
+    if reached != critical:
+        y = np.where((y == critical.low) & (mu < y) | (y == critical.high) & (mu > y), mu, y)
+        critical = reached
     margin = critical.margin(y)
     at_edge = margin == 0.0
     if not at_edge.any() or (margin < 0.0).any():
@@ -176,8 +183,8 @@ class Opened:
 
     Args:
         metamodel: learns them.
-        critical: M_c; with two finite ends nothing is changed.
-        beyond: metrics that end go on; otherwise only steps are looked for.
+        critical: M_c.
+        beyond: the metamodel is told of M_c, and metrics that end go on; otherwise only steps are looked for.
     """
 
     metamodel: Metamodel
@@ -186,5 +193,39 @@ class Opened:
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> Predictor:
         """Return the predictor; see `Metamodel.fit`."""
-        learned = opened(u, y, self.critical, rng) if self.beyond else centred(u, y, self.critical)
-        return self.metamodel.fit(u, learned, rng)
+        critical = as_reached(self.critical, y)
+        learned = opened(u, y, critical, rng) if self.beyond else centred(u, y, critical)
+        predictor = (with_target(self.metamodel, critical) if self.beyond else self.metamodel).fit(u, learned, rng)
+        return predictor if critical == self.critical else _Ending(predictor, self.critical, critical)
+
+
+@dataclass(frozen=True)
+class _Ending:
+    """A predictor of a metric that ends at one end of M_c.
+
+    Args:
+        predictor: of the metric, as if it went on.
+        critical: M_c.
+        reached: M_c without that end.
+    """
+
+    predictor: Predictor
+    critical: CriticalInterval
+    reached: CriticalInterval
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the prediction at u (n, d), which knows where the metric ends."""
+        found = self.predictor(u)
+        if self.reached.low < self.critical.low:
+            return replace(found, lowest=self.critical.low)
+        return replace(found, highest=self.critical.high)
+
+    def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, m) draws of the metric as a function, at u (m, d)."""
+        low, high = self.critical.low, self.critical.high
+        paths = sample_paths(self.predictor, u, n, rng)
+        return np.maximum(paths, low) if self.reached.low < low else np.minimum(paths, high)
+
+    def sketch(self, rows: int) -> _Ending:
+        """Return what predicts about the same from so many rows."""
+        return replace(self, predictor=sketched(self.predictor, rows))

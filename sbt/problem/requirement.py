@@ -13,9 +13,10 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.problem.arrays import FARTHEST, Mask, Vector
 
-__all__ = ["CriticalInterval", "Measured", "Requirement", "within_scale"]
+__all__ = ["CriticalInterval", "Measured", "Requirement", "as_reached", "within_scale"]
 
 
+_FEWEST = 2  # runs with the value of an end of M_c: one may be there by chance
 _BEYOND = 0.1  # of the range of finite values: far enough to be told from them, near enough to leave them their scale
 
 
@@ -79,6 +80,26 @@ class CriticalInterval:
     def margin(self, y: Vector) -> Vector:
         """Return (n,) the signed distance of y to M_c, <= 0 where critical, in the unit of y; NaN stays NaN."""
         return np.maximum(self.low - np.asarray(y), np.asarray(y) - self.high)
+
+
+def as_reached(critical: CriticalInterval, y: Vector) -> CriticalInterval:
+    """Return M_c without the end that the metric ends at: several of y (n,) have its value, and none lies beyond.
+
+    "A time to collision of 0 to 1.5 s" is "at most 1.5 s" then, and "a collision flag of 1" is "at least 1": what is predicted
+    beyond 0, or 1, is no other value.
+
+    >>> as_reached(CriticalInterval(0.0, 1.5), np.array([0.0, 0.0, 0.7, 4.0]))
+    CriticalInterval(low=-inf, high=1.5)
+    >>> as_reached(CriticalInterval(0.0, 1.5), np.array([-1.0, 0.0, 0.0, 4.0]))
+    CriticalInterval(low=0.0, high=1.5)
+    """
+    if not (math.isfinite(critical.low) and math.isfinite(critical.high)):
+        return critical
+    ends_low = (y == critical.low).sum() >= _FEWEST and not (y < critical.low).any()
+    ends_high = (y == critical.high).sum() >= _FEWEST and not (y > critical.high).any()
+    if ends_low == ends_high:
+        return critical
+    return CriticalInterval(high=critical.high) if ends_low else CriticalInterval(low=critical.low)
 
 
 def within_scale(y: Vector, critical: CriticalInterval) -> Vector:
@@ -178,6 +199,11 @@ class Requirement:
     def margins(self, runs: Measured) -> Vector:
         """Return (n,) signed distances to M_c, <= 0 where critical; NaN for a run without the metric."""
         return self.critical.margin(self.values(runs))
+
+    def depths(self, runs: Measured) -> Vector:
+        """Return (n,) margins by which runs are ranked: an end of M_c at which the metric ends does not count (`as_reached`)."""
+        y = self.values(runs)
+        return as_reached(self.critical, y).margin(y)
 
     def is_critical(self, metrics: Mapping[str, float]) -> bool:
         """Return whether the metrics of one run violate the requirement."""

@@ -50,7 +50,7 @@ def _ranked(found: Findings, space: ParameterSpace) -> Iterator[tuple[int, str]]
             yield mode.nearest_safe.run, f"nearest safe run to failure mode {k}"
     if not history.ok.any():
         return
-    critical, margin = found.critical, np.where(history.ok, requirement.margins(history), np.inf)
+    critical, margin = found.critical, np.where(history.ok, requirement.depths(history), np.inf)
     order = worst_first(history, margin)
     worst = order[critical[order]]
     safe = np.flatnonzero(history.ok & ~critical)

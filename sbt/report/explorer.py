@@ -73,7 +73,7 @@ def explorer_data(
         "weights": [float(f"{w:.4g}") for w in np.asarray(weights).tolist()],
         "order": np.argsort(-np.asarray(weights), kind="stable").tolist(),
         "index": _whole(shown.index), "verdict": verdict.tolist(), "margin": _floats(margin),
-        "rank": _whole(np.argsort(worst_first(shown, margin), kind="stable")),
+        "rank": _whole(np.argsort(worst_first(shown, requirement.depths(shown)), kind="stable")),
         "x": [_floats(shown.x[:, k]) for k in range(shown.x.shape[1])],
         "y": [_floats(shown.y(m)) for m in history.metrics],
         "stages": stages, "stage": [stages.index(s) for s in shown.stage.tolist()],
@@ -122,7 +122,7 @@ def _slices(found: Findings, scenario: LogicalScenario, predict: Predict | None,
         return None
     spread = history.index[history.ok]
     spread = spread[np.unique(np.linspace(0, len(spread) - 1, _SLICES).astype(int))].tolist()
-    margin = np.where(history.ok, found.requirement.margins(history), np.inf)
+    margin = np.where(history.ok, found.requirement.depths(history), np.inf)
     worst = history.index[worst_first(history, margin)[: min(_WORST, len(spread))]].tolist()
     runs = list(dict.fromkeys([*filmed, *worst, *spread]))[:_SLICES]
     rows = {int(index): row for row, index in enumerate(history.index)}

@@ -185,7 +185,7 @@ def critical_table(history: History, requirement: Requirement, replay: str, judg
     judged: dict[int, list[Judgement]] = {}
     for each in judgements:
         judged.setdefault(each.run, []).append(each)
-    margin = requirement.margins(history)
+    margin = requirement.depths(history)
     found = [int(k) for k in worst_first(history, margin) if margin[k] <= 0]
     metrics = sorted(history.metrics, key=lambda name: name not in [part.metric for part in requirement.parts])
     rows = []

@@ -24,7 +24,7 @@ from sbt.metamodels.warp import JointWarp, Warp, warp_around
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN, CombinedInterval
 from sbt.problem.cube import CONTINUOUS, Cube
-from sbt.problem.requirement import CriticalInterval
+from sbt.problem.requirement import CriticalInterval, as_reached
 from sbt.samplers.noise import hidden_by_noise
 
 __all__ = [
@@ -153,8 +153,9 @@ class WarpedModel:
 
 def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator, success: LogSuccess | None = None) -> WarpedModel:
     """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2; `success` is passed on."""
-    warp = warp_around(y, search.critical)
-    inputs, target = search.columns(u), warp.interval(search.critical)
+    reached = as_reached(search.critical, y)
+    warp = warp_around(y, reached)
+    inputs, target = search.columns(u), warp.interval(reached)
     with named_errors(search.metamodel, len(y)):
         predictor = metamodel_for(search.metamodel, target).fit(inputs, warp.learned(y), rng)
     critical = MARGIN if isinstance(target, CombinedInterval) else target

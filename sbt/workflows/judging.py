@@ -260,7 +260,7 @@ def _judgement(study: Study, run: int, driver: str, outcome: Outcome) -> Judgeme
 
 def _deepest(study: Study, history: History) -> list[int]:
     """Return the indices of the critical runs deepest in the critical interval."""
-    margins = study.scenario.requirement.margins(history)
+    margins = study.scenario.requirement.depths(history)
     critical = np.flatnonzero(margins <= 0)
     return [int(history.index[k]) for k in critical[np.argsort(margins[critical], kind="stable")][:MOST_JUDGED]]
 
