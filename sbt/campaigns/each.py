@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
-from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations, with_event
+from sbt.campaigns.counting import DRAWN, FEW_KNOWN, Seen, counted_batches, counted_iterations, with_event
 from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.parts import CriticalShare, share_of
@@ -100,6 +100,8 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
             ends = _bounds(part, log, settings, tail)
         else:
             ends = _ends(spread_of_draws(log, safe, critical), value, low, high, few=few, confidence=tail)
+            seen = _seen(part, log, settings)
+            ends = ends[0], max(ends[1], seen.most_critical(tail)) if seen.known < FEW_KNOWN else ends[1]
         found.append(RequirementEstimate(part.label, value, min(ends[0], value), max(ends[1], value), hits))
     return tuple(found)
 
@@ -115,9 +117,14 @@ def _ends(
 
 def _bounds(part: Requirement, log: Log, settings: Settings, confidence: float) -> tuple[float, float]:
     """Return the exact limits of the probability of one requirement by the draws in proportion to the inputs' distribution."""
-    seen = Seen.of(log, replace(settings, scenario=replace(settings.scenario, requirement=part)))
+    seen = _seen(part, log, settings)
     safe = seen.draws - seen.hits - seen.failed
     return 1.0 - seen.most(safe + seen.failed, confidence), seen.most(seen.hits + seen.failed, confidence)
+
+
+def _seen(part: Requirement, log: Log, settings: Settings) -> Seen:
+    """Return what the runs met of one requirement."""
+    return Seen.of(log, replace(settings, scenario=replace(settings.scenario, requirement=part)))
 
 
 def _batches_of(k: int, part: Requirement, log: Log, settings: Settings, *, failed_critical: bool) -> list[CountedBatch]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sbt.campaigns.clustering import Spread
-from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations, held
+from sbt.campaigns.counting import DRAWN, FEW_KNOWN, Seen, counted_batches, counted_iterations, held
 from sbt.campaigns.crude import NOMINAL, MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
@@ -37,9 +37,6 @@ __all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "conclude_sum",
 _HIGH_DIMENSION = 20  # inputs from which on the metamodels learn less than the chains of subset simulation find
 _CONFIDENCE = 0.95
 _HEAVY = 0.25  # share of the weight that one draw may carry before the reader is warned
-_FEW_KNOWN = 10
-"""Inputs of critical runs, below which the size of their region was a guess: 4 of 30 intervals lay below a P of .02 that 150 runs
-beside a plateau had met 3 to 10 times. The exact limit of random draws holds whatever the metamodel makes of them."""
 _NOTHING = "no draw that counts was critical: the probability is only bounded from above, by draws from the inputs' distribution"
 
 
@@ -250,10 +247,11 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         missed = (lambda c: 1.0 - seen.most(seen.draws - seen.hits, c)) if few_low else limits.lower
         limits = Limits(lambda c: min(low.limit(c, side=-1), missed(c)), lambda _: 1.0)
         warnings.append("no counted draw was safe: only a lower bound is given")
-    elif seen.known < _FEW_KNOWN:
+    elif seen.known < FEW_KNOWN:
         limits = limits.reaching(seen.most_critical)
         draws = f"the upper end is at least that of {plural(seen.draws, 'draw')} from the inputs' distribution"
-        warnings.append(f"critical runs are known at {plural(seen.known, 'input')}, fewer than {_FEW_KNOWN}: {draws}")
+        whose = " of a requirement" if settings.scenario.requirement.combined else ""
+        warnings.append(f"critical runs{whose} are known at {plural(seen.known, 'input')}, fewer than {FEW_KNOWN}: {draws}")
     elif min(hits, misses) < FEW_HITS:
         few, what = (hits, "critical") if hits < FEW_HITS else (misses, "safe")
         met = f"{few} counted draw{' was' if few == 1 else 's were'} {what}"

@@ -16,7 +16,6 @@ from sbt.problem.arrays import FARTHEST, Mask, Vector
 __all__ = ["CriticalInterval", "Measured", "Requirement", "as_reached", "within_scale"]
 
 
-_FEWEST = 2  # runs with the value of an end of M_c: one may be there by chance
 _BEYOND = 0.1  # of the range of finite values: far enough to be told from them, near enough to leave them their scale
 
 
@@ -83,7 +82,7 @@ class CriticalInterval:
 
 
 def as_reached(critical: CriticalInterval, y: Vector) -> CriticalInterval:
-    """Return M_c without the end that the metric ends at: several of y (n,) have its value, and none lies beyond.
+    """Return M_c without the end that the metric ends at: some y (n,) has its very value, and none lies beyond.
 
     "A time to collision of 0 to 1.5 s" is "at most 1.5 s" then, and "a collision flag of 1" is "at least 1": what is predicted
     beyond 0, or 1, is no other value.
@@ -95,8 +94,8 @@ def as_reached(critical: CriticalInterval, y: Vector) -> CriticalInterval:
     """
     if not (math.isfinite(critical.low) and math.isfinite(critical.high)):
         return critical
-    ends_low = (y == critical.low).sum() >= _FEWEST and not (y < critical.low).any()
-    ends_high = (y == critical.high).sum() >= _FEWEST and not (y > critical.high).any()
+    ends_low = (y == critical.low).any() and not (y < critical.low).any()
+    ends_high = (y == critical.high).any() and not (y > critical.high).any()
     if ends_low == ends_high:
         return critical
     return CriticalInterval(high=critical.high) if ends_low else CriticalInterval(low=critical.low)
