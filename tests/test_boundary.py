@@ -150,7 +150,7 @@ def test_campaigns_that_look_for_the_edge_hand_it_to_the_metamodel(campaign: str
     settings, targeted = settings_of(loaded), Targeted()
     names, metric = settings.scenario.space.names, settings.scenario.requirement.metric
     runs = [
-        Record(i, "initial", 0, dict(zip(names, x, strict=True)), i, "ok", {metric: float(i)})
+        Record(i, "initial", 0, dict(zip(names, x, strict=True)), i, "ok", {metric: i + 0.1})
         for i, x in enumerate(settings.scenario.space.from_unit(stream(0, "runs").random((3, len(names)))).tolist())
     ]
     assert settings.learner is not None

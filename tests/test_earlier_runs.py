@@ -70,7 +70,7 @@ def test_the_store_remembers_the_earlier_runs(old, tmp_path):
     copy = shutil.copytree(old, tmp_path / "copy")
     warm = {"store": str(copy), "transfer": True}
     whole = boundary(tmp_path / "whole", scenario("after", later), budget=30, warm_start=warm)
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match=r"warm_start\.store.*nowhere"):
         boundary(tmp_path / "part", scenario("after", later), budget=30, warm_start=warm | {"store": "nowhere"})
     boundary(tmp_path / "part", scenario("after", later), budget=20, initial=10, warm_start=warm)
     shutil.rmtree(copy)

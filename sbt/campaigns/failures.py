@@ -40,9 +40,9 @@ __all__ = [
     "links_of", "search_runs", "with_links",
 ]  # fmt: skip
 
-_TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
 Links = tuple[Link, ...]
 
+_TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
 FILLING = ("initial", "even", VALIDATION)
 """Stages of runs that fill the space, whatever the results."""
 

@@ -228,4 +228,5 @@ class _Ending:
 
     def sketch(self, rows: int) -> _Ending:
         """Return what predicts about the same from so many rows."""
-        return replace(self, predictor=sketched(self.predictor, rows))
+        rough = sketched(self.predictor, rows)
+        return self if rough is self.predictor else replace(self, predictor=rough)

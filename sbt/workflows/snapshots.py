@@ -33,8 +33,9 @@ def which_isolation(spec: ScenarioSpec) -> list[Finding]:
     isolation = simulate.isolation
     numbers: dict[str, float] = {}
     if isolation.warm:
-        times = f"{isolation.seeds} time{'s' if isolation.seeds > 1 else ''} here; in a campaign, by its budget"
-        said = f"snapshot: traffic is warmed up until t = {isolation.until:g} s, where runs begin ({times})"
+        times = f"{isolation.seeds} time{'s' if isolation.seeds > 1 else ''}"
+        said = f"snapshot: traffic is warmed up {times} until t = {isolation.until:g} s, where runs begin"
+        said += "; a campaign without warm_up.seeds chooses the number by its budget"
         numbers = {"until": isolation.until, "seeds": isolation.seeds}
     else:
         said = f"fresh: every run simulates its traffic from the beginning: {isolation.why or 'so did the first run'}"

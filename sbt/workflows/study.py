@@ -267,6 +267,7 @@ class Study:
 
         Raises:
             InputError: it has not concluded, or has another scenario, ego or step and is no transfer.
+            StoreError: there is none.
         """
         choice = self.config.warm_start
         if choice is None:
@@ -276,7 +277,7 @@ class Study:
             with Store.read(folder) as store:
                 before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
         except StoreError as error:
-            raise InputError(f"warm_start.store: {error}") from None
+            raise StoreError(f"warm_start.store: {error}") from None
         if not finished:
             raise InputError(f"warm_start.store must be a finished campaign, but the one in {folder} has not concluded")
         if not choice.transfer and before._simulator != self._simulator:
