@@ -31,6 +31,7 @@ from sbt.errors import PluginError, SbtError, described
 from sbt.execution.pool import broken, close_pool, open_pool
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
+from sbt.execution.starting import start_apart
 from sbt.execution.streams import open_missing
 from sbt.execution.worker import run_at_levels
 from sbt.problem.outcome import Job, Outcome, Status
@@ -111,11 +112,14 @@ class LocalExecutor:
 
     def _start(self) -> None:
         self._pool, self._started = open_pool(self._workers, self._folder), 0
-        ready = [self._pool.submit(_prepare, self._folder, self._workers) for _ in range(self._workers)]
+        ready = start_apart(self._prepare_all)  # an interruption between start and entry would leave a process to itself
         wait(ready)
         for future in ready:
             if not isinstance(future.exception(), broken()):
                 future.result()
+
+    def _prepare_all(self) -> list[Future[None]]:
+        return [self._pool.submit(_prepare, self._folder, self._workers) for _ in range(self._workers)]
 
     def _stop(self) -> None:
         if self._pool is not None:
