@@ -60,7 +60,7 @@ def test_an_end_that_the_metric_ends_at_makes_no_difference(shape, two_ends, one
 
     def answers(critical):
         learned = Opened(GaussianProcess(nu=2.5), critical).fit(u, y, np.random.default_rng(0))
-        search = fit_warped(Search(critical, GaussianProcess(nu=2.5)), u, y, np.random.default_rng(0))
+        search = fit_warped(Search(critical, GaussianProcess(nu=2.5)).reached(y), u, y, np.random.default_rng(0))
         belief = fit_log_probability(GaussianProcess(nu=2.5), lambda z: z, critical, u, y, np.random.default_rng(0))
         return learned(at).probability(critical), np.exp(search.log_probability(at)), np.exp(belief(at)[0])
 

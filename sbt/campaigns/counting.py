@@ -138,9 +138,9 @@ class Seen:
 
 def _known(requirement: Requirement, history: History) -> int:
     """Return the number of different inputs of critical runs, of the requirement that is known by fewest where any is enough."""
-    apart = requirement.parts if isinstance(requirement, CombinedRequirement) and requirement.how == "any" else (requirement,)
-    inputs = [len(np.unique(history.x[part.critical_runs(history)], axis=0)) for part in apart]
-    return min((n for n in inputs if n), default=0)
+    if isinstance(requirement, CombinedRequirement) and requirement.how == "any":
+        return min((n for n in (_known(item, history) for item in requirement.items) if n), default=0)
+    return len(np.unique(history.x[requirement.critical_runs(history)], axis=0))
 
 
 def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool) -> Limits:

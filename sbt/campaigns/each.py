@@ -119,7 +119,7 @@ def _bounds(part: Requirement, log: Log, settings: Settings, confidence: float) 
     """Return the exact limits of the probability of one requirement by the draws in proportion to the inputs' distribution."""
     seen = _seen(part, log, settings)
     safe = seen.draws - seen.hits - seen.failed
-    return 1.0 - seen.most(safe + seen.failed, confidence), seen.most(seen.hits + seen.failed, confidence)
+    return 1.0 - seen.most(safe + seen.failed, confidence), seen.most_critical(confidence)
 
 
 def _seen(part: Requirement, log: Log, settings: Settings) -> Seen:

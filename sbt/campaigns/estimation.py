@@ -29,6 +29,7 @@ from sbt.errors import InputError
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.estimators.subset import combine_repeats
 from sbt.loop.stages import Campaign, Facts, Log, Stage
+from sbt.problem.combination import CombinedRequirement
 from sbt.problem.plain import Json
 from sbt.store.records import optional, to_json
 
@@ -250,7 +251,8 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
     elif seen.known < FEW_KNOWN:
         limits = limits.reaching(seen.most_critical)
         draws = f"the upper end is at least that of {plural(seen.draws, 'draw')} from the inputs' distribution"
-        whose = " of a requirement" if settings.scenario.requirement.combined else ""
+        need = settings.scenario.requirement
+        whose = " of a requirement" if isinstance(need, CombinedRequirement) and need.how == "any" else ""
         warnings.append(f"critical runs{whose} are known at {plural(seen.known, 'input')}, fewer than {FEW_KNOWN}: {draws}")
     elif min(hits, misses) < FEW_HITS:
         few, what = (hits, "critical") if hits < FEW_HITS else (misses, "safe")

@@ -225,12 +225,13 @@ class FailureSearch:
             return _Learned([Mode((only,), only, only, None)], rates)
         u, y = scenario.space.to_unit(history.x[ok]), scenario.requirement.values(history)[ok]
         rng = stream(self.settings.seed, "modes", len(history))
-        fitted = fit_warped(self.search.for_noise(u, y), u, y, rng)
+        search = self.search.reached(y)
+        fitted = fit_warped(search.for_noise(u, y), u, y, rng)
         if not self.noisy(history):
             return _Learned(modes_of(fitted, history, scenario, links=links), rates, fitted)
         again = history.where(np.zeros(len(history), dtype=bool)) if raced is None else raced.where(raced.ok)
         critical = scenario.requirement.critical_runs(again)
-        found = local_rates(self.search, u, y, history.drawn[ok], scenario.space.to_unit(again.x), critical, rng)
+        found = local_rates(search, u, y, history.drawn[ok], scenario.space.to_unit(again.x), critical, rng)
         rates.mean[ok], rates.std[ok] = found.mean, found.std
         return _Learned(modes_of(fitted, history, scenario, rates=rates.mean), rates)
 

@@ -146,7 +146,7 @@ class PairStage:
         """Return whether the drawn traffic explains more of how near runs come than the inputs do: these are searched in vain."""
         s, runs = self.settings, _to_learn(history)
         runs = runs.where(runs.ok)
-        score = scores(s.scenario.requirement.margins(runs))
+        score = scores(s.scenario.requirement.depths(runs))
         if len(runs) < _FEWEST or np.ptp(score) == 0.0:
             return False
         inputs = s.scenario.space.metamodel_inputs_at(runs.x)
@@ -203,7 +203,7 @@ class PairStage:
         inputs = self._inputs(known.x, self._covariates.at(known.x, known.seed.tolist()))
 
         def learn(part: Requirement) -> Risk:
-            margin = np.where(known.ok, np.nan_to_num(part.margins(known), nan=np.inf, posinf=np.inf), np.inf)
+            margin = np.where(known.ok, np.nan_to_num(part.depths(known), nan=np.inf, posinf=np.inf), np.inf)
             return fit_risk(inputs, scores(margin), margin, part.critical_runs(known), rng)
 
         whole = learn(requirement)

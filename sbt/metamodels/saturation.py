@@ -102,7 +102,7 @@ def _moved(
     if not tied.all():
         told = _extrapolated if (~tied).sum() >= _ENOUGH else _by_slope
         depth = told(u[tied], u[~tied], left[~tied], rng)
-        if outwards:  # a process that knows critical runs alone expects more of them where it knows nothing
+        if outwards and told is _extrapolated:  # it knows critical runs alone, and expects more where it knows nothing
             depth = np.maximum(depth, _OUTWARDS * _by_slope(u[tied], u[~tied], left[~tied], rng))
     moved = np.array(y, dtype=np.float64)
     moved[tied] += depth if math.isfinite(critical.low) != outwards else -depth
@@ -165,10 +165,9 @@ def _by_slope(at: Points, u: Points, margin: Vector, rng: np.random.Generator) -
 
 def scored(y: Vector, mu: Vector, critical: CriticalInterval) -> Vector:
     """Return the values that predictions mu (n,) are scored by: of a run where a metric ends, its side alone."""
-    reached = as_reached(critical, y)
-    if reached != critical:
-        y = np.where((y == critical.low) & (mu < y) | (y == critical.high) & (mu > y), mu, y)
-        critical = reached
+    lowest, highest = _ends(critical, y)
+    y = np.where((y == lowest) & (mu < y) | (y == highest) & (mu > y), mu, y)
+    critical = as_reached(critical, y)
     margin = critical.margin(y)
     at_edge = margin == 0.0
     if not at_edge.any() or (margin < 0.0).any():
@@ -196,7 +195,13 @@ class Opened:
         critical = as_reached(self.critical, y)
         learned = opened(u, y, critical, rng) if self.beyond else centred(u, y, critical)
         predictor = (with_target(self.metamodel, critical) if self.beyond else self.metamodel).fit(u, learned, rng)
-        return predictor if critical == self.critical else _Ending(predictor, self.critical, critical)
+        return predictor if critical == self.critical else _Ending(predictor, *_ends(self.critical, y))
+
+
+def _ends(critical: CriticalInterval, y: Vector) -> tuple[float, float]:
+    """Return where the metric ends: the end of M_c that `as_reached` leaves out, and infinity."""
+    reached = as_reached(critical, y)
+    return critical.low if reached.low < critical.low else -np.inf, critical.high if reached.high > critical.high else np.inf
 
 
 @dataclass(frozen=True)
@@ -205,26 +210,20 @@ class _Ending:
 
     Args:
         predictor: of the metric, as if it went on.
-        critical: M_c.
-        reached: M_c without that end.
+        lowest, highest: where it ends; one of them is infinite.
     """
 
     predictor: Predictor
-    critical: CriticalInterval
-    reached: CriticalInterval
+    lowest: float
+    highest: float
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction at u (n, d), which knows where the metric ends."""
-        found = self.predictor(u)
-        if self.reached.low < self.critical.low:
-            return replace(found, lowest=self.critical.low)
-        return replace(found, highest=self.critical.high)
+        return replace(self.predictor(u), lowest=self.lowest, highest=self.highest)
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of the metric as a function, at u (m, d)."""
-        low, high = self.critical.low, self.critical.high
-        paths = sample_paths(self.predictor, u, n, rng)
-        return np.maximum(paths, low) if self.reached.low < low else np.minimum(paths, high)
+        return np.clip(sample_paths(self.predictor, u, n, rng), self.lowest, self.highest)
 
     def sketch(self, rows: int) -> _Ending:
         """Return what predicts about the same from so many rows."""

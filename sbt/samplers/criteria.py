@@ -88,8 +88,8 @@ def propose_by(
     Raises:
         KeyError: there is no such criterion.
     """
-    criterion = CRITERIA[name]
-    seen, d = search_data(search, u, y, batch, rng), u.shape[1]
+    criterion, search, d = CRITERIA[name], search.reached(y), u.shape[1]
+    seen = search_data(search, u, y, batch, rng)
     if len(seen.u) < 2:
         return Picks(fill_uniformly(seen.admissible, n, d, rng), (name,) * n)
     model = fit_warped(search, seen.u, seen.y, rng, seen.success)

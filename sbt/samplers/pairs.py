@@ -61,7 +61,7 @@ def propose_pairs(
         n: pairs wanted >= 1.
         rng: the only source of randomness.
     """
-    margin = search.margins(y)
+    margin = search.reached(y).margins(y)
     score = scores(margin)
     inputs = search.columns(u)
     known = np.column_stack([inputs, draw(u, seeds)])

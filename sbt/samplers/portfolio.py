@@ -81,7 +81,8 @@ def propose(
         Trust regions and Thompson draws: Eriksson et al. (2019), TuRBO, arXiv 1910.01739; the mixture, the niches
         and the deflation were measured, see docs/measured/falsification.md.
     """
-    seen, d = search_data(search, u, y, batch, rng), u.shape[1]
+    search, d = search.reached(y), u.shape[1]
+    seen = search_data(search, u, y, batch, rng)
     again = _repeats(search, seen, u, y, n) if repeats else ()
     n -= len(again)
     if len(seen.u) < 2:

@@ -70,6 +70,10 @@ class Search:
     cube: Cube = CONTINUOUS
     most_rows: int = 4000
 
+    def reached(self, y: Vector) -> Search:
+        """Return the search without an end of M_c that the metric ends at, by y (n,) of all runs, NaN where one failed."""
+        return replace(self, critical=as_reached(self.critical, y))
+
     def margins(self, y: Vector) -> Vector:
         """Return (n,) distances of y (n,) to M_c, inf where a run failed."""
         return np.where(self.critical.known(y), self.critical.margin(y), np.inf)
@@ -153,9 +157,8 @@ class WarpedModel:
 
 def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator, success: LogSuccess | None = None) -> WarpedModel:
     """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2; `success` is passed on."""
-    reached = as_reached(search.critical, y)
-    warp = warp_around(y, reached)
-    inputs, target = search.columns(u), warp.interval(reached)
+    warp = warp_around(y, search.critical)
+    inputs, target = search.columns(u), warp.interval(search.critical)
     with named_errors(search.metamodel, len(y)):
         predictor = metamodel_for(search.metamodel, target).fit(inputs, warp.learned(y), rng)
     critical = MARGIN if isinstance(target, CombinedInterval) else target
