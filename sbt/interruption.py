@@ -3,11 +3,15 @@
 Python turns Ctrl-C into a `KeyboardInterrupt`, which any code may raise as well. Only a signal handler knows
 that there was a signal: the one installed here remembers it. A run may then raise what it likes; it is an
 interruption only if a signal has arrived.
+
+Python drops an exception that is raised in a finaliser or in the callback of a weak reference (the lock of an import has
+one). An interruption that ended there is raised again a moment later.
 """
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,6 +22,8 @@ __all__ = ["check", "handled", "is_interruption", "requested"]
 Notify = Callable[[int], bool]
 """Is called with every signal; returns whether it interrupts."""
 _received: list[int] = []
+_SOON = 0.02
+"""Seconds after which an interruption that was dropped is raised again."""
 
 
 class _Handler:
@@ -25,16 +31,41 @@ class _Handler:
 
     def __init__(self, before: Any, notify: Notify | None):
         self.before, self._notify = before, notify
-        self.active = True
+        self.active, self._repeated = True, False
 
     def __call__(self, number: int, frame: Any) -> None:
-        if self.active:  # other code may have kept the handler for later
+        if self._repeated:
+            self._repeated = False
+        elif self.active:  # other code may have kept the handler for later
             _received.append(number)
             if self._notify is not None and not self._notify(number):
                 return
         if number == signal.SIGINT and callable(self.before):
             self.before(number, frame)  # Python's own raises KeyboardInterrupt
         raise KeyboardInterrupt
+
+    def repeat(self, number: int) -> None:
+        """Raise again what has been raised and was dropped."""
+        installed: Any = signal.getsignal(number)
+        if self.active and installed is self:
+            self._repeated = True
+            signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+
+class _Dropped:
+    """What Python calls with an exception that it cannot raise: an interruption among them is raised again."""
+
+    def __init__(self, before: Callable[[Any], Any]):
+        self.before = before
+
+    def __call__(self, dropped: Any) -> None:
+        handler = signal.getsignal(_received[-1]) if _received else None
+        if not isinstance(dropped.exc_value, KeyboardInterrupt) or not isinstance(handler, _Handler):
+            self.before(dropped)
+            return
+        again = threading.Timer(_SOON, handler.repeat, (_received[-1],))  # not from here, where it would be dropped as well
+        again.daemon = True
+        again.start()
 
 
 @contextmanager
@@ -58,11 +89,16 @@ def handled(*numbers: int, notify: Notify | None = None) -> Iterator[None]:
                 installed[number] = _Handler(before, notify)
         if installed and outermost:
             _received.clear()
+    dropped = _Dropped(sys.unraisablehook)
     try:
+        if installed and outermost:
+            sys.unraisablehook = dropped
         for number, own in installed.items():
             signal.signal(number, own)
         yield
     finally:
+        if sys.unraisablehook is dropped:
+            sys.unraisablehook = dropped.before
         for number, own in installed.items():
             own.active = False
             now: Any = signal.getsignal(number)

@@ -234,6 +234,24 @@ def test_the_library_is_interrupted_as_a_notebook_expects(
     assert list(temporary.iterdir()) == []
 
 
+class Finalised:
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interruption_that_python_drops_is_raised_again(capfd: pytest.CaptureFixture[str]):
+    told: list[int] = []
+    before = sys.unraisablehook
+    with interruption.handled(notify=lambda number: not told.append(number)):
+        Finalised()  # where Python drops the exception
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(3.0)
+        assert told == [signal.SIGINT], "the user has interrupted once"
+        time.sleep(0.1)  # it is not raised a second time
+    assert sys.unraisablehook is before
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_a_signal_is_told_from_what_code_raises():
     with interruption.handled():
         assert not interruption.is_interruption(KeyboardInterrupt())

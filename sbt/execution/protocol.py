@@ -66,6 +66,12 @@ def is_apart(executor: Executor) -> bool:
 
 def groups_of(executor: Executor, queue: deque[Job]) -> Iterator[list[Outcome]]:
     """Yield the outcomes of queued runs in the groups that the executor makes; alone where it makes none."""
+    for outcomes in _grouped(executor, queue):
+        yield outcomes
+        interruption.check()  # code of a plug-in may have caught it
+
+
+def _grouped(executor: Executor, queue: deque[Job]) -> Iterator[list[Outcome]]:
     if isinstance(executor, Grouping):
         yield from executor.groups(queue)
     while queue:
