@@ -297,6 +297,29 @@ def test_ctrl_c_while_anything_is_imported_is_one_sentence(folder: Path, module:
     assert done.stderr in ("interrupted, nothing was run yet\n", "interrupted\n")
 
 
+IN_EXEC = """
+import signal, sys, threading, time
+import typer
+from sbt.cli import console
+
+@console.verb
+def go():
+    exec("signal.raise_signal(signal.SIGINT)")
+
+threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
+with console.process():
+    try:
+        go()
+    except typer.Exit as end:
+        sys.exit(end.exit_code)
+"""
+
+
+def test_ctrl_c_in_the_making_of_a_class_ends_with_the_code_as_well():
+    done = subprocess.run([sys.executable, "-c", IN_EXEC], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
 @pytest.mark.parametrize("seconds", [0.25, 0.5, 1.0])
 def test_ctrl_c_at_any_moment_is_told_without_a_traceback(folder: Path, seconds: float):
     running = subprocess.Popen([*SBT, "run", "c.yaml"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

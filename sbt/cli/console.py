@@ -179,10 +179,10 @@ def process() -> Iterator[None]:
             finally:
                 interrupted = interruption.requested()
     except SystemExit as end:
+        if interrupted:  # Python kills itself with SIGINT, whatever the exit code, where that has ended an `exec` of text
+            exec("")  # (of a dataclass, say), unless another one ends well
         if not interrupted or not end.code:
             raise
-        # Python kills itself with SIGINT, whatever the exit code, where that has interrupted an `exec` (of a dataclass, say).
-        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
         raise SystemExit(int(Exit.INTERRUPTED)) from end
 
 
