@@ -315,8 +315,9 @@ with console.process():
 """
 
 
-def test_ctrl_c_in_the_making_of_a_class_ends_with_the_code_as_well():
-    done = subprocess.run([sys.executable, "-c", IN_EXEC], capture_output=True, text=True, timeout=60, check=False)
+def test_ctrl_c_in_the_making_of_a_class_ends_with_the_code_as_well(folder: Path):
+    (folder / "in_exec.py").write_text(IN_EXEC)
+    done = subprocess.run([sys.executable, "-m", "in_exec"], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (130, "interrupted\n")
 
 
