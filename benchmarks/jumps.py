@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import sbt
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.seeds import stream
 
 
@@ -85,6 +85,28 @@ def flag(d: Vector, x: Points) -> Vector:
     return np.where(d <= 0.0, 1.0, 0.0)
 
 
+def gap(d: Vector, x: Points) -> Vector:
+    """A distance, 0 in every collision, which is critical."""
+    return np.maximum(10.0 * d, 0.0)
+
+
+def none_below(d: Vector, x: Points) -> Vector:
+    """A time that is -1 where nothing comes within 3, and critical from 0 to 1.5."""
+    t = time_to_collision(d, x)
+    return np.where(t > 3.0, -1.0, t)
+
+
+def none_999(d: Vector, x: Points) -> Vector:
+    """A time that is 999 where nothing comes within 3."""
+    t = time_to_collision(d, x)
+    return np.where(t > 3.0, 999.0, t)
+
+
+def impact(d: Vector, x: Points) -> Vector:
+    """A speed of impact that nothing reaches 100 of, 0 where nothing touches; critical from .1 to 100."""
+    return 15.0 * np.sqrt(np.maximum(-d, 0.0))
+
+
 Metric = Callable[[Vector, Points], Vector]
 PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "disc_01": (2, disc, two_values), "wave_01": (2, wave, two_values),
@@ -94,8 +116,14 @@ PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "ball_sentinel": (3, ball, sentinel),
     "disc_depth": (2, disc, depth), "disc_speed": (2, disc, speed), "wave_depth": (2, wave, depth),
     "ball_speed": (3, ball, speed), "slope_ttc": (4, slope, time_to_collision), "disc_flag": (2, disc, flag),
+    "ball_gap": (3, ball, gap), "slope_gap": (4, slope, gap), "slope_near_miss": (4, slope, gap),
+    "slope_none": (4, slope, none_below), "slope_999": (4, slope, none_999),
+    "slope_impact": (4, slope, impact), "slope_scratch": (4, slope, impact),
 }  # fmt: skip
-CRITICAL = {"slope_ttc": (0.0, 1.5), "disc_flag": (1.0, 1.0)}
+CRITICAL = {
+    "slope_ttc": (0.0, 1.5), "disc_flag": (1.0, 1.0), "slope_near_miss": (1e-3, 1.0), "slope_none": (0.0, 1.5),
+    "slope_999": (0.0, 1.5), "slope_impact": (0.1, 100.0), "slope_scratch": (0.1, 3.0),
+}  # fmt: skip
 """M_c of those that are not critical at 0 and below."""
 
 
@@ -105,9 +133,18 @@ def evaluate(given: dict[str, float], seed: int, problem: str) -> dict[str, floa
     return {"y": float(metric(region(x), x)[0])}
 
 
+def requirement(problem: str) -> sbt.Requirement:
+    return sbt.Requirement("y", *CRITICAL.get(problem, (-math.inf, 0.0)))
+
+
+def critical(problem: str, x: Points) -> Mask:
+    _, region, metric = PROBLEMS[problem]
+    return requirement(problem).critical.contains(metric(region(x), x))
+
+
 def campaign(kind: str, problem: str, seed: int, budget: int, folder: Path) -> sbt.Result:
     inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abcdef"[: PROBLEMS[problem][0]]]
-    need = sbt.Requirement("y", *CRITICAL.get(problem, (-math.inf, 0.0)))
+    need = requirement(problem)
     scenario = sbt.Scenario("jumps", inputs, need, evaluate=partial(evaluate, problem=problem))
     stop = {"stop": {"cov": None}} if kind == "estimation" else {}
     return sbt.run(
@@ -118,13 +155,12 @@ def campaign(kind: str, problem: str, seed: int, budget: int, folder: Path) -> s
 
 def boundary(problem: str, seed: int, budget: int) -> tuple[float, ...]:
     """Return F1, log loss, stated and true share, expected and true share on the wrong side."""
-    dimension, region, _ = PROBLEMS[problem]
-    x = stream(7, "points").random((8000, dimension))
+    x = stream(7, "points").random((8000, PROBLEMS[problem][0]))
     with tempfile.TemporaryDirectory() as folder:
         result = campaign("boundary", problem, seed, budget, Path(folder))
         found, space = result.conclusion, result.scenario.space
         p = result.predict(dict(zip(space.names, x.T, strict=True)))["p_critical"].to_numpy()
-    inside, said = region(x) <= 0.0, p > 0.5
+    inside, said = critical(problem, x), p > 0.5
     f1 = 2.0 * (said & inside).sum() / max(said.sum() + inside.sum(), 1)
     loss = -np.log(np.clip(np.where(inside, p, 1.0 - p), 1e-9, 1.0)).mean()
     return f1, loss, found.critical_fraction or 0.0, inside.mean(), found.expected_misclassified or 0.0, (said != inside).mean()
@@ -156,8 +192,7 @@ def main() -> None:
             f1, loss, *shares = np.mean([boundary(problem, seed, given.budget) for seed in seeds], axis=0)
             print(f"| {problem} | {f1:.3f} | {loss:.3f} | {' | '.join(f'{share:.3f}' for share in shares)} |", flush=True)
             continue
-        dimension, region, _ = PROBLEMS[problem]
-        truth = float((region(stream(8, "truth").random((4_000_000, dimension))) <= 0.0).mean())
+        truth = float(critical(problem, stream(8, "truth").random((4_000_000, PROBLEMS[problem][0]))).mean())
         value, low, high = np.array([estimation(problem, seed, given.budget) for seed in seeds]).T
         error, crude = math.sqrt(np.mean((value / truth - 1.0) ** 2)), math.sqrt((1.0 - truth) / truth / given.budget)
         width = float(np.median(high - low)) / 2.0 / (1.96 * error * truth)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sbt
-from sbt.problem.requirement import CriticalInterval, within_scale
+from sbt.problem.requirement import CriticalInterval, within_scale, without_placeholders
 from sbt.problem.scenario import LogicalScenario
 
 
@@ -24,6 +25,54 @@ def test_infinities_lie_beyond_all_values_and_keep_their_verdict(critical: Criti
     assert within_scale(found, critical) is found
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_value_that_stands_for_none_is_an_infinity(sign: float):
+    critical = CriticalInterval(high=1.5) if sign > 0 else CriticalInterval(low=-1.5)
+    y = sign * np.array([0.4, 2.0, math.nan, 3.1, 999.0, 999.0])
+    assert without_placeholders(y, critical)[4:].tolist() == [sign * math.inf] * 2
+    need = sbt.Requirement("y", low=critical.low, high=critical.high)
+    found = need.values(Runs(y))
+    assert np.abs(found[4:]).max() < 4.0
+    assert need.told(Runs(y))[4] == 999.0 * sign, "it is told as it is"
+    assert (critical.contains(found) == critical.contains(y)).all()
+
+
+@pytest.mark.parametrize(
+    ("y", "critical"),
+    [
+        ([0.4, 2.0, 3.1, 999.0], CriticalInterval(high=1.5)),  # one may be a value
+        ([0.4, 2.0, 3.1, 5.0, 5.0], CriticalInterval(high=1.5)),  # near: a cap
+        ([0.0, 0.0, 1.0, 1.0], CriticalInterval(low=0.2)),  # a flag
+        ([0.4, 2.0, 3.1, 999.0, 999.0], CriticalInterval(900.0, 1200.0)),  # M_c lies there
+    ],
+)
+def test_other_values_are_what_they_are(y: list[float], critical: CriticalInterval):
+    values = np.array(y)
+    assert without_placeholders(values, critical) is values
+
+
+@pytest.mark.parametrize("kind", ["boundary", "estimation"])
+@pytest.mark.parametrize("none", [-1.0, 999.0])
+def test_times_to_collision_are_learned_whatever_stands_for_none(none: float, kind: str, tmp_path: Path):
+    """Critical from 0 to 1.5 s; before, -1 lay next to a collision, and F1 was .1 to .8."""
+
+    def evaluate(values: dict[str, float], seed: int) -> dict[str, float]:
+        time = max(1.5 + 10.0 * (values["a"] + 0.7 * values["b"] - 0.5 * values["c"] - 0.3), 0.0)
+        return {"ttc": none if time > 3.0 else time}
+
+    box = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+    scenario = LogicalScenario("none", box, sbt.Requirement("ttc", 0.0, 1.5), evaluate=evaluate)
+    result = campaign(tmp_path, scenario, kind, 70)
+    at = np.random.default_rng(0).random((20_000, 3))
+    inside = at @ np.array([1.0, 0.7, -0.5]) <= 0.3
+    if kind == "estimation":
+        assert result.conclusion.probability == pytest.approx(inside.mean(), rel=0.1)
+        return
+    assert result.conclusion.critical_fraction == pytest.approx(inside.mean(), rel=0.06)
+    said = result.predict(dict(zip("abc", at[:3000].T, strict=True)))["p_critical"].to_numpy() > 0.5
+    assert (said == inside[:3000]).mean() > 0.98
+
+
 def _hole(values: dict[str, float], seed: int) -> dict[str, float]:
     a, b = values["a"], values["b"]
     return {"y": math.inf if a < 0.3 else (a - 0.6) ** 2 + (b - 0.5) ** 2 - 0.03}
@@ -35,6 +84,16 @@ def _grid(values: dict[str, float], seed: int) -> dict[str, float]:
 
 def _jitter(values: dict[str, float], seed: int) -> dict[str, float]:
     return {"y": _grid(values, seed)["y"] + 0.3 * math.sin(seed)}
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Values of one metric."""
+
+    values: np.ndarray
+
+    def y(self, metric: str) -> np.ndarray:
+        return self.values
 
 
 GRID = [sbt.Parameter("k", 0, 3, kind="integer"), sbt.Parameter("m", 0, 4, kind="integer")]

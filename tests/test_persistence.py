@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import io
 import json
+import pkgutil
 import zipfile
 
 import numpy as np
 import pytest
 
+import sbt.metamodels
 from sbt.errors import InputError
 from sbt.metamodels import persistence
 from sbt.metamodels.automatic import Auto, MixturePredictor, ModelComparison
@@ -18,9 +22,11 @@ from sbt.metamodels.deep_gp import DeepGaussianProcess
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.persistence import load, read_info, save
+from sbt.metamodels.saturation import Opened
 from sbt.metamodels.sigma_point import DeepSigmaPointProcess
 from sbt.metamodels.sparse_gp import SparseGaussianProcess
 from sbt.plugins import names
+from sbt.problem.requirement import CriticalInterval
 
 KINDS = {
     "auto": Auto(folds=2),
@@ -79,6 +85,32 @@ def test_loaded_predictors_predict_the_same_bits(name, tmp_path):
     assert again.read_bytes() == path.read_bytes()
     with zipfile.ZipFile(path) as file:
         assert not any(b"pickle" in file.read(n)[:200] or file.read(n)[:1] == b"\x80" for n in file.namelist())
+
+
+@pytest.mark.parametrize(
+    ("y", "critical"),
+    [
+        (np.maximum(Y - 0.3, 0.0), CriticalInterval(high=0.0)),  # ends at the edge: it is known of some rows that they lie below
+        (np.maximum(Y - 0.3, 0.0), CriticalInterval(0.0, 0.4)),  # ends at an end of M_c
+        ((Y > 0.5) * 1.0, CriticalInterval(low=1.0)),
+    ],
+)
+def test_what_is_learned_of_a_metric_that_ends_is_loaded_as_it_was(y, critical, tmp_path):
+    predictor = Opened(Auto(), critical).fit(U, y, np.random.default_rng(1))
+    save(predictor, tmp_path / "model")
+    before, after = predictor(U + 0.01), load(tmp_path / "model")(U + 0.01)
+    np.testing.assert_array_equal(before.probability(critical), after.probability(critical))
+
+
+def test_every_predictor_of_this_package_can_be_saved():
+    found = {
+        kind
+        for module in pkgutil.iter_modules(sbt.metamodels.__path__, "sbt.metamodels.")
+        for name, kind in vars(importlib.import_module(module.name)).items()
+        if name.endswith(("Predictor", "Ending")) and dataclasses.is_dataclass(kind)
+    }
+    assert len(found) > 10
+    assert found <= set(persistence._KINDS.values())
 
 
 def test_auto_with_its_ensemble_keeps_its_choice(tmp_path):

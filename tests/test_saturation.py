@@ -60,13 +60,29 @@ def test_an_end_that_the_metric_ends_at_makes_no_difference(shape, two_ends, one
 
     def answers(critical):
         learned = Opened(GaussianProcess(nu=2.5), critical).fit(u, y, np.random.default_rng(0))
-        search = fit_warped(Search(critical, GaussianProcess(nu=2.5)).reached(y), u, y, np.random.default_rng(0))
+        search, _ = Search(critical, GaussianProcess(nu=2.5)).reached(u, y)
+        search = fit_warped(search, u, y, np.random.default_rng(0))
         belief = fit_log_probability(GaussianProcess(nu=2.5), lambda z: z, critical, u, y, np.random.default_rng(0))
         return learned(at).probability(critical), np.exp(search.log_probability(at)), np.exp(belief(at)[0])
 
     for found, expected in zip(answers(two_ends), answers(one_end), strict=True):
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
         assert found.max() > 0.9 > 0.1 > found.min()
+
+
+def test_an_end_that_no_run_lies_beyond_does_not_rank_them_nor_hide_a_jump():
+    """Of speeds of impact in [.1, 100] the fastest is the worst; what is learned is what [.1, null] gives."""
+    need, runs = sbt.Requirement("impact", 0.1, 100.0), Runs(np.array([0.0, 0.0, 7.0, 60.0, 90.0]))
+    assert need.depths(runs).argsort()[:2].tolist() == [4, 3]
+    assert need.depths(Runs(np.array([0.0, 7.0, 60.0, 120.0]))).argsort()[0] == 2
+    rng = np.random.default_rng(2)
+    u, at = rng.random((60, 2)), rng.random((300, 2))
+    y = 15.0 * np.sqrt(np.maximum(0.4 - np.linalg.norm(u - 0.5, axis=1), 0.0))
+    found, expected = (
+        Opened(GaussianProcess(nu=2.5), critical).fit(u, y, np.random.default_rng(0))(at).probability(need.critical)
+        for critical in (need.critical, CriticalInterval(low=0.1))
+    )
+    assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_an_end_that_the_metric_ends_at_does_not_rank_runs():

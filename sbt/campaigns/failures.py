@@ -225,7 +225,7 @@ class FailureSearch:
             return _Learned([Mode((only,), only, only, None)], rates)
         u, y = scenario.space.to_unit(history.x[ok]), scenario.requirement.values(history)[ok]
         rng = stream(self.settings.seed, "modes", len(history))
-        search = self.search.reached(y)
+        search, y = self.search.reached(u, y)
         fitted = fit_warped(search.for_noise(u, y), u, y, rng)
         if not self.noisy(history):
             return _Learned(modes_of(fitted, history, scenario, links=links), rates, fitted)

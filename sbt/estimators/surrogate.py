@@ -18,9 +18,10 @@ from scipy.special import ndtr
 
 from sbt.estimators.transfer import Trend, trended
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sketched, with_target, without_repetitions
+from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.saturation import opened
+from sbt.metamodels.saturation import on_side, opened_and_limit
 from sbt.metamodels.stacking import cell_shares, surely_positive
 from sbt.metamodels.tails import student_mixture
 from sbt.metamodels.warp import Warp
@@ -28,7 +29,7 @@ from sbt.metamodels.warped import better_warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.cube import Cube
-from sbt.problem.requirement import CriticalInterval, as_reached
+from sbt.problem.requirement import CriticalInterval, as_passed
 from sbt.problem.space import ParameterSpace
 
 __all__ = ["MOST_LEARNED", "Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability", "settled", "sketch_of"]
@@ -133,6 +134,7 @@ class _Form:
         log_slope: (n,) log of its derivative by the metric.
         trend: at the metamodel's inputs; None: the whole metric is learned.
         noise: smallest variance of the noise, in its unit.
+        limit: what is known, in its unit, of runs with the value that the metric ends with; None: there are none.
     """
 
     values: Vector
@@ -140,13 +142,18 @@ class _Form:
     log_slope: Vector
     trend: Callable[[Points], Vector] | None = None
     noise: float = 0.0
+    limit: Limit | None = None
 
     def fit(self, metamodel: Metamodel, u: Points, rows: NDArray[np.intp], rng: np.random.Generator) -> _Learned:
         """Return the predictor of the values, learned from some rows of u (n, d)."""
         values = self.values if self.trend is None else self.values - self.trend(u)
         target = with_target(metamodel, self.interval) if self.trend is None else metamodel
         with named_errors(metamodel, len(u)):
-            return _Learned(self, target.fit(u[rows], values[rows], rng), metamodel, len(u))
+            predictor = target.fit(u[rows], values[rows], rng)
+        if self.limit is not None:
+            trend = 0.0 if self.trend is None else self.trend(self.limit.u)
+            predictor = beyond(predictor, replace(self.limit, value=self.limit.value - trend))
+        return _Learned(self, predictor, metamodel, len(u))
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +272,8 @@ def fit_log_probability(
             for k, leaf in enumerate(critical.leaves)
         ]
         return JointLogProbability(critical, tuple(parts))
-    critical, least = as_reached(critical, y), noise[0] if noise else 0.0
+    y = on_side(coordinates(z), y, critical)
+    critical, least = as_passed(critical, y), noise[0] if noise else 0.0
     if earlier and math.sqrt(least) > _NOISE_COUNTS * earlier[0].warp.scale and len(y) >= _FEWEST_SCORED:
         coordinates = earlier[0].beside(coordinates)
     elif earlier:
@@ -274,13 +282,15 @@ def fit_log_probability(
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
     u = coordinates(z)
-    y = opened(u, y, critical, rng)
+    y, limit = opened_and_limit(u, y, critical, rng)
     better = _better_warp(metamodel, u, y, critical)
     warp = better or Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
     metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel
-    whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=least / (warp.scale * float(warp.scale_at(np.array(1.0)))))
-    plain = _Form(y, critical, np.zeros(len(y)), noise=least)
+    smallest = least / (warp.scale * float(warp.scale_at(np.array(1.0))))
+    warped = None if limit is None else replace(limit, value=warp.values(limit.value))
+    whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=smallest, limit=warped)
+    plain = _Form(y, critical, np.zeros(len(y)), noise=least, limit=limit)
     wholes = [whole] if better else [whole, plain]
     trends = [replace(form, trend=_trend(u, form.values)) for form in wholes]
     forms = [*wholes, *(form for form in trends if form.trend is not None)]

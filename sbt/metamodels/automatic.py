@@ -13,6 +13,7 @@ import numpy as np
 
 from sbt.errors import InputError
 from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, is_rate, sample_paths, sketched, without_repetitions
+from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -253,6 +254,10 @@ class MixturePredictor:
                 ends = p * (1.0 - 1e-9), p * (1.0 + 1e-9)
             low, high = low + weight * ends[0], high + weight * ends[1]
         return low, np.minimum(high, 1.0)
+
+    def beyond(self, limit: Limit) -> MixturePredictor:
+        """Return the mixture of predictors that know the limit, where they can."""
+        return replace(self, predictors=tuple(beyond(p, limit) for p in self.predictors))
 
     def sketch(self, rows: int) -> MixturePredictor:
         """Return the mixture of the predictors' sketches, or of themselves where they have none."""

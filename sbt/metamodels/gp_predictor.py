@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from sbt.metamodels.censored import Limit, observations
 from sbt.metamodels.extra_trees import ForestPredictor
 from sbt.metamodels.gp_algebra import (
     NOISE_FLOOR,
@@ -44,6 +45,7 @@ _ROUNDED = {np.float32: 1e-6, np.float64: 2e-15}  # of a correlation: at most a 
 _ROUGH = 1e-3  # error of the mean, relative to the std of y, up to which single precision will do
 _CANCELLED = 2e-15  # of a squared distance, relative to the squares that it is the difference of: a few roundings
 _LOG_CHI2 = 1.27036  # -E[log chi^2_1]: log of the mean of z^2 minus the mean of log z^2
+_MOST_LIMITED = 1000  # rows of which a limit is known: up to 60 sweeps cost their cube each
 _CLIP = 6.9  # about log(1000): relative noise variances stay within [1e-3, 1e3]
 
 
@@ -62,6 +64,7 @@ class GaussianProcessPredictor:
         scale: see `shift`.
         widths: (k,) factors on sigma, equally likely: one factor of 1, or more for heavy tails.
         device: auto, cpu or cuda; where moments and draws are computed.
+        row_noise: (n,) noise variance of each row, standardised; None: that of the process, with its spread.
     """
 
     hyper: Hyperparameters
@@ -74,6 +77,7 @@ class GaussianProcessPredictor:
     scale: float
     widths: Vector
     device: str = "cpu"
+    row_noise: Vector | None = None
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction at u (n, d)."""
@@ -110,11 +114,35 @@ class GaussianProcessPredictor:
         kept = np.flatnonzero(np.arange(n) * _GOLDEN % 1.0 < rows / n)
         u = self.u[kept]
         noise = self.hyper.noise * (np.ones(len(u)) if self.spread is None else self.spread(u))
+        row_noise = None if self.row_noise is None else self.row_noise[kept]
+        noise = noise if row_noise is None else row_noise
         with single_threaded():
             at = placed(u, device_of(self.device))
             factor = cholesky(self.hyper.covariance(at, at), np.maximum(noise, NOISE_FLOOR))
             alpha = solve_right(factor, (z[kept] - self.centre)[:, None])[:, 0]
-        return replace(self, u=u, factor=host(factor), alpha=alpha)
+        return replace(self, u=u, factor=host(factor), alpha=alpha, row_noise=row_noise)
+
+    def beyond(self, limit: Limit) -> GaussianProcessPredictor:
+        """Return the process conditioned on its other rows and the limit; itself where noise is uneven, or rows are many."""
+        which = limit.rows(self.u)
+        tied = which >= 0
+        if self.spread is not None or not 0 < tied.sum() <= _MOST_LIMITED or tied.all():
+            return self
+        hyper, noise = self.hyper, max(self.hyper.noise, NOISE_FLOOR)
+        side = np.where(limit.at_most[which[tied]], 1.0, -1.0)
+        with single_threaded():
+            z = self.factor @ (self.factor.T @ self.alpha)  # less the centre
+            end = (limit.value[which[tied]] - self.shift) / self.scale - self.centre
+            across = hyper.covariance(self.u[~tied], self.u[tied])
+            factor = cholesky(hyper.covariance(self.u[~tied], self.u[~tied]), np.full(int((~tied).sum()), noise))
+            mean = across.T @ solve_right(factor, z[~tied][:, None])[:, 0]
+            covariance = hyper.covariance(self.u[tied], self.u[tied]) - across.T @ solve_right(factor, across)
+            values, variances = observations(side * mean, covariance * np.outer(side, side), side * end, noise)
+            z[tied], row_noise = side * values, np.full(len(z), noise)
+            row_noise[tied] = variances
+            factor = cholesky(hyper.covariance(self.u, self.u), row_noise)
+            alpha = solve_right(factor, z[:, None])[:, 0]
+        return replace(self, factor=factor, alpha=alpha, row_noise=row_noise)
 
     def leave_one_out(self, u: Points, y: Vector) -> Prediction:
         """Return the prediction of each row y (n,) at u (n, d) from all other rows, the hyperparameters kept; cubic in n.
@@ -132,8 +160,12 @@ class GaussianProcessPredictor:
         at = self._learned_as(u, y)
         own, k = at >= 0, len(self.widths)
         mean, sigma, noise = np.empty(len(y)), np.empty(len(y)), np.empty(len(y))
-        mean[own] = y[own] - self.scale * (self.alpha * variance)[at[own]]
-        sigma[own] = self.scale * np.sqrt(variance)[at[own]]
+        learned, extra = y[own], np.zeros(len(self.u))
+        if self.row_noise is not None:  # what stands for a row is not what was measured there
+            z = self.centre + self.factor @ (self.factor.T @ self.alpha)
+            learned, extra = (self.shift + self.scale * z)[at[own]], self.row_noise - self.hyper.noise
+        mean[own] = learned - self.scale * (self.alpha * variance)[at[own]]
+        sigma[own] = self.scale * np.sqrt(np.maximum(variance - extra, self.hyper.noise))[at[own]]
         noise[own] = self.scale * np.sqrt(self.hyper.noise * relative)[at[own]]
         if not own.all():
             others = self(u[~own])
@@ -218,8 +250,20 @@ class GaussianProcessPredictor:
             if k > 0:
                 found[0] += correlation
         correlation = found[0]
+        mean = self.centre + correlation @ weights
+        if self._known is not None:
+            correlation *= self._known
         nearest = correlation[np.arange(len(r)), correlation.argmax(axis=1)]  # quicker than max
-        return self.centre + correlation @ weights, nearest.astype(np.float64)
+        return mean, nearest.astype(np.float64)
+
+    @cached_property
+    def _known(self) -> Vector | None:
+        """(n,) how much less rows tell than one with the noise of the process, of a correlation; None: none does."""
+        if self.row_noise is None:
+            return None
+        scale, most = self.hyper.variance, 1.0 if self.spread is None else self.spread.largest
+        usual = scale + self.hyper.noise * most
+        return np.asarray(np.sqrt(usual / np.maximum(scale + self.row_noise, usual)), dtype=self._precision)
 
     @cached_property
     def _total_weight(self) -> float:

@@ -24,7 +24,20 @@ from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
 from sbt.metamodels import deep_ensemble as ensemble
 from sbt.metamodels import extra_trees as et
-from sbt.metamodels import gp_algebra, gp_predictor, joint, noise_shape, recalibrated, sided, sparse, stepped, warp, warped
+from sbt.metamodels import (
+    gp_algebra,
+    gp_predictor,
+    joint,
+    noise_shape,
+    rated,
+    recalibrated,
+    saturation,
+    sided,
+    sparse,
+    stepped,
+    warp,
+    warped,
+)
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
 from sbt.problem.combination import CombinedInterval
@@ -50,7 +63,9 @@ _KINDS: dict[str, Any] = {
         gp_predictor.GaussianProcessPredictor,
         gp_predictor.NoiseSpread,
         joint.JointPredictor,
+        rated.RatePredictor,
         recalibrated.RecalibratedPredictor,
+        saturation.Ending,
         sparse.SparseLayer,
         sparse.SparseMixture,
         sparse.SparsePredictor,

@@ -16,11 +16,12 @@ from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
 from sbt.metamodels.base import Metamodel, Predictor, is_rate, sample_paths, sketched, with_target
+from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.problem.requirement import CriticalInterval, as_reached
+from sbt.problem.requirement import CriticalInterval, as_passed, as_reached, within_scale
 
-__all__ = ["Opened", "centred", "opened", "scored"]
+__all__ = ["Ending", "Opened", "centred", "on_side", "opened", "opened_and_limit", "scored"]
 
 _FEWEST = 2
 """Critical runs with the value of the edge: one may be there by chance."""
@@ -35,6 +36,9 @@ _ENOUGH, _MOST = 8, 400
 """Uncritical runs from which on a process is asked, and that it learns from at most: those nearest to the edge."""
 _USUAL = 0.9
 """Quantile of the margins that asinh begins to bend at."""
+_FEWEST_OTHERS, _SURE = 3, 1.0
+"""Fewest different values on the other side of M_c than the one that stands for none; standard errors of the rank correlation
+that tells its side."""
 _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 """Ends of a depth, in asinh(margin / usual margin)."""
 
@@ -62,15 +66,30 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
     >>> opened(u, np.array([0.0, 0.0, 0.1, 0.2, 0.3]), CriticalInterval(high=0.0), None).round(2).tolist()
     [-0.2, -0.02, 0.1, 0.2, 0.3]
     """
+    return opened_and_limit(u, y, critical, rng)[0]
+
+
+def opened_and_limit(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> tuple[Vector, Limit | None]:
+    """Return what `opened` does, and what is known of the values that it moved; None where it moved none, or steps alone."""
     if not critical.one_sided:
+        moved = y
         for end in (CriticalInterval(high=critical.high), CriticalInterval(low=critical.low)):
-            y = _opened_outside(u, y, end, rng)
-        return y
+            moved = _opened_outside(u, moved, end, rng)
+        return moved, _limit(u, y, moved)
     margin = critical.margin(y)
     tied = margin == 0.0
     if tied.sum() < _FEWEST or (margin < 0.0).any() or is_rate(u, y):
-        return _opened_outside(u, centred(u, y, critical), critical, rng)
-    return _moved(u, y, tied, margin, critical, rng)
+        y = centred(u, y, critical)
+        moved = _opened_outside(u, y, critical, rng)
+    else:
+        moved = _moved(u, y, tied, margin, critical, rng)
+    return moved, _limit(u, y, moved)
+
+
+def _limit(u: Points, y: Vector, moved: Vector) -> Limit | None:
+    """Return that the metric goes on beyond y (n,) where it was moved."""
+    tied = moved != y
+    return Limit(u[tied], y[tied], moved[tied] < y[tied]) if tied.any() else None
 
 
 def _opened_outside(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
@@ -107,6 +126,38 @@ def _moved(
     moved = np.array(y, dtype=np.float64)
     moved[tied] += depth if math.isfinite(critical.low) != outwards else -depth
     return moved
+
+
+def on_side(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
+    """Return y with a value that stands for none on the side of M_c on which its neighbours are.
+
+    Of a time to collision in [0, 1.5] s, which is -1 where none comes, times are longer, not shorter, nearer to runs without one,
+    and most of those have one above 1.5 s next to them.
+
+    Args:
+        u: (n, d) metamodel inputs.
+        y: (n,) finite values of the metric.
+        critical: M_c; with one finite end y is returned.
+
+    >>> u = np.linspace(0.0, 1.0, 8)[:, None]
+    >>> on_side(u, np.array([0.0, 0.6, 1.2, 1.8, 2.0, 2.5, -1.0, -1.0]), CriticalInterval(0.0, 1.5)).tolist()
+    [0.0, 0.6, 1.2, 1.8, 2.0, 2.5, 2.75, 2.75]
+    """
+    if critical.one_sided:
+        return y
+    from scipy.stats import rankdata
+
+    for away, other, to in ((y < critical.low, critical.high, np.inf), (y > critical.high, critical.low, -np.inf)):
+        rest, there = ~away, y > critical.high if to > 0.0 else y < critical.low
+        if away.sum() < _FEWEST or np.ptp(y[away]) > 0.0 or len(np.unique(y[there])) < _FEWEST_OTHERS:
+            continue
+        distance = cdist(u[rest], u[away])
+        near, beside = distance.min(axis=1), there[rest][distance.argmin(axis=0)]
+        nearer_longer = -np.corrcoef(rankdata(near), rankdata(y[rest]))[0, 1] * np.sign(to)
+        if nearer_longer * math.sqrt(rest.sum() - 1) > _SURE and beside.mean() > there[rest].mean():
+            one_end = CriticalInterval(high=other) if to > 0.0 else CriticalInterval(low=other)
+            return within_scale(np.where(away, to, y), one_end)
+    return y
 
 
 def centred(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
@@ -192,10 +243,14 @@ class Opened:
 
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> Predictor:
         """Return the predictor; see `Metamodel.fit`."""
-        critical = as_reached(self.critical, y)
-        learned = opened(u, y, critical, rng) if self.beyond else centred(u, y, critical)
-        predictor = (with_target(self.metamodel, critical) if self.beyond else self.metamodel).fit(u, learned, rng)
-        return predictor if critical == self.critical else _Ending(predictor, *_ends(self.critical, y))
+        y = on_side(u, y, self.critical)
+        critical = as_passed(self.critical, y)
+        if self.beyond:
+            learned, limit = opened_and_limit(u, y, critical, rng)
+            predictor = beyond(with_target(self.metamodel, critical).fit(u, learned, rng), limit)
+        else:
+            predictor = self.metamodel.fit(u, centred(u, y, critical), rng)
+        return predictor if as_reached(self.critical, y) == self.critical else Ending(predictor, *_ends(self.critical, y))
 
 
 def _ends(critical: CriticalInterval, y: Vector) -> tuple[float, float]:
@@ -205,7 +260,7 @@ def _ends(critical: CriticalInterval, y: Vector) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class _Ending:
+class Ending:
     """A predictor of a metric that ends at one end of M_c.
 
     Args:
@@ -225,7 +280,7 @@ class _Ending:
         """Return (n, m) draws of the metric as a function, at u (m, d)."""
         return np.clip(sample_paths(self.predictor, u, n, rng), self.lowest, self.highest)
 
-    def sketch(self, rows: int) -> _Ending:
+    def sketch(self, rows: int) -> Ending:
         """Return what predicts about the same from so many rows."""
         rough = sketched(self.predictor, rows)
         return self if rough is self.predictor else replace(self, predictor=rough)

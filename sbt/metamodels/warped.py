@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sbt.metamodels.base import Predictor, Screened, sample_paths, sketched
+from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins, cell_shares
 from sbt.metamodels.warp import Warp
@@ -126,6 +127,10 @@ class WarpedPredictor:
             return self.predictor.probability_bounds(u, warped)
         p = self.predictor(u).probability(warped)
         return p, p
+
+    def beyond(self, limit: Limit) -> WarpedPredictor:
+        """Return the same with a predictor that knows the limit, where it can."""
+        return replace(self, predictor=beyond(self.predictor, replace(limit, value=self.warp.values(limit.value))))
 
     def sketch(self, rows: int) -> WarpedPredictor:
         """Return the same with the sketch of its predictor."""

@@ -13,7 +13,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.problem.arrays import FARTHEST, Mask, Vector
 
-__all__ = ["CriticalInterval", "Measured", "Requirement", "as_reached", "within_scale"]
+__all__ = ["CriticalInterval", "Measured", "Requirement", "as_passed", "as_reached", "within_scale", "without_placeholders"]
 
 
 _BEYOND = 0.1  # of the range of finite values: far enough to be told from them, near enough to leave them their scale
@@ -25,6 +25,8 @@ class Measured(Protocol):
     def y(self, metric: str) -> Vector:
         """Return (n,) values of a metric, NaN where a run has none."""
         ...
+_PLACEHOLDERS, _OTHERS = 2, 3
+"""Fewest runs with the value that stands for none, and fewest different values beside it."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,43 @@ def as_reached(critical: CriticalInterval, y: Vector) -> CriticalInterval:
     return CriticalInterval(high=critical.high) if ends_low else CriticalInterval(low=critical.low)
 
 
+def as_passed(critical: CriticalInterval, y: Vector) -> CriticalInterval:
+    """Return M_c without an end that no y (n,) lies beyond, where some lie beyond the other; else `as_reached`.
+
+    A "speed of impact of 0.1 to 100 m/s" is "at least 0.1 m/s" as long as there is no faster one.
+
+    >>> as_passed(CriticalInterval(0.1, 100.0), np.array([0.0, 0.0, 7.0, 31.0]))
+    CriticalInterval(low=0.1, high=inf)
+    """
+    if not (math.isfinite(critical.low) and math.isfinite(critical.high)):
+        return critical
+    below, above = bool((y < critical.low).any()), bool((y > critical.high).any())
+    if below == above:
+        return as_reached(critical, y)
+    return CriticalInterval(low=critical.low) if below else CriticalInterval(high=critical.high)
+
+
+def without_placeholders(y: Vector, critical: CriticalInterval) -> Vector:
+    """Return metrics in which the value that stands for none is infinite, such as a time to collision of 999 s where none comes.
+
+    It is the largest or the smallest one of two runs or more, farther from all other values and the ends of M_c than these are
+    from each other; three others must differ.
+
+    >>> without_placeholders(np.array([0.4, 2.0, 3.1, 999.0, 999.0]), CriticalInterval(high=1.5)).tolist()
+    [0.4, 2.0, 3.1, inf, inf]
+    """
+    for sign in (1.0, -1.0):
+        known = sign * y[np.isfinite(y)]
+        last = known.max(initial=-np.inf)
+        others, ends = known[known < last], sign * np.array([end for end in (critical.low, critical.high) if math.isfinite(end)])
+        if len(known) - len(others) < _PLACEHOLDERS or len(np.unique(others)) < _OTHERS:
+            continue
+        scale = np.concatenate([others, ends])
+        if last - scale.max() > np.ptp(scale):
+            y = np.where(sign * y == last, sign * np.inf, y)
+    return y
+
+
 def within_scale(y: Vector, critical: CriticalInterval) -> Vector:
     """Return (n,) metrics with inf and -inf a tenth of the range beyond all that is finite, values and ends of M_c.
 
@@ -170,13 +209,13 @@ class Requirement:
     def values(self, runs: Measured) -> Vector:
         """Return what is learned of runs: (n,) the metric, NaN for a run without it; (n, q) of a combination of q.
 
-        Infinities are ends of the scale: see `within_scale`.
+        Infinities, and values that stand for none, are ends of the scale: see `within_scale`, `without_placeholders`.
         """
-        return within_scale(runs.y(self.metric), self.critical)
+        return within_scale(without_placeholders(runs.y(self.metric), self.critical), self.critical)
 
     def told(self, runs: Measured) -> Vector:
         """Return (n,) the one number that a run is told by: the metric, of a combination its margin; NaN where there is none."""
-        return self.values(runs)
+        return within_scale(runs.y(self.metric), self.critical)
 
     @property
     def told_as(self) -> str:
@@ -200,9 +239,9 @@ class Requirement:
         return self.critical.margin(self.values(runs))
 
     def depths(self, runs: Measured) -> Vector:
-        """Return (n,) margins by which runs are ranked: an end of M_c at which the metric ends does not count (`as_reached`)."""
+        """Return (n,) margins by which runs are ranked: an end of M_c that no run lies beyond does not count (`as_passed`)."""
         y = self.values(runs)
-        return as_reached(self.critical, y).margin(y)
+        return as_passed(self.critical, y).margin(y)
 
     def is_critical(self, metrics: Mapping[str, float]) -> bool:
         """Return whether the metrics of one run violate the requirement."""

@@ -88,7 +88,8 @@ def propose_by(
     Raises:
         KeyError: there is no such criterion.
     """
-    criterion, search, d = CRITERIA[name], search.reached(y), u.shape[1]
+    criterion, d = CRITERIA[name], u.shape[1]
+    search, y = search.reached(u, y)
     seen = search_data(search, u, y, batch, rng)
     if len(seen.u) < 2:
         return Picks(fill_uniformly(seen.admissible, n, d, rng), (name,) * n)

@@ -61,7 +61,8 @@ def propose_pairs(
         n: pairs wanted >= 1.
         rng: the only source of randomness.
     """
-    margin = search.reached(y).margins(y)
+    search, y = search.reached(u, y)
+    margin = search.margins(y)
     score = scores(margin)
     inputs = search.columns(u)
     known = np.column_stack([inputs, draw(u, seeds)])

@@ -81,7 +81,8 @@ def propose(
         Trust regions and Thompson draws: Eriksson et al. (2019), TuRBO, arXiv 1910.01739; the mixture, the niches
         and the deflation were measured, see docs/measured/falsification.md.
     """
-    search, d = search.reached(y), u.shape[1]
+    d = u.shape[1]
+    search, y = search.reached(u, y)
     seen = search_data(search, u, y, batch, rng)
     again = _repeats(search, seen, u, y, n) if repeats else ()
     n -= len(again)

@@ -19,6 +19,7 @@ from scipy.spatial.distance import cdist
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, gives_different, named_errors, sample_paths
 from sbt.metamodels.joint import metamodel_for
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.saturation import on_side
 from sbt.metamodels.success import LogSuccess, log_success
 from sbt.metamodels.warp import JointWarp, Warp, warp_around
 from sbt.problem.arrays import Mask, Points, Vector
@@ -70,9 +71,18 @@ class Search:
     cube: Cube = CONTINUOUS
     most_rows: int = 4000
 
-    def reached(self, y: Vector) -> Search:
-        """Return the search without an end of M_c that the metric ends at, by y (n,) of all runs, NaN where one failed."""
-        return replace(self, critical=as_reached(self.critical, y))
+    def reached(self, u: Points, y: Vector) -> tuple[Search, Vector]:
+        """Return the search without an end of M_c that the metric ends at, and the metric with what stands for none on its side.
+
+        Args:
+            u: (n, d) all runs.
+            y: (n,) their metric, NaN where one failed; see `as_reached`, `on_side`.
+        """
+        if self.critical.one_sided or isinstance(self.critical, CombinedInterval):
+            return self, y
+        known, y = np.isfinite(y), np.array(y, dtype=np.float64)
+        y[known] = on_side(self.columns(u[known]), y[known], self.critical)
+        return replace(self, critical=as_reached(self.critical, y)), y
 
     def margins(self, y: Vector) -> Vector:
         """Return (n,) distances of y (n,) to M_c, inf where a run failed."""
