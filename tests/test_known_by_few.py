@@ -43,7 +43,7 @@ def test_an_interval_reaches_what_random_draws_allow_while_few_critical_runs_are
 
 def test_a_boundary_says_where_runs_that_fill_the_space_deny_its_share(tmp_path: Path):
     denied = []
-    for seed in range(3):
+    for seed in (6, 7):
         result = sbt.run(
             campaign="boundary", scenario=plateau(), budget=120, seed=seed, acquisition="even", executor="serial",
             store=tmp_path / str(seed), report=False,
@@ -88,7 +88,7 @@ def test_of_several_requirements_each_is_known_by_its_own_runs(tmp_path: Path):
     inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abcd"]
     scenario = sbt.Scenario("two", inputs, need, evaluate=evaluate, metrics=["ttc", "hit"])
     result = sbt.run(
-        campaign="estimation", scenario=scenario, budget=150, seed=1, executor="serial", store=tmp_path / "s", report=False,
+        campaign="estimation", scenario=scenario, budget=100, seed=1, executor="serial", store=tmp_path / "s", report=False,
         stop={"cov": None},
     )  # fmt: skip
     found, runs = result.conclusion, result.history

@@ -160,12 +160,14 @@ class GaussianProcessPredictor:
         at = self._learned_as(u, y)
         own, k = at >= 0, len(self.widths)
         mean, sigma, noise = np.empty(len(y)), np.empty(len(y)), np.empty(len(y))
-        learned, extra = y[own], np.zeros(len(self.u))
+        learned = y[own]
         if self.row_noise is not None:  # what stands for a row is not what was measured there
             z = self.centre + self.factor @ (self.factor.T @ self.alpha)
-            learned, extra = (self.shift + self.scale * z)[at[own]], self.row_noise - self.hyper.noise
+            learned = (self.shift + self.scale * z)[at[own]]
         mean[own] = learned - self.scale * (self.alpha * variance)[at[own]]
-        sigma[own] = self.scale * np.sqrt(np.maximum(variance - extra, self.hyper.noise))[at[own]]
+        if self.row_noise is not None:
+            variance = np.maximum(variance - self.row_noise, 0.0) + self.hyper.noise
+        sigma[own] = self.scale * np.sqrt(variance)[at[own]]
         noise[own] = self.scale * np.sqrt(self.hyper.noise * relative)[at[own]]
         if not own.all():
             others = self(u[~own])
