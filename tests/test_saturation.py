@@ -143,6 +143,39 @@ def test_runs_that_nothing_happens_in_go_away_from_the_edge(edge: float, critica
     assert held_out.tolist() == np.where(nothing, 0.2, y).tolist()
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_metric_that_ends_deep_in_the_critical_region_goes_on(sign: float):
+    """A time to collision is 0 in every collision, and critical up to 1.5 s."""
+    rng = np.random.default_rng(3)
+    u, at = rng.random((100, 3)), rng.random((2000, 3))
+
+    def time(x):
+        return 10.0 * (np.linalg.norm(x - 0.5, axis=1) - 0.3)
+
+    critical = CriticalInterval(high=1.5) if sign > 0 else CriticalInterval(low=-1.5)
+    y = sign * np.maximum(time(u), 0.0)
+    found, ended = opened(u, y, critical, np.random.default_rng(0)), y == 0.0
+    assert np.array_equal(found[~ended], y[~ended])
+    assert np.corrcoef(sign * found[ended], time(u[ended]))[0, 1] > 0.7
+    p = Opened(GaussianProcess(nu=2.5, input_noise=False), critical).fit(u, y, rng)(at).probability(critical)
+    inside = time(at) <= 1.5
+    assert ((p > 0.5) != inside).mean() < 0.01
+    assert scored(y, np.where(ended, sign * -2.0, y), critical).tolist() == np.where(ended, sign * -2.0, y).tolist()
+
+
+@pytest.mark.parametrize(
+    ("y", "critical"),
+    [
+        ([-5.0, -5.0, 0.4, 0.5, 0.6, 0.9, 1.2, 2.0, 3.0, 4.0], CriticalInterval(high=0.5)),  # a collision counts -5: a jump
+        ([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0], CriticalInterval(high=0.5)),  # a flag
+        ([0.0, 0.2, 0.3, 0.4, 0.5, 0.9, 1.2, 2.0, 3.0, 4.0], CriticalInterval(high=0.5)),  # it goes on
+    ],
+)
+def test_a_metric_that_jumps_to_its_last_value_is_left_alone(y, critical):
+    found = opened(np.linspace(0, 1, 10)[:, None], np.array(y), critical, np.random.default_rng(0))
+    assert found.tolist() == y
+
+
 @pytest.mark.parametrize(
     ("y", "critical"),
     [

@@ -26,8 +26,10 @@ __all__ = ["Ending", "Opened", "centred", "on_side", "opened", "opened_and_limit
 _FEWEST = 2
 """Critical runs with the value of the edge: one may be there by chance."""
 _MANY, _NEAR = 0.25, 0.25
-"""Least share of the uncritical runs that have the last value, where a metric ends with it; its largest margin over the depth of
-the deepest run."""
+"""Least share of the uncritical, or critical, runs that have the last value, where a metric ends with it; its largest margin over
+the depth of the deepest run."""
+_DEEP = 0.5
+"""Share of the depth of the last critical value that other runs must reach."""
 _OUTWARDS = 0.5
 """Least of these moves, in that by the usual slope."""
 _LEAST = 0.25
@@ -47,7 +49,8 @@ def opened(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Gene
     """Return y with the values at the edge of M_c moved into it, where no run lies beyond the edge; else `centred`.
 
     So are two values that chance decides between: those at the edge are no deeper than they are. Where instead many
-    uncritical runs have the same, last value, much nearer to the edge than the deepest run, these are moved away from it.
+    uncritical runs have the same, last value, much nearer to the edge than the deepest run, these are moved away from it; and
+    where many critical runs have the deepest value, which others come up to, as a time to collision of 0, these go on.
 
     A Gaussian process of the uncritical margins says where each of them would lie; it is the mean of that prediction, cut off
     at the edge (one step of the expectation maximisation for censored values). Where few runs are uncritical, the depth is the
@@ -80,7 +83,7 @@ def opened_and_limit(u: Points, y: Vector, critical: CriticalInterval, rng: np.r
     tied = margin == 0.0
     if tied.sum() < _FEWEST or (margin < 0.0).any() or is_rate(u, y):
         y = centred(u, y, critical)
-        moved = _opened_outside(u, y, critical, rng)
+        moved = _opened_outside(u, _opened_inside(u, y, critical, rng), critical, rng)
     else:
         moved = _moved(u, y, tied, margin, critical, rng)
     return moved, _limit(u, y, moved)
@@ -90,6 +93,24 @@ def _limit(u: Points, y: Vector, moved: Vector) -> Limit | None:
     """Return that the metric goes on beyond y (n,) where it was moved."""
     tied = moved != y
     return Limit(u[tied], y[tied], moved[tied] < y[tied]) if tied.any() else None
+
+
+def _opened_inside(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
+    """Return y with the last critical value moved on where the metric ends with it beyond the edge."""
+    margin = critical.margin(y)
+    tied = _ends_inside(margin)
+    return _moved(u, y, tied, margin - margin.min(), critical, rng) if tied.any() else y
+
+
+def _ends_inside(margin: Vector) -> Mask:
+    """Return (n,) which margins are the deepest one, where a metric ends with it beyond the edge; all False where it goes on.
+
+    Other runs must come half as deep, or it may be a jump: a collision that counts -5, a flag.
+    """
+    deepest = margin.min(initial=np.inf)
+    tied, rest = margin == deepest, margin[margin > deepest]
+    many = tied.sum() >= max(_FEWEST, _MANY * (margin <= 0.0).sum()) and len(rest) >= _ENOUGH
+    return np.asarray(tied & bool(many and rest.min() <= _DEEP * deepest < 0.0))
 
 
 def _opened_outside(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
@@ -222,8 +243,9 @@ def scored(y: Vector, mu: Vector, critical: CriticalInterval) -> Vector:
     margin = critical.margin(y)
     at_edge = margin == 0.0
     if not at_edge.any() or (margin < 0.0).any():
-        ends = _ends_outside(margin, int((margin <= 0.0).sum()))
-        return np.where(ends & (critical.margin(mu) > margin), mu, y) if critical.one_sided else y
+        beyond = critical.margin(mu) - margin
+        ends = _ends_outside(margin, int((margin <= 0.0).sum())) & (beyond > 0.0) | _ends_inside(margin) & (beyond < 0.0)
+        return np.where(ends, mu, y) if critical.one_sided else y
     return np.where(at_edge & critical.contains(mu), mu, y)
 
 
