@@ -32,6 +32,8 @@ _DEEP = 0.5
 """Share of the depth of the last critical value that other runs must reach."""
 _OUTWARDS = 0.5
 """Least of these moves, in that by the usual slope."""
+_SURELY = 0.5
+"""What is certain of a move away from M_c."""
 _LEAST = 0.25
 """Least depth beyond the edge, in the median margin of the uncritical runs that are nearest to critical ones."""
 _ENOUGH, _MOST = 8, 400
@@ -78,7 +80,7 @@ def opened_and_limit(u: Points, y: Vector, critical: CriticalInterval, rng: np.r
         moved = y
         for end in (CriticalInterval(high=critical.high), CriticalInterval(low=critical.low)):
             moved = _opened_outside(u, moved, end, rng)
-        return moved, _limit(u, y, moved)
+        return moved, _limit(u, y, moved, critical)
     margin = critical.margin(y)
     tied = margin == 0.0
     if tied.sum() < _FEWEST or (margin < 0.0).any() or is_rate(u, y):
@@ -86,13 +88,14 @@ def opened_and_limit(u: Points, y: Vector, critical: CriticalInterval, rng: np.r
         moved = _opened_outside(u, _opened_inside(u, y, critical, rng), critical, rng)
     else:
         moved = _moved(u, y, tied, margin, critical, rng)
-    return moved, _limit(u, y, moved)
+    return moved, _limit(u, y, moved, critical)
 
 
-def _limit(u: Points, y: Vector, moved: Vector) -> Limit | None:
-    """Return that the metric goes on beyond y (n,) where it was moved."""
+def _limit(u: Points, y: Vector, moved: Vector, critical: CriticalInterval) -> Limit | None:
+    """Return that the metric goes on beyond y (n,) where it was moved; away from M_c, half as far as it was moved."""
     tied = moved != y
-    return Limit(u[tied], y[tied], moved[tied] < y[tied]) if tied.any() else None
+    surely = np.where(critical.margin(y[tied]) > 0.0, _SURELY, 0.0)  # else steep edges are expected wherever nothing is known
+    return Limit(u[tied], y[tied] + surely * (moved - y)[tied], (moved < y)[tied]) if tied.any() else None
 
 
 def _opened_inside(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
