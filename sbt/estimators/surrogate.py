@@ -150,10 +150,9 @@ class _Form:
         target = with_target(metamodel, self.interval) if self.trend is None else metamodel
         with named_errors(metamodel, len(u)):
             predictor = target.fit(u[rows], values[rows], rng)
-        if self.limit is not None:
-            trend = 0.0 if self.trend is None else self.trend(self.limit.u)
-            predictor = beyond(predictor, replace(self.limit, value=self.limit.value - trend))
-        return _Learned(self, predictor, metamodel, len(u))
+        less = self.trend(self.limit.u) if self.limit is not None and self.trend is not None else 0.0
+        limit = None if self.limit is None else self.limit.moved(lambda value: value - less)
+        return _Learned(self, beyond(predictor, limit), metamodel, len(u))
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +287,7 @@ def fit_log_probability(
     t = warp.values(y)
     metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel
     smallest = least / (warp.scale * float(warp.scale_at(np.array(1.0))))
-    warped = None if limit is None else replace(limit, value=warp.values(limit.value))
+    warped = None if limit is None else limit.moved(warp.values)
     whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=smallest, limit=warped)
     plain = _Form(y, critical, np.zeros(len(y)), noise=least, limit=limit)
     wholes = [whole] if better else [whole, plain]

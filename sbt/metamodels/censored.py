@@ -7,7 +7,8 @@ a smooth function that goes on would have been there is on the other side of tha
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -32,18 +33,33 @@ class Limit:
 
     Args:
         u: (k, d) the rows.
+        learned: (k,) the values that a predictor was fitted to there.
         value: (k,) the limit there.
         at_most: (k,) the metric lies below; otherwise above.
     """
 
     u: Points
+    learned: Vector
     value: Vector
     at_most: Mask
 
-    def rows(self, u: Points) -> NDArray[np.intp]:
-        """Return (n,) which of the rows each of u (n, d) is, -1 where it is none."""
-        known = {row.tobytes(): k for k, row in enumerate(np.ascontiguousarray(self.u))}
-        return np.array([known.get(row.tobytes(), -1) for row in np.ascontiguousarray(u)], dtype=np.intp)
+    def moved(self, to: Callable[[Vector], Vector]) -> Limit:
+        """Return the limit in another unit."""
+        return replace(self, learned=to(self.learned), value=to(self.value))
+
+    def rows(self, u: Points, y: Vector, within: float) -> NDArray[np.intp]:
+        """Return (n,) which of the rows each of u (n, d) is that was learned with y (n,), -1 where it is none.
+
+        Of a noisy simulator other runs at the same inputs may have ended beside the limit.
+        """
+        known: dict[bytes, list[int]] = {}
+        for k, row in enumerate(np.ascontiguousarray(self.u)):
+            known.setdefault(row.tobytes(), []).append(k)
+        found = np.full(len(u), -1, dtype=np.intp)
+        for i, row in enumerate(np.ascontiguousarray(u)):
+            same = [k for k in known.get(row.tobytes(), ()) if abs(self.learned[k] - y[i]) <= within]
+            found[i] = same[0] if same else -1
+        return found
 
 
 @runtime_checkable
@@ -98,7 +114,10 @@ def observations(mean: Vector, covariance: Points, limit: Vector, noise: float) 
 
 
 def _inverse(matrix: Points) -> Points:
-    """Return the inverse of a symmetric positive definite matrix (k, k)."""
-    factor, _ = lapack.dpotrf(matrix, lower=1, clean=1)
-    inverse = np.tril(lapack.dpotri(factor, lower=1)[0])
-    return np.asarray(inverse + np.tril(inverse, -1).T)
+    """Return the inverse of a symmetric positive definite matrix (k, k), with jitter where rounding made it indefinite."""
+    for jitter in (0.0, 1e-8, 1e-6, 1e-4, 1e-2):
+        factor, failed = lapack.dpotrf(matrix + jitter * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), lower=1, clean=1)
+        if not failed:
+            inverse = np.tril(lapack.dpotri(factor, lower=1)[0])
+            return np.asarray(inverse + np.tril(inverse, -1).T)
+    raise np.linalg.LinAlgError("the covariance of censored rows must be positive definite, but is not, with jitter 0.01")

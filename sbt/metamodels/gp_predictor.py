@@ -46,6 +46,7 @@ _ROUGH = 1e-3  # error of the mean, relative to the std of y, up to which single
 _CANCELLED = 2e-15  # of a squared distance, relative to the squares that it is the difference of: a few roundings
 _LOG_CHI2 = 1.27036  # -E[log chi^2_1]: log of the mean of z^2 minus the mean of log z^2
 _MOST_LIMITED = 1000  # rows of which a limit is known: up to 60 sweeps cost their cube each
+_SAME = 1e-3  # of the standard deviation of y: values that differ less are the same
 _CLIP = 6.9  # about log(1000): relative noise variances stay within [1e-3, 1e3]
 
 
@@ -124,14 +125,15 @@ class GaussianProcessPredictor:
 
     def beyond(self, limit: Limit) -> GaussianProcessPredictor:
         """Return the process conditioned on its other rows and the limit; itself where noise is uneven, or rows are many."""
-        which = limit.rows(self.u)
+        with single_threaded():
+            z = self.factor @ (self.factor.T @ self.alpha)  # less the centre
+        which = limit.rows(self.u, self.shift + self.scale * (self.centre + z), _SAME * self.scale)
         tied = which >= 0
         if self.spread is not None or not 0 < tied.sum() <= _MOST_LIMITED or tied.all():
             return self
         hyper, noise = self.hyper, max(self.hyper.noise, NOISE_FLOOR)
         side = np.where(limit.at_most[which[tied]], 1.0, -1.0)
         with single_threaded():
-            z = self.factor @ (self.factor.T @ self.alpha)  # less the centre
             end = (limit.value[which[tied]] - self.shift) / self.scale - self.centre
             across = hyper.covariance(self.u[~tied], self.u[tied])
             factor = cholesky(hyper.covariance(self.u[~tied], self.u[~tied]), np.full(int((~tied).sum()), noise))

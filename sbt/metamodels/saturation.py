@@ -95,7 +95,7 @@ def _limit(u: Points, y: Vector, moved: Vector, critical: CriticalInterval) -> L
     """Return that the metric goes on beyond y (n,) where it was moved; away from M_c, half as far as it was moved."""
     tied = moved != y
     surely = np.where(critical.margin(y[tied]) > 0.0, _SURELY, 0.0)  # else steep edges are expected wherever nothing is known
-    return Limit(u[tied], y[tied] + surely * (moved - y)[tied], (moved < y)[tied]) if tied.any() else None
+    return Limit(u[tied], moved[tied], y[tied] + surely * (moved - y)[tied], (moved < y)[tied]) if tied.any() else None
 
 
 def _opened_inside(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
@@ -177,7 +177,8 @@ def on_side(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
             continue
         distance = cdist(u[rest], u[away])
         near, beside = distance.min(axis=1), there[rest][distance.argmin(axis=0)]
-        nearer_longer = -np.corrcoef(rankdata(near), rankdata(y[rest]))[0, 1] * np.sign(to)
+        with np.errstate(invalid="ignore", divide="ignore"):  # all may be equally near
+            nearer_longer = -np.corrcoef(rankdata(near), rankdata(y[rest]))[0, 1] * np.sign(to)
         if nearer_longer * math.sqrt(rest.sum() - 1) > _SURE and beside.mean() > there[rest].mean():
             one_end = CriticalInterval(high=other) if to > 0.0 else CriticalInterval(low=other)
             return within_scale(np.where(away, to, y), one_end)

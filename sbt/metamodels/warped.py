@@ -130,7 +130,7 @@ class WarpedPredictor:
 
     def beyond(self, limit: Limit) -> WarpedPredictor:
         """Return the same with a predictor that knows the limit, where it can."""
-        return replace(self, predictor=beyond(self.predictor, replace(limit, value=self.warp.values(limit.value))))
+        return replace(self, predictor=beyond(self.predictor, limit.moved(self.warp.values)))
 
     def sketch(self, rows: int) -> WarpedPredictor:
         """Return the same with the sketch of its predictor."""
