@@ -163,6 +163,12 @@ def test_a_metric_that_ends_deep_in_the_critical_region_goes_on(sign: float):
     assert scored(y, np.where(ended, sign * -2.0, y), critical).tolist() == np.where(ended, sign * -2.0, y).tolist()
 
 
+def test_repetitions_of_the_deepest_run_are_no_end_of_the_metric():
+    u = np.append(np.linspace(0, 1, 12), [0.0, 0.0])[:, None]
+    y = np.append(np.linspace(-1, 4, 12), [-1.0, -1.0])
+    assert opened(u, y, CriticalInterval(high=0.0), np.random.default_rng(0)).tolist() == y.tolist()
+
+
 @pytest.mark.parametrize(
     ("y", "critical"),
     [

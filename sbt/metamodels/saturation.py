@@ -101,8 +101,10 @@ def _limit(u: Points, y: Vector, moved: Vector, critical: CriticalInterval) -> L
 def _opened_inside(u: Points, y: Vector, critical: CriticalInterval, rng: np.random.Generator) -> Vector:
     """Return y with the last critical value moved on where the metric ends with it beyond the edge."""
     margin = critical.margin(y)
-    tied = _ends_inside(margin)
-    return _moved(u, y, tied, margin - margin.min(), critical, rng) if tied.any() else y
+    once = np.unique(np.column_stack([u, y]), axis=0, return_index=True)[1]  # a repetition may have the same value anywhere
+    if not _ends_inside(margin[once]).any():
+        return y
+    return _moved(u, y, margin == margin.min(), margin - margin.min(), critical, rng)
 
 
 def _ends_inside(margin: Vector) -> Mask:
