@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 import sbt
 from sbt.problem.requirement import CriticalInterval, within_scale, without_placeholders
 from sbt.problem.scenario import LogicalScenario
+from tests.measured_runs import Runs
 
 
 @pytest.mark.parametrize("critical", [CriticalInterval(high=2.0), CriticalInterval(low=9.0), CriticalInterval(-1.0, 1.0)])
@@ -31,9 +31,9 @@ def test_a_value_that_stands_for_none_is_an_infinity(sign: float):
     y = sign * np.array([0.4, 2.0, math.nan, 3.1, 999.0, 999.0])
     assert without_placeholders(y, critical)[4:].tolist() == [sign * math.inf] * 2
     need = sbt.Requirement("y", low=critical.low, high=critical.high)
-    found = need.values(Runs(y))
+    found = need.values(Runs(y=y))
     assert np.abs(found[4:]).max() < 4.0
-    assert need.told(Runs(y))[4] == 999.0 * sign, "it is told as it is"
+    assert need.told(Runs(y=y))[4] == 999.0 * sign, "it is told as it is"
     assert (critical.contains(found) == critical.contains(y)).all()
 
 
@@ -84,16 +84,6 @@ def _grid(values: dict[str, float], seed: int) -> dict[str, float]:
 
 def _jitter(values: dict[str, float], seed: int) -> dict[str, float]:
     return {"y": _grid(values, seed)["y"] + 0.3 * math.sin(seed)}
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Values of one metric."""
-
-    values: np.ndarray
-
-    def y(self, metric: str) -> np.ndarray:
-        return self.values
 
 
 GRID = [sbt.Parameter("k", 0, 3, kind="integer"), sbt.Parameter("m", 0, 4, kind="integer")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -15,6 +14,7 @@ from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.saturation import Opened, centred, opened, scored
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers.search import Search, fit_warped
+from tests.measured_runs import Runs
 
 CRITICAL = CriticalInterval(high=0.0)
 
@@ -72,9 +72,9 @@ def test_an_end_that_the_metric_ends_at_makes_no_difference(shape, two_ends, one
 
 def test_an_end_that_no_run_lies_beyond_does_not_rank_them_nor_hide_a_jump():
     """Of speeds of impact in [.1, 100] the fastest is the worst; what is learned is what [.1, null] gives."""
-    need, runs = sbt.Requirement("impact", 0.1, 100.0), Runs(np.array([0.0, 0.0, 7.0, 60.0, 90.0]))
+    need, runs = sbt.Requirement("impact", 0.1, 100.0), Runs(impact=np.array([0.0, 0.0, 7.0, 60.0, 90.0]))
     assert need.depths(runs).argsort()[:2].tolist() == [4, 3]
-    assert need.depths(Runs(np.array([0.0, 7.0, 60.0, 120.0]))).argsort()[0] == 2
+    assert need.depths(Runs(impact=np.array([0.0, 7.0, 60.0, 120.0]))).argsort()[0] == 2
     rng = np.random.default_rng(2)
     u, at = rng.random((60, 2)), rng.random((300, 2))
     y = 15.0 * np.sqrt(np.maximum(0.4 - np.linalg.norm(u - 0.5, axis=1), 0.0))
@@ -87,20 +87,10 @@ def test_an_end_that_no_run_lies_beyond_does_not_rank_them_nor_hide_a_jump():
 
 def test_an_end_that_the_metric_ends_at_does_not_rank_runs():
     """Of times to collision in [0, 1.5] the collision is the worst, not the run in the middle."""
-    need, runs = sbt.Requirement("ttc", 0.0, 1.5), Runs(np.array([0.7, 0.0, 0.0, 1.4, 3.0]))
+    need, runs = sbt.Requirement("ttc", 0.0, 1.5), Runs(ttc=np.array([0.7, 0.0, 0.0, 1.4, 3.0]))
     assert need.margins(runs).tolist() == pytest.approx([-0.7, 0.0, 0.0, -0.1, 1.5])
     assert need.depths(runs).tolist() == pytest.approx([-0.8, -1.5, -1.5, -0.1, 1.5])
     assert sbt.Requirement("ttc", 0.5, 1.5).depths(runs).tolist() == pytest.approx([-0.2, 0.5, 0.5, -0.1, 1.5])
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Values of one metric."""
-
-    values: np.ndarray
-
-    def y(self, metric: str) -> np.ndarray:
-        return self.values
 
 
 def test_of_a_metric_that_ends_its_values_are_scored():

@@ -19,20 +19,10 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import JointWarp
 from sbt.problem.combination import MARGIN, CombinedInterval, all_of, any_of, from_plain, to_plain
 from sbt.problem.requirement import CriticalInterval, Requirement
+from tests.measured_runs import Runs
 
 NEAR, FAST, BOTH_ENDS = Requirement("near", high=1.0), Requirement("fast", low=5.0), Requirement("mid", -1.0, 2.0, name="middle")
 NESTED = any_of(NEAR, all_of(FAST, BOTH_ENDS, name="inner"))
-
-
-class Runs:
-    """Runs by metric."""
-
-    def __init__(self, **metrics: list[float]):
-        self.metrics = {name: np.array(values) for name, values in metrics.items()}
-
-    def y(self, metric: str) -> np.ndarray:
-        """Return the values of a metric."""
-        return self.metrics[metric]
 
 
 def test_the_margin_says_what_is_critical_whatever_its_scale():

@@ -271,16 +271,17 @@ def fit_log_probability(
             for k, leaf in enumerate(critical.leaves)
         ]
         return JointLogProbability(critical, tuple(parts))
-    y = on_side(coordinates(z), y, critical)
+    u = coordinates(z)
+    y = on_side(u, y, critical)
     critical, least = as_passed(critical, y), noise[0] if noise else 0.0
     if earlier and math.sqrt(least) > _NOISE_COUNTS * earlier[0].warp.scale and len(y) >= _FEWEST_SCORED:
         coordinates = earlier[0].beside(coordinates)
+        u = coordinates(z)
     elif earlier:
         warp = earlier[0].warp
-        belief, edges = trended(metamodel, earlier[0], coordinates(z), z, warp.values(y), rng), warp.interval(critical)
+        belief, edges = trended(metamodel, earlier[0], u, z, warp.values(y), rng), warp.interval(critical)
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
-    u = coordinates(z)
     y, limit = opened_and_limit(u, y, critical, rng)
     better = _better_warp(metamodel, u, y, critical)
     warp = better or Warp.around_edge(y, critical, quantile=_QUANTILE)

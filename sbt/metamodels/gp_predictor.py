@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from sbt.metamodels.censored import Limit, observations
+from sbt.metamodels.censored import Limit
 from sbt.metamodels.extra_trees import ForestPredictor
 from sbt.metamodels.gp_algebra import (
     NOISE_FLOOR,
@@ -30,6 +30,7 @@ from sbt.metamodels.gp_algebra import (
     squared_columns,
     triangular,
 )
+from sbt.metamodels.gp_limits import observations
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.torch_tools import device_of, single_threaded
 from sbt.problem.arrays import Points, Vector
@@ -111,7 +112,6 @@ class GaussianProcessPredictor:
         n = len(self.u)
         if n <= 2 * rows:
             return self
-        z = self.centre + self.factor @ (self.factor.T @ self.alpha)
         kept = np.flatnonzero(np.arange(n) * _GOLDEN % 1.0 < rows / n)
         u = self.u[kept]
         noise = self.hyper.noise * (np.ones(len(u)) if self.spread is None else self.spread(u))
@@ -120,13 +120,12 @@ class GaussianProcessPredictor:
         with single_threaded():
             at = placed(u, device_of(self.device))
             factor = cholesky(self.hyper.covariance(at, at), np.maximum(noise, NOISE_FLOOR))
-            alpha = solve_right(factor, (z[kept] - self.centre)[:, None])[:, 0]
+            alpha = solve_right(factor, self._learned[kept][:, None])[:, 0]
         return replace(self, u=u, factor=host(factor), alpha=alpha, row_noise=row_noise)
 
     def beyond(self, limit: Limit) -> GaussianProcessPredictor:
         """Return the process conditioned on its other rows and the limit; itself where noise is uneven, or rows are many."""
-        with single_threaded():
-            z = self.factor @ (self.factor.T @ self.alpha)  # less the centre
+        z = self._learned.copy()
         which = limit.rows(self.u, self.shift + self.scale * (self.centre + z), _SAME * self.scale)
         tied = which >= 0
         if self.spread is not None or not 0 < tied.sum() <= _MOST_LIMITED or tied.all():
@@ -164,8 +163,7 @@ class GaussianProcessPredictor:
         mean, sigma, noise = np.empty(len(y)), np.empty(len(y)), np.empty(len(y))
         learned = y[own]
         if self.row_noise is not None:  # what stands for a row is not what was measured there
-            z = self.centre + self.factor @ (self.factor.T @ self.alpha)
-            learned = (self.shift + self.scale * z)[at[own]]
+            learned = (self.shift + self.scale * (self.centre + self._learned))[at[own]]
         mean[own] = learned - self.scale * (self.alpha * variance)[at[own]]
         if self.row_noise is not None:
             variance = np.maximum(variance - self.row_noise, 0.0) + self.hyper.noise
@@ -268,6 +266,12 @@ class GaussianProcessPredictor:
         scale, most = self.hyper.variance, 1.0 if self.spread is None else self.spread.largest
         usual = scale + self.hyper.noise * most
         return np.asarray(np.sqrt(usual / np.maximum(scale + self.row_noise, usual)), dtype=self._precision)
+
+    @cached_property
+    def _learned(self) -> Vector:
+        """(n,) what stands for the rows, standardised, less the centre."""
+        with single_threaded():
+            return np.asarray(self.factor @ (self.factor.T @ self.alpha))
 
     @cached_property
     def _total_weight(self) -> float:

@@ -278,7 +278,8 @@ class Opened:
             predictor = beyond(with_target(self.metamodel, critical).fit(u, learned, rng), limit)
         else:
             predictor = self.metamodel.fit(u, centred(u, y, critical), rng)
-        return predictor if as_reached(self.critical, y) == self.critical else Ending(predictor, *_ends(self.critical, y))
+        ends = _ends(self.critical, y)
+        return predictor if np.isinf(ends).all() else Ending(predictor, *ends)
 
 
 def _ends(critical: CriticalInterval, y: Vector) -> tuple[float, float]:

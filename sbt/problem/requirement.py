@@ -17,6 +17,8 @@ __all__ = ["CriticalInterval", "Measured", "Requirement", "as_passed", "as_reach
 
 
 _BEYOND = 0.1  # of the range of finite values: far enough to be told from them, near enough to leave them their scale
+_PLACEHOLDERS, _OTHERS = 2, 3
+"""Fewest runs with the value that stands for none, and fewest different values beside it."""
 
 
 class Measured(Protocol):
@@ -25,8 +27,6 @@ class Measured(Protocol):
     def y(self, metric: str) -> Vector:
         """Return (n,) values of a metric, NaN where a run has none."""
         ...
-_PLACEHOLDERS, _OTHERS = 2, 3
-"""Fewest runs with the value that stands for none, and fewest different values beside it."""
 
 
 @dataclass(frozen=True)
