@@ -69,6 +69,8 @@ def test_times_to_collision_are_learned_whatever_stands_for_none(none: float, ki
         assert result.conclusion.probability == pytest.approx(inside.mean(), rel=0.1)
         return
     assert result.conclusion.critical_fraction == pytest.approx(inside.mean(), rel=0.06)
+    held_out = result.history.held_out
+    assert result.conclusion.validation.n_critical == (held_out.y("ttc") <= 1.5).sum() - (held_out.y("ttc") < 0.0).sum()
     said = result.predict(dict(zip("abc", at[:3000].T, strict=True)))["p_critical"].to_numpy() > 0.5
     assert (said == inside[:3000]).mean() > 0.98
 

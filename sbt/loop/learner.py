@@ -182,7 +182,8 @@ class Learner:
         """Return the scores of a prediction of runs; of a combination (n, q) those of its margin."""
         if not isinstance(predictor, JointPredictor):
             critical = self.scenario.requirement.critical
-            return scores(unseen, scored(y, unseen.mu, critical) if self.target_aware else y, critical)
+            told = scored(y, unseen.mu, critical) if self.target_aware else y
+            return scores(unseen, told, critical, critical.contains(y))
         margin = predictor.critical.margin(y)
         known = np.isfinite(margin)
         return scores(unseen.take(known), margin[known], MARGIN)

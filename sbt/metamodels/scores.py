@@ -20,7 +20,9 @@ __all__ = ["precision_recall", "reliability", "scores"]
 _BINS = 15  # of the calibration, as in Guo et al. (2017), On calibration of modern neural networks
 
 
-def scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> dict[str, float | int | None]:
+def scores(
+    prediction: Prediction, y: Vector, critical: CriticalInterval, inside: Mask | None = None
+) -> dict[str, float | int | None]:
     """Return every score of a prediction at n points against the values y (n,) observed there.
 
     Keys, in the unit of y where they have one:
@@ -39,6 +41,12 @@ def scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> dic
 
     A value is None where it is undefined: nothing observed, or no critical run for those that need one.
 
+    Args:
+        prediction: of n points.
+        y: (n,) observed there.
+        critical: M_c.
+        inside: (n,) which runs were critical; None: where y is in M_c.
+
     Raises:
         InputError: y is not (n,) or not finite.
 
@@ -49,7 +57,7 @@ def scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> dic
     if not np.isfinite(observed).all():
         raise InputError("scores need finite y, but got NaN or infinity")
     with np.errstate(over="ignore"):  # squares of enormous errors: -inf, which becomes None
-        return _scores(prediction, observed, critical)
+        return _scores(prediction, observed, critical, critical.contains(observed) if inside is None else inside)
 
 
 def precision_recall(p: Vector, critical: Mask) -> tuple[Vector, Vector, Vector]:
@@ -105,9 +113,9 @@ def reliability(p: Vector, critical: Mask, bins: int = _BINS) -> tuple[Vector, V
     return mean_p, frequency, count
 
 
-def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval) -> dict[str, float | int | None]:
+def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval, mask: Mask) -> dict[str, float | int | None]:
     gaussian, mixture = prediction.log_density_gaussian(y), prediction.log_density(y)
-    mask, error, level = critical.contains(y), prediction.mu - y, prediction.cdf(y)
+    error, level = prediction.mu - y, prediction.cdf(y)
     log_p, log_not = prediction.log_probability(critical)
     log_likelihood = _mean(gaussian)
     result = {
