@@ -75,6 +75,18 @@ def test_times_to_collision_are_learned_whatever_stands_for_none(none: float, ki
     assert (said == inside[:3000]).mean() > 0.98
 
 
+def test_where_no_run_was_critical_a_value_that_stands_for_none_makes_none_likely(tmp_path: Path):
+    """10 s, or none: beside the jump a process went below 1.5, and said so with P = .95."""
+    scenario = LogicalScenario(
+        "never", [sbt.Parameter(name, 0.0, 1.0) for name in "ab"], sbt.Requirement("ttc", high=1.5),
+        evaluate=lambda values, _: {"ttc": 999.0 if values["a"] < 0.5 else 10.0},
+    )  # fmt: skip
+    result = campaign(tmp_path, scenario, "boundary", 60)
+    assert result.conclusion.critical_fraction < 0.005
+    at = np.random.default_rng(0).random((3000, 2))
+    assert result.predict(dict(zip("ab", at.T, strict=True)))["p_critical"].max() < 0.1
+
+
 def _hole(values: dict[str, float], seed: int) -> dict[str, float]:
     a, b = values["a"], values["b"]
     return {"y": math.inf if a < 0.3 else (a - 0.6) ** 2 + (b - 0.5) ** 2 - 0.03}

@@ -123,7 +123,7 @@ def without_placeholders(y: Vector, critical: CriticalInterval) -> Vector:
     """Return metrics in which the value that stands for none is infinite, such as a time to collision of 999 s where none comes.
 
     It is the largest or the smallest one of two runs or more, farther from all other values and the ends of M_c than these are
-    from each other; three others must differ.
+    from each other; three others must differ, or all be on its side of M_c: a flag has two values.
 
     >>> without_placeholders(np.array([0.4, 2.0, 3.1, 999.0, 999.0]), CriticalInterval(high=1.5)).tolist()
     [0.4, 2.0, 3.1, inf, inf]
@@ -132,7 +132,8 @@ def without_placeholders(y: Vector, critical: CriticalInterval) -> Vector:
         known = sign * y[np.isfinite(y)]
         last = known.max(initial=-np.inf)
         others, ends = known[known < last], sign * np.array([end for end in (critical.low, critical.high) if math.isfinite(end)])
-        if len(known) - len(others) < _PLACEHOLDERS or len(np.unique(others)) < _OTHERS:
+        few = len(np.unique(others)) < _OTHERS and not (len(others) and others.min() > ends.max())
+        if len(known) - len(others) < _PLACEHOLDERS or few:
             continue
         scale = np.concatenate([others, ends])
         if last - scale.max() > np.ptp(scale):
