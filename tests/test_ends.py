@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import sbt
+from sbt.metamodels.saturation import on_side
 from sbt.problem.requirement import CriticalInterval, within_scale, without_placeholders
 from sbt.problem.scenario import LogicalScenario
 from tests.measured_runs import Runs
@@ -73,6 +74,33 @@ def test_times_to_collision_are_learned_whatever_stands_for_none(none: float, ki
     assert result.conclusion.validation.n_critical == (held_out.y("ttc") <= 1.5).sum() - (held_out.y("ttc") < 0.0).sum()
     said = result.predict(dict(zip("abc", at[:3000].T, strict=True)))["p_critical"].to_numpy() > 0.5
     assert (said == inside[:3000]).mean() > 0.98
+
+
+def lane(x: np.ndarray) -> np.ndarray:
+    """A time of 0 in collisions, -1 wherever another lane is taken: next to any time."""
+    return np.where(x[:, 0] > 0.75, -1.0, np.maximum(8.0 * x[:, 1] / (0.2 + x[:, 2]) - 2.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("low", "metric", "least", "most"),
+    [
+        (0.0, lane, 6, 6),
+        (0.1, lane, 4, 6),  # collisions are uncritical, too
+        (0.1, lambda x: 15.0 * np.sqrt(np.maximum(0.6 - x.sum(axis=1) / 2.0, 0.0)), 0, 0),  # a speed of impact
+        (1e-3, lambda x: np.maximum(5.0 * (x.sum(axis=1) - 1.2), 0.0), 0, 0),  # a distance
+    ],
+)
+def test_a_value_that_stands_for_none_is_told_from_one_that_is_in_its_place(low, metric, least, most):
+    moved = 0
+    for seed in range(6):
+        u = np.random.default_rng(seed).random((100, 3))
+        y, critical = metric(u), CriticalInterval(low, 1.5)
+        found = on_side(u, y, critical)
+        moved += found is not y
+        assert (critical.contains(found) == critical.contains(y)).all()
+        assert (found[y != y.min()] == y[y != y.min()]).all()
+        assert found is y or (found[y == y.min()] > 1.5).all()
+    assert least <= moved <= most
 
 
 def test_where_no_run_was_critical_a_value_that_stands_for_none_makes_none_likely(tmp_path: Path):

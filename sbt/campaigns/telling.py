@@ -146,10 +146,10 @@ def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) ->
         return "test it: validation.reference: 300 scores the metamodel on 300 more runs drawn at random"
     scores, unsure = found.validation, found.ambiguous_volume or 0.0
     if scores is not None and scores.n_critical < 10:
-        return (
-            "a larger budget, or validation.reference: 300, since held-out runs with so few critical ones among them"
-            f" ({scores.n_critical} of {scores.n}) cannot tell whether a critical region is missing"
-        )
+        few = f"held-out runs with so few critical ones among them ({scores.n_critical} of {scores.n})"
+        if 2 * scores.n_critical > scores.n:
+            few = f"so few held-out runs ({scores.n}, {scores.n_critical} of them critical)"
+        return f"a larger budget, or validation.reference: 300, since {few} cannot tell whether a critical region is missing"
     if found.place is None:
         return "campaign: falsification searches for the rare critical run"
     return (

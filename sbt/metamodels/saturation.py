@@ -40,9 +40,9 @@ _ENOUGH, _MOST = 8, 400
 """Uncritical runs from which on a process is asked, and that it learns from at most: those nearest to the edge."""
 _USUAL = 0.9
 """Quantile of the margins that asinh begins to bend at."""
-_FEWEST_OTHERS, _SURE = 3, 1.0
-"""Fewest different values on the other side of M_c than the one that stands for none; standard errors of the rank correlation
-that tells its side."""
+_FEWEST_OTHERS, _SURE = 3, 2.0
+"""Fewest different values on the other side of M_c than the one that stands for none; standard errors from which on values that
+grow with the distance from it tell that it is in its place."""
 _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 """Ends of a depth, in asinh(margin / usual margin)."""
 
@@ -155,10 +155,11 @@ def _moved(
 
 
 def on_side(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
-    """Return y with a value that stands for none on the side of M_c on which its neighbours are.
+    """Return y with a value that stands for none on the other side of M_c where runs are predicted better so.
 
-    Of a time to collision in [0, 1.5] s, which is -1 where none comes, times are longer, not shorter, nearer to runs without one,
-    and most of those have one above 1.5 s next to them.
+    A time to collision in [0, 1.5] s is -1 where none comes: as a number it lies next to the collisions, but those runs are next
+    to long times, or to anything. A speed of impact of 0, of which [1, 5] is critical, is where it belongs: speeds grow with the
+    distance from such runs.
 
     Args:
         u: (n, d) metamodel inputs.
@@ -171,20 +172,39 @@ def on_side(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
     """
     if critical.one_sided:
         return y
+    for last, there, to in ((y.min(), y > critical.high, np.inf), (y.max(), y < critical.low, -np.inf)):
+        away = (y == last) & ~critical.contains(y)
+        if away.sum() < _FEWEST or (away & there).any() or len(np.unique(y[there])) < _FEWEST_OTHERS:
+            continue
+        if np.sign(to) * _rises_from(u, y, away) > _SURE:
+            continue
+        moved = within_scale(np.where(away, to, y), critical)
+        if _sides_told(u, moved, critical) > _sides_told(u, y, critical):
+            return moved
+    return y
+
+
+def _rises_from(u: Points, y: Vector, away: Mask) -> float:
+    """Return how surely y (n,) grows with the distance from some runs: standard errors of the rank correlation."""
     from scipy.stats import rankdata
 
-    for away, other, to in ((y < critical.low, critical.high, np.inf), (y > critical.high, critical.low, -np.inf)):
-        rest, there = ~away, y > critical.high if to > 0.0 else y < critical.low
-        if away.sum() < _FEWEST or np.ptp(y[away]) > 0.0 or len(np.unique(y[there])) < _FEWEST_OTHERS:
-            continue
-        distance = cdist(u[rest], u[away])
-        near, beside = distance.min(axis=1), there[rest][distance.argmin(axis=0)]
-        with np.errstate(invalid="ignore", divide="ignore"):  # all may be equally near
-            nearer_longer = -np.corrcoef(rankdata(near), rankdata(y[rest]))[0, 1] * np.sign(to)
-        if nearer_longer * math.sqrt(rest.sum() - 1) > _SURE and beside.mean() > there[rest].mean():
-            one_end = CriticalInterval(high=other) if to > 0.0 else CriticalInterval(low=other)
-            return within_scale(np.where(away, to, y), one_end)
-    return y
+    rest = ~away
+    ranks = rankdata(cdist(u[rest], u[away]).min(axis=1)), rankdata(y[rest])
+    constant = any(np.ptp(each) == 0.0 for each in ranks)
+    return 0.0 if constant else float(np.corrcoef(*ranks)[0, 1]) * math.sqrt(rest.sum() - 1)
+
+
+def _sides_told(u: Points, y: Vector, critical: CriticalInterval) -> float:
+    """Return the mean log P(the side of M_c that a run fell on), as a process says that learned all others."""
+    from sbt.metamodels.gaussian_process import GaussianProcess
+    from sbt.metamodels.stepped import side_score
+
+    rng = np.random.Generator(np.random.PCG64(1))  # the same rows both times
+    rows = np.sort(rng.permutation(len(y))[:_MOST])
+    u = u[rows]
+    y = opened(u, y[rows], as_passed(critical, y), rng)
+    process = GaussianProcess(nu=2.5, input_noise=False, kernels=1).fit(u, y, rng)
+    return float(side_score(process.leave_one_out(u, y), y, critical).mean())
 
 
 def centred(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
