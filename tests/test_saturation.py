@@ -153,6 +153,17 @@ def test_a_metric_that_ends_deep_in_the_critical_region_goes_on(sign: float):
     assert scored(y, np.where(ended, sign * -2.0, y), critical).tolist() == np.where(ended, sign * -2.0, y).tolist()
 
 
+@pytest.mark.parametrize("low", [0.0, -0.5, -5.0])
+def test_what_goes_on_is_critical_however_far_an_end_is_that_no_run_lies_beyond(low: float):
+    """Times of 0 in collisions, in [-0.5, 1]: what is learned of them lies below -0.5, and is no less critical."""
+    rng = np.random.default_rng(4)
+    u, at = rng.random((80, 2)), rng.random((2000, 2))
+    critical = CriticalInterval(low, 1.0)
+    y = np.maximum(3.0 * (u[:, 0] - 0.4), 0.0)
+    p = Opened(GaussianProcess(nu=2.5, input_noise=False), critical).fit(u, y, rng)(at).probability(critical)
+    assert ((p > 0.5) == (3.0 * (at[:, 0] - 0.4) <= 1.0)).mean() > 0.99
+
+
 def test_repetitions_of_the_deepest_run_are_no_end_of_the_metric():
     u = np.append(np.linspace(0, 1, 12), [0.0, 0.0])[:, None]
     y = np.append(np.linspace(-1, 4, 12), [-1.0, -1.0])

@@ -18,6 +18,7 @@ from scipy.special import log_ndtr
 from sbt.metamodels.base import Metamodel, Predictor, is_rate, sample_paths, sketched, with_target
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval, as_passed, as_reached, within_scale
 
@@ -40,9 +41,9 @@ _ENOUGH, _MOST = 8, 400
 """Uncritical runs from which on a process is asked, and that it learns from at most: those nearest to the edge."""
 _USUAL = 0.9
 """Quantile of the margins that asinh begins to bend at."""
-_FEWEST_OTHERS, _SURE = 3, 2.0
-"""Fewest different values on the other side of M_c than the one that stands for none; standard errors from which on values that
-grow with the distance from it tell that it is in its place."""
+_FEWEST_OTHERS, _RANKS = 3, 2.0
+"""Fewest different values on the other side of M_c than the one that stands for none; log likelihoods of left-out runs that the
+square of a standard error counts (both add up over runs that tell the same)."""
 _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 """Ends of a depth, in asinh(margin / usual margin)."""
 
@@ -159,7 +160,7 @@ def on_side(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
 
     A time to collision in [0, 1.5] s is -1 where none comes: as a number it lies next to the collisions, but those runs are next
     to long times, or to anything. A speed of impact of 0, of which [1, 5] is critical, is where it belongs: speeds grow with the
-    distance from such runs.
+    distance from such runs. Both count: how the sides of left-out runs are predicted, and how surely the values grow.
 
     Args:
         u: (n, d) metamodel inputs.
@@ -176,10 +177,8 @@ def on_side(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
         away = (y == last) & ~critical.contains(y)
         if away.sum() < _FEWEST or (away & there).any() or len(np.unique(y[there])) < _FEWEST_OTHERS:
             continue
-        if np.sign(to) * _rises_from(u, y, away) > _SURE:
-            continue
-        moved = within_scale(np.where(away, to, y), critical)
-        if _sides_told(u, moved, critical) > _sides_told(u, y, critical):
+        moved, z = within_scale(np.where(away, to, y), critical), np.sign(to) * _rises_from(u, y, away)
+        if _sides_told(u, moved, critical) - _sides_told(u, y, critical) > _RANKS * z * abs(z):
             return moved
     return y
 
@@ -195,16 +194,19 @@ def _rises_from(u: Points, y: Vector, away: Mask) -> float:
 
 
 def _sides_told(u: Points, y: Vector, critical: CriticalInterval) -> float:
-    """Return the mean log P(the side of M_c that a run fell on), as a process says that learned all others."""
+    """Return the sum of log P(the side of M_c that a run fell on), each as a process says that learned all others."""
     from sbt.metamodels.gaussian_process import GaussianProcess
     from sbt.metamodels.stepped import side_score
 
     rng = np.random.Generator(np.random.PCG64(1))  # the same rows both times
     rows = np.sort(rng.permutation(len(y))[:_MOST])
-    u = u[rows]
-    y = opened(u, y[rows], as_passed(critical, y), rng)
+    critical, u = as_passed(critical, y), u[rows]
+    y = opened(u, y[rows], critical, rng)
+    if critical.one_sided:
+        warp = Warp.around_edge(y, critical)
+        y, critical = warp.values(y), warp.interval(critical)
     process = GaussianProcess(nu=2.5, input_noise=False, kernels=1).fit(u, y, rng)
-    return float(side_score(process.leave_one_out(u, y), y, critical).mean())
+    return float(side_score(process.leave_one_out(u, y), y, critical).sum())
 
 
 def centred(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
@@ -294,12 +296,15 @@ class Opened:
         y = on_side(u, y, self.critical)
         critical = as_passed(self.critical, y)
         if self.beyond:
-            learned, limit = opened_and_limit(u, y, critical, rng)
-            predictor = beyond(with_target(self.metamodel, critical).fit(u, learned, rng), limit)
+            metamodel, (learned, limit) = with_target(self.metamodel, critical), opened_and_limit(u, y, critical, rng)
         else:
-            predictor = self.metamodel.fit(u, centred(u, y, critical), rng)
-        ends = _ends(self.critical, y)
-        return predictor if np.isinf(ends).all() else Ending(predictor, *ends)
+            metamodel, learned, limit = self.metamodel, centred(u, y, critical), None
+        predictor = beyond(metamodel.fit(u, learned, rng), limit)
+        lowest, highest = _ends(self.critical, y)
+        if critical != self.critical:  # what goes on beyond the last value is not beyond an end of M_c that no run lies beyond
+            lowest = y.min() if critical.low < self.critical.low and learned.min() < y.min() else lowest
+            highest = y.max() if critical.high > self.critical.high and learned.max() > y.max() else highest
+        return predictor if np.isinf([lowest, highest]).all() else Ending(predictor, lowest, highest)
 
 
 def _ends(critical: CriticalInterval, y: Vector) -> tuple[float, float]:
