@@ -155,3 +155,22 @@ def test_few_combinations_are_run_once_each_unless_the_simulator_is_noisy(kind: 
     assert len(searched) == len(np.unique(searched.x, axis=0)) == 20
     noisy = campaign(tmp_path / "b", LogicalScenario("jitter", GRID, need, evaluate=_jitter), kind, 30).history
     assert len(noisy) >= 30
+
+
+def test_runs_are_told_by_what_they_gave(tmp_path: Path):
+    """The nearest safe run of a failure has a time of inf: the number that was learned in its place was told."""
+
+    def evaluate(values: dict[str, float], seed: int) -> dict[str, float]:
+        return {"ttc": 3.0 * values["a"] + values["b"] if values["a"] < 0.3 else math.inf}
+
+    box = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
+    for high, found in ((1.2, True), (-1.0, False)):
+        scenario = LogicalScenario("inf", box, sbt.Requirement("ttc", high=high), evaluate=evaluate)
+        result = campaign(tmp_path / str(found), scenario, "falsification", 60)
+        told = result.conclusion
+        points = [point for mode in told.failure_modes for point in (mode, mode.nearest_safe)] if found else [told.closest]
+        rows = {int(index): y for index, y in zip(result.history.index, result.history.y("ttc"), strict=True)}
+        for point in points:
+            y = rows[getattr(point, "run", getattr(point, "representative", None))]
+            assert point.metric == (y if math.isfinite(y) else None)
+        assert not found or any(mode.nearest_safe.metric is None for mode in told.failure_modes)

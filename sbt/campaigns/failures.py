@@ -85,7 +85,7 @@ class ClosestRun:
 
     run: int
     inputs: Mapping[str, Value]
-    metric: float
+    metric: float | None
     margin: float
 
 

@@ -53,11 +53,11 @@ class Mode:
 
 @dataclass(frozen=True)
 class RunPoint:
-    """A run, its inputs and its metric."""
+    """A run, its inputs and its metric; None: it is infinite."""
 
     run: int
     inputs: Mapping[str, Value]
-    metric: float
+    metric: float | None
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class NearestSafe:
 
     run: int
     inputs: Mapping[str, Value]
-    metric: float
+    metric: float | None
     change: Mapping[str, Value]
 
 
@@ -101,7 +101,7 @@ class FailureMode:
 
     Attributes:
         representative: index of its run deepest in the critical interval, or most likely to fail again (see `Mode`).
-        inputs, metric: of the representative.
+        inputs, metric: of the representative; a metric of None is infinite.
         size: critical runs in it, of the search and between its runs.
         conflict: how ego and the nearest other met; None where it is not measured.
         runs: their indices.
@@ -118,7 +118,7 @@ class FailureMode:
 
     representative: int
     inputs: Mapping[str, Value]
-    metric: float
+    metric: float | None
     size: int
     conflict: str | None
     runs: tuple[int, ...]

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from sbt.campaigns.wording import number, percent, plural
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Json
-from sbt.problem.requirement import Requirement
+from sbt.problem.requirement import Requirement, within_scale
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import PlannedRun
@@ -103,16 +103,20 @@ def simulator_noise(history: History, requirement: Requirement) -> SimulatorNois
     if repeats == 0:
         return SimulatorNoise(0, None, None)
     noisy = any(_differs(runs.y(name), group) for name in runs.metrics)
-    y = np.nan_to_num(requirement.told(runs), posinf=np.nan, neginf=np.nan)
+    y = requirement.told(runs)
     inputs = int((size > 1).sum())
     if not _differs(y, group):
         return SimulatorNoise(repeats, noisy, 0.0, inputs=inputs)
-    finite = np.isfinite(y)
-    count = np.bincount(group[finite], minlength=len(size))
-    mean = np.bincount(group[finite], y[finite], len(size)) / np.maximum(count, 1)
-    squares = float(((y[finite] - mean[group[finite]]) ** 2).sum())
-    std = float(np.sqrt(squares / max(int((count - 1).clip(0).sum()), 1)))
+    std = _pooled(y, group) or _pooled(within_scale(y, requirement.critical), group)  # at times infinite, at times not
     return SimulatorNoise(repeats, noisy, std, inputs=inputs)
+
+
+def _pooled(y: Vector, group: NDArray[np.intp]) -> float:
+    """Return the standard deviation within groups of the finite values among y (n,)."""
+    y, group = y[np.isfinite(y)], group[np.isfinite(y)]
+    count = np.bincount(group, minlength=1)
+    mean = np.bincount(group, y, len(count)) / np.maximum(count, 1)
+    return float(np.sqrt(((y - mean[group]) ** 2).sum() / max(int((count - 1).clip(0).sum()), 1)))
 
 
 def stated_noise(history: History, scenario: LogicalScenario) -> SimulatorNoise | None:

@@ -216,7 +216,7 @@ class Requirement:
 
     def told(self, runs: Measured) -> Vector:
         """Return (n,) the one number that a run is told by: the metric, of a combination its margin; NaN where there is none."""
-        return within_scale(runs.y(self.metric), self.critical)
+        return runs.y(self.metric)
 
     @property
     def told_as(self) -> str:

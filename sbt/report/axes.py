@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sbt.problem.arrays import Vector
-from sbt.problem.requirement import CriticalInterval
+from sbt.problem.requirement import CriticalInterval, Measured, Requirement, within_scale
 from sbt.report.style import CRITICAL, REGION
 
 if TYPE_CHECKING:
@@ -36,6 +36,11 @@ def reach(y: Vector, critical: CriticalInterval, middle: float = 1.0) -> tuple[f
     low, high = min(low, nearest), max(high, nearest)
     gap = 0.05 * (high - low) if high > low else 0.5
     return low - gap, high + gap
+
+
+def drawn(requirement: Requirement, runs: Measured) -> Vector:
+    """Return (n,) the numbers that runs are drawn at: what they are told by, infinities at the ends of the scale."""
+    return within_scale(requirement.told(runs), requirement.critical)
 
 
 def padded(low: float, high: float) -> tuple[float, float]:

@@ -13,7 +13,7 @@ import numpy as np
 from sbt.estimators.binomial import interval
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.requirement import Requirement
-from sbt.report.axes import reach, shade
+from sbt.report.axes import drawn, reach, shade
 from sbt.report.style import CRITICAL, MODEL, UNCRITICAL, label
 from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord
@@ -133,7 +133,7 @@ def plot_metric_histogram(history: History, requirement: Requirement, ax: Axes, 
     The middle 99 % of the values and the ends of the critical interval set the range; the outermost
     bins hold what lies beyond.
     """
-    y = requirement.told(history)
+    y = drawn(requirement, history)
     held = y[history.ok & (history.stage == VALIDATION)]
     chosen = y[history.ok & (history.stage != VALIDATION)]
     chosen, held = chosen[np.isfinite(chosen)], held[np.isfinite(held)]

@@ -16,7 +16,7 @@ from sbt.problem.arrays import Mask, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
-from sbt.report.axes import padded, reach, shade
+from sbt.report.axes import drawn, padded, reach, shade
 from sbt.report.projection import Plane
 from sbt.report.style import CRITICAL, FAILED, HELD_OUT, MODEL, UNCRITICAL, label
 from sbt.store.history import VALIDATION, History
@@ -72,7 +72,7 @@ def plot_metric(
     column: int = 0,
 ) -> Axes:
     """Scatter the safety metric over one input, the critical interval shaded; failed runs on the floor."""
-    parameter, y = space.parameters[column], requirement.told(history)
+    parameter, y = space.parameters[column], drawn(requirement, history)
     known = np.isfinite(y)
     floor, top = reach(y[known], requirement.critical)
     shade(requirement.critical, (floor, top), ax, along="y")

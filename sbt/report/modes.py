@@ -13,6 +13,7 @@ from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, number, percent, written_unit
 from sbt.problem.arrays import Vector
 from sbt.problem.space import ParameterSpace
+from sbt.report.axes import drawn
 from sbt.report.figures import whole_ticks
 from sbt.report.style import label, new_figure, to_svg
 from sbt.report.tables import Cell, Table
@@ -83,7 +84,8 @@ def _change(mode: FailureMode, space: ParameterSpace) -> str:
         for name, change in ranked
     )
     rest = len(safe.change) - len(ranked)
-    return f"{changes or 'another seed'}{f' and {rest} more' if rest > 0 else ''}: {number(safe.metric)} (run {safe.run})"
+    gave = "infinite" if safe.metric is None else number(safe.metric)
+    return f"{changes or 'another seed'}{f' and {rest} more' if rest > 0 else ''}: {gave} (run {safe.run})"
 
 
 def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) -> Iterator[tuple[str, str]]:
@@ -94,7 +96,7 @@ def drawing_of_modes(found: Findings, space: ParameterSpace, weights: Vector) ->
     modes = _modes(found)
     if not modes:
         return
-    history, y = found.history, found.requirement.told(found.history)
+    history, y = found.history, drawn(found.requirement, found.history)
     order = np.argsort(-weights, kind="stable")[:2]
     across = int(min(order))
     up = int(max(order)) if space.dimension > 1 else None
