@@ -135,6 +135,11 @@ class Seen:
         """Return the exact upper limit of the probability of being critical by these draws alone, failed ones as critical."""
         return self.most(self.hits + self.failed, confidence)
 
+    @property
+    def limits(self) -> Limits:
+        """The exact limits of that probability by these draws alone, failed ones as safe below and as critical above."""
+        return Limits(lambda confidence: 1.0 - self.most(self.draws - self.hits, confidence), self.most_critical)
+
 
 def _known(requirement: Requirement, history: History) -> int:
     """Return the number of different inputs of critical runs, of the requirement that is known by fewest where any is enough."""
@@ -153,6 +158,6 @@ def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool)
         high: as critical.
         unstated: runs failed, and no belief states where: the upper limit reaches the exact bound too.
     """
-    lower = (lambda c: min(limits.lower(c), 1.0 - seen.most(seen.draws - seen.hits, c))) if low >= 1.0 else limits.lower
+    lower = (lambda c: min(limits.lower(c), seen.limits.lower(c))) if low >= 1.0 else limits.lower
     found = Limits(lower, limits.upper)
     return found.reaching(seen.most_critical) if high <= 0.0 or unstated else found

@@ -16,10 +16,10 @@ from sbt.campaigns.levels import LevelsTold, is_two_level, left_two_levels, leve
 from sbt.campaigns.likeness import EarlierTold, earlier_told
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
 from sbt.campaigns.pairing import PairStage, pairs_of, pairs_words
+from sbt.campaigns.precision import cautions
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
-from sbt.campaigns.stopping import FEWEST_BATCHES
 from sbt.campaigns.summing import SummingStage, summed, sums, took_sum
 from sbt.campaigns.telling import tell_estimation
 from sbt.campaigns.two_level import TwoLevelStage
@@ -37,7 +37,6 @@ __all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "conclude_sum",
 
 _HIGH_DIMENSION = 20  # inputs from which on the metamodels learn less than the chains of subset simulation find
 _CONFIDENCE = 0.95
-_HEAVY = 0.25  # share of the weight that one draw may carry before the reader is warned
 _NOTHING = "no draw that counts was critical: the probability is only bounded from above, by draws from the inputs' distribution"
 
 
@@ -245,7 +244,7 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), missed(c)))
         warnings.append("no counted draw was critical: only an upper bound is given")
     elif misses == 0:
-        missed = (lambda c: 1.0 - seen.most(seen.draws - seen.hits, c)) if few_low else limits.lower
+        missed = seen.limits.lower if few_low else limits.lower
         limits = Limits(lambda c: min(low.limit(c, side=-1), missed(c)), lambda _: 1.0)
         warnings.append("no counted draw was safe: only a lower bound is given")
     elif seen.known < FEW_KNOWN:
@@ -257,16 +256,11 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
     elif min(hits, misses) < FEW_HITS:
         few, what = (hits, "critical") if hits < FEW_HITS else (misses, "safe")
         met = f"{few} counted draw{' was' if few == 1 else 's were'} {what}"
-        warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
-    if len(safe) < FEWEST_BATCHES:
-        counts = "1 batch counts" if len(safe) == 1 else f"{len(safe)} batches count"
-        warnings.append(f"only {counts}, fewer than {FEWEST_BATCHES}: their spread says little")
-    if low.largest_term > _HEAVY * value > 0.0:
-        warnings.append(f"one draw moves the estimate by {low.largest_term / value:.0%}")
-    if seen.surprises:
-        warnings.append(
-            f"{plural(seen.surprises, 'draw')} from the inputs' distribution met a critical region that the metamodel had denied"
-        )
+        draws = f"{plural(seen.draws, 'draw')} from the inputs' distribution"
+        warnings.append(f"only {met}, fewer than {FEW_HITS}: so small a number, or {draws}, set the interval")
+    if few_low or few_high:
+        limits = limits.within(seen.limits, value, max(_clipped(high.value), value))
+    warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
     return _conclusion(
         value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,
         effective_sample_size=low.effective_sample_size,

@@ -24,6 +24,13 @@ class Limits:
         """Return limits of which the upper one is at least this one."""
         return Limits(self.lower, lambda confidence: max(self.upper(confidence), upper(confidence)))
 
+    def within(self, others: Limits, low: float, high: float) -> Limits:
+        """Return the nearer ones of these limits and of others with half of their error, none beyond the estimates."""
+        return Limits(
+            lambda confidence: max(self.lower(confidence), min(others.lower(0.5 * (1.0 + confidence)), low)),
+            lambda confidence: min(self.upper(confidence), max(others.upper(0.5 * (1.0 + confidence)), high)),
+        )
+
 
 @dataclass(frozen=True)
 class GateVerdict:

@@ -1,22 +1,25 @@
-"""How many more runs an estimate needs, and whether as many random draws would tell more."""
+"""What limits an estimate, how many more runs it needs, and whether as many random draws would tell more."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
+from sbt.campaigns.stopping import FEWEST_BATCHES
+from sbt.campaigns.wording import plural
 from sbt.estimators import binomial
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 
 if TYPE_CHECKING:
     from sbt.campaigns.estimation import EstimationConclusion
 
-__all__ = ["NO_BETTER", "PRECISE", "as_many_draws", "rounded", "runs_for_precision", "too_wide"]
+__all__ = ["NO_BETTER", "PRECISE", "as_many_draws", "cautions", "rounded", "runs_for_precision", "too_wide"]
 
 PRECISE = 0.1
 """Coefficient of variation that is asked for by default."""
 NO_BETTER = 1.5
 """Factor by which an interval is wider than by as many random draws, from which on that is said."""
+_HEAVY = 0.25  # of the estimate: what one draw may move it by before the reader is warned
 _FAR = 100.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
 
 
@@ -55,3 +58,17 @@ def rounded(value: float) -> int:
         return max(math.ceil(value), 1)
     unit = 10 ** (math.floor(math.log10(value)) - 1)
     return math.ceil(value / unit) * unit
+
+
+def cautions(batches: int, largest_term: float, value: float, surprises: int) -> list[str]:
+    """Return what makes an estimate, and its interval, less certain than they say."""
+    said = []
+    if batches < FEWEST_BATCHES:
+        counts = "1 batch counts" if batches == 1 else f"{batches} batches count"
+        said.append(f"only {counts}, fewer than {FEWEST_BATCHES}: their spread says little")
+    if largest_term > _HEAVY * value > 0.0:
+        said.append(f"one draw moves the estimate by {largest_term / value:.0%}")
+    if surprises:
+        draws = plural(surprises, "draw")
+        said.append(f"{draws} from the inputs' distribution met a critical region that the metamodel had denied")
+    return said
