@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.special import ndtr, rel_entr
 
 import sbt
 from sbt.problem.arrays import Mask, Points, Vector
@@ -107,6 +108,11 @@ def impact(d: Vector, x: Points) -> Vector:
     return 15.0 * np.sqrt(np.maximum(-d, 0.0))
 
 
+def parted(d: Vector, x: Points) -> Vector:
+    """A margin of which a collision takes 3 more."""
+    return np.where(d <= 0.0, 10.0 * d - 3.0, 10.0 * d)
+
+
 Metric = Callable[[Vector, Points], Vector]
 PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "disc_01": (2, disc, two_values), "wave_01": (2, wave, two_values),
@@ -119,7 +125,11 @@ PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "ball_gap": (3, ball, gap), "slope_gap": (4, slope, gap), "slope_near_miss": (4, slope, gap),
     "slope_none": (4, slope, none_below), "slope_999": (4, slope, none_999),
     "slope_impact": (4, slope, impact), "slope_scratch": (4, slope, impact),
+    "disc_parted": (2, disc, parted), "ball_parted": (3, ball, parted), "slope_parted": (4, slope, parted),
+    "disc_parted_noisy": (2, disc, parted), "slope_parted_noisy": (4, slope, parted),
 }  # fmt: skip
+NOISE = {"disc_parted_noisy": 0.05, "slope_parted_noisy": 0.1}
+"""Standard deviation of the distance from seed to seed; M_c of these is where it is at most 0."""
 CRITICAL = {
     "slope_ttc": (0.0, 1.5), "disc_flag": (1.0, 1.0), "slope_near_miss": (1e-3, 1.0), "slope_none": (0.0, 1.5),
     "slope_999": (0.0, 1.5), "slope_impact": (0.1, 100.0), "slope_scratch": (0.1, 3.0),
@@ -130,7 +140,8 @@ CRITICAL = {
 def evaluate(given: dict[str, float], seed: int, problem: str) -> dict[str, float]:
     _, region, metric = PROBLEMS[problem]
     x = np.array([list(given.values())])
-    return {"y": float(metric(region(x), x)[0])}
+    distance = region(x) + NOISE.get(problem, 0.0) * np.random.default_rng(seed).standard_normal()
+    return {"y": float(metric(distance, x)[0])}
 
 
 def requirement(problem: str) -> sbt.Requirement:
@@ -138,8 +149,15 @@ def requirement(problem: str) -> sbt.Requirement:
 
 
 def critical(problem: str, x: Points) -> Mask:
+    """Say where most runs are critical."""
     _, region, metric = PROBLEMS[problem]
     return requirement(problem).critical.contains(metric(region(x), x))
+
+
+def share(problem: str, x: Points) -> Vector:
+    """Return the P(critical) there is."""
+    noise = NOISE.get(problem)
+    return critical(problem, x).astype(float) if noise is None else ndtr(-PROBLEMS[problem][1](x) / noise)
 
 
 def campaign(kind: str, problem: str, seed: int, budget: int, folder: Path) -> sbt.Result:
@@ -154,7 +172,7 @@ def campaign(kind: str, problem: str, seed: int, budget: int, folder: Path) -> s
 
 
 def boundary(problem: str, seed: int, budget: int) -> tuple[float, ...]:
-    """Return F1, log loss, stated and true share, expected and true share on the wrong side."""
+    """Return F1, log loss beyond the least there is, stated and true share, expected and true share of runs on the wrong side."""
     x = stream(7, "points").random((8000, PROBLEMS[problem][0]))
     with tempfile.TemporaryDirectory() as folder:
         result = campaign("boundary", problem, seed, budget, Path(folder))
@@ -162,8 +180,10 @@ def boundary(problem: str, seed: int, budget: int) -> tuple[float, ...]:
         p = result.predict(dict(zip(space.names, x.T, strict=True)))["p_critical"].to_numpy()
     inside, said = critical(problem, x), p > 0.5
     f1 = 2.0 * (said & inside).sum() / max(said.sum() + inside.sum(), 1)
-    loss = -np.log(np.clip(np.where(inside, p, 1.0 - p), 1e-9, 1.0)).mean()
-    return f1, loss, found.critical_fraction or 0.0, inside.mean(), found.expected_misclassified or 0.0, (said != inside).mean()
+    true = share(problem, x)
+    loss = rel_entr(true, np.clip(p, 1e-9, 1.0)) + rel_entr(1.0 - true, np.clip(1.0 - p, 1e-9, 1.0))
+    wrong = np.where(said, 1.0 - true, true)
+    return f1, loss.mean(), found.critical_fraction or 0.0, true.mean(), found.expected_misclassified or 0.0, wrong.mean()
 
 
 def estimation(problem: str, seed: int, budget: int) -> tuple[float, float, float]:
@@ -192,7 +212,7 @@ def main() -> None:
             f1, loss, *shares = np.mean([boundary(problem, seed, given.budget) for seed in seeds], axis=0)
             print(f"| {problem} | {f1:.3f} | {loss:.3f} | {' | '.join(f'{share:.3f}' for share in shares)} |", flush=True)
             continue
-        truth = float(critical(problem, stream(8, "truth").random((4_000_000, PROBLEMS[problem][0]))).mean())
+        truth = float(share(problem, stream(8, "truth").random((4_000_000, PROBLEMS[problem][0]))).mean())
         value, low, high = np.array([estimation(problem, seed, given.budget) for seed in seeds]).T
         error, crude = math.sqrt(np.mean((value / truth - 1.0) ** 2)), math.sqrt((1.0 - truth) / truth / given.budget)
         width = float(np.median(high - low)) / 2.0 / (1.96 * error * truth)

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from sbt.estimators.ridge import ridge_trend
 from sbt.estimators.transfer import Trend, trended
 from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sketched, with_target, without_repetitions
 from sbt.metamodels.censored import Limit, beyond
+from sbt.metamodels.gaps import better_without_gap
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import on_side, opened_and_limit
@@ -41,13 +43,11 @@ MOST_LEARNED = 2000
 """Runs, drawn at random, that a Gaussian process of an estimation learns from at most: a proposal costs their square."""
 _REACH = 5.0  # normal scores from -5 to 5 are the unit interval: 6e-7 of the distribution lies beyond
 _QUANTILE = 0.5  # of the distances to the edge: the scale of the warp; a smaller one becomes a step as runs gather there
-_LEAST_R2 = 0.5  # leave-one-out R2 from which on a trend is taken: it explains more than it leaves
 _NOISE_COUNTS = 0.1  # of the usual distance to the edge: a standard deviation among repeats, beyond which it is learned in full
 _FEWEST_SCORED = 16  # runs from which on forms are compared
 _HELD_OUT, _MOST_SCORED = 3, 150  # one run in so many scores the forms, of at most so many
 _SURE = 1.0  # gain in mean log density (nats a run) of a trend from which on it is trusted alone
 _UNEVEN = 2.0  # standard errors by which noise that depends on the input has to predict left-out runs better
-_RIDGES = (1e-6, 1e-4, 1e-2, 1.0)  # penalties relative to the number of rows
 
 
 @dataclass(frozen=True)
@@ -292,7 +292,7 @@ def fit_log_probability(
     whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=smallest, limit=warped)
     plain = _Form(y, critical, np.zeros(len(y)), noise=least, limit=limit)
     wholes = [whole] if better else [whole, plain]
-    trends = [replace(form, trend=_trend(u, form.values)) for form in wholes]
+    trends = [replace(form, trend=ridge_trend(u, form.values)) for form in wholes]
     forms = [*wholes, *(form for form in trends if form.trend is not None)]
     if least == 0.0 and (sided := _sided(metamodel, whole, u, rng)) is not None:
         return _Largest(coordinates, (sided,))
@@ -312,11 +312,13 @@ def fit_log_probability(
 
 def _better_warp(metamodel: Metamodel, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:
     """Return the warp in which left-out runs are predicted better than as they are; None: there is none, or no process learns."""
-    if not getattr(metamodel, "CUBIC", False):
-        return None
     from sbt.metamodels.gaussian_process import GaussianProcess
 
-    return better_warp(metamodel, u, y, critical) if isinstance(metamodel, GaussianProcess) else None
+    if not isinstance(metamodel, GaussianProcess):
+        return None
+    warp = better_warp(metamodel, u, y, critical)
+    other = warp or Warp.around_edge(y, critical, quantile=_QUANTILE)
+    return better_without_gap(metamodel, *without_repetitions(u, y), critical, other) or warp
 
 
 def _sided(metamodel: Metamodel, form: _Form, u: Points, rng: np.random.Generator) -> _Learned | None:
@@ -356,7 +358,7 @@ def _gains(metamodel: Metamodel, forms: list[_Form], u: Points, weight: Vector, 
     scores = []
     for form in forms:
         if form.trend is not None:
-            rest = _trend(u[learned], form.values[learned])
+            rest = ridge_trend(u[learned], form.values[learned])
             if rest is None:
                 scores.append(-np.inf)
                 continue
@@ -365,35 +367,3 @@ def _gains(metamodel: Metamodel, forms: list[_Form], u: Points, weight: Vector, 
         log_density = prediction.log_density(form.values[held_out]) + form.log_slope[held_out]
         scores.append(float(np.average(log_density, weights=weight[held_out] + 1e-9)))
     return np.array(scores) - scores[0]
-
-
-def _trend(u: Points, t: Vector) -> Callable[[Points], Vector] | None:
-    """Return the quadratic or linear ridge trend of larger leave-one-out R2; None where neither exceeds 0.5."""
-    best, best_score = None, _LEAST_R2
-    for basis in (_linear, _quadratic):
-        b = basis(u)
-        if len(t) < 4 or b.shape[1] > 4 * len(t):
-            continue
-        for ridge in _RIDGES:
-            penalty = np.eye(b.shape[1]) * ridge * len(t)
-            penalty[0, 0] = 1e-9
-            solved = np.linalg.solve(b.T @ b + penalty, b.T)  # (p, n)
-            leverage = np.einsum("np,pn->n", b, solved)
-            left_out = (t - b @ (solved @ t)) / np.maximum(1.0 - leverage, 1e-6)
-            score = 1.0 - float((left_out**2).sum() / max(((t - t.mean()) ** 2).sum(), 1e-300))
-            if score > best_score:
-                best, best_score = (basis, solved @ t), score
-    if best is None:
-        return None
-    basis, coefficients = best
-    return lambda points: np.asarray(basis(points) @ coefficients)
-
-
-def _linear(u: Points) -> Points:
-    return np.column_stack([np.ones(len(u)), 2.0 * u - 1.0])
-
-
-def _quadratic(u: Points) -> Points:
-    v = 2.0 * u - 1.0
-    i, j = np.triu_indices(v.shape[1])
-    return np.column_stack([np.ones(len(u)), v, v[:, i] * v[:, j]])

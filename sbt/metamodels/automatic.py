@@ -16,6 +16,7 @@ from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, is_r
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.gaps import better_without_gap
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.noise_shape import better_uneven, shaped
 from sbt.metamodels.prediction import Prediction
@@ -197,6 +198,7 @@ class _TargetedAuto:
         """Return the mixture fitted to u (n, d) and y (n,), in the unit of `better_warp`; see `Metamodel.fit`."""
         u, y = without_repetitions(*check_rows(u, y))
         warp = better_warp(self.settings.simplest, u, y, self.critical)
+        warp = better_without_gap(self.settings.simplest, u, y, self.critical, warp) or warp
         if warp is None:
             return self.settings._fit(u, y, rng, self.critical)
         return WarpedPredictor(self.settings._fit(u, warp.values(y), rng, warp.interval(self.critical), warp), warp)

@@ -11,22 +11,28 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr
 
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["JointWarp", "Warp", "warp_around"]
+__all__ = ["JointWarp", "Warp", "gap_of", "warp_around"]
+
+_SPACINGS, _WIDE = 8, 8.0
+"""Spacings between the values nearest to the edge on either side, and the fewest of them that a gap is as wide as: before the
+root that a speed of impact ends with there are 3 to 6."""
 
 
 @dataclass(frozen=True)
 class Warp:
-    """w = asinh((y - edge) / scale), on either side of the edge with its own scale.
+    """w = asinh((y - edge) / scale), on either side of the edge with its own scale; without the gap in which no value lies.
 
     Args:
         edge: end of the critical interval, in the unit of y.
         scale: > 0; within it the warp is nearly straight.
         above: > 0, the scale of values above the edge; None: the same.
+        gap: distances >= 0 below and above the edge that are left out.
 
     >>> warp = Warp.around_edge(np.array([1.0, 5.0, 1e6]), CriticalInterval(high=0.0))
     >>> warp.interval(CriticalInterval(high=0.0)).high, bool(warp.values(np.array([1e6]))[0] < 14)
@@ -36,6 +42,7 @@ class Warp:
     edge: float
     scale: float
     above: float | None = None
+    gap: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def around_edge(cls, y: Vector, critical: CriticalInterval, quantile: float = 0.25) -> Warp:
@@ -56,19 +63,35 @@ class Warp:
         """Return the scale where y is so far beyond the edge (negative: below it), in any unit; shape kept."""
         return np.where(np.asarray(beyond) > 0.0, self.scale if self.above is None else self.above, self.scale)
 
+    def _gap_at(self, beyond: Vector) -> Vector:
+        """Return what is left out where y is so far beyond the edge, in any unit; shape kept."""
+        return np.where(np.asarray(beyond) > 0.0, self.gap[1], self.gap[0])
+
+    def kept(self, y: Vector) -> Vector:
+        """Return how far y is beyond the edge without the gap, shape kept; 0 in it."""
+        beyond = np.asarray(y) - self.edge
+        return np.sign(beyond) * np.maximum(np.abs(beyond) - self._gap_at(beyond), 0.0)
+
     def values(self, y: Vector) -> Vector:
         """Return the warped y, shape kept."""
-        beyond = np.asarray(y) - self.edge
-        return np.asarray(np.arcsinh(beyond / self.scale_at(beyond)))
+        kept = self.kept(y)
+        return np.asarray(np.arcsinh(kept / self.scale_at(kept)))
 
     def back(self, warped: Vector) -> Vector:
         """Return the y of warped values, shape kept."""
-        return np.asarray(self.edge + self.scale_at(warped) * np.sinh(warped))
+        return np.asarray(self.edge + np.sign(warped) * self._gap_at(warped) + self.scale_at(warped) * np.sinh(warped))
+
+    def stretch(self, mean: Points, std: Points) -> Points:
+        """Return factors to means, and standard deviations, of y - edge from those of the warped y: P(y > edge) stays."""
+        slope = self.scale_at(mean) * np.divide(np.sinh(mean), mean, out=np.ones_like(mean), where=np.abs(mean) > 1e-6)
+        z = np.maximum(np.abs(mean), 1e-6 * std) / std
+        return np.asarray(slope + self._gap_at(mean) * (2.0 * ndtr(z) - 1.0) / (z * std))
 
     def log_slope(self, y: Vector) -> Vector:
         """Return (n,) the logarithm of the warp's derivative at y (n,)."""
-        scale = self.scale_at(np.asarray(y) - self.edge)
-        return np.asarray(-0.5 * np.log1p(((y - self.edge) / scale) ** 2) - np.log(scale))
+        kept = self.kept(y)
+        scale = self.scale_at(kept)
+        return np.asarray(-0.5 * np.log1p((kept / scale) ** 2) - np.log(scale))
 
     def learned(self, y: Vector) -> Vector:
         """Return what a metamodel learns: the warped y."""
@@ -119,3 +142,25 @@ def warp_around(y: Vector, critical: CriticalInterval) -> Warp | JointWarp:
     if isinstance(critical, CombinedInterval):
         return JointWarp.around_edges(y, critical)
     return Warp.around_edge(y, critical)
+
+
+def gap_of(y: Vector, critical: CriticalInterval) -> tuple[float, float]:
+    """Return distances below and above the edge in which no y (n,) lies, less a usual spacing; 0 where there is no more.
+
+    >>> y = np.concatenate([np.linspace(-1.0, -0.1, 10), np.linspace(3.0, 3.9, 10)])
+    >>> [round(each, 2) for each in gap_of(y, CriticalInterval(high=0.0))]
+    [0.1, 2.9]
+    """
+    if not critical.one_sided:
+        return 0.0, 0.0
+    beyond, inside = y - critical.edge, critical.contains(y)
+    above = ~inside if critical.outward > 0 else inside
+    sides = [np.sort(np.abs(beyond[side])) for side in (~above, above)]
+    if min(map(len, sides)) <= _SPACINGS:
+        return 0.0, 0.0
+    spacings = [float(side[_SPACINGS] - side[0]) / _SPACINGS for side in sides if side[_SPACINGS] > side[0]]
+    spacing, width = float(np.mean(spacings)) if spacings else np.inf, float(sides[0][0] + sides[1][0])
+    if not _WIDE * spacing < width:
+        return 0.0, 0.0
+    left = 1.0 - spacing / width
+    return left * float(sides[0][0]), left * float(sides[1][0])

@@ -34,7 +34,9 @@ _SURE, _SURER, _FEW = 2.0, 3.0, 8  # standard errors, and while so few rows lie 
 _FARTHEST = 300.0  # warped units, beyond which values are no numbers any more
 
 
-def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:
+def better_warp(
+    settings: GaussianProcess, u: Points, y: Vector, critical: CriticalInterval, gap: tuple[float, float] = (0.0, 0.0)
+) -> Warp | None:  # fmt: skip
     """Return the warp in whose unit y is learned best; None where its own is, or where M_c has two ends or none.
 
     Rows are predicted from all others, and scored by the range that they fell into (see `Bins`), half of the weight even, half by
@@ -45,6 +47,7 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
         u: (n, d) rows.
         y: (n,) their metric.
         critical: M_c.
+        gap: of the warps, see `gap_of`.
     """
     if not critical.one_sided or len(y) < _FEWEST:
         return None
@@ -60,7 +63,7 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
     judge, bins = replace(settings, kernels=1), Bins.around_edge(y, critical)
     weight = 0.5 / len(y) + 0.5 * cell_shares(u, rng)
 
-    inside, heavy = critical.contains(y), float(np.std(y)) > _HEAVY * float(np.median(distance))
+    inside = critical.contains(y)
 
     def score(warp: Warp | None) -> Points:
         """Return (2, n) log probabilities of the range that y fell into, and of the side of the edge."""
@@ -77,9 +80,7 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
         error = np.sqrt((gain - mean[:, None]) ** 2 @ weight**2)
         return float(mean[0]), float(error[0]), float(mean[1])
 
-    safe = distance[(distance > 0.0) & ~inside]
-    scales = np.unique(np.quantile(safe if len(safe) else distance[distance > 0.0], _QUANTILES + _SMALLER * heavy))
-    tried = {warp: gained(warp) for warp in (Warp(edge, scale) for scale in scales.tolist())}
+    tried = {warp: gained(warp) for warp in _warps(y, critical, gap)}
     best = max(tried, key=lambda warp: tried[warp][0])
     if tried[best][0] < -tried[best][1]:
         return None  # as good as never is one side's scale another then
@@ -94,11 +95,23 @@ def better_warp(settings: GaussianProcess, u: Points, y: Vector, critical: Criti
     return best if sides >= 0.0 and mean > (_SURER if few else _SURE) * error else None
 
 
+def _warps(y: Vector, critical: CriticalInterval, gap: tuple[float, float]) -> list[Warp]:
+    """Return warps of y (n,) with this gap and one scale on both sides: usual distances to the edge of uncritical values."""
+    distance, safe = np.abs(Warp(critical.edge, 1.0, gap=gap).kept(y)), ~critical.contains(y)
+    positive = distance > 0.0
+    among = distance[positive & safe] if (positive & safe).any() else distance[positive]
+    if not len(among):
+        return []
+    heavy = float(np.std(y)) > _HEAVY * float(np.median(distance))
+    scales = np.unique(np.quantile(among, _QUANTILES + _SMALLER * heavy))
+    return [Warp(critical.edge, scale, gap=gap) for scale in scales.tolist()]
+
+
 def _steeper(warp: Warp, factor: float, critical: CriticalInterval) -> Warp:
     """Return the warp with a scale of the critical side that is so much larger; itself where it is large, or small, enough."""
     above = warp.scale if warp.above is None else warp.above
     below, above = (warp.scale * factor, above) if math.isfinite(critical.high) else (warp.scale, above * factor)
-    return Warp(warp.edge, below, above) if 1.0 / _STEEPEST <= below / above <= _STEEPEST else warp
+    return replace(warp, scale=below, above=above) if 1.0 / _STEEPEST <= below / above <= _STEEPEST else warp
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +130,7 @@ class WarpedPredictor:
         """Return the prediction of y at u (n, d): of each component the mean goes back, and P(y beyond the edge) stays."""
         found = self.predictor(u)
         mean = np.clip(found.mean, -_FARTHEST, _FARTHEST)
-        ratio = self.warp.scale_at(mean) * np.divide(np.sinh(mean), mean, out=np.ones_like(mean), where=np.abs(mean) > 1e-6)
+        ratio = self.warp.stretch(mean, found.std)
         return Prediction(self.warp.edge + ratio * mean, found.std * ratio, found.weight, found.noise * (found.weight @ ratio))
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
