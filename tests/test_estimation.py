@@ -215,6 +215,17 @@ def test_the_gate_decides_by_one_sided_limits():
     assert gate_verdict(limits, Gate(0.01)).verdict == "undecided"
 
 
+def test_limits_by_few_draws_are_no_wider_than_exact_ones_with_half_the_error():
+    few, exact = Limits(lambda c: 0.01 * (1 - c), lambda c: 0.4 * c), Limits(lambda c: 0.02 * (1 - c), lambda c: 0.1 * c)
+    found = few.within(exact, 0.05, 0.06)
+    assert found.lower(0.9) == pytest.approx(0.001)  # its own: the other, with 0.95, is as near
+    assert found.upper(0.9) == pytest.approx(0.095)
+    for value in (0.0, 0.3):  # an end is never beyond the estimate
+        held = few.within(exact, value, value)
+        assert held.lower(0.9) <= max(value, few.lower(0.9))
+        assert held.upper(0.9) >= min(value, few.upper(0.9))
+
+
 def test_a_gate_does_not_pass_on_a_metamodel_that_was_refuted():
     limits = Limits(lambda _: 0.001, lambda _: 0.002)
     refuted = gate_verdict(limits, Gate(0.02), 0.12, 1)
