@@ -40,8 +40,8 @@ def better_without_gap(
     """Return a unit without the gap in which left-out rows are surely better known than in another one; else None.
 
     Their sides are, or their values are much likelier and their sides are known better, if not surely (of a noisy simulator: are
-    known as well). In the other unit jumps are widened, or
-    signed distances learned, where that is better (see `stepped`, `sided`).
+    known as well). In the other unit jumps are widened, or signed distances learned, where that is better (see `stepped`,
+    `sided`).
 
     Args:
         settings: of the process.
@@ -50,9 +50,8 @@ def better_without_gap(
         critical: M_c.
         unit: the other one; None: that of y.
     """
-    if len(y) > _MOST or (gap := gap_of(y, critical)) == (0.0, 0.0):
-        return None
-    warp = better_warp(settings, u, y, critical, gap)
+    gap = gap_of(y, critical)
+    warp = None if len(y) > _MOST or gap == (0.0, 0.0) else better_warp(settings, u, y, critical, gap)
     if warp is None:
         return None
     shares = cell_shares(u, _generator())

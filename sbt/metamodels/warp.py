@@ -84,6 +84,8 @@ class Warp:
     def stretch(self, mean: Points, std: Points) -> Points:
         """Return factors to means, and standard deviations, of y - edge from those of the warped y: P(y > edge) stays."""
         slope = self.scale_at(mean) * np.divide(np.sinh(mean), mean, out=np.ones_like(mean), where=np.abs(mean) > 1e-6)
+        if self.gap == (0.0, 0.0):
+            return np.asarray(slope)
         z = np.maximum(np.abs(mean), 1e-6 * std) / std
         return np.asarray(slope + self._gap_at(mean) * (2.0 * ndtr(z) - 1.0) / (z * std))
 
