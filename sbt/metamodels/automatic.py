@@ -50,14 +50,15 @@ class Auto:
     fitted to all rows. Too few rows to score: equal weights of `gp` and `et`. The preset `quick`, for fits after
     every batch, takes about a quarter of the time: a smaller ensemble, two folds of at most 400 rows, and none below 300.
 
-    For a known critical interval (`with_target`) the metric is learned in the unit of `better_warp`, where that is better without a
-    gap beside the edge (`gaps`), and the score is not the density of y but the probability of the range that it fell into (see
-    `Bins`). The process leaves out one row at a time, in closed form; the others learn from 80 % of the rows, 90 % from 1,000 rows
-    on where all rows are compared (or ten folds are needed to hold as many as are). The first model, `gp` with nu 2.5 and one noise, is taken alone unless the mixture is better
-    by three standard errors, and better over the space, too (rows crowd at the edge, where a mixture that hedges looks better
-    than it is). Where the metric jumps at the edge, `gp` learns a widened jump if that predicts the sides better (see
-    `stepped`); of a noisy one, noise that depends on the inputs (`noise_shape`), or the rate of two values (`rated`). Where it
-    leaves next to nothing to gain, the others are not even tried.
+    For a known critical interval (`with_target`) the metric is learned in the unit of `better_warp`, where that is better
+    without a gap beside the edge (`gaps`), and the score is not the density of y but the probability of the range that it fell
+    into (see `Bins`). The process leaves out one row at a time, in closed form; the others learn from 80 % of the rows, 90 %
+    from 1,000 rows on where all rows are compared (or ten folds are needed to hold as many as are). The first model, `gp` with
+    nu 2.5 and one noise, is taken alone unless the mixture is better by three standard errors, and better over the space, too
+    (rows crowd at the edge, where a mixture that hedges looks better than it is). Where the metric jumps at the edge, `gp`
+    learns a widened jump if that predicts the sides better (see `stepped`); of a noisy one, noise that depends on the inputs
+    (`noise_shape`), or the rate of two values (`rated`). Where it leaves next to nothing to gain, the others are not even
+    tried.
 
     Args:
         folds: of the cross-validation, >= 2.
