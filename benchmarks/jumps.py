@@ -77,6 +77,15 @@ def slope(x: Points) -> Vector:
     return x[:, :4] @ np.array([1.0, 0.7, -0.5, 0.3]) - 0.35
 
 
+def box(x: Points) -> Vector:
+    """A corner, and a box that nothing tells of."""
+    return np.where(((x > 0.7) & (x < 0.95)).all(axis=1), -1.0, x[:, 0] + 0.5 * x[:, 1] - 0.25)
+
+
+def plain(d: Vector, x: Points) -> Vector:
+    return d
+
+
 def time_to_collision(d: Vector, x: Points) -> Vector:
     """A time that is 0 in a collision, and critical from 0 to 1.5."""
     return np.maximum(1.5 + 10.0 * d, 0.0)
@@ -126,7 +135,7 @@ PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "slope_none": (4, slope, none_below), "slope_999": (4, slope, none_999),
     "slope_impact": (4, slope, impact), "slope_scratch": (4, slope, impact),
     "disc_parted": (2, disc, parted), "ball_parted": (3, ball, parted), "slope_parted": (4, slope, parted),
-    "disc_parted_noisy": (2, disc, parted), "slope_parted_noisy": (4, slope, parted),
+    "disc_parted_noisy": (2, disc, parted), "slope_parted_noisy": (4, slope, parted), "box_hidden": (2, box, plain),
 }  # fmt: skip
 NOISE = {"disc_parted_noisy": 0.05, "slope_parted_noisy": 0.1}
 """Standard deviation of the distance from seed to seed; M_c of these is where it is at most 0."""

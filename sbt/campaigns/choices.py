@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sbt.acquisitions import boundary, even, log_scores
-from sbt.campaigns.exploration import about_regions, exploration_share, explore, should_explore
+from sbt.campaigns.exploration import about_regions, exploration_share, explore, should_explore, space_filling
 from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Acquisition, Settings
@@ -35,6 +35,8 @@ _MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to pa
 _MOST_EVEN = 2**23  # where none is scored: 8,000 runs of a space of which constraints leave a thousandth
 _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
 _MOST_FILLING = 0.6  # the same where noise alone decides: where P is said to be small nobody would look again
+_SETTLED = 0.5  # the same while edges are known far better than what even runs may have missed
+_KNOWN, _SHARP = 0.1, 0.05  # of 1 / the even runs, and of the critical share: expected on the wrong side where they are
 _ALIKE = 1.0, 0.6  # the same while all runs are critical: of one value, which tells of no direction, and of several
 _PROBED = 512  # points at which the noise is taken
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
@@ -90,12 +92,12 @@ def greedily(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: in
 def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
     """Return a batch of parts: exploration where critical runs are rare, representative, greedy and space-filling runs.
 
-    Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the
-    least uncertainty far from a run. One fifth is chosen one by one by a_BI times the squared distance to the
-    nearest run, which also looks into the corners. 10 % fill the space; held-out runs count as such. While all runs are
-    critical at least 60 % do, as uncertainty is largest in the corners then. Where
-    the mean P(critical) is below 1 %, half of the batch explores first (see `explore`); beside plateaus all of it does, or
-    none, which then looks about the known regions (see `exploration_share`).
+    Four fifths of the batch are representative: of points drawn from a_BI as in the paper those that leave the least
+    uncertainty far from a run. One fifth is chosen one by one by a_BI times the squared distance to the nearest run, which also
+    looks into the corners. 10 % fill the space; held-out runs count as such; half of the runs where edges are known far better
+    than what so few of them may have missed. While all runs are critical at least 60 % do, as uncertainty is largest in the
+    corners then. Where the mean P(critical) is below 1 %, half of the batch explores first (see `explore`); beside plateaus all
+    of it does, or none, which then looks about the known regions (see `exploration_share`).
     """
     if fitted is None:
         return evenly(settings, fitted, log, n)
@@ -103,7 +105,8 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     share = exploration_share(settings, log) if exploring else 0.0
     fitted = _within(fitted, about_regions(settings, log) if exploring else None)
     looking = explore(settings, log, min(_rounded(share * n, log), n))
-    filled = max(_FILLING, _MOST_FILLING * _open_share(settings, fitted, log), _all_critical(settings, log))
+    opened = _MOST_FILLING * _open_share(settings, fitted, log)
+    filled = max(_FILLING, opened, _settled(fitted, log), _all_critical(settings, log))
     filling = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
@@ -119,6 +122,16 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
         filling=len(fill), representative=len(typical), greedy=len(greedy),
     )  # fmt: skip
     return Chosen(so_far, proposal)
+
+
+def _settled(fitted: FittedMetamodel, log: Log) -> float:
+    """Return the share of runs that fill the space while edges are known, and regions that no run met are not; else 0.
+
+    A region next to which nothing tells of it is met by even runs alone, of size 1 / n by n of them.
+    """
+    record, n = fitted.record, int(space_filling(log).sum())
+    wrong = record.expected_misclassified
+    return _SETTLED if n and wrong < _KNOWN / n and wrong < _SHARP * record.critical_fraction else 0.0
 
 
 def _all_critical(settings: Settings, log: Log) -> float:
