@@ -185,14 +185,14 @@ def critical_table(history: History, requirement: Requirement, replay: str, judg
     judged: dict[int, list[Judgement]] = {}
     for each in judgements:
         judged.setdefault(each.run, []).append(each)
-    margin = requirement.depths(history)
+    margin, told = requirement.depths(history), requirement.told(history)
     found = [int(k) for k in worst_first(history, margin) if margin[k] <= 0]
     metrics = sorted(history.metrics, key=lambda name: name not in [part.metric for part in requirement.parts])
     rows = []
     for k in found[:_MOST]:
         record = history.record(k)
         rows.append((
-            Cell.of(record.index), Cell.of(float(margin[k])),
+            Cell.of(record.index), Cell.of(float(margin[k]) if np.isfinite(told[k]) else None),
             *((Cell(", ".join(requirement.violated(record.metrics))),) if requirement.combined else ()),
             *(Cell.of(record.inputs[name]) for name in history.names),
             *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
