@@ -136,7 +136,7 @@ def test_where_noise_decides_the_space_is_filled(tmp_path: Path):
         with Store.read(tmp_path / name) as store:
             filled.append([batch.proposal.get("filling") or 0 for batch in store.iterations()])
     assert sum(filled[0]) >= 12
-    assert sum(filled[1]) == 0, "the held-out tenth fills it"
+    assert filled[1][:2] == [0, 0], "the held-out tenth fills it, until edges are known"
 
 
 @pytest.mark.parametrize("critical", [CriticalInterval(low=1.0), CriticalInterval(high=-1.0)])
