@@ -174,3 +174,5 @@ def test_runs_are_told_by_what_they_gave(tmp_path: Path):
             y = rows[getattr(point, "run", getattr(point, "representative", None))]
             assert point.metric == (y if math.isfinite(y) else None)
         assert not found or any(mode.nearest_safe.metric is None for mode in told.failure_modes)
+        frame = result.frame
+        assert (frame["margin"] == frame["y.ttc"] - high).all()

@@ -343,9 +343,9 @@ class History:
         data |= {f"x.{name}": column for name, column in named_columns(self.x, self.names, self.choices).items()}
         data |= {f"y.{name}": self.y(name) for name in self.metrics}
         if requirement is not None:
-            margin = requirement.margins(self)
-            data["critical"] = pd.arrays.BooleanArray(requirement.critical_runs(self), np.isnan(margin))
-            data["margin"] = margin
+            told = requirement.told(self)  # of infinite metrics margins are infinite, too
+            data["critical"] = pd.arrays.BooleanArray(requirement.critical_runs(self), np.isnan(told))
+            data["margin"] = told if requirement.combined else requirement.critical.margin(told)
             if requirement.combined:
                 data["violates"] = violated_names(self, requirement)
         data["log_q"] = self.log_q
