@@ -20,6 +20,7 @@ from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp, gap_of
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.combination import MARGIN
 from sbt.problem.requirement import CriticalInterval, as_passed, as_reached, within_scale
 
 __all__ = ["Ending", "Opened", "centred", "on_side", "opened", "opened_and_limit", "scored"]
@@ -44,8 +45,6 @@ _USUAL = 0.9
 _FEWEST_OTHERS, _RANKS = 3, 2.0
 """Fewest different values on the other side of M_c than the one that stands for none; log likelihoods of left-out runs that the
 square of a standard error counts (both add up over runs that tell the same)."""
-_NEGATIVE = CriticalInterval(high=0.0)
-"""Where margins are critical."""
 _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 """Ends of a depth, in asinh(margin / usual margin)."""
 
@@ -125,8 +124,10 @@ def _opened_outside(u: Points, y: Vector, critical: CriticalInterval, rng: np.ra
     """Return y with the last uncritical value moved away from M_c where the metric ends with it."""
     margin = critical.margin(y)
     tied = _ends_outside(margin, len(np.unique(u[margin <= 0.0], axis=0)))
-    left = margin.max() - margin - sum(gap_of(margin, _NEGATIVE))
-    return _moved(u, y, tied, left, critical, rng, outwards=True) if tied.any() else y
+    if not tied.any():
+        return y
+    left = margin.max() - margin - sum(gap_of(margin, MARGIN))
+    return _moved(u, y, tied, left, critical, rng, outwards=True)
 
 
 def _ends_outside(margin: Vector, inputs: int) -> Mask:

@@ -100,8 +100,6 @@ def _warps(y: Vector, critical: CriticalInterval, gap: tuple[float, float]) -> l
     distance, safe = np.abs(Warp(critical.edge, 1.0, gap=gap).kept(y)), ~critical.contains(y)
     positive = distance > 0.0
     among = distance[positive & safe] if (positive & safe).any() else distance[positive]
-    if not len(among):
-        return []
     heavy = float(np.std(y)) > _HEAVY * float(np.median(distance))
     scales = np.unique(np.quantile(among, _QUANTILES + _SMALLER * heavy))
     return [Warp(critical.edge, scale, gap=gap) for scale in scales.tolist()]
