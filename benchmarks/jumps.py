@@ -1,11 +1,15 @@
 """Metrics that jump or end at the critical edge, as collisions, counts, sentinels and speeds of impact do: are boundaries sharp,
 and do intervals cover?
 
-    python benchmarks/jumps.py [--campaign boundary|estimation] [--problems a,b] [--seeds 6] [--first-seed 0] [--budget 100]
+    python benchmarks/jumps.py [--campaign boundary|estimation|values] [--problems a,b] [--seeds 6] [--first-seed 0]
+        [--budget 100]
 
 A row is a problem, campaigns with the product's defaults. Boundary: F1 and log loss at 8,000 fixed points, the stated share and
 what is expected on the wrong side, beside the truth. Estimation (without a stop rule): relative error beside that of crude Monte
-Carlo of as many runs, intervals that cover, and their half width over 1.96 of that error.
+Carlo of as many runs, intervals that cover, and their half width over 1.96 of that error. Values: what `auto` predicts of the
+metric itself at 3,000 fresh runs from as many random ones: mean log likelihood, of the mixture and of the Gaussian with its
+moments, RMSE over the metric's standard deviation, root mean square of the error over sigma, and how many lie between the 5 % and
+the 95 % quantile; medians over seeds.
 """
 
 from __future__ import annotations
@@ -21,6 +25,8 @@ import numpy as np
 from scipy.special import ndtr, rel_entr
 
 import sbt
+from sbt.metamodels.automatic import Auto
+from sbt.metamodels.base import with_target
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.seeds import stream
 
@@ -122,6 +128,20 @@ def parted(d: Vector, x: Points) -> Vector:
     return np.where(d <= 0.0, 10.0 * d - 3.0, 10.0 * d)
 
 
+def orders(d: Vector, x: Points) -> Vector:
+    """Values over many orders of magnitude."""
+    return np.sign(d) * np.expm1(8.0 * np.abs(d))
+
+
+def outliers(d: Vector, x: Points) -> Vector:
+    """A margin, and far values where nothing happens."""
+    return np.where(d > 0.3, 1e4 * (d - 0.3) ** 2 + d, d)
+
+
+def steep(d: Vector, x: Points) -> Vector:
+    return np.where(d < 0.0, 30.0 * d, d)
+
+
 Metric = Callable[[Vector, Points], Vector]
 PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "disc_01": (2, disc, two_values), "wave_01": (2, wave, two_values),
@@ -136,8 +156,10 @@ PROBLEMS: dict[str, tuple[int, Callable[[Points], Vector], Metric]] = {
     "slope_impact": (4, slope, impact), "slope_scratch": (4, slope, impact),
     "disc_parted": (2, disc, parted), "ball_parted": (3, ball, parted), "slope_parted": (4, slope, parted),
     "disc_parted_noisy": (2, disc, parted), "slope_parted_noisy": (4, slope, parted), "box_hidden": (2, box, plain),
+    "slope_orders": (4, slope, orders), "slope_orders_noisy": (4, slope, orders), "disc_outliers": (2, disc, outliers),
+    "slope_steep": (4, slope, steep),
 }  # fmt: skip
-NOISE = {"disc_parted_noisy": 0.05, "slope_parted_noisy": 0.1}
+NOISE = {"disc_parted_noisy": 0.05, "slope_parted_noisy": 0.1, "slope_orders_noisy": 0.05}
 """Standard deviation of the distance from seed to seed; M_c of these is where it is at most 0."""
 CRITICAL = {
     "slope_ttc": (0.0, 1.5), "disc_flag": (1.0, 1.0), "slope_near_miss": (1e-3, 1.0), "slope_none": (0.0, 1.5),
@@ -202,9 +224,24 @@ def estimation(problem: str, seed: int, budget: int) -> tuple[float, float, floa
     return found.probability or 0.0, found.low, found.high
 
 
+def values(problem: str, seed: int, budget: int) -> tuple[float, ...]:
+    """Return both log likelihoods, RMSE, root mean square of the standardised error, and the share between two quantiles."""
+    d, region, metric = PROBLEMS[problem]
+    rng = stream(seed, "values")
+    x = rng.random((budget + 3000, d))
+    y = metric(region(x) + NOISE.get(problem, 0.0) * rng.standard_normal(len(x)), x)
+    known, fresh = slice(0, budget), slice(budget, None)
+    predictor = with_target(Auto(), requirement(problem).critical).fit(x[known], y[known], stream(seed, "fit"))
+    found = predictor(x[fresh])
+    error, between = found.mu - y[fresh], (found.quantile(0.05) <= y[fresh]) & (y[fresh] <= found.quantile(0.95))
+    likelihoods = [float(found.log_density(y[fresh]).mean()), float(found.log_density_gaussian(y[fresh]).mean())]
+    return (*likelihoods, float(np.sqrt(np.mean(error**2)) / y.std()), float(np.sqrt(np.mean((error / found.sigma) ** 2))),
+            float(between.mean()))  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--campaign", choices=("boundary", "estimation"), default="boundary")
+    parser.add_argument("--campaign", choices=("boundary", "estimation", "values"), default="boundary")
     parser.add_argument("--problems", default=",".join(PROBLEMS))
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--first-seed", type=int, default=0)
@@ -213,10 +250,16 @@ def main() -> None:
     seeds = range(given.first_seed, given.first_seed + given.seeds)
     if given.campaign == "boundary":
         print("| problem | F1 | log loss | share stated | true | wrong side, stated | true |")
+    elif given.campaign == "values":
+        print("| problem | log likelihood | Gaussian's | RMSE / std | error / sigma | in 5 to 95 % |")
     else:
         print("| problem | P | RMSE / P | crude | covered | half width / (1.96 RMSE) |")
     print("|---|---|---|---|---|---|" + "---|" * (given.campaign == "boundary"), flush=True)
     for problem in given.problems.split(","):
+        if given.campaign == "values":
+            found = np.median([values(problem, seed, given.budget) for seed in seeds], axis=0)
+            print(f"| {problem} | {' | '.join(f'{value:.3g}' for value in found)} |", flush=True)
+            continue
         if given.campaign == "boundary":
             f1, loss, *shares = np.mean([boundary(problem, seed, given.budget) for seed in seeds], axis=0)
             print(f"| {problem} | {f1:.3f} | {loss:.3f} | {' | '.join(f'{share:.3f}' for share in shares)} |", flush=True)

@@ -118,6 +118,11 @@ class Prediction:
         """Return the prediction with every standard deviation of a component multiplied."""
         return replace(self, std=factor * self.std)
 
+    def rescaled(self, factor: float) -> Prediction:
+        """Return the prediction with `sigma` multiplied; the mean stays."""
+        mean = self.mu + factor * (self.mean - self.mu)
+        return replace(self, mean=mean, std=factor * self.std, noise=factor * self.noise)
+
     def with_tails(self, factor: Vector, probability: Vector) -> Prediction:
         """Return the prediction with every component in several widths: its standard deviation times each factor (m,).
 
@@ -158,10 +163,13 @@ class Prediction:
         Source:
             Winkelmann et al. (2022), section V-A: P from the cumulative distribution function.
         """
-        low = -np.inf if critical.low <= self.lowest else critical.low
-        high = np.inf if critical.high >= self.highest else critical.high
-        inside, outside = _log_interval(self.mean, self.std, CriticalInterval(low, high))
+        inside, outside = _log_interval(self.mean, self.std, self._open(critical))
         return np.minimum(self._mix(inside), 0.0), np.minimum(self._mix(outside), 0.0)
+
+    def _open(self, critical: CriticalInterval) -> CriticalInterval:
+        """Return M_c without ends that the metric does not go beyond."""
+        low = -np.inf if critical.low <= self.lowest else critical.low
+        return CriticalInterval(low, np.inf if critical.high >= self.highest else critical.high)
 
     def probability(self, critical: CriticalInterval) -> Vector:
         """Return (n,) P(y in M_c), in [0, 1]."""

@@ -64,5 +64,4 @@ class RecalibratedPredictor:
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction at u (n, d)."""
-        p = check_prediction(self.predictor(u), len(u))
-        return Prediction(p.mu + self.factor * (p.mean - p.mu), self.factor * p.std, p.weight, self.factor * p.noise)
+        return check_prediction(self.predictor(u), len(u)).rescaled(self.factor)

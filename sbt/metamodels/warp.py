@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, stdtr
 
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
@@ -22,6 +22,13 @@ __all__ = ["JointWarp", "Warp", "gap_of", "warp_around"]
 _SPACINGS, _WIDE = 8, 8.0
 """Spacings between the values nearest to the edge on either side, and the fewest of them that a gap is as wide as: before the
 root that a speed of impact ends with there are 3 to 6."""
+_CROSSED = 1e-6
+"""Of the scale on its side, what a gap that is left out measures: in it nothing is likely, but nothing impossible."""
+_FARTHEST, _LEAST = 300.0, 1e-300
+"""Warped units, beyond which values are no numbers any more; the standard deviation of what has none, as a divisor."""
+_TAILS = 4.0
+"""Degrees of freedom of the side in a variance: once in some thousand points a process is surer of a side than it is right, and
+then a value is wrong by the height of the jump."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +74,18 @@ class Warp:
         """Return what is left out where y is so far beyond the edge, in any unit; shape kept."""
         return np.where(np.asarray(beyond) > 0.0, self.gap[1], self.gap[0])
 
+    def _crossing(self, beyond: Vector) -> Vector:
+        """Return how wide the gap is without itself, in the unit of y, where y is so far beyond the edge; shape kept."""
+        return np.where(self._gap_at(beyond) > 0.0, _CROSSED * self.scale_at(beyond), 0.0)
+
     def kept(self, y: Vector) -> Vector:
-        """Return how far y is beyond the edge without the gap, shape kept; 0 in it."""
+        """Return how far y is beyond the edge without the gap, shape kept; in the gap next to 0."""
         beyond = np.asarray(y) - self.edge
-        return np.sign(beyond) * np.maximum(np.abs(beyond) - self._gap_at(beyond), 0.0)
+        if self.gap == (0.0, 0.0):
+            return beyond
+        gap, crossing, far = self._gap_at(beyond), self._crossing(beyond), np.abs(beyond)
+        across = crossing * np.divide(far, gap, out=np.zeros_like(far), where=gap > 0.0)
+        return np.asarray(np.sign(beyond) * np.where(far > gap, far - gap + crossing, across))
 
     def values(self, y: Vector) -> Vector:
         """Return the warped y, shape kept."""
@@ -78,22 +93,39 @@ class Warp:
         return np.asarray(np.arcsinh(kept / self.scale_at(kept)))
 
     def back(self, warped: Vector) -> Vector:
-        """Return the y of warped values, shape kept."""
-        return np.asarray(self.edge + np.sign(warped) * self._gap_at(warped) + self.scale_at(warped) * np.sinh(warped))
-
-    def stretch(self, mean: Points, std: Points) -> Points:
-        """Return factors to means, and standard deviations, of y - edge from those of the warped y: P(y > edge) stays."""
-        slope = self.scale_at(mean) * np.divide(np.sinh(mean), mean, out=np.ones_like(mean), where=np.abs(mean) > 1e-6)
+        """Return the y of warped values, shape kept; those so far away that they are no numbers any more are nearer."""
+        warped = np.clip(warped, -_FARTHEST, _FARTHEST)
+        kept = self.scale_at(warped) * np.sinh(warped)
         if self.gap == (0.0, 0.0):
-            return np.asarray(slope)
-        z = np.maximum(np.abs(mean), 1e-6 * std) / std
-        return np.asarray(slope + self._gap_at(mean) * (2.0 * ndtr(z) - 1.0) / (z * std))
+            return np.asarray(self.edge + kept)
+        gap, crossing, far = self._gap_at(warped), self._crossing(warped), np.abs(kept)
+        across = gap * np.divide(far, crossing, out=np.zeros_like(far), where=crossing > 0.0)
+        return np.asarray(self.edge + np.sign(warped) * np.where(far > crossing, far - crossing + gap, across))
+
+    def moments(self, mean: Points, std: Points) -> tuple[Points, Points]:
+        """Return mean and standard deviation of y where the warped y is Gaussian with these, shape kept.
+
+        The mean is that of the warped mean, as an expectation of sinh is what its farthest tail makes of it, and the standard
+        deviation half of what lies between a standard deviation on either side; of a gap there are the moments of the sides.
+        """
+        mean, std = np.clip(mean, -_FARTHEST, _FARTHEST), np.clip(std, _LEAST, _FARTHEST)
+        low, high = mean - std, mean + std
+        spread = 0.5 * (self.scale_at(high) * np.sinh(high) - self.scale_at(low) * np.sinh(low))
+        middle = self.edge + self.scale_at(mean) * np.sinh(mean)
+        if self.gap == (0.0, 0.0):
+            return middle, spread
+        above, beyond = ndtr(mean / std), stdtr(_TAILS, -np.abs(mean) / std)
+        middle += above * self.gap[1] - (1.0 - above) * self.gap[0]
+        return middle, spread + sum(self.gap) * np.sqrt(beyond * (1.0 - beyond))
 
     def log_slope(self, y: Vector) -> Vector:
         """Return (n,) the logarithm of the warp's derivative at y (n,)."""
         kept = self.kept(y)
         scale = self.scale_at(kept)
-        return np.asarray(-0.5 * np.log1p((kept / scale) ** 2) - np.log(scale))
+        slope = -0.5 * np.log1p((kept / scale) ** 2) - np.log(scale)
+        gap, crossing = self._gap_at(kept), self._crossing(kept)
+        inside = np.abs(kept) < crossing
+        return np.asarray(slope + np.log(np.divide(crossing, gap, out=np.ones_like(scale), where=inside)))
 
     def learned(self, y: Vector) -> Vector:
         """Return what a metamodel learns: the warped y."""

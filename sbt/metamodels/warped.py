@@ -18,6 +18,7 @@ from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins, cell_shares
 from sbt.metamodels.warp import Warp
+from sbt.metamodels.warped_prediction import WarpedPrediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -31,7 +32,6 @@ _HEAVY, _SMALLER = 10.0, (0.1, 0.03)  # standard deviation over the median dista
 _STEEPEST = 16.0  # one side's scale over the other's
 _FEWEST, _MOST = 10, 200  # rows, from which on warps are compared, and on which at most: half of them those nearest to the edge
 _SURE, _SURER, _FEW = 2.0, 3.0, 8  # standard errors, and while so few rows lie on one side: units were taken by chance
-_FARTHEST = 300.0  # warped units, beyond which values are no numbers any more
 
 
 def better_warp(
@@ -125,11 +125,8 @@ class WarpedPredictor:
     warp: Warp
 
     def __call__(self, u: Points) -> Prediction:
-        """Return the prediction of y at u (n, d): of each component the mean goes back, and P(y beyond the edge) stays."""
-        found = self.predictor(u)
-        mean = np.clip(found.mean, -_FARTHEST, _FARTHEST)
-        ratio = self.warp.stretch(mean, found.std)
-        return Prediction(self.warp.edge + ratio * mean, found.std * ratio, found.weight, found.noise * (found.weight @ ratio))
+        """Return the prediction of y at u (n, d)."""
+        return WarpedPrediction.of(self.predictor(u), self.warp)
 
     def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) lower and upper bounds of P(y in M_c) at u (n, d)."""
@@ -149,7 +146,7 @@ class WarpedPredictor:
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of y as a function at u (m, d)."""
-        return self.warp.back(np.clip(sample_paths(self.predictor, u, n, rng), -_FARTHEST, _FARTHEST))
+        return self.warp.back(sample_paths(self.predictor, u, n, rng))
 
     @property
     def comparison(self) -> Any:
