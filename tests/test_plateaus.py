@@ -33,10 +33,45 @@ def floor(u):
 
 def test_a_plateau_is_a_value_shared_next_to_the_edge_and_slopes_around_it():
     slope = np.linspace(0.1, 1.0, 20)
-    assert plateau(np.r_[np.full(4, 0.02), slope, np.inf, -1.0]).tolist() == [True] * 4 + [False] * 22
-    assert not plateau(np.r_[np.full(3, 0.02), slope]).any()  # by chance
-    assert not plateau(np.r_[np.full(30, 0.02), np.full(30, 1.0)]).any()  # no slopes: nothing to follow
-    assert not plateau(np.r_[slope, np.full(30, 2.0)]).any()  # far from the edge
+
+    def shared(*margins: np.ndarray | float) -> np.ndarray:
+        margin = np.r_[margins]
+        return plateau(margin, stream(0, "anywhere").random((len(margin), 2)))
+
+    assert shared(np.full(4, 0.02), slope, np.inf, -1.0).tolist() == [True] * 4 + [False] * 22
+    assert not shared(np.full(3, 0.02), slope).any()  # by chance
+    assert not shared(np.full(30, 0.02), np.full(30, 1.0)).any()  # no slopes: nothing to follow
+    assert not shared(slope, np.full(30, 2.0)).any()  # far from the edge
+
+
+def test_the_least_of_a_slope_at_the_end_of_a_range_is_no_plateau():
+    """The same value at many inputs that do nothing, where the one that does is at its end: nothing lies beneath."""
+    u = stream(0, "slope").random((40, 3))
+    u[:12, 0] = 0.0
+    assert not plateau(1.0 + u[:, 0], u).any()
+    assert plateau(1.0 + np.maximum(u[:, 0] - 0.2, 0.0), u)[:12].all()  # it ends within the range, too
+
+
+def _slope_away(values: dict[str, float], seed: int) -> dict[str, float]:
+    """A slope to a corner where nothing is critical, and 1.6 % of the space at the opposite one, which nothing tells of."""
+    a, b, c = values["a"], values["b"], values["c"]
+    return {"y": -1.0 if abs(a - 0.85) < 0.1 and abs(b - 0.9) < 0.1 and c > 0.6 else 1.0 + a + b}
+
+
+def test_a_known_least_value_is_not_run_again_and_again(tmp_path):
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abcd"]
+    scenario = sbt.Scenario("slope_away", inputs, sbt.Requirement("y", high=0.0), evaluate=_slope_away)
+    found, again = [], 0
+    for seed in range(3, 7):
+        result = sbt.run(
+            campaign="falsification", scenario=scenario, budget=100, seed=seed, store=tmp_path / str(seed), executor="serial",
+            report=False,
+        )  # fmt: skip
+        late = result.frame[["x.a", "x.b"]].to_numpy()[60:]
+        again += int((late < 0.02).all(axis=1).sum())
+        found.append(result.conclusion.critical_runs > 0)
+    assert again <= 15  # of 160 runs; it was 52
+    assert sum(found) >= 3
 
 
 def test_picks_lie_beneath_the_middle_of_a_plateau_until_a_failure_explains_it():

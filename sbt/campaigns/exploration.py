@@ -102,8 +102,8 @@ def largest_batch(settings: Settings, log: Log) -> int:
 
 def _hidden(settings: Settings, log: Log) -> bool:
     """Return whether many runs share the best uncritical value: beneath such a plateau there may be critical regions."""
-    margin = settings.scenario.requirement.margins(log.history)
-    return bool(plateau(np.where(log.history.ok, margin, np.inf)).any())
+    margin, u = settings.scenario.requirement.margins(log.history), settings.scenario.space.to_unit(log.history.x)
+    return bool(plateau(np.where(log.history.ok, margin, np.inf), u).any())
 
 
 def space_filling(log: Log) -> Mask:

@@ -14,7 +14,17 @@ from sbt.metamodels.base import check_prediction, named_errors, sample_paths
 from sbt.metamodels.bootstrap import drawn_regression
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.noise import scores
-from sbt.samplers.search import Picks, Search, SearchData, WarpedModel, fill_uniformly, fit_warped, log_repulsion, refine_best
+from sbt.samplers.search import (
+    Picks,
+    Search,
+    SearchData,
+    WarpedModel,
+    fill_uniformly,
+    fit_warped,
+    log_repulsion,
+    refine_best,
+    spread_out,
+)  # fmt: skip
 
 __all__ = ["propose_in_noise"]
 
@@ -22,11 +32,15 @@ _UNIFORM = 3000  # candidates
 _LOG_AMONG = math.log(50.0), math.log(800.0)  # of the number that a draw decides among
 _LARGEST = 0.3  # share of the picks where the failure rate is believed to be largest; the others are draws
 _KINDS = 4  # of draws
+_HOPELESS, _INFLATION = 1e-6, 2.0  # P(critical), with sigma inflated, below which no run tells of failures
+_FILLING = 0.5  # share of the picks that fills space then
 _CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
 _BEST, _STEPS, _STEP = 20, 10, 0.1  # runs of the lowest scores, steps from each, their standard deviation in the unit cube
 
 
-def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, rng: np.random.Generator) -> Picks:
+def propose_in_noise(
+    search: Search, seen: SearchData, margin: Vector, n: int, rng: np.random.Generator, known: Points
+) -> Picks:  # fmt: skip
     """Return n points, those of the best mean score first: where the failure rate is believed to be largest, and draws.
 
     Three of ten (`rate`) are where the metamodel of the metric has the largest P(critical), wherever that is: runs there correct
@@ -35,7 +49,7 @@ def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, r
     sample path of the metamodel of the scores, and one of that of the metric. Lines learn a trend from few runs, trees
     thresholds, a process hollows. A draw decides among 50 to 800 random candidates: the best of few looks about, that of many
     looks closer. Runs that failed have the worst score. No failure's neighbourhood is left out: its rate is to be learned, and
-    is highest there.
+    is highest there. Where nothing was critical and noise explains no failure anywhere, half of the picks fill space.
 
     Args:
         search: what is searched.
@@ -43,6 +57,7 @@ def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, r
         margin: (m,) of `seen`.
         n: points wanted >= 1.
         rng: the only source of randomness.
+        known: (k, d) all runs, which picks that fill space keep away from.
 
     Source:
         Draws: Rubin (1981), The Bayesian bootstrap; choosing by the best of a draw: Thompson (1933).
@@ -57,9 +72,11 @@ def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, r
     with named_errors(noisy.metamodel, len(u)):
         process = noisy.metamodel.fit(inputs, score, rng)
     model = fit_warped(noisy, seen.u, seen.y, rng, seen.success)
-    largest = _largest(search, seen, model, best[seen.admissible(best)], round(_LARGEST * n), rng)
+    nowhere = bool(model.log_probability(candidates, _INFLATION).max() < math.log(_HOPELESS))
+    filled = round(_FILLING * n) if nowhere else 0
+    largest = _largest(search, seen, model, best[seen.admissible(best)], round(_LARGEST * (n - filled)), rng)
     picks: list[int] = []
-    for k in range(n - len(largest)):
+    for k in range(n - filled - len(largest)):
         among = rng.choice(len(at), min(int(np.exp(rng.uniform(*_LOG_AMONG))), len(at)), replace=False)
         points, kind = at[among], k % _KINDS
         if kind == 3:
@@ -70,7 +87,8 @@ def propose_in_noise(search: Search, seen: SearchData, margin: Vector, n: int, r
             value = drawn_regression(inputs, score, points, rng, trees=kind == 1)
         picks.append(int(among[np.argmin(value)]))
     chosen = np.vstack([largest, candidates[np.array(picks, dtype=np.intp)]])
-    why = ("rate",) * len(largest) + ("drawn",) * len(picks)
+    chosen = np.vstack([chosen, spread_out(seen.admissible, np.vstack([known, chosen]), filled, rng, search.cube)])
+    why = ("rate",) * len(largest) + ("drawn",) * len(picks) + ("fill",) * filled
     order = np.argsort(check_prediction(process(search.columns(chosen)), n).mu, kind="stable")
     return Picks(chosen[order], tuple(why[k] for k in order))
 

@@ -20,17 +20,22 @@ from sbt.samplers.search import Search, SearchData, fill_uniformly
 __all__ = ["beneath_plateaus", "plateau"]
 
 _FEWEST = 4  # runs that share the best uncritical value: two may do so by chance, or by a repeated input
+_FEWEST_WITHIN = 2  # of them, that lie at no end of a range
 _FEWEST_AROUND = 8  # other values, which make the slopes
 _EQUAL = 1e-6  # of the range of the margins
 _UNIFORM, _CHILDREN, _STEP = 1000, 8, 0.08  # candidates: uniform ones, and steps from each run of a plateau
+_LEAST_DEPTH = 0.05  # in median margins, beneath a floor: where slopes lead no deeper it is the least value that they lead to
 _BESIDE = 0.25  # share of the picks that look at slopes
 _ASIDE, _SLOPE = 0.15, 0.5  # steps from a floor to the slopes around it; how far above it those reach, in median margins
 _ALONG = 6  # points of the segment to a known failure: where none rises, the failure explains the place
 _BEST = 60  # candidates for which that is asked at once
 
 
-def plateau(margin: Vector) -> Mask:
-    """Return (n,) the runs that share the smallest margin > 0; none where they are few, or most, or there is no slope."""
+def plateau(margin: Vector, u: Points) -> Mask:
+    """Return (n,) the runs that share the smallest margin > 0; none where they are few, or most, or there is no slope.
+
+    Runs at an end of an input's range are no sign of one: the least of a slope is there, the same whatever other inputs are.
+    """
     safe = np.isfinite(margin) & (margin > 0)
     none = np.zeros(len(margin), dtype=bool)
     if not safe.any():
@@ -38,7 +43,8 @@ def plateau(margin: Vector) -> Mask:
     low, high = float(margin[safe].min()), float(margin[safe].max())
     flat = safe & (margin <= low + _EQUAL * (high - low))
     count, around = int(flat.sum()), len(np.unique(margin[safe & ~flat]))
-    few = count < _FEWEST or around < _FEWEST_AROUND
+    within = int((flat & ((u > 0.0) & (u < 1.0)).all(axis=1)).sum())
+    few = count < _FEWEST or around < _FEWEST_AROUND or within < _FEWEST_WITHIN
     return none if few else flat
 
 
@@ -64,7 +70,7 @@ def beneath_plateaus(
     """
     none = np.empty((0, u.shape[1]))
     margin = search.margins(y)
-    flat = plateau(margin)
+    flat = plateau(margin, u)
     if n <= 0 or seen.noisy or not flat.any():
         return none
     latent, floor = _latent(search, u, margin, flat, rng)
@@ -74,7 +80,7 @@ def beneath_plateaus(
     steps = search.cube.flipped(near, steps, _STEP, rng)
     points = np.vstack([fill_uniformly(seen.admissible, _UNIFORM, u.shape[1], rng), steps[seen.admissible(steps)]])
     depth = floor - latent(points)
-    points, depth = points[depth > 0], depth[depth > 0]
+    points, depth = points[depth > _LEAST_DEPTH], depth[depth > _LEAST_DEPTH]
     at = search.cube.embedded
     there = u if pending is None else np.vstack([u, pending])
     square = cdist(at(points), at(there), "sqeuclidean").min(axis=1) if len(points) else np.empty(0)

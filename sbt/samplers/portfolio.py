@@ -89,7 +89,7 @@ def propose(
     if len(seen.u) < 2:
         return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n, again)
     if repeats and seen.noisy and hidden_by_noise(u, search.margins(y)):
-        return replace(propose_in_noise(search, seen, search.critical.margin(seen.y), n, rng), repeat=again)
+        return replace(propose_in_noise(search, seen, search.critical.margin(seen.y), n, rng, u), repeat=again)
     seen = seen.thinned(search.critical.margin(seen.y), search.most_rows, rng)
     model = fit_warped(search, seen.u, seen.y, rng, seen.success)
     margin = search.critical.margin(seen.y) if not seen.noisy else model.critical.margin(model(seen.u).mu)
@@ -102,7 +102,7 @@ def propose(
     hopeful = _hopeful(model, found, seen.admissible, rng, search.cube)
     stagnant = not seen.noisy and seen.runs_since(margin) >= _STAGNANT  # noise hides what is better
     pending = np.empty((0, d)) if pending is None else pending
-    floor = plateau(search.margins(y))
+    floor = plateau(search.margins(y), u)
     beneath = _share_beneath(search.margins(y), floor if filling is None else floor & ~filling)
     under = beneath_plateaus(search, seen, u, y, round(beneath * n), rng, pending, beside=around_floors)
     flat = floor[seen.rows] & around_floors
