@@ -159,9 +159,12 @@ class _Builder:
             warm=self._warm_up(), space=space or ParameterSpace(()), covariates=self._covariates(),
         ))  # fmt: skip
         problems.check()
+        own = space or ParameterSpace(())
+        whole = problems.attempt(("ego",), lambda: own if simulation is None else own.extended(simulation.inputs)) or own
+        problems.check()
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
         return LogicalScenario(
-            name, space or ParameterSpace(()), requirement or Requirement("", high=0.0), simulation, metrics,
+            name, whole, requirement or Requirement("", high=0.0), simulation, metrics,
             model.description, roles=Roles(model.ego.id, None),
         )  # fmt: skip
 

@@ -297,11 +297,7 @@ class LogicalScenario:
 
     def _space_with(self, inputs: tuple[Parameter, ...]) -> ParameterSpace:
         """Return the space with these inputs of an AV under test in place of those of the present one."""
-        present = {p.name for p in getattr(self.simulate, "inputs", ())}
-        kept = tuple(p for p in self.space.parameters if p.name not in present)
-        if not present and not inputs:
-            return self.space
-        return replace(self.space, parameters=(*kept, *inputs))
+        return self.space.extended(inputs, without={p.name for p in getattr(self.simulate, "inputs", ())})
 
     def limited(self, timeout: float | None) -> LogicalScenario:
         """Return a copy whose runs look at the clock, where the scenario can."""

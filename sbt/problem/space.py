@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -91,6 +91,22 @@ class ParameterSpace:
                 raise InputError(f"'{name}' in '{formula.text}' is a number, but is compared with the text '{choice}'")
             if name in known:
                 known[name].number(choice)
+
+    def extended(self, inputs: tuple[Parameter, ...], without: Collection[str] = ()) -> ParameterSpace:
+        """Return the space with further inputs, independent of the others, and without some.
+
+        Raises:
+            InputError: there would be two inputs of one name.
+        """
+        kept = [k for k, name in enumerate(self.names) if name not in without]
+        if not inputs and len(kept) == self.dimension:
+            return self
+        correlation = None
+        if self.correlation is not None:
+            matrix = np.eye(len(kept) + len(inputs))
+            matrix[: len(kept), : len(kept)] = np.asarray(self.correlation)[np.ix_(kept, kept)]
+            correlation = tuple(map(tuple, matrix.tolist()))
+        return replace(self, parameters=(*(self.parameters[k] for k in kept), *inputs), correlation=correlation)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from sbt.errors import InputError
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
 from sbt.seeds import stream
-from sbt.sumo.actors import Controller, VehicleType
+from sbt.sumo.actors import Actor, Controller, VehicleType
 from sbt.sumo.formatting import format_number, plain
 from sbt.sumo.models import DEFAULT_LANE_CHANGE, unit_of, vtype_attributes
 
@@ -23,6 +23,7 @@ __all__ = ["SUMO", "Ego"]
 SUMO = "sumo"
 """The kind of an ego that one of SUMO's models drives."""
 _DEFAULTS = {"decel": "4.5", "emergencyDecel": "9", "accel": "2.6", "minGap": "2.5"}
+_SIZE = ("length", "width")
 _DECIDED_BEFORE = ("lane_change", "laneChangeModel")
 _RANGE_KEYS = ({"min", "max"}, {"min", "max", "unit"})
 
@@ -129,6 +130,21 @@ class Ego:
         length, width = float(given.pop("length", base.length)), float(given.pop("width", base.width))
         attributes = {"maxSpeed": format_number(set_speed), **_DEFAULTS, **dict(base.attributes), **given}
         return replace(base, length=length, width=width, attributes=tuple(sorted(attributes.items())))
+
+
+    def check_driven(self, actor: Actor) -> None:
+        """Refuse an actor that leaves settings of SUMO's model out: without the vehicle type they would do nothing.
+
+        Raises:
+            InputError: its type has not all that the settings give.
+        """
+        if self.kind != SUMO or not self.settings:
+            return
+        given, there = vtype_attributes(dict(self.settings)), {*_SIZE, *dict(actor.type.attributes)}
+        lacking = [name for name in given if name not in there] if actor.driver is None else list(given)
+        if lacking:
+            rule = "the scene must give the ego ego.driver(rng, set_speed) and the type ego.vehicle_type(base, set_speed)"
+            raise InputError(f"{rule}, or settings of ego do nothing, but {actor.name} lacks {', '.join(lacking)}")
 
 
 def _setting(name: str, value: Any) -> Any:

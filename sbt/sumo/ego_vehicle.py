@@ -12,6 +12,7 @@ import numpy as np
 
 from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
+from sbt.problem.plain import Values
 from sbt.sumo.actors import Controller, State
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.ego import SUMO, Ego
@@ -85,6 +86,10 @@ class EgoVehicle:
     def with_driver(self, driver: Ego) -> EgoVehicle:
         """Return the same vehicle with another driver."""
         return replace(self, driver=driver)
+
+    def bound(self, values: Values) -> EgoVehicle:
+        """Return the vehicle of one run, with the values of its driver's settings that are inputs."""
+        return self if self.driver is None else self.with_driver(self.driver.bind(values))
 
     def vehicle_type(self) -> str | None:
         """Return the XML of the vehicle type for another model of SUMO; None where none is needed."""

@@ -19,11 +19,14 @@ import numpy as np
 from sbt.errors import InputError, RunError
 from sbt.metrics.conflict_types import from_behind
 from sbt.problem.outcome import STRUCK, Status
+from sbt.problem.parameter import Parameter
+from sbt.problem.plain import Values
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import view_of
 from sbt.sumo.appearances import AppearanceMonitor
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, listed_only, unconfirmed_contact
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture
+from sbt.sumo.ego import Ego
 from sbt.sumo.ego_vehicle import EgoControl, EgoVehicle
 from sbt.sumo.guided import Placed
 from sbt.sumo.surroundings import Surroundings
@@ -73,6 +76,27 @@ class RecordingSettings:
         for name in ("duration", "within", "wait"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be > 0 and finite, but got {getattr(self, name)}")
+
+    @property
+    def inputs(self) -> tuple[Parameter, ...]:
+        """The settings of drivers that are inputs of the scenario, each once.
+
+        Raises:
+            InputError: two vehicles under test have different ranges of one setting.
+        """
+        found: dict[str, Parameter] = {}
+        for parameter in (p for one in (self.ego, *self.further) if one.driver is not None for p in one.driver.inputs):
+            if found.setdefault(parameter.name, parameter) != parameter:
+                raise InputError(f"vehicles under test must have one range of a setting, but {parameter.name} has several")
+        return tuple(found.values())
+
+    def with_driver(self, driver: Ego) -> RecordingSettings:
+        """Return the settings with this driver of all vehicles under test."""
+        return replace(self, ego=self.ego.with_driver(driver), further=tuple(one.with_driver(driver) for one in self.further))
+
+    def bound(self, values: Values) -> RecordingSettings:
+        """Return the settings of one run, with the values of what is an input."""
+        return replace(self, ego=self.ego.bound(values), further=tuple(one.bound(values) for one in self.further))
 
 
 class Recorder:

@@ -190,7 +190,9 @@ class SumoSimulation:
     def build_scene(self, values: Values, seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
         values = plain_values(values)
-        scene = self.scene(values, self.ego.bind(values), stream(seed, "scene"))
+        ego = self.ego.bind(values)
+        scene = self.scene(values, ego, stream(seed, "scene"))
+        ego.check_driven(scene.actors[0])
         if self.friction is None:
             return scene
         mu = self.friction

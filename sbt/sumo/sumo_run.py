@@ -16,6 +16,7 @@ from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import KEEP, Action, Actor, Obstacle, Scene, State, view_of
 from sbt.sumo.appearances import refuse_overlap_at_start
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, unconfirmed_contact
+from sbt.sumo.dead_ends import refuse_dead_ends
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
 from sbt.sumo.reading import ROW, Onlooker, observer, table
@@ -25,6 +26,7 @@ __all__ = ["SumoRun"]
 
 _SLACK = 1e-6
 """Below this distance (m) of two rectangles the quick separation tests do not decide, but the exact one."""
+_SPEED = 3  # column of a table of states
 _START_REMEDY = "change where the actors start, or keep the inputs apart by constraints"
 
 
@@ -54,6 +56,7 @@ class SumoRun:
         self._unconfirmed: tuple[str, ...] = ()
         self._onlooker: Onlooker | None = None
         self._ended = ""
+        self._sumo, self._prefix = sumo, prefix
         self.advance, self.recorded = self._functions(sumo, prefix)
 
     def _functions(self, sumo: Any, prefix: str) -> tuple[Callable[[], bool], Callable[[], int]]:
@@ -118,10 +121,15 @@ class SumoRun:
             self._unconfirmed = (unconfirmed_contact(sumo, ego, name, t, both, moved=moved, prefix=prefix),)
 
     def trace(self) -> Trace:
-        """Return the recorded trace, with the obstacles as standing actors."""
+        """Return the recorded trace, with the obstacles as standing actors.
+
+        Raises:
+            RunError: SUMO stopped a vehicle dead where its lane does not go on.
+        """
         scene, actors = self._scene, self._scene.actors
         seen = self._onlooker
         states = table(self._rows, 0, self.recorded(), len(actors)).copy() if seen is None else seen.table()
+        refuse_dead_ends(self._sumo, actors, states[:, :, _SPEED], self._dt, self._prefix)
         sizes = [(a.type.length, a.type.width) for a in actors]
         names = [a.name for a in actors]
         if scene.obstacles:

@@ -115,8 +115,9 @@ class TraciProxy:
     def start_files(self, files: SumoFiles) -> None:
         """Fill the placeholders of the files, start SUMO with them, and begin to record."""
         simulation = self._user_simulation
-        ego = simulation.recording.ego
-        vehicle_types = "".join(one.vehicle_type() or "" for one in (ego, *simulation.recording.further))
+        recording = simulation.recording.bound(self._values)
+        ego = recording.ego
+        vehicle_types = "".join(one.vehicle_type() or "" for one in (ego, *recording.further))
         if vehicle_types:
             path = scratch_folder() / "ego.add.xml"
             path.write_text(f"<additional>{vehicle_types}</additional>")
@@ -125,11 +126,11 @@ class TraciProxy:
         self._files = files
         self._module = self._connect(files)
         self._time = float(self._module.simulation.getTime())
-        waiting = WaitingEgo(ego.id, ego.delay, simulation.recording.wait)
+        waiting = WaitingEgo(ego.id, ego.delay, recording.wait)
         departures = DepartureMonitor(self._module, waiting, requested, files, self._values)
         rng = stream(self._seed, "ego")
-        first = Recorder(self._module, simulation.recording, rng, departures, simulation.timeout)
-        further = further_recorders(self._module, simulation.recording, files, self._values, self._seed)
+        first = Recorder(self._module, recording, rng, departures, simulation.timeout)
+        further = further_recorders(self._module, recording, files, self._values, self._seed)
         self._recorder = Recorders(first, further) if further else first
         self._motions = tuple(p.begin(self._module, self._values) for p in simulation.participants)
         self._watch.enter(PHASES[1])

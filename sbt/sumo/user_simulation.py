@@ -27,6 +27,7 @@ import numpy as np
 from sbt.errors import InputError, RunError
 from sbt.problem.isolation import SNAPSHOT, Isolation
 from sbt.problem.outcome import Status
+from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
 from sbt.problem.profile import Profile
 from sbt.problem.space import ParameterSpace
@@ -121,6 +122,11 @@ class UserSimulation:
         found = periods_of([one.driver for one in (self.recording.ego, *self.recording.further)], self.files)
         return (*found, ("the warm-up", self._divided(self.space, self.isolation.until).lasts)) if self.isolation.warm else found
 
+    @property
+    def inputs(self) -> tuple[Parameter, ...]:
+        """The settings of drivers that are inputs of the scenario."""
+        return self.recording.inputs
+
     def configured(
         self, ego: Mapping[str, Any] | None = None, isolation: str | None = None, step_length: float | None = None
     ) -> UserSimulation:
@@ -128,11 +134,7 @@ class UserSimulation:
         if isolation not in (None, "auto", "fresh", SNAPSHOT):
             raise InputError(f"executor.isolation must be auto, fresh or snapshot here, but got '{isolation}'")
         level = self.level if isolation is None else None if isolation == "auto" else isolation
-        recording = self.recording
-        if ego is not None:
-            driver = Ego.of(**ego)
-            further = tuple(one.with_driver(driver) for one in recording.further)
-            recording = replace(recording, ego=recording.ego.with_driver(driver), further=further)
+        recording = self.recording if ego is None else self.recording.with_driver(Ego.of(**ego))
         made = replace(self, recording=recording, step=self.step if step_length is None else step_length, level=level)
         if isolation == SNAPSHOT:
             made.isolation_in(made.space, WARM_UPS)  # refuses what cannot be
@@ -231,8 +233,7 @@ class UserSimulation:
         if low != high:
             rule = 'a range of friction must be an input of scenario.yaml (friction: "${mu}")'
             raise InputError(f"{rule}, but got simulation.friction from {low:g} to {high:g}")
-        others = tuple(p for p in self.participants if not isinstance(p, Friction))
-        return replace(self, participants=(Friction(str(low)), *others))
+        return replace(self, participants=(Friction(str(low)), *(p for p in self.participants if not isinstance(p, Friction))))
 
     def prepare(self) -> None:
         """Import libsumo, and read and check the files.
@@ -332,8 +333,7 @@ class UserSimulation:
         if not self.isolation.warm:
 
             def load(files: SumoFiles, given: Values) -> AbstractContextManager[Any]:
-                launch = files.launch(given, scratch_folder(), self.step)
-                return traci_connection(traci, [*program, *launch.command(seed)])
+                return traci_connection(traci, [*program, *files.launch(given, scratch_folder(), self.step).command(seed)])
 
             return self._run(values, seed, load, Stopwatch())
         state, launch = self._state(seed), self._warmed.launch
