@@ -22,6 +22,7 @@ from sbt.cli import app
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
 from sbt.metrics.geometry import select_instants
+from sbt.problem.outcome import Status
 from sbt.store.database import Store
 from sbt.sumo.files import options_of_command
 from sbt.sumo.template import template
@@ -203,6 +204,18 @@ def test_check_fails_where_sumo_leaves_out_traffic_that_is_not_sorted(study):
     code, output = check(study({CARS: [("</routes>", behind)]}))
     assert code != 0
     assert "SUMO leaves out 'early': a route file must be sorted by departure" in re.sub(r"\s+", " ", output)
+
+
+@pytest.mark.sumo
+def test_a_run_of_which_sumo_leaves_out_traffic_is_invalid(study):
+    """A file that is sorted for some values of an input, and for others not: no run is silently one without that traffic."""
+    behind = '    <person id="first" depart="${gap / 10}"><walk edges="road" arrivalPos="400"/></person>\n'
+    behind += '    <person id="late" depart="4"><walk edges="road" arrivalPos="400"/></person>\n</routes>'
+    scenario = ScenarioSpec(str(study({CARS: [("</routes>", behind)]}))).resolve()
+    assert scenario.simulate(scenario.space.values({"gap": 30.0}), 1).ended
+    with pytest.raises(RunError, match="a route file must be sorted by departure, whatever the inputs are, but SUMO leaves out 'late'") as raised:
+        scenario.simulate(scenario.space.values({"gap": 50.0}), 1)
+    assert raised.value.status == Status.INVALID
 
 
 def test_all_mistakes_are_reported_at_once(study):

@@ -8,6 +8,7 @@ import pytest
 from test_doors import files_of
 
 import sbt
+from sbt.errors import InputError
 
 FUNCTION = """import sbt
 SCENARIO = sbt.Scenario('s', [sbt.Parameter('a', 0, 1, 'm')], sbt.Requirement('gap', high=0.0),
@@ -50,3 +51,20 @@ def test_a_resolved_configuration_goes_on_from_any_folder(tmp_path, monkeypatch,
     again = sbt.run(tmp_path / "store" / "config.resolved.yaml", budget=6)
     assert len(again.history) == 6
     assert (again.history.x[:4] == first.history.x[:4]).all()
+
+
+def test_a_change_that_only_some_runs_show_is_refused_every_time(tmp_path):
+    """The first and the last run do not depend on it; of files that were changed since, more runs are tried."""
+    file = tmp_path / "mine.py"
+    file.write_text(FUNCTION.format("values['a']"))
+    study = {"campaign": "coverage", "scenario": f"{file}:SCENARIO", "store": tmp_path / "store", "executor": "serial"}
+    x = sbt.run(budget=12, **study).history.x[:, 0].tolist()
+    file.write_text(FUNCTION.format(f"values['a'] + (values['a'] not in ({x[0]!r}, {x[-1]!r}))"))
+    later = (tmp_path / "store" / "config.resolved.yaml").stat().st_mtime + 10.0
+    os.utime(file, (later, later))
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"code and files must give the runs of .* again .*changed since: .*mine\.py"):
+            sbt.run(budget=14, **study)
+    file.write_text(FUNCTION.format("values['a'] * 1.0"))
+    os.utime(file, (later, later))
+    assert len(sbt.run(budget=14, **study).history) == 14

@@ -220,6 +220,21 @@ def test_an_estimation_tells_the_probability_of_each_from_the_same_draws(tmp_pat
         assert found.probability == pytest.approx(union, rel=0.1)
 
 
+def test_the_noise_of_a_margin_is_what_is_left_where_the_metrics_are_known():
+    """Of the larger, or smaller, of two noisy margins; none where no metric is noisy."""
+    rng, mean, noise = np.random.default_rng(5), np.array([[0.2, 1.0], [0.4, -0.5]]), np.array([[0.3, 0.1], [0.2, 0.6]])
+    leaves = (Requirement("a", high=0.0), Requirement("b", high=0.0))
+    drawn = mean[:, :, None] + noise[:, :, None] * rng.standard_normal((2, 2, 200_000))
+    for how, of in ((any_of, np.min), (all_of, np.max)):
+        critical = how(*leaves).critical
+        parts = [Prediction.gaussian(mean[k], 2.0 * noise[k], noise[k]) for k in range(2)]
+        found = JointPrediction.of(parts, critical)
+        assert found.noise == pytest.approx(of(drawn, axis=0).std(axis=1), rel=0.02)
+        assert (found.epistemic > 0.0).all()
+        sure = JointPrediction.of([Prediction.gaussian(mean[k], 2.0 * noise[k]) for k in range(2)], critical)
+        assert (sure.noise == 0.0).all()
+
+
 def test_the_noise_of_repeats_is_that_of_each_metric():
     """An estimation whose metamodels learn no noise from the runs: what repeats tell is left to each metric alone."""
     z = np.linspace(-2.0, 2.0, 15)[:, None]

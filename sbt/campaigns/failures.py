@@ -321,10 +321,11 @@ def _rates(found: FalsificationConclusion) -> list[str]:
         f"run {run} {percent(r.estimate or 0.0)} of {r.runs} ({percent(r.low)} to {percent(r.high)})" for run, r in rates[:_TOLD]
     )
     race = "" if found.raced is None else f" and {plural(found.raced, 'repetition')} that count in no rate below"
+    first = f" of the first {_TOLD} of {len(rates)}" if len(rates) > _TOLD else ""
     return [
-        f"Failure modes are told in the order of their failure rates, by the share of critical runs near them{race}, not of how"
-        " deep they are.",
-        f"Failure rates with fresh seeds ({percent(rates[0][1].confidence)} interval): {told}.",
+        "Failure modes are told in the order of the failure rates that the search expects, by the share of critical runs near"
+        f" them{race}, not of how deep they are; few repetitions may say otherwise.",
+        f"Failure rates{first} with fresh seeds ({percent(rates[0][1].confidence)} interval): {told}.",
     ]
 
 

@@ -215,7 +215,7 @@ def _worst(mode: FailureMode, facts: Facts) -> str:
         deepest = int(history.index[int(np.nanargmin(margins))])
         own = history.index == mode.representative
         if own.any() and np.nanmin(margins) < margins[own][0]:  # of a noisy simulator: the likeliest is not the deepest
-            said = said.replace(f"{one}, ", "", 1) + f", the likeliest to fail again (run {deepest} is the deepest)"
+            said = said.replace(f"{one}, ", "", 1) + f", by the search the likeliest to fail again (run {deepest} is the deepest)"
     n = mode.confirmation_runs
     if mode.confirmed is None or n == 0:
         return f"{said}, was not repeated"

@@ -25,6 +25,8 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["JointMetamodel", "JointPrediction", "JointPredictor", "LogPair", "joined_log_probability", "metamodel_for"]
 
+_LEAST = 1e-6
+"""Of a metric's standard deviation: its noise, at least, where that of another one is asked for."""
 LogPair = tuple[Vector, Vector]
 """(n,) log P(critical) and (n,) log P(uncritical)."""
 
@@ -120,11 +122,17 @@ class JointPrediction(Prediction):
         Source:
             Clark (1961), The greatest of a finite set of random variables, Operations Research 9: the moments.
         """
-        margins = []
-        for part, leaf, unit in zip(parts, critical.leaves, critical.scale or (1.0,) * len(parts), strict=True):
-            margins.append((leaf.margin(part.mu) / unit, part.sigma / unit))
-        mean, std = critical.fold(margins, lambda a, b: _negated(_clark(_negated(a), _negated(b))), _clark)
-        return cls(mean[None], std[None], np.ones(1), np.zeros(len(mean)), parts=tuple(parts), critical=critical)
+        units = critical.scale or (1.0,) * len(parts)
+        means = [leaf.margin(part.mu) / unit for part, leaf, unit in zip(parts, critical.leaves, units, strict=True)]
+
+        def moments(spreads: list[Vector]) -> _Moments:
+            margins = [(mean, spread / unit) for mean, spread, unit in zip(means, spreads, units, strict=True)]
+            return critical.fold(margins, lambda a, b: _negated(_clark(_negated(a), _negated(b))), _clark)
+
+        mean, std = moments([part.sigma for part in parts])
+        noise = moments([np.maximum(part.noise, _LEAST * part.sigma) for part in parts])[1]  # what is left where means are known
+        noise = np.where(np.any([part.noise > 0.0 for part in parts], axis=0), np.minimum(noise, std), 0.0)
+        return cls(mean[None], std[None], np.ones(1), noise, parts=tuple(parts), critical=critical)
 
     @cached_property
     def _whole(self) -> CombinedInterval:

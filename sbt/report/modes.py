@@ -26,9 +26,9 @@ _COLOURS = ("#c1272d", "#1f4e79", "#e08e0b", "#2e7d5b", "#7b4fa3", "#0e8fa0", "#
 _JOINED = "Critical runs are one mode where the metamodel joins them by a segment with P(critical) > 0.5"
 _ALIKE = " and the nearest road user was on the same side of ego and on the same course"
 _NOTE = (
-    "; the deepest mode first, of a noisy simulator the one that fails most often. Confirmed: share of repetitions of the"
-    " representative with fresh seeds that were critical again. What makes it safe: the change of inputs to the nearest run, in"
-    " the unit cube, that is not critical. Most likely: the mode's run of largest density."
+    "; the deepest mode first, of a noisy simulator the one that the search expects to fail most often. Confirmed: share of"
+    " repetitions of the representative with fresh seeds that were critical again. What makes it safe: the change of inputs"
+    " to the nearest run, in the unit cube, that is not critical. Most likely: the mode's run of largest density."
 )
 
 

@@ -6,15 +6,18 @@ SUMO names the id of an element, but neither its file nor its line, and seldom a
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from sbt.errors import did_you_mean
+from sbt.errors import RunError, did_you_mean
+from sbt.problem.outcome import Status
 from sbt.sumo.elements import Element, elements
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import template
 
-__all__ = ["explained"]
+__all__ = ["DROPPED", "dropped", "explained", "refuse_dropped"]
 
+DROPPED = "should be sorted by departure time, ignoring"
+"""In SUMO's warning about such traffic."""
 _PREFIX = "SUMO: "
 _KINDS = {
     "vehicle": ("vehicle", "trip", "flow"), "flow": ("flow", "personFlow"), "route": ("route",), "vehicle type": ("vType",),
@@ -47,6 +50,24 @@ def explained(reason: str, files: SumoFiles) -> str:
             remedy = ": " + advise(match, known, files)
             break
     return f"{'' if first is None else _place(reason, first, known)}{reason.rstrip('. ')}{remedy}"
+
+
+def dropped(lines: Sequence[str]) -> list[str]:
+    """Return the traffic, as SUMO names it, that it left out of a run because a file is not sorted by departure."""
+    return [line.rpartition("ignoring ")[2].rstrip("!") for line in lines if DROPPED in line]
+
+
+def refuse_dropped(lines: Sequence[str]) -> None:
+    """Refuse a run of which SUMO left out traffic that its files ask for.
+
+    Raises:
+        RunError: it did.
+    """
+    names = dropped(lines)
+    if names:
+        rule = "a route file must be sorted by departure, whatever the inputs are"
+        remedy = "put what departs by an input into a route file of its own"
+        raise RunError(Status.INVALID, f"{rule}, but SUMO leaves out {', '.join(dict.fromkeys(names))}: {remedy}")
 
 
 def _element(known: list[Element], kind: str, name: str) -> Element | None:

@@ -42,7 +42,7 @@ from sbt.sumo.formatting import plain_values
 from sbt.sumo.friction import Friction
 from sbt.sumo.guided import GuidedVehicle, Participant
 from sbt.sumo.levels import levels_of
-from sbt.sumo.messages import explained
+from sbt.sumo.messages import explained, refuse_dropped
 from sbt.sumo.phases import Stopwatch
 from sbt.sumo.recorder import RecordingSettings, RunEnded
 from sbt.sumo.session import scratch_folder, session
@@ -220,9 +220,9 @@ class UserSimulation:
         """Return what a seed draws by the user's function, at no simulation; None where there is none."""
         if self.covariates is None:
             return None
-        curves = {profile.name: profile.curve(plain_values(values)) for profile in self.profiles}
+        given = plain_values(values)
         with contextlib.chdir(self.folder):
-            return self.covariates({**plain_values(values), **curves}, stream(seed, "loop"))
+            return self.covariates({**given, **{p.name: p.curve(given) for p in self.profiles}}, stream(seed, "loop"))
 
     def with_friction(self, low: float, high: float) -> UserSimulation:
         """Return a copy on roads of this friction.
@@ -253,8 +253,7 @@ class UserSimulation:
         """Run one concrete scenario in libsumo.
 
         Raises:
-            RunError: SUMO or the loop fails, a vehicle departs differently than requested, the ego is absent
-                or leaves, or the run takes too long.
+            RunError: SUMO or the loop fails, traffic departs differently than requested, the ego is absent, or time is over.
         """
         return self._simulated(values, seed)[0]
 
@@ -280,24 +279,26 @@ class UserSimulation:
                 session().ask(lambda sumo: levels_of(sumo).warning)  # found once a network, here and not in every child
                 limit = None if self.timeout is None else self.timeout + _GRACE
                 return in_fork(partial(self._in_child, values, seed, connect), limit, "a run")
-        watch = Stopwatch()
-        trace = self._run(values, seed, connect, watch)
-        watch.enter(watch.phase)
-        return trace, watch.seconds
+        return self._complete(values, seed, connect)
 
     def _in_child(self, values: Values, seed: int, connect: Connect) -> tuple[Trace, dict[str, float]]:
         """Run in a child of the process that holds the simulation."""
         session().begin_child()
         self._warmed.begin_child()
+        return self._complete(values, seed, connect)
+
+    def _complete(self, values: Values, seed: int, connect: Connect) -> tuple[Trace, dict[str, float]]:
+        """Run with libsumo, and refuse a run of which SUMO left out traffic."""
         watch = Stopwatch()
         trace = self._run(values, seed, connect, watch)
+        refuse_dropped(session().messages())
         watch.enter(watch.phase)
         return trace, watch.seconds
 
     def _state(self, seed: int) -> Path:
         """Write the state that a run begins with, and return its path."""
-        warmed, chosen = self._warmed, self.isolation
-        return warmed.state(seed % chosen.seeds, chosen.states).write(seed, warmed.folder / "run.state.xml")
+        state = self._warmed.state(seed % self.isolation.seeds, self.isolation.states)
+        return state.write(seed, self._warmed.folder / "run.state.xml")
 
     def _loaded(self, files: SumoFiles, values: Values, *, seed: int) -> AbstractContextManager[Any]:
         """Load the files of a run."""
@@ -313,7 +314,7 @@ class UserSimulation:
 
     def warnings(self) -> tuple[str, ...]:
         """Return SUMO's warnings about the files in the last run of this process, each once, and that on missing heights."""
-        lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
+        lines = [line for line in session().messages() if line.startswith(("Warning:", "Error:"))]
         found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
         return (*filter(None, [session().ask(lambda sumo: levels_of(sumo).warning)]), *found)
 
@@ -324,8 +325,7 @@ class UserSimulation:
             values: of the inputs.
             seed: of the run.
             traci: the module.
-            program: the SUMO program and options that the run itself does not set, such as
-                `("sumo-gui", "--delay", "100")`.
+            program: the SUMO program and options that the run does not set, such as `("sumo-gui", "--delay", "100")`.
 
         Returns:
             The trace, identical to that of a call.
@@ -342,7 +342,7 @@ class UserSimulation:
 
     @property
     def outputs(self) -> Path:
-        """The folder that holds what the last run in this process wrote."""
+        """Where the last run in this process wrote."""
         return self._warmed.folder if self.isolation.warm else scratch_folder()
 
     def write_files(self, values: Values, seed: int, folder: Path) -> None:

@@ -26,6 +26,7 @@ from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.seeds import run_seed
 from sbt.sumo.files import SumoFiles
+from sbt.sumo.messages import DROPPED, dropped
 from sbt.sumo.suggesting import units_apart
 from sbt.workflows.comparing import compared_times
 from sbt.workflows.drawn import covariates_first
@@ -45,7 +46,6 @@ _INSTANTLY = "; SUMO changes lanes within a step unless its option lanechange.du
 _MOVED = "; SUMO moves walkers, and who parks or rides, from one place to another within a step"
 _STEP = 1.0
 """How much shorter than a formula's horizon a run may be (s): a step of SUMO at most."""
-_DROPPED = "should be sorted by departure time, ignoring"
 _WARNINGS = 8
 """Most warnings of the simulator that are shown."""
 _RUN_DEADLINE = 60.0
@@ -271,10 +271,10 @@ def _warned(spec: ScenarioSpec) -> list[Finding]:
     """Return what the simulator warned of in the last run, where the scenario passes it on (a user's own SUMO files)."""
     said = getattr(spec.resolve().simulate, "warnings", None)
     every = () if said is None else said()
-    dropped = [line.rpartition("ignoring ")[2].rstrip("!") for line in every if _DROPPED in line]
-    detail = f"SUMO leaves out {', '.join(dropped)}: a route file must be sorted by departure"
-    complete = [Finding("all traffic of the files is there", ok=False, detail=detail)] if dropped else []
-    return [*complete, *_warnings([line for line in every if _DROPPED not in line])]
+    names = dropped(every)
+    detail = f"SUMO leaves out {', '.join(names)}: a route file must be sorted by departure"
+    complete = [Finding("all traffic of the files is there", ok=False, detail=detail)] if names else []
+    return [*complete, *_warnings([line for line in every if DROPPED not in line])]
 
 
 def _warnings(lines: Sequence[str]) -> list[Finding]:

@@ -18,7 +18,7 @@ from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.running import Finished, check_shard, run_shard, run_stages
 from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard, sentences_of
-from sbt.plugins import OBJECT, Objects, forget_files
+from sbt.plugins import OBJECT, Objects, forget_files, newer
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Doubt, Job, Outcome, Status
@@ -36,6 +36,8 @@ from sbt.workflows.study import RESOLVED, Study, changed_since
 
 __all__ = ["Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
 
+_TRIED = 20
+"""Runs that are tried again before a campaign goes on whose files were changed since, evenly spread over those that are there."""
 _MAY_CHANGE = {COARSE_COST, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
@@ -113,7 +115,9 @@ def run_study(
             check_shard(campaign)
         store.begin(snapshot)
         _check_same(store, snapshot)
-        keep_configuration(store, study, snapshot)
+        changed = newer(store.folder / RESOLVED) if (store.folder / RESOLVED).is_file() else []
+        if not changed:  # else what is written is newer, so that the runs are tried before
+            keep_configuration(store, study, snapshot)
         common: Json = {
             "seed": study.config.seed, "requirement": study.scenario.requirement, "versions": versions(),
             "listener": progress or (lambda _: None),
@@ -121,7 +125,9 @@ def run_study(
         executor = study.executor()  # at the isolation level that the store remembers
         warm_up(study.spec, study.config.executor.workers, partial(_tell, store, study, common["listener"]))
         with executor:
-            _check_code(store, study, executor)
+            _check_code(store, study, executor, changed)
+            if changed:
+                keep_configuration(store, study, snapshot)
             if shard is None:
                 finished = run_stages(campaign, store, executor, budget=study.budget, workers=study.workers, **common)
             else:
@@ -144,21 +150,23 @@ def _tell(store: Store, study: Study, listener: Callable[[Progress], None], acti
     listener(Progress(*counts, activity))
 
 
-def _check_code(store: Store, study: Study, executor: Executor) -> None:
-    """Refuse to go on with a store whose runs the user's code would not give again.
+def _check_code(store: Store, study: Study, executor: Executor, changed: Sequence[Path]) -> None:
+    """Refuse to go on with a store whose runs the user's code and files would not give again.
 
-    The first and the last with metrics are tried, and the first that could not be: code may change just what is invalid.
+    The first and the last with metrics are tried, where files were changed since as many as `_TRIED` of all, and the first that
+    could not be run: code may change just what is invalid.
     """
     history = store.history()
     if not _own_code(study):
         return
     ok, invalid = np.flatnonzero(history.ok), np.flatnonzero(history.status == str(Status.INVALID))
-    for record, outcome in _again(history, [*ok[:1], *ok[-1:], *invalid[:1]], executor):
+    tried = ok[np.linspace(0, len(ok) - 1, min(_TRIED if changed else 2, len(ok))).round().astype(np.intp)]
+    for record, outcome in _again(history, [*tried, *invalid[:1]], executor):
         if dict(outcome.metrics) != dict(record.metrics):
             now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics) or record.reason
             rule = f"code and files must give the runs of {store.folder} again to go on, but run {record.index} now gives {now}"
-            remedy = "choose another store for what has changed"
-            raise InputError(f"{rule}, not {stored}{changed_since(store.folder)}; {remedy}")
+            since = f"; changed since: {', '.join(map(str, changed))}" if changed else ""
+            raise InputError(f"{rule}, not {stored}{since}; choose another store for what has changed")
 
 
 def _check_earlier(study: Study) -> None:
