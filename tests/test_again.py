@@ -103,6 +103,7 @@ def test_one_requirement_of_a_combination_is_asked_for_by_its_name(tmp_path):
         store=tmp_path / "store",
     )  # fmt: skip
     assert found.estimate(metric="late").probability == pytest.approx(norm.sf(2.0), rel=0.05)
+    assert found.estimate(metric="y") == found.estimate(metric="late")
     assert found.estimate(metric="late", critical=(2.5, np.inf)) == found.estimate(metric="y", critical=(2.5, np.inf))
     said = CliRunner().invoke(app, ["estimate-again", str(found.store), "--metric", "late", "--critical", "1e3,inf"])
     assert "among 120 runs" in " ".join(said.output.split())

@@ -104,6 +104,27 @@ def test_the_scenario_contract_finds_a_scenario_that_is_never_the_same(analytic)
     assert "same seed, same trace" in [finding.rule for finding in bad if not finding.ok]
 
 
+_IDLE = """
+import sbt
+
+INPUTS = [*(sbt.Parameter(name, 0, 1) for name in ("a", "b", "late")), sbt.Parameter("kind", choices=["car", "van"])]
+
+def evaluate(values, seed):
+    return {"m": values["a"] + seed % 7 + (values["late"] if values["a"] > 0.6 else 0.0)}
+
+SCENARIO = sbt.Scenario("s", INPUTS, sbt.Requirement("m", high=0.5), evaluate=evaluate, metrics=["m"])
+"""
+
+
+def test_inputs_that_change_nothing_are_told(tmp_path: Path):
+    """Those that do somewhere are not among them, and a seed's noise hides none."""
+    (tmp_path / "s.py").write_text(_IDLE)
+    found = check_scenario(ScenarioSpec(f"{tmp_path / 's.py'}:SCENARIO"))
+    (idle,) = (one for one in found if one.rule.endswith("inputs that change nothing"))
+    assert idle.ok
+    assert idle.detail.startswith("b, kind: 8 random runs are bit by bit the same")
+
+
 _HANGS = """
 import os
 import time

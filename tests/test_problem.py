@@ -389,6 +389,9 @@ def test_closed_ends_belong_to_the_critical_interval():
     assert CriticalInterval(0.0, 0.0).contains(np.array([0.0, 1e-300])).tolist() == [True, False]
     assert CriticalInterval(high=0.0).contains(np.array([-np.inf, np.nan])).tolist() == [True, False]
     assert np.isnan(CriticalInterval(high=0.0).margin(np.array([np.nan]))).all()
+    with np.errstate(all="raise"):
+        for interval, deep, far in ((CriticalInterval(high=0.0), -np.inf, np.inf), (CriticalInterval(low=2.0), np.inf, -np.inf)):
+            assert interval.margin(np.array([deep, far])).tolist() == [-np.inf, np.inf]
 
 
 def test_metrics_of_a_run_are_finite_or_the_run_failed():

@@ -353,10 +353,10 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     unseen = 3.0 / max(found.probability, 1e-300)
     if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
         return (
-            f"it is as narrow as asked; to bound the unseen by the estimate itself, draw {rounded(unseen):,} runs from the"
+            f"it is narrow enough; to bound the unseen by the estimate itself, draw {rounded(unseen):,} runs from the"
             " inputs' distribution (acquisition: {kind: monte_carlo})"
         )
-    return f"it is as narrow as asked{'; look at the critical runs in the report' if found.hits else ''}"
+    return f"it is narrow enough{'; look at the critical runs in the report' if found.hits else ''}"
 
 
 def _every_combination(facts: Facts) -> str:

@@ -79,8 +79,14 @@ class CriticalInterval:
         return (np.asarray(y) >= self.low) & (np.asarray(y) <= self.high)
 
     def margin(self, y: Vector) -> Vector:
-        """Return (n,) the signed distance of y to M_c, <= 0 where critical, in the unit of y; NaN stays NaN."""
-        return np.maximum(self.low - np.asarray(y), np.asarray(y) - self.high)
+        """Return (n,) the signed distance of y to M_c, <= 0 where critical, in the unit of y; NaN stays NaN.
+
+        An infinite y beyond an open end is infinitely deep.
+        """
+        y = np.asarray(y, dtype=np.float64)
+        nowhere = np.where(np.isnan(y), np.nan, -np.inf)
+        below = self.low - y if math.isfinite(self.low) else nowhere
+        return np.maximum(below, y - self.high if math.isfinite(self.high) else nowhere)
 
 
 def as_reached(critical: CriticalInterval, y: Vector) -> CriticalInterval:

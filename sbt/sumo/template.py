@@ -21,6 +21,8 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from xml.sax.saxutils import escape, quoteattr, unescape
 
+import numpy as np
+
 from sbt.errors import InputError, RunError
 from sbt.plugins import kept, noted
 from sbt.problem.expression import Expression
@@ -203,10 +205,13 @@ def text_of(placeholder: Placeholder, values: Values) -> str:
     for name in placeholder.formula.numbers():
         if isinstance(values.get(name), str):
             rule = f"'{name}' is an input with choices and no number"
-            raise RunError(Status.INVALID, f"{placeholder.place}: ${{{placeholder.formula.text}}} must be a formula, but {rule}")
-    value = float(placeholder.formula(values))
+            place = placeholder.place.removesuffix(": ")
+            raise RunError(Status.INVALID, f"{place}: ${{{placeholder.formula.text}}} must be a formula, but {rule}")
+    with np.errstate(all="ignore"):
+        value = float(placeholder.formula(values))
     if not math.isfinite(value):
-        raise RunError(Status.INVALID, f"{placeholder.place}: ${{{placeholder.formula.text}}} must be finite, but got {value}")
+        place = placeholder.place.removesuffix(": ")
+        raise RunError(Status.INVALID, f"{place}: ${{{placeholder.formula.text}}} must be finite, but got {value}")
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 

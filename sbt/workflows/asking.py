@@ -111,7 +111,8 @@ def _settings(study: Study, requirement: Requirement) -> Settings:
 
 
 def _requirement(old: Requirement, metric: str | None, critical: tuple[float, float] | None) -> Requirement:
-    named = next((part for part in old.parts if metric == part.label), None)
+    of_metric = [part for part in old.parts if metric == part.metric]
+    named = next((part for part in old.parts if metric == part.label), of_metric[0] if len(of_metric) == 1 else None)
     if named is not None:
         return named if critical is None else replace(named, low=critical[0], high=critical[1])
     if metric is not None and metric != old.metric and critical is None:

@@ -24,7 +24,7 @@ from sbt.problem.plain import Value, Values, written
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
-from sbt.seeds import run_seed
+from sbt.seeds import run_seed, stream
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.messages import DROPPED, dropped
 from sbt.sumo.suggesting import units_apart
@@ -48,6 +48,8 @@ _STEP = 1.0
 """How much shorter than a formula's horizon a run may be (s): a step of SUMO at most."""
 _WARNINGS = 8
 """Most warnings of the simulator that are shown."""
+_FEWEST_CHANGED, _MOST_CHANGED = 3, 8
+"""Random runs, at most, that are made again with other values of an input, until one tells that it changes something."""
 _RUN_DEADLINE = 60.0
 """Longest run (s), where the scenario looks at the clock."""
 _WORKER_DEADLINE = 300.0
@@ -119,13 +121,14 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
         return
     again = _runs(spec, jobs[::-1])[::-1]
     yield _equal("same seed, same trace", first, again, points)
+    yield from _idle(spec, asked.space, seed)
     yield from drawn()
     same = "same seed, same trace in a worker process"
     yield Finding(same, ok=False, detail=other.why) if isinstance(other, _Lost) else _equal(same, first, other, points)
     yield from _isolations(spec, jobs, points)
     yield from snapshot_findings(spec, points, seed, _digest)
     yield from fidelity_findings(spec, asked, seed)
-    yield from _physics(first, points)
+    yield from _physics(first, points, spec)
     yield _sides([run for run in first if not run.problem], asked)
     for name, said in compared_times(asked, jobs):
         yield Finding(f"for information: {name}", ok=True, detail=said)
@@ -149,6 +152,26 @@ def _points(space: ParameterSpace) -> Iterator[dict[str, Value]]:
             if choice != p.centre:
                 chosen = np.vstack([chosen, at[space.feasible(at)][:1]])
     yield from (space.named(point) for point in chosen)
+
+
+def _idle(spec: ScenarioSpec, space: ParameterSpace, seed: int) -> list[Finding]:
+    """Return which inputs change nothing of random runs, at whichever end of their range they are; none where all do."""
+    still, tried = [p.name for p in space.parameters], 0
+    points = space.from_unit(stream(seed, "idle").random((_MOST_CHANGED, space.dimension)))
+    for k, values in enumerate(map(space.named, points[space.feasible(points)])):
+        ends = [(p.name, end) for p in space.parameters if p.name in still for end in (p.choices or p.bounds)]
+        given = [(name, {**values, name: end}) for name, end in ends]
+        inside = space.feasible(np.array([space.numbers(one) for _, one in given]))
+        given = [one for one, possible in zip(given, inside, strict=True) if possible]
+        run, *changed = _runs(spec, [(one, run_seed(seed, k)) for one in (values, *(one for _, one in given))])
+        moves = {name for (name, _), other in zip(given, changed, strict=True) if other != run}
+        still, tried = [name for name in still if name not in moves], tried + 1
+        if not still:
+            return []
+    if tried < _FEWEST_CHANGED:
+        return []
+    detail = f"{', '.join(still)}: {tried} random runs are bit by bit the same, with the same seed, at the ends of the range"
+    return [Finding("for information: inputs that change nothing", ok=True, detail=detail)]
 
 
 def _runs(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_Run]:
@@ -300,7 +323,7 @@ def _looks_beyond(runs: list[_Run], scenario: LogicalScenario) -> list[Finding]:
     return [Finding("for information: formulas", ok=True, detail=detail)] if said else []
 
 
-def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:
+def _physics(runs: list[_Run], points: list[dict[str, Value]], spec: ScenarioSpec) -> list[Finding]:
     """Return which laws of motion are broken, and where first: a failure in such a run is hardly one of the AV."""
     broken = [(breach, values) for run, values in zip(runs, points, strict=True) for breach in run.breaches]
     if not broken:
@@ -308,7 +331,8 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]]) -> list[Finding]:
     share = f"{sum(bool(run.breaches) for run in runs)} of {len(runs)} runs"
     first = {breach.partition(" must")[0]: (breach, values) for breach, values in broken[::-1]}
     detail = "; ".join(f"{breach} ({written(values)})" for breach, values in first.values())
-    if any(name.startswith(("sideways", "lateral")) for name in first):
+    options = getattr(getattr(spec.resolve().simulate, "files", None), "options", {})
+    if any(name.startswith(("sideways", "lateral")) for name in first) and "lanechange.duration" not in options:
         detail += _INSTANTLY
     if any(name.startswith("walking") for name in first):
         detail += _MOVED
