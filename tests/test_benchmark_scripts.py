@@ -43,6 +43,7 @@ SMALLEST = {
     "fuzz.py": "--configurations 2 --scenarios 1",
     "jumps.py": "--problems disc_count --seeds 1 --budget 30",
     "kernels.py": "--problems metaball --runs 40 --seeds 1",
+    "least_values.py": "--problems flat --seeds 1 --budget 20",
     "links.py": "--seeds 1 --budget 40",
     "large.py": "--runs 200 --batch 100",
     "pair_estimates.py": (

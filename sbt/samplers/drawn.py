@@ -33,7 +33,7 @@ _LOG_AMONG = math.log(50.0), math.log(800.0)  # of the number that a draw decide
 _LARGEST = 0.3  # share of the picks where the failure rate is believed to be largest; the others are draws
 _KINDS = 4  # of draws
 _HOPELESS, _INFLATION = 1e-6, 2.0  # P(critical), with sigma inflated, below which no run tells of failures
-_FILLING = 0.5  # share of the picks that fills space then
+_FILLING = 0.8  # share of the picks that fills space then
 _CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
 _BEST, _STEPS, _STEP = 20, 10, 0.1  # runs of the lowest scores, steps from each, their standard deviation in the unit cube
 
@@ -49,7 +49,7 @@ def propose_in_noise(
     sample path of the metamodel of the scores, and one of that of the metric. Lines learn a trend from few runs, trees
     thresholds, a process hollows. A draw decides among 50 to 800 random candidates: the best of few looks about, that of many
     looks closer. Runs that failed have the worst score. No failure's neighbourhood is left out: its rate is to be learned, and
-    is highest there. Where nothing was critical and noise explains no failure anywhere, half of the picks fill space.
+    is highest there. Where nothing was critical and noise explains no failure anywhere, four fifths of the picks fill space.
 
     Args:
         search: what is searched.

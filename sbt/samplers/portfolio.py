@@ -99,7 +99,7 @@ def propose(
         np.concatenate([seen.batch[fresh], seen.failed_batch]), search.cube,
         np.concatenate([fills[seen.rows][fresh], np.zeros(len(seen.failed), dtype=bool)]), minima=not seen.noisy,
     )  # fmt: skip
-    hopeful = _hopeful(model, found, seen.admissible, rng, search.cube)
+    hopeful = _hopeful(model, found, seen, rng, search.cube)
     stagnant = not seen.noisy and seen.runs_since(margin) >= _STAGNANT  # noise hides what is better
     pending = np.empty((0, d)) if pending is None else pending
     floor = plateau(search.margins(y), u)
@@ -169,16 +169,20 @@ def _in_niches(
 
 
 def _hopeful(
-    model: WarpedModel, found: list[Region], admissible: Callable[[Points], Mask], rng: np.random.Generator, cube: Cube
+    model: WarpedModel, found: list[Region], seen: SearchData, rng: np.random.Generator, cube: Cube
 ) -> list[tuple[Region, Points]]:
-    """Return the regions in which a critical run may be, each with its candidates."""
+    """Return the regions in which a critical run may be, each with its candidates.
+
+    A deterministic metric is followed a while whatever P(critical) is, since the slope may get steeper than few runs tell; of a
+    noisy one the noise is known.
+    """
     hopeful = []
     for region in found:
         points = region.candidates(_LOCAL, rng, cube)
-        points = points[admissible(points)]
+        points = points[seen.admissible(points)]
         if len(points) == 0:
             continue
-        tried = region.failures >= PATIENCE
+        tried = seen.noisy or region.failures >= PATIENCE
         if not tried or model.log_probability(points, _INFLATION).max() >= np.log(_HOPELESS):
             hopeful.append((region, points))
     return hopeful
