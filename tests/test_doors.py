@@ -170,7 +170,7 @@ def test_seed_is_the_runs_and_repeats(study):
         ({YAML: [("ego: ego", "ego: {id: ego, kind: acc_aeb, reaction_tiem: 1}")]}, r"scenario.yaml:5:6: ego: ego settings must be ones that 'acc_aeb' takes"),
         ({YAML: [("duration: 10", "duratoin: 10")]}, r"scenario.yaml:6:1: duratoin: unknown key \(did you mean 'duration'"),
         ({YAML: [("sumo: my.sumocfg\n", "")]}, r"needs files \(sumo\) or a loop \(simulate\)"),
-        ({YAML: [("metric: ttc_min", "metric: pet")]}, r"requirement.metric: a metric must be one of ttc_min"),
+        ({YAML: [("metric: ttc_min", "metric: pet")]}, r"requirement.metric: a metric must be one of ttc_min, .*; pet is measured where it is among metrics"),
     ],
 )  # fmt: skip
 def test_mistakes_in_the_files_are_reported_before_any_run(study, changes, message):

@@ -17,7 +17,7 @@ from sbt.config.fidelity import check_levels, coarse_level
 from sbt.config.load import Loaded
 from sbt.config.model import Choice
 from sbt.config.several import combined_requirement
-from sbt.config.source import Problems, must_be_one_of
+from sbt.config.source import Problems, must_be_measured
 from sbt.config.space import configured_space
 from sbt.errors import InputError
 from sbt.execution.carrying import carry, keep_here
@@ -178,7 +178,7 @@ def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) 
         return own
     metric = own.metric if change.metric is None else change.metric
     if metric not in scenario.measured:
-        problems.add(("requirement", "metric"), must_be_one_of("a metric", metric, scenario.measured))
+        problems.add(("requirement", "metric"), must_be_measured(metric, scenario.measured))
         return own
     if change.critical is None and metric != own.metric:
         problems.add(("requirement",), f"critical: [low, high] is required with the metric {metric}")

@@ -17,7 +17,7 @@ from sbt.config.profiles import guided_vehicles, profile_of
 from sbt.config.recorded import net_of_recording, recorded_traffic
 from sbt.config.scenario_model import EgoEntry, InputEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.several import combined_requirement
-from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_one_of, read_yaml
+from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_measured, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load, noted
@@ -341,7 +341,7 @@ class _Builder:
             problems.add(("requirement",), "a requirement must have a metric and critical: [low, high]")
             return None
         if wanted.metric not in names and len(names) >= len(self._model.metrics):
-            problems.add(("requirement", "metric"), must_be_one_of("a metric", wanted.metric, names))
+            problems.add(("requirement", "metric"), must_be_measured(wanted.metric, names))
         return Requirement(wanted.metric, *wanted.critical)
 
     def _check_inputs(self, files: SumoFiles, space: ParameterSpace | None) -> None:

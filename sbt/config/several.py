@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from sbt.config.requirement_model import RequirementChange, RequirementItem
-from sbt.config.source import Problems, must_be_one_of
+from sbt.config.source import Problems, must_be_measured
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.requirement import Requirement
 
@@ -60,7 +60,7 @@ def _item(
         problems.add(path, "one of several requirements must have a metric, a formula (stl), any or all, but has none")
         return None
     if item.metric not in measured:
-        problems.add((*path, "metric"), must_be_one_of("a metric", item.metric, measured))
+        problems.add((*path, "metric"), must_be_measured(item.metric, measured))
         return None
     interval = item.critical or intervals.get(item.metric)
     if interval is None:

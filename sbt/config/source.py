@@ -14,6 +14,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from sbt import plugins
 from sbt.errors import InputError, did_you_mean
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Place",
     "Problems",
     "SourceMap",
+    "must_be_measured",
     "must_be_one_of",
     "read_yaml",
     "yaml_reader",
@@ -142,6 +144,12 @@ class Problems:
 def must_be_one_of(what: str, name: str, known: Sequence[str]) -> str:
     """Return the message about a name that is not among the known ones."""
     return f"{what} must be one of {', '.join(known)}, but got '{name}'{did_you_mean(name, known)}"
+
+
+def must_be_measured(name: str, measured: Sequence[str]) -> str:
+    """Return the message about a metric that a scenario does not measure; an installed one can be."""
+    more = f"; {name} is measured where it is among metrics" if name in plugins.names("metrics") else ""
+    return f"{must_be_one_of('a metric', name, measured)}{more}"
 
 
 def _path(key: str | Key) -> Key:

@@ -66,7 +66,7 @@ def refuse_dropped(lines: Sequence[str]) -> None:
     names = dropped(lines)
     if names:
         rule = "a route file must be sorted by departure, whatever the inputs are"
-        remedy = "put what departs by an input into a route file of its own"
+        remedy = "sort it, and put what departs by an input into a route file of its own"
         raise RunError(Status.INVALID, f"{rule}, but SUMO leaves out {', '.join(dict.fromkeys(names))}: {remedy}")
 
 
