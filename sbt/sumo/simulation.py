@@ -34,6 +34,7 @@ Covariates = Callable[[Values, Scene], Mapping[str, float]]
 SceneBuilder = Callable[[Values, Ego, np.random.Generator], Scene]
 """Values of the inputs, the ego, and the random generator of the run to the scene."""
 
+_LEVELS = ("fresh", "reuse", "replicas")
 CLOCK_STEPS = 256
 """Steps between two looks at the wall clock."""
 
@@ -82,6 +83,8 @@ class SumoSimulation:
             )
         if round(self.step_length * 1000) / 1000 != self.step_length:
             raise InputError(f"SUMO counts time in whole milliseconds, but got step_length {self.step_length} s")
+        if not self.isolations or not set(self.isolations) <= {*_LEVELS}:
+            raise InputError(f"isolations must be some of {', '.join(_LEVELS)}, but got {', '.join(self.isolations) or 'none'}")
         if self.isolation is not None and self.isolation not in self.isolations:
             raise InputError(f"executor.isolation must be auto or {', '.join(self.isolations)} here, but got '{self.isolation}'")
         check_options(self.options)
