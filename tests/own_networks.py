@@ -99,7 +99,8 @@ def roundabout(folder: Path) -> Path:
     ego = '  <trip id="ego" depart="20.5" from="ins" to="outn" departSpeed="${speed}" departPos="60"/>\n'
     cars = _cars(14, arms, every=1.45, seed=5, kinds="truck bike")
     later = _cars(20, arms, every=1.5, seed=6, kinds="truck bike").replace('id="c', 'id="d').replace('depart="', 'depart="2')
-    return _write(folder, cars + ego + later, "speed: {min: 4, max: 12, unit: m/s}", duration=9)
+    first, rest = later.split("\n", 1)  # what departs before ego stands before it: SUMO leaves out what is not sorted
+    return _write(folder, cars + first + "\n" + ego + rest, "speed: {min: 4, max: 12, unit: m/s}", duration=9)
 
 
 def bridges(folder: Path) -> Path:

@@ -52,6 +52,15 @@ def test_other_values_are_what_they_are(y: list[float], critical: CriticalInterv
     assert without_placeholders(values, critical) is values
 
 
+def test_what_every_collision_counts_is_a_value_of_the_metric():
+    """-5 where nothing else is critical, beside distances from 1 to 2.3; -999 is one that stands for none."""
+    safe = np.linspace(1.0, 2.3, 12)
+    counted = np.r_[safe, np.full(5, -5.0)]
+    assert without_placeholders(counted, CriticalInterval(high=0.0)) is counted
+    assert np.isneginf(without_placeholders(np.r_[safe, np.full(5, -999.0)], CriticalInterval(high=0.0))[-5:]).all()
+    assert np.isneginf(without_placeholders(np.r_[counted, -0.5], CriticalInterval(high=0.0))[12:17]).all()
+
+
 @pytest.mark.parametrize("kind", ["boundary", "estimation"])
 @pytest.mark.parametrize("none", [-1.0, 999.0])
 def test_times_to_collision_are_learned_whatever_stands_for_none(none: float, kind: str, tmp_path: Path):

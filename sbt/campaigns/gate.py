@@ -91,6 +91,7 @@ def gate_verdict(
         verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:
         verdict = "undecided"
-        ends = f"at least {low:.3g} and at most {high:.3g}"
+        digits = next((k for k in (3, 4, 5) if gate.probability not in (float(f"{low:.{k}g}"), float(f"{high:.{k}g}"))), 6)
+        ends = f"at least {low:.{digits}g} and at most {high:.{digits}g}"
         statement = f"{sure} each the probability is {ends}: whether it is within {allowed} is open"
     return GateVerdict(verdict, gate.probability, gate.confidence, low, high, statement)

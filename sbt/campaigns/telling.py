@@ -343,7 +343,9 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     if all_critical(facts):
         return _WIDEN
     if found.gate is not None and found.gate.verdict == "undecided":
-        return f"a larger budget than {n:,} runs: it narrows the interval until it lies on one side of the gate"
+        ends = f", with stop: {{cov: null}} as the campaign ends at {percent(PRECISE)} of the estimate otherwise"
+        ends = ends if found.cov is not None and found.cov <= PRECISE else ""
+        return f"a larger budget than {n:,} runs{ends}: it narrows the interval until it lies on one side of the gate"
     wide, counted = too_wide(found), found.counted or n
     traffic = found.warmed_traffic
     if wide > 1.0 and traffic is not None and traffic.decides(found.cov, found.probability):

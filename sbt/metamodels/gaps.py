@@ -50,8 +50,9 @@ def better_without_gap(
         critical: M_c.
         unit: the other one; None: that of y.
     """
-    gap = gap_of(y, critical)
-    warp = None if len(y) > _MOST or gap == (0.0, 0.0) else better_warp(settings, u, y, critical, gap)
+    gap, inside = gap_of(y, critical), critical.contains(y)
+    flat = min(np.ptp(y[side]) if side.any() else 0.0 for side in (inside, ~inside)) == 0.0  # one value goes on to nothing
+    warp = None if len(y) > _MOST or gap == (0.0, 0.0) or flat else better_warp(settings, u, y, critical, gap)
     if warp is None:
         return None
     shares = cell_shares(u, _generator())

@@ -93,8 +93,8 @@ class Warp:
         return np.asarray(np.arcsinh(kept / self.scale_at(kept)))
 
     def back(self, warped: Vector) -> Vector:
-        """Return the y of warped values, shape kept; those so far away that they are no numbers any more are nearer."""
-        warped = np.clip(warped, -_FARTHEST, _FARTHEST)
+        """Return the y of warped values, shape kept; finite ones so far away that they are no numbers any more are nearer."""
+        warped = np.where(np.isinf(warped), warped, np.clip(warped, -_FARTHEST, _FARTHEST))
         kept = self.scale_at(warped) * np.sinh(warped)
         if self.gap == (0.0, 0.0):
             return np.asarray(self.edge + kept)

@@ -18,6 +18,7 @@ __all__ = ["CriticalInterval", "Measured", "Requirement", "as_passed", "as_reach
 
 _BEYOND = 0.1  # of the range of finite values: far enough to be told from them, near enough to leave them their scale
 _PLACEHOLDERS, _OTHERS = 2, 3
+_FAR_ALONE = 10.0
 """Fewest runs with the value that stands for none, and fewest different values beside it."""
 
 
@@ -129,7 +130,8 @@ def without_placeholders(y: Vector, critical: CriticalInterval) -> Vector:
     """Return metrics in which the value that stands for none is infinite, such as a time to collision of 999 s where none comes.
 
     It is the largest or the smallest one of two runs or more, farther from all other values and the ends of M_c than these are
-    from each other; three others must differ, or all be on its side of M_c: a flag has two values.
+    from each other; three others must differ, or all be on its side of M_c: a flag has two values. What every
+    critical run has, and no other, may be what a collision counts: it is one only if it is ten times as far.
 
     >>> without_placeholders(np.array([0.4, 2.0, 3.1, 999.0, 999.0]), CriticalInterval(high=1.5)).tolist()
     [0.4, 2.0, 3.1, inf, inf]
@@ -142,7 +144,8 @@ def without_placeholders(y: Vector, critical: CriticalInterval) -> Vector:
         if len(known) - len(others) < _PLACEHOLDERS or few:
             continue
         scale = np.concatenate([others, ends])
-        if last - scale.max() > np.ptp(scale):
+        alone = critical.contains(np.array([sign * last]))[0] and not critical.contains(sign * others).any()
+        if last - scale.max() > (_FAR_ALONE if alone else 1.0) * np.ptp(scale):
             y = np.where(sign * y == last, sign * np.inf, y)
     return y
 

@@ -48,7 +48,7 @@ _STEP = 1.0
 """How much shorter than a formula's horizon a run may be (s): a step of SUMO at most."""
 _WARNINGS = 8
 """Most warnings of the simulator that are shown."""
-_FEWEST_CHANGED, _MOST_CHANGED = 3, 8
+_FEWEST_CHANGED, _MOST_CHANGED, _MOST_CORNERS = 3, 8, 17
 """Random runs, at most, that are made again with other values of an input, until one tells that it changes something."""
 _RUN_DEADLINE = 60.0
 """Longest run (s), where the scenario looks at the clock."""
@@ -121,7 +121,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
         return
     again = _runs(spec, jobs[::-1])[::-1]
     yield _equal("same seed, same trace", first, again, points)
-    yield from _idle(spec, asked.space, seed)
+    yield from _idle(spec, asked.space, jobs, seed)
     yield from drawn()
     same = "same seed, same trace in a worker process"
     yield Finding(same, ok=False, detail=other.why) if isinstance(other, _Lost) else _equal(same, first, other, points)
@@ -154,23 +154,24 @@ def _points(space: ParameterSpace) -> Iterator[dict[str, Value]]:
     yield from (space.named(point) for point in chosen)
 
 
-def _idle(spec: ScenarioSpec, space: ParameterSpace, seed: int) -> list[Finding]:
-    """Return which inputs change nothing of random runs, at whichever end of their range they are; none where all do."""
+def _idle(spec: ScenarioSpec, space: ParameterSpace, corners: Sequence[tuple[Values, int]], seed: int) -> list[Finding]:
+    """Return which inputs change nothing of random runs and of the first ones, at the ends of their range; none where all do."""
     still, tried = [p.name for p in space.parameters], 0
     points = space.from_unit(stream(seed, "idle").random((_MOST_CHANGED, space.dimension)))
-    for k, values in enumerate(map(space.named, points[space.feasible(points)])):
-        ends = [(p.name, end) for p in space.parameters if p.name in still for end in (p.choices or p.bounds)]
-        given = [(name, {**values, name: end}) for name, end in ends]
+    random = [(values, run_seed(seed, k)) for k, values in enumerate(map(space.named, points[space.feasible(points)]))]
+    for values, number in (*random, *corners[:_MOST_CORNERS]):
+        left = [p for p in space.parameters if p.name in still]
+        given = [(p.name, {**values, p.name: end}) for p in left for end in (p.choices or p.bounds)]
         inside = space.feasible(np.array([space.numbers(one) for _, one in given]))
         given = [one for one, possible in zip(given, inside, strict=True) if possible]
-        run, *changed = _runs(spec, [(one, run_seed(seed, k)) for one in (values, *(one for _, one in given))])
+        run, *changed = _runs(spec, [(one, number) for one in (values, *(one for _, one in given))])
         moves = {name for (name, _), other in zip(given, changed, strict=True) if other != run}
         still, tried = [name for name in still if name not in moves], tried + 1
         if not still:
             return []
     if tried < _FEWEST_CHANGED:
         return []
-    detail = f"{', '.join(still)}: {tried} random runs are bit by bit the same, with the same seed, at the ends of the range"
+    detail = f"{', '.join(still)}: {tried} runs (random ones, centre, corners) are bit by bit the same at the ends of the range"
     return [Finding("for information: inputs that change nothing", ok=True, detail=detail)]
 
 
