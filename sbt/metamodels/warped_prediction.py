@@ -22,6 +22,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["WarpedPrediction"]
 
+
 @dataclass(frozen=True, eq=False)
 class WarpedPrediction(Prediction):
     """A prediction of y by one of the warped y.

@@ -18,8 +18,9 @@ __all__ = ["CriticalInterval", "Measured", "Requirement", "as_passed", "as_reach
 
 _BEYOND = 0.1  # of the range of finite values: far enough to be told from them, near enough to leave them their scale
 _PLACEHOLDERS, _OTHERS = 2, 3
-_FAR_ALONE = 10.0
 """Fewest runs with the value that stands for none, and fewest different values beside it."""
+_FAR_ALONE = 10.0
+"""Ranges of the other values that it is away, at least, where it alone is critical."""
 
 
 class Measured(Protocol):

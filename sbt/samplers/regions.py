@@ -13,14 +13,14 @@ from scipy.spatial import cKDTree
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import CONTINUOUS, Cube
 
-__all__ = ["BETTER", "PATIENCE", "Region", "clusters", "niches", "regions"]
+__all__ = ["PATIENCE", "Region", "clusters", "niches", "regions"]
 
 _APART = 0.25  # of the best runs of two trust regions, Chebyshev distance: a little more than DEFLATION
 _MOST_REGIONS = 3  # a batch of ten has two Thompson draws for each
 _LONGEST, _SHORTEST = 0.8, 2.0**-6  # side of a trust region: TuRBO's first one; it is retired after six halvings
 PATIENCE = 3
 """Batches without an improvement before a trust region is halved; two were measured to be worse."""
-BETTER = 0.01
+_BETTER = 0.01
 """Part of a margin that a run has to come nearer to M_c to be an improvement: ever smaller steps to a least value are not."""
 _CLUSTER = 0.15  # reach of the neighbourhood that is left out to ask whether a run surprises, Chebyshev
 _SURPRISE = 2.5  # standard deviations of a prediction without the cluster
@@ -103,7 +103,7 @@ def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
         if best < 0:
             best = leader
             continue
-        if margin[leader] < (1.0 - BETTER) * margin[best]:
+        if margin[leader] < margin[best] - _BETTER * abs(margin[best]):
             best, successes, failures = leader, successes + 1, 0
             side = min(2 * side, _LONGEST) if successes >= 2 else side
         elif (np.abs(u[mine] - u[best]).max(axis=1) <= 0.5 * side).any():
