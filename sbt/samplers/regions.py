@@ -103,7 +103,8 @@ def _side(u: Points, margin: Vector, batch: Vector) -> tuple[float, int]:
         if best < 0:
             best = leader
             continue
-        if margin[leader] < margin[best] - _BETTER * abs(margin[best]):
+        nearer = _BETTER * abs(margin[best]) if np.isfinite(margin[best]) else 0.0  # where the first run failed any other is
+        if margin[leader] < margin[best] - nearer:
             best, successes, failures = leader, successes + 1, 0
             side = min(2 * side, _LONGEST) if successes >= 2 else side
         elif (np.abs(u[mine] - u[best]).max(axis=1) <= 0.5 * side).any():
