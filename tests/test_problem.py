@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 from scipy.special import ndtri
 
+import sbt
 from sbt.errors import InputError, RunError
 from sbt.problem.distribution import KINDS, Distribution
 from sbt.problem.expression import Expression
@@ -416,3 +417,21 @@ def test_streams_depend_on_seed_and_path_only():
     assert len(set(seeds)) == 200
     assert 0 <= min(seeds) <= max(seeds) < 2**31
     assert seeds == [run_seed(7, k) for k in range(200)]
+
+
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda: sbt.Parameter("a", 0, 1, "m", 5), "input a: a distribution is one such as Normal.*but got 5"),
+    (lambda: sbt.any_of("m"), "what is combined must be requirements, but got 'm'"),
+    (lambda: _of(inputs=sbt.Parameter("a", 0, 1)), "inputs must be a list of parameters, but got the parameter a"),
+    (lambda: _of(requirement="m"), "a requirement is needed"),
+    (lambda: _of(evaluate=5), "must be a function of values and seed"),
+    (lambda: sbt.simulate(_of(), [1, 2]), r"inputs must be values by name.*but got \[1, 2\]"),
+])  # fmt: skip
+def test_what_is_no_such_thing_is_told_as_that(make, said):
+    with pytest.raises(InputError, match=said):
+        make()
+
+
+def _of(inputs=None, requirement=None, evaluate=lambda values, seed: {"m": values["a"]}):
+    inputs = [sbt.Parameter("a", 0, 1)] if inputs is None else inputs
+    return sbt.Scenario("x", inputs, requirement or sbt.Requirement("m", high=0.0), evaluate=evaluate)

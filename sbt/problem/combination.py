@@ -153,6 +153,9 @@ class CombinedRequirement(Requirement):
         if self.how not in KINDS or not self.items:
             rule = f"requirements are combined by {' or '.join(KINDS)}, and there must be at least one"
             raise InputError(f"{rule}, but got {self.how} of {len(self.items)}")
+        other = next((item for item in self.items if not isinstance(item, Requirement)), None)
+        if other is not None:
+            raise InputError(f"what is combined must be requirements, but got {other!r}")
         object.__setattr__(self, "metric", f"{self.how}({', '.join(item.label for item in self.items)})")
         for what, names in (("metric", [p.metric for p in self.parts]), ("name", [p.label for p in self.parts])):
             twice = next((name for k, name in enumerate(names) if name in names[:k]), None)

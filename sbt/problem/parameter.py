@@ -90,6 +90,8 @@ class Parameter:
             "kind": "continuous" if kind is None else kind, "description": description, "choices": tuple(choices),
             "probabilities": tuple(probabilities),
         }  # fmt: skip
+        if distribution is not None and not hasattr(distribution, "truncated"):
+            raise InputError(f"input {name}: a distribution is one such as Normal(0, 1), but got {distribution!r}")
         for key, value in values.items():
             object.__setattr__(self, key, value)
         self._check()

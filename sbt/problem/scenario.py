@@ -223,10 +223,14 @@ class LogicalScenario:
         given = space if inputs is None else inputs
         if (inputs is None) == (space is None) or given is None:
             raise InputError(f"scenario {name}: give the inputs (or a space) once")
-        if requirement is None:
+        if not isinstance(requirement, Requirement):
             raise InputError(f"scenario {name}: a requirement is needed, such as Requirement('ttc_min', high=1.0)")
+        if isinstance(given, Parameter):
+            raise InputError(f"scenario {name}: inputs must be a list of parameters, but got the parameter {given.name}")
         if (simulate is None) == (evaluate is None):
             raise InputError(f"scenario {name}: give either simulate or evaluate")
+        if not callable(simulate if evaluate is None else evaluate):
+            raise InputError(f"scenario {name}: what simulates or evaluates must be a function of values and seed")
         if evaluate is not None:
             metrics = _returned(name, metrics, tuple(metric_names) or tuple(part.metric for part in requirement.parts))
             metric_names = [m.name for m in metrics]

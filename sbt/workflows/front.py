@@ -270,6 +270,8 @@ def simulate_scenario(
     choice = {"kind": ego} if isinstance(ego, str) else ego
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError(f"seed must be a whole number >= 0, but got {seed!r}")
+    if inputs is not None and not isinstance(inputs, Mapping):
+        raise InputError(f"inputs must be values by name, such as {{'d_v': 110}}, but got {inputs!r}")
     if step_length is not None and not 0 < step_length < math.inf:
         raise InputError(f"step_length must be > 0 s, but got {step_length}")
     named = tuple(m for m in metrics if isinstance(m, str))
