@@ -26,7 +26,6 @@ __all__ = ["SumoRun"]
 
 _SLACK = 1e-6
 """Below this distance (m) of two rectangles the quick separation tests do not decide, but the exact one."""
-_SPEED = 3  # column of a table of states
 _START_REMEDY = "change where the actors start, or keep the inputs apart by constraints"
 
 
@@ -129,7 +128,6 @@ class SumoRun:
         scene, actors = self._scene, self._scene.actors
         seen = self._onlooker
         states = table(self._rows, 0, self.recorded(), len(actors)).copy() if seen is None else seen.table()
-        refuse_dead_ends(self._sumo, actors, states[:, :, _SPEED], self._dt, self._prefix)
         sizes = [(a.type.length, a.type.width) for a in actors]
         names = [a.name for a in actors]
         if scene.obstacles:
@@ -138,6 +136,7 @@ class SumoRun:
             sizes += [(o.length, o.width) for o in scene.obstacles]
             names += [o.name for o in scene.obstacles]
         x, y, heading, speed, acceleration = np.moveaxis(states, 2, 0)
+        refuse_dead_ends(self._sumo, actors, speed[:, : len(actors)], self._dt, self._prefix)
         return Trace(
             np.arange(len(states), dtype=np.float64) * self._dt,
             tuple(names),

@@ -190,8 +190,8 @@ def placeholders(text: str, place: str) -> tuple[Placeholder, ...]:
 
 
 def fill(text: str, values: Values, place: str = "") -> str:
-    """Return a text with its placeholders filled."""
-    return _PLACEHOLDER.sub(lambda match: text_of(_placeholder(match.group(1), place), values), text)
+    """Return a text with its placeholders filled; errors begin with the place, which may end with a colon already."""
+    return _PLACEHOLDER.sub(lambda match: text_of(_placeholder(match.group(1), place.removesuffix(": ")), values), text)
 
 
 def text_of(placeholder: Placeholder, values: Values) -> str:
@@ -205,13 +205,11 @@ def text_of(placeholder: Placeholder, values: Values) -> str:
     for name in placeholder.formula.numbers():
         if isinstance(values.get(name), str):
             rule = f"'{name}' is an input with choices and no number"
-            place = placeholder.place.removesuffix(": ")
-            raise RunError(Status.INVALID, f"{place}: ${{{placeholder.formula.text}}} must be a formula, but {rule}")
+            raise RunError(Status.INVALID, f"{placeholder.place}: ${{{placeholder.formula.text}}} must be a formula, but {rule}")
     with np.errstate(all="ignore"):
         value = float(placeholder.formula(values))
     if not math.isfinite(value):
-        place = placeholder.place.removesuffix(": ")
-        raise RunError(Status.INVALID, f"{place}: ${{{placeholder.formula.text}}} must be finite, but got {value}")
+        raise RunError(Status.INVALID, f"{placeholder.place}: ${{{placeholder.formula.text}}} must be finite, but got {value}")
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 

@@ -314,7 +314,7 @@ class UserSimulation:
 
     def warnings(self) -> tuple[str, ...]:
         """Return SUMO's warnings about the files in the last run of this process, each once, and that on missing heights."""
-        lines = [line for line in session().messages() if line.startswith(("Warning:", "Error:"))]
+        lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
         found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
         return (*filter(None, [session().ask(lambda sumo: levels_of(sumo).warning)]), *found)
 

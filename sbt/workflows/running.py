@@ -18,7 +18,7 @@ from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.running import Finished, check_shard, run_shard, run_stages
 from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard, sentences_of
-from sbt.plugins import OBJECT, Objects, forget_files, newer
+from sbt.plugins import OBJECT, Objects, forget_files
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Doubt, Job, Outcome, Status
@@ -115,7 +115,7 @@ def run_study(
             check_shard(campaign)
         store.begin(snapshot)
         _check_same(store, snapshot)
-        changed = newer(store.folder / RESOLVED) if (store.folder / RESOLVED).is_file() else []
+        changed = (store.folder / RESOLVED).is_file() and bool(changed_since(store.folder))
         if not changed:  # else what is written is newer, so that the runs are tried before
             keep_configuration(store, study, snapshot)
         common: Json = {
@@ -125,7 +125,7 @@ def run_study(
         executor = study.executor()  # at the isolation level that the store remembers
         warm_up(study.spec, study.config.executor.workers, partial(_tell, store, study, common["listener"]))
         with executor:
-            _check_code(store, study, executor, changed)
+            _check_code(store, study, executor, changed=changed)
             if changed:
                 keep_configuration(store, study, snapshot)
             if shard is None:
@@ -150,7 +150,7 @@ def _tell(store: Store, study: Study, listener: Callable[[Progress], None], acti
     listener(Progress(*counts, activity))
 
 
-def _check_code(store: Store, study: Study, executor: Executor, changed: Sequence[Path]) -> None:
+def _check_code(store: Store, study: Study, executor: Executor, *, changed: bool) -> None:
     """Refuse to go on with a store whose runs the user's code and files would not give again.
 
     The first and the last with metrics are tried, where files were changed since as many as `_TRIED` of all, and the first that
@@ -165,8 +165,8 @@ def _check_code(store: Store, study: Study, executor: Executor, changed: Sequenc
         if dict(outcome.metrics) != dict(record.metrics):
             now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics) or record.reason
             rule = f"code and files must give the runs of {store.folder} again to go on, but run {record.index} now gives {now}"
-            since = f"; changed since: {', '.join(map(str, changed))}" if changed else ""
-            raise InputError(f"{rule}, not {stored}{since}; choose another store for what has changed")
+            remedy = "choose another store for what has changed"
+            raise InputError(f"{rule}, not {stored}{changed_since(store.folder)}; {remedy}")
 
 
 def _check_earlier(study: Study) -> None:
