@@ -11,9 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.metric import Metric
 from sbt.problem.plain import Values
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.testbeds.problem import parameters_of

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 __all__ = [
-    "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean", "place_of",
+    "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean", "must_be",
+    "place_of",
 ]  # fmt: skip
 
 
@@ -49,6 +50,18 @@ class RunError(SbtError):
     def __reduce__(self) -> tuple[type[RunError], tuple[str, str]]:
         """Pickle by status and reason (`Exception` would call `__init__` with the reason alone)."""
         return type(self), (self.status, self.reason)
+
+
+def must_be(rule: str, value: object, *kinds: type) -> None:
+    """Refuse a value that is none of these types; True and False are no numbers.
+
+    Raises:
+        InputError: the rule, then the value.
+
+    >>> must_be("a name must be text", "a", str)
+    """
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        raise InputError(f"{rule}, but got {value!r}")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -13,8 +13,8 @@ from sbt.metrics.planar import TTC_2D_MIN
 from sbt.metrics.preventability import applicability, why_not
 from sbt.metrics.stl import stl
 from sbt.metrics.traffic import ttc_path_min
+from sbt.problem.metric import Metric
 from sbt.problem.requirement import CriticalInterval
-from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
 CRITICAL = CriticalInterval(high=1.5)

@@ -11,7 +11,8 @@ import pytest
 
 from sbt import plugins
 from sbt.execution.spec import ScenarioSpec
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.metric import Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.testing import ContractError, check_acquisition, check_metric, check_scenario
 

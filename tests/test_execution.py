@@ -74,7 +74,8 @@ import numpy as np
 from sbt.errors import RunError
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.metric import Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
@@ -339,7 +340,7 @@ def test_a_file_that_ends_the_program_when_it_is_imported_is_told_with_its_line(
 
 METRICS = """
 import sys
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 
 def farthest(trace):
     return float(trace.x.max())

@@ -16,9 +16,9 @@ import pytest
 from browser import PROGRAM
 from test_report import CRITICAL, fill, metric, predict, scenario_of
 
+from sbt.problem.metric import Metric
 from sbt.problem.outcome import Outcome, Status
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import Metric
 from sbt.problem.trace import FieldOfView, Trace
 from sbt.report.explorer import packed
 from sbt.report.html import write_report

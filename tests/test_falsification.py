@@ -39,7 +39,8 @@ from sbt.errors import RunError
 from sbt.testbeds import analytic
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric, Pool
+from sbt.problem.metric import Metric
+from sbt.problem.scenario import LogicalScenario, Pool
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 

@@ -25,8 +25,9 @@ from sbt.metrics.fcd import Recording, read_fcd
 from sbt.metrics.moments import metric_so_far
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.planar import DISTANCE_MIN
+from sbt.problem.metric import Metric
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import FieldOfView, Trace
 from sbt.report.contacts import Contacts, contacts_of
 from sbt.report.film import write_film

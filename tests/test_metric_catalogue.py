@@ -25,7 +25,7 @@ from sbt.metrics.planar import distance_min, pet, severity, ttc_2d, ttc_2d_min
 from sbt.metrics.reference_line import Curve, deviation, heading_error_max, lateral_error_max
 from sbt.metrics.rss import Rss, rss_lateral_min, rss_longitudinal_min, rss_violation
 from sbt.metrics.signals import signal
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 L, W = 5.0, 1.8

@@ -17,10 +17,11 @@ import sbt
 from sbt.errors import InputError, RunError
 from sbt.problem.distribution import KINDS, Distribution
 from sbt.problem.expression import Expression
+from sbt.problem.metric import Metric
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import TAIL, Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.seeds import run_seed, stream

@@ -25,9 +25,10 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build
 from sbt.metamodels.recalibrated import Recalibrated
 from sbt.plugins import OBJECT
+from sbt.problem.metric import metric_from
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, metric_from
+from sbt.problem.scenario import LogicalScenario
 
 __all__ = ["Assembly", "acquisition_of", "assemble", "check", "metamodel_of", "scenario_of", "spec_of"]
 
@@ -133,8 +134,8 @@ def spec_of(loaded: Loaded) -> ScenarioSpec:
         scenario = scope.load("scenarios", config.scenario)
         if not isinstance(scenario, LogicalScenario):
             raise InputError(f"a scenario must be a Scenario or the name of one, but got {scenario!r}")
-        kept = tuple(m for m in scenario.metrics if m.name not in {metric.name for metric in own})
-        whole = replace(scenario, metrics=(*kept, *own)) if own else scenario
+        further = tuple(metric for metric in own if metric not in scenario.metrics)
+        whole = replace(scenario, metrics=(*scenario.metrics, *further)) if further else scenario
         carried = keep_here(whole) if config.executor.kind == "serial" else carry(whole)
     return ScenarioSpec(
         config.scenario, str(loaded.folder.resolve()), ego, config.executor.isolation, config.simulation.step_length,

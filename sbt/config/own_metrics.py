@@ -17,8 +17,8 @@ from sbt.errors import InputError
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.stl import stl
 from sbt.plugins import load
+from sbt.problem.metric import Metric
 from sbt.problem.plain import Json
-from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["actors_of", "metric_of", "metrics_of_several"]

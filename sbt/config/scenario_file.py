@@ -21,10 +21,11 @@ from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_mea
 from sbt.config.space import SpaceChanges, configured_space, distribution_of
 from sbt.errors import InputError, did_you_mean
 from sbt.plugins import load, noted
+from sbt.problem.metric import Metric
 from sbt.problem.parameter import Parameter
 from sbt.problem.profile import KnotProfile, Profile
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric, Roles
+from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.ego import Ego
 from sbt.sumo.ego_vehicle import EgoVehicle

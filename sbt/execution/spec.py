@@ -20,8 +20,9 @@ from sbt.metrics.conflict_types import Decisive, conflict_type
 from sbt.metrics.pairwise import in_traffic, without_overtaking
 from sbt.plugins import kept, load
 from sbt.problem.isolation import Isolation, Warmable
+from sbt.problem.metric import Metric
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 
 __all__ = ["CoarseLevel", "ScenarioSpec"]
 

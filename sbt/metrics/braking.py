@@ -10,7 +10,7 @@ import numpy as np
 
 from sbt.metrics.longitudinal import DRAC_LIMIT, HORIZON, Encounter, encounter
 from sbt.problem.arrays import Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["CAPABILITY", "REACTION", "btn", "btn_max", "drac", "mdrac", "mdrac_max", "mttc", "mttc_min"]

@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.paths import HORIZON, path_of
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["Worst", "path_clearance", "worst_pair"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sbt.problem.arrays import Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["deceleration_max", "jerk", "jerk_max"]

@@ -17,8 +17,8 @@ from sbt.metrics.geometry import part_pairs, rectangle_distance
 from sbt.metrics.longitudinal import FAR
 from sbt.metrics.moments import first_at_its_worst
 from sbt.problem.arrays import Vector
+from sbt.problem.metric import Metric
 from sbt.problem.requirement import CriticalInterval
-from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = [

@@ -6,7 +6,7 @@ import numpy as np
 
 from sbt.metrics.longitudinal import encounter, first_contact, time_to_collision
 from sbt.problem.arrays import Mask, Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["THRESHOLD", "integral", "tet", "tit"]

@@ -28,7 +28,7 @@ from sbt.errors import InputError
 from sbt.metrics.pairwise import without_overtaking
 from sbt.plugins import load, names
 from sbt.problem.arrays import Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", "pair_traces", "read_fcd", "recording_of_columns"]

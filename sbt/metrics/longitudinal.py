@@ -17,7 +17,7 @@ import numpy as np
 from sbt.metrics.cache import per_trace
 from sbt.metrics.geometry import contact_index, rectangles
 from sbt.problem.arrays import Mask, Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = [

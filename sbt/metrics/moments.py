@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sbt.problem.arrays import Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["first_at_its_worst", "metric_so_far"]

@@ -18,7 +18,7 @@ from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import D_MIN, FAR, HORIZON, TTC_MIN, d_min, ttc_min
 from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, signal
 from sbt.problem.arrays import Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["in_traffic", "without_overtaking", "worst_signal"]

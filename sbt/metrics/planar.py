@@ -23,7 +23,7 @@ from sbt.metrics.geometry import (
 )
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
 from sbt.problem.arrays import Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = [

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sbt.metrics.conflict_types import Decisive, conflict, side_and_course
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["APPLICABLE", "METRIC_NAME", "applicability", "why_not"]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from sbt.metrics.cache import per_trace
 from sbt.problem.arrays import Points, Vector, as_points
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["Curve", "deviation", "heading_error_max", "lateral_error_max", "lateral_metrics"]

@@ -21,7 +21,7 @@ from sbt.metrics.exposure import integral
 from sbt.metrics.geometry import part_pairs
 from sbt.metrics.longitudinal import FAR
 from sbt.problem.arrays import Mask, Vector
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["Rss", "lateral_margin", "longitudinal_margin", "rss_lateral_min", "rss_longitudinal_min", "rss_violation"]

@@ -34,8 +34,8 @@ from sbt.metrics.pairwise import worst_signal
 from sbt.metrics.signals import check_signal, signal
 from sbt.metrics.stl_grammar import Binary, Number, Signal, Term, Unary, parse
 from sbt.problem.arrays import Vector
+from sbt.problem.metric import Metric
 from sbt.problem.outcome import Status
-from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["FORMULA", "parse", "robustness", "stl"]

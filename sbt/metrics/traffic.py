@@ -5,12 +5,15 @@ Runs with background traffic have different actors every time; these metrics ref
 
 from __future__ import annotations
 
+import numpy as np
+
 from sbt.metrics.around import first_contacts, smallest_distance
 from sbt.metrics.longitudinal import FAR, HORIZON, relative_speed_at_contact
 from sbt.metrics.paths import HORIZON as PATH_HORIZON
 from sbt.metrics.paths import smallest_ttc_on_paths, ttc_on_paths
+from sbt.metrics.physics import persons
 from sbt.metrics.planar import time_behind
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["any_collision", "any_impact_speed", "nearest_distance", "others_braking_max", "pet_ego_first", "ttc_path_min"]
@@ -67,14 +70,16 @@ def any_impact_speed(ego: str = "ego") -> Metric:
 
 
 def others_braking_max(ego: str = "ego") -> Metric:
-    """Return the strongest deceleration of any other road user (m/s^2, positive), 0 without braking."""
+    """Return the strongest deceleration of any other vehicle (m/s^2, positive), 0 without braking; persons halt in one step."""
 
     def function(trace: Trace) -> float:
-        others = [k for k, name in enumerate(trace.actors) if name != ego]
-        return max(0.0, float(-trace.acceleration[:, others].min())) if others else 0.0
+        walking = persons(trace)
+        others = [k for k, name in enumerate(trace.actors) if name != ego and not walking[k]]
+        braking = -trace.acceleration[:, others]
+        return float(np.nanmax(braking, initial=0.0))
 
     return Metric(
-        "others_braking_max", function, "m/s^2", "high", 0.0, "hardest braking of anyone but ego: how much ego relies on them"
+        "others_braking_max", function, "m/s^2", "high", 0.0, "hardest braking of any vehicle but ego: how much ego relies on them"
     )
 
 

@@ -9,9 +9,10 @@ from sbt.errors import InputError
 from sbt.problem.combination import from_plain, to_plain
 from sbt.problem.distribution import Distribution
 from sbt.problem.expression import Expression
+from sbt.problem.metric import Metric
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Json, JsonMapping, Values
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 

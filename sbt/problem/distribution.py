@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, must_be
 from sbt.problem.arrays import Vector
 
 __all__ = [
@@ -65,7 +66,10 @@ class Distribution:
     @classmethod
     def of(cls, kind: str, **parameters: float | str) -> Distribution:
         """Return the distribution of this kind with these parameters, checked."""
-        distribution = cls(kind, tuple(sorted(parameters.items())))
+        for name, value in parameters.items() if kind in KINDS else ():
+            must_be(f"distribution '{kind}': {name} must be a number", value, Real)
+        given = {name: float(value) if isinstance(value, Real) else value for name, value in parameters.items()}
+        distribution = cls(kind, tuple(sorted(given.items())))
         distribution.frozen()
         return distribution
 
@@ -194,37 +198,37 @@ def Uniform() -> Distribution:  # noqa: N802  (it stands where a class would)
 
 def Normal(mean: float, std: float) -> Distribution:  # noqa: N802
     """Return a normal distribution by mean and standard deviation, truncated to the input's range."""
-    return Distribution.of("normal", mean=float(mean), std=float(std))
+    return Distribution.of("normal", mean=mean, std=std)
 
 
 def LogNormal(mean: float, std: float) -> Distribution:  # noqa: N802
     """Return a lognormal distribution by mean and standard deviation of the variable itself."""
-    return Distribution.of("lognormal", mean=float(mean), std=float(std))
+    return Distribution.of("lognormal", mean=mean, std=std)
 
 
 def Exponential(mean: float) -> Distribution:  # noqa: N802
     """Return an exponential distribution by its mean."""
-    return Distribution.of("exponential", mean=float(mean))
+    return Distribution.of("exponential", mean=mean)
 
 
 def Gumbel(mean: float, std: float) -> Distribution:  # noqa: N802
     """Return a Gumbel distribution of maxima by mean and standard deviation."""
-    return Distribution.of("gumbel", mean=float(mean), std=float(std))
+    return Distribution.of("gumbel", mean=mean, std=std)
 
 
 def Weibull(shape: float, scale: float) -> Distribution:  # noqa: N802
     """Return a Weibull distribution by shape and scale."""
-    return Distribution.of("weibull", shape=float(shape), scale=float(scale))
+    return Distribution.of("weibull", shape=shape, scale=scale)
 
 
 def Beta(a: float, b: float) -> Distribution:  # noqa: N802
     """Return a beta distribution on [0, 1]."""
-    return Distribution.of("beta", a=float(a), b=float(b))
+    return Distribution.of("beta", a=a, b=b)
 
 
 def Triangular(low: float, mode: float, high: float) -> Distribution:  # noqa: N802
     """Return a triangular distribution."""
-    return Distribution.of("triangular", low=float(low), mode=float(mode), high=float(high))
+    return Distribution.of("triangular", low=low, mode=mode, high=high)
 
 
 def SciPy(name: str, **parameters: float) -> Distribution:  # noqa: N802

@@ -6,12 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Literal
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbt.errors import InputError, did_you_mean
+from sbt.errors import InputError, did_you_mean, must_be
 from sbt.problem.arrays import FARTHEST, NEAREST, Mask, Vector
 from sbt.problem.distribution import Distribution, TruncatedDistribution
 from sbt.problem.plain import Value
@@ -85,6 +86,7 @@ class Parameter:
             low, high, kind = 0.0, len(choices) - 1.0, "categorical" if kind is None else kind
         if low is None or high is None:
             raise InputError(f"input {name}: a range (low, high) or choices are needed")
+        low, high = (end.item() if isinstance(end, np.generic) else end for end in (low, high))
         values = {
             "name": name, "low": low, "high": high, "unit": unit, "distribution": distribution,
             "kind": "continuous" if kind is None else kind, "description": description, "choices": tuple(choices),
@@ -98,11 +100,9 @@ class Parameter:
 
     def _check(self) -> None:
         for end in ("low", "high"):
-            value = getattr(self, end)
-            if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
-                raise InputError(f"input {self.name}: {end} must be a number, but got {value!r}")
-        if not isinstance(self.unit, str):
-            raise InputError(f"input {self.name}: a unit must be text (a distribution comes after it), but got {self.unit!r}")
+            must_be(f"input {self.name}: {end} must be a number", getattr(self, end), Real)
+        must_be(f"input {self.name}: a unit must be text (a distribution comes after it)", self.unit, str)
+        must_be("an input's name must be an identifier", self.name, str)
         if not self.name.isidentifier():
             raise InputError(f"an input's name must be an identifier, but got '{self.name}'")
         if self.kind not in ("continuous", "integer", "categorical"):
@@ -123,7 +123,10 @@ class Parameter:
         if self.kind == "integer" and not (finite and self.low % 1 == 0 and self.high % 1 == 0):
             raise InputError(f"input {self.name}: an integer range needs whole ends, but got [{self.low}, {self.high}]")
         if self.distribution is not None:
-            self.distribution.truncated(*self._support)
+            try:
+                self.distribution.truncated(*self._support)
+            except InputError as error:
+                raise InputError(f"{error} (input {self.name})") from None
 
     def _check_choices(self) -> None:
         """Refuse what are no choices with probabilities."""
@@ -189,9 +192,8 @@ class Parameter:
             InputError: it is no choice, or no number.
         """
         if not self.choices:
-            if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
-                raise InputError(f"input {self.name} must be a number, but got {value!r}")
-            return float(value)
+            must_be(f"input {self.name} must be a number", value, Real)
+            return float(value)  # type: ignore[arg-type]
         if value not in self.choices:
             hint = did_you_mean(value, self.choices) if isinstance(value, str) else ""
             raise InputError(f"input {self.name} must be one of {', '.join(self.choices)}, but got {value!r}{hint}")

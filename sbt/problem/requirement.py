@@ -6,11 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Protocol
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, must_be
 from sbt.problem.arrays import FARTHEST, Mask, Vector
 
 __all__ = ["CriticalInterval", "Measured", "Requirement", "as_passed", "as_reached", "within_scale", "without_placeholders"]
@@ -49,6 +50,8 @@ class CriticalInterval:
     high: float = math.inf
 
     def __post_init__(self) -> None:
+        for end in (self.low, self.high):
+            must_be("an end of a critical interval must be a number", end, Real)
         if not self.low <= self.high:
             raise InputError(f"a critical interval needs low <= high, but got [{self.low}, {self.high}]")
         if math.isinf(self.low) and math.isinf(self.high):
@@ -190,10 +193,10 @@ class Requirement:
     name: str = ""
 
     def __post_init__(self) -> None:
+        must_be("a requirement's metric must be text", self.metric, str)
         for name in ("low", "high"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-                raise InputError(f"a requirement's {name} must be a number, but got {value!r}")
+            must_be(f"a requirement's {name} must be a number", value, Real)
             object.__setattr__(self, name, float(value))
         CriticalInterval(self.low, self.high)
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt import plugins
-from sbt.errors import InputError, RunError, did_you_mean
-from sbt.problem.arrays import FARTHEST, Mask, Points, Vector
+from sbt.errors import InputError, RunError, did_you_mean, must_be
+from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.metric import Metric, meaningful, metric_from
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
@@ -82,50 +82,6 @@ class OnRoads(Protocol):
     def with_friction(self, low: float, high: float) -> Simulate:
         """Return a copy on roads of this coefficient of friction, an input where it is a range."""
         ...
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A named function of a trace.
-
-    Args:
-        name: as written in requirements and in the store (`y.<name>`).
-        function: trace to a number, inf or -inf at an end of its scale; None: a scenario without traces gives it itself.
-        unit: "" for a pure number or a flag.
-        direction: "low" where small values are critical, "high" where large ones are.
-        without: the value where there was no interaction to measure.
-        description: one sentence.
-        source: reference of the definition.
-        alone: it measures the ego alone, whoever else is there.
-        over_time: trace to (t,) values whose worst is the metric; for one that knows, of an instant, what came after it, and
-            that therefore cannot be told from the trace up to there.
-        lagged: it compares where two road users were at different times: the one may come when the other has gone.
-    """
-
-    name: str
-    function: Callable[[Trace], float] | None = None
-    unit: str = ""
-    direction: str = "low"
-    without: float = math.inf
-    description: str = ""
-    source: str = ""
-    alone: bool = False
-    over_time: Callable[[Trace], Vector] | None = None
-    lagged: bool = False
-
-    def __call__(self, trace: Trace) -> float:
-        """Return the metric of a trace.
-
-        Raises:
-            RunError: the value is no number.
-        """
-        return _meaningful(self.name, self.value(trace))
-
-    def value(self, trace: Trace) -> float:
-        """Return its value on a trace, finite or not."""
-        if self.function is None:
-            raise InputError(f"metric {self.name} is given by its scenario: it cannot be measured on a trace")
-        return float(self.function(trace))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,19 +174,21 @@ class LogicalScenario:
         evaluate: Evaluate | None = None, metric_names: Sequence[str] = (), pool: Pool | None = None, roles: Roles = Roles(), *,
         space: ParameterSpace | None = None,
     ):  # fmt: skip
-        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+        if not (isinstance(name, str) and name.strip() and name.isprintable()):
             raise InputError(f"a scenario's name must be text on one line, but got {name!r}")
         given = space if inputs is None else inputs
         if (inputs is None) == (space is None) or given is None:
             raise InputError(f"scenario {name}: give the inputs (or a space) once")
         if not isinstance(requirement, Requirement):
             raise InputError(f"scenario {name}: a requirement is needed, such as Requirement('ttc_min', high=1.0)")
-        if isinstance(given, Parameter):
-            raise InputError(f"scenario {name}: inputs must be a list of parameters, but got the parameter {given.name}")
+        if isinstance(given, Parameter) or not isinstance(given, ParameterSpace | Iterable):
+            got = f"the parameter {given.name}" if isinstance(given, Parameter) else repr(given)
+            raise InputError(f"scenario {name}: inputs must be a list of parameters, but got {got}")
         if (simulate is None) == (evaluate is None):
             raise InputError(f"scenario {name}: give either simulate or evaluate")
         if not callable(simulate if evaluate is None else evaluate):
             raise InputError(f"scenario {name}: what simulates or evaluates must be a function of values and seed")
+        must_be(f"scenario {name}: metrics must be a list", metrics, list, tuple, Mapping)
         if evaluate is not None:
             metrics = _returned(name, metrics, tuple(metric_names) or tuple(part.metric for part in requirement.parts))
             metric_names = [m.name for m in metrics]
@@ -241,6 +199,9 @@ class LogicalScenario:
         }  # fmt: skip
         for key, value in values.items():
             object.__setattr__(self, key, value)
+        doubled = [m for k, m in enumerate(self.measured) if m in self.measured[:k]]
+        if doubled:
+            raise InputError(f"scenario {name}: metrics must have different names, but got '{doubled[0]}' twice")
         for part in requirement.parts:
             if part.metric not in self.measured:
                 known, hint = ", ".join(self.measured), did_you_mean(part.metric, self.measured)
@@ -346,25 +307,6 @@ def _returned(
     return tuple(found) or tuple(Metric(name) for name in names)
 
 
-def metric_from(given: Metric | str | Callable[[Trace], float]) -> Metric:
-    """Return a metric: itself, the installed one of this name, or a function of a trace under its own name.
-
-    Raises:
-        InputError: it is none of these.
-    """
-    if isinstance(given, Metric):
-        return given
-    if isinstance(given, str):
-        found = plugins.load("metrics", given)
-        if isinstance(found, str):
-            raise InputError(f"a metric must be a Metric or a function of a trace, but '{given}' is text")
-        return metric_from(found)
-    if not callable(given):
-        raise InputError(f"a metric must be a Metric, the name of one, or a function of a trace, but got {given!r}")
-    lines = (getattr(given, "__doc__", None) or "").strip().splitlines()
-    return Metric(getattr(given, "__name__", type(given).__name__), given, description=lines[0] if lines else "")
-
-
 def _checked(returned: Any, names: tuple[str, ...]) -> dict[str, float]:
     """Return the metrics of a run by name.
 
@@ -389,12 +331,4 @@ def _finite(name: str, value: Any) -> float:
         number = None
     if number is None:
         raise RunError(Status.FAILED, f"metric {name} must be one number, but got {value!r}")
-    return _meaningful(name, number)
-
-
-def _meaningful(name: str, value: float) -> float:
-    """Return a metric's value: inf, -inf, or a number whose square is still one."""
-    if abs(value) <= FARTHEST or math.isinf(value):
-        return value
-    limit = "" if math.isnan(value) else f" and within {FARTHEST:g}"
-    raise RunError(Status.FAILED, f"metric {name} must be finite{limit}, inf or -inf, but got {value}")
+    return meaningful(name, number)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from sbt.errors import InputError, did_you_mean
+from sbt.errors import InputError, did_you_mean, must_be
 from sbt.problem.arrays import Mask, Points, Vector, as_points
 from sbt.problem.cube import Cube
 from sbt.problem.expression import Expression
@@ -53,6 +53,10 @@ class ParameterSpace:
     def __post_init__(self) -> None:
         if not self.parameters:
             raise InputError("a parameter space needs at least one input, but got none")
+        for one in self.parameters:
+            must_be("inputs must be a list of parameters, such as [Parameter('gap', 5, 60, 'm')]", one, Parameter)
+        for pair in (*self.constraints, *self.features):
+            must_be("a constraint or feature is a pair of its text and a function of columns", pair, tuple)
         if len(set(self.names)) != len(self.names):
             raise InputError(f"inputs must have different names, but got {', '.join(self.names)}")
         if self.correlation is not None:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sbt.metrics.moments import metric_so_far
+from sbt.problem.metric import Metric
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import Metric
 from sbt.problem.trace import Trace
 from sbt.report.contacts import Contacts
 from sbt.report.scene import BICYCLE, EGO, FEW, OTHER, PERSON, ROAD, STANDING, Scenery, View, draw_lanes, is_wide, view_of

@@ -10,9 +10,9 @@ import numpy as np
 
 from sbt.metrics.geometry import rectangle_distance, time_to_contact
 from sbt.metrics.moments import metric_so_far
+from sbt.problem.metric import Metric
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import Metric
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.report.contacts import contacts_of
 from sbt.report.scene import actor_kind, is_wide, view_of

@@ -9,7 +9,7 @@ import numpy as np
 
 from sbt.errors import RunError
 from sbt.metrics.moments import first_at_its_worst
-from sbt.problem.scenario import Metric
+from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
 __all__ = ["worst_moment"]

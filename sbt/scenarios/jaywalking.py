@@ -15,9 +15,10 @@ import numpy as np
 
 from sbt.errors import InputError
 from sbt.metrics.cache import per_trace
+from sbt.problem.metric import Metric
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric, Roles
+from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import Actor, EndCondition, Obstacle, Scene, State, VehicleType

@@ -15,9 +15,10 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.cache import per_trace
 from sbt.metrics.geometry import contact_index, rectangle_distance, swept_contact
+from sbt.problem.metric import Metric
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric, Roles
+from sbt.problem.scenario import LogicalScenario, Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import Actor, EndCondition, Pose, Scene, State, VehicleType

@@ -13,10 +13,11 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.problem.arrays import Points, Vector, as_points, as_vector
 from sbt.problem.distribution import Distribution
+from sbt.problem.metric import Metric
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 

@@ -25,9 +25,10 @@ from sbt.loop.stages import Campaign, Progress
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.metric import Metric
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import CriticalInterval, Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.seeds import stream
 from sbt.store.history import Record

@@ -11,9 +11,10 @@ from typing import Any
 from sbt.errors import SbtError
 from sbt.execution.worker import run_traced
 from sbt.plugins.approval import UntrustedError
+from sbt.problem.metric import Metric
 from sbt.problem.outcome import Job
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.report.reel import Film
 from sbt.store.history import History, Record

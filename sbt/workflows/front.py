@@ -17,16 +17,17 @@ from sbt import plugins
 from sbt.config.load import load
 from sbt.config.scenario_file import is_scenario
 from sbt.config.source import read_yaml
-from sbt.errors import InputError, PluginError, SbtError, did_you_mean
+from sbt.errors import InputError, PluginError, SbtError, did_you_mean, must_be
 from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_traced
 from sbt.plugins import OBJECT, Objects, Scope
 from sbt.plugins.approval import trust_store
 from sbt.problem.description import describe_scenario, scenario_differences
+from sbt.problem.metric import Metric, metric_from
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Json, Value, written
-from sbt.problem.scenario import LogicalScenario, Metric, metric_from
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.workflows.checking import Finding, findings_of
@@ -78,11 +79,15 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
         StoreError: the store cannot be written.
     """
     plugins.forget_changed()
+    if config is not None:
+        must_be("a configuration must be the path of a file", config, str, Path)
     known = (*CampaignKeys.__annotations__, "campaign")
     for name in keys:
         if name not in known:
             raise InputError(f"run takes the keys of a configuration, but got '{name}'{did_you_mean(name, known)}")
     progress, report, workers = keys.pop("progress", None), keys.pop("report", True), keys.pop("workers", None)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function, but got {progress!r}")
     data, objects = as_data(keys)
     if config is not None:
         overrides = [] if workers is None else [f"executor.workers={int(workers)}"]
@@ -115,6 +120,7 @@ def open_result(
         StoreError: the folder holds no campaign.
         InputError: an object is not the one that the store was made with.
     """
+    must_be("a store must be the path of a folder", store, str, Path)
     folder = Path(store)
     if trust:
         trust_store(folder)
@@ -297,8 +303,7 @@ def _spec(scenario: LogicalScenario | str | Path, isolation: str) -> ScenarioSpe
     """Return a scenario as its specification."""
     if isinstance(scenario, LogicalScenario):
         return ScenarioSpec(OBJECT + scenario.name, str(Path.cwd()), isolation=isolation, carried=carry(scenario))
-    if not isinstance(scenario, str | Path):
-        raise InputError(f"a scenario must be a Scenario or its name, but got {type(scenario).__name__}")
+    must_be("a scenario must be a Scenario or its name", scenario, str, Path)
     return ScenarioSpec(str(scenario), str(Path.cwd()), isolation=isolation)
 
 
@@ -339,7 +344,7 @@ def check_target(target: LogicalScenario | str | Path, *, seed: int = 0, isolati
 def findings_in(target: LogicalScenario | str | Path, *, seed: int, isolation: str) -> Iterator[Finding]:
     """Yield what `check_target` finds, each finding as soon as it is known."""
     plugins.forget_changed()
-    if not isinstance(target, LogicalScenario) and Path(target).suffix in (".yaml", ".yml") and not is_scenario(Path(target)):
+    if isinstance(target, str | Path) and Path(target).suffix in (".yaml", ".yml") and not is_scenario(Path(target)):
         study = Study(load(target))
         return chain(_starts_warm(study), findings_of(study.spec, seed, study.scenario))
     return findings_of(_spec(target, isolation), seed)
@@ -370,6 +375,7 @@ def installed(kind: str = "scenarios") -> dict[str, str]:
     Raises:
         InputError: there is no such kind.
     """
+    must_be("KIND must be text", kind, str)
     if kind not in plugins.KINDS:
         raise InputError(f"KIND must be one of {', '.join(plugins.KINDS)}, but got '{kind}'{did_you_mean(kind, plugins.KINDS)}")
     if kind == "sources":

@@ -8,14 +8,16 @@ from typing import Any, TypedDict
 
 import numpy as np
 
+from sbt.errors import must_be
 from sbt.loop.stages import Progress
 from sbt.plugins import OBJECT
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.distribution import Distribution
+from sbt.problem.metric import Metric, metric_from
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Metric, metric_from
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 
 __all__ = ["CampaignKeys", "Setting", "as_data"]
@@ -79,6 +81,7 @@ def as_data(keys: JsonMapping) -> tuple[Json, dict[tuple[str, str], Any]]:
         elif key in ("scenario", "campaign"):
             data[key] = str(given) if isinstance(given, str | Path) else named(f"{key}s", given)
         elif key == "metrics":
+            must_be("metrics must be a list of metrics or names", given, list, tuple)
             data[key] = [m if isinstance(m, str) else named("metrics", metric_from(m)) for m in given]
         elif key in ("ego", "executor") and isinstance(given, str):
             data[key] = {"kind": given}

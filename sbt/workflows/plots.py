@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from sbt.errors import InputError, did_you_mean
+from sbt.errors import InputError, did_you_mean, must_be
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion
 from sbt.problem.arrays import Mask, Vector
@@ -268,6 +268,9 @@ class Plots:
 def _axes(ax: Axes | None) -> Axes:
     """Return the axes, or those of a new figure that a notebook shows."""
     if ax is not None:
+        from matplotlib.axes import Axes
+
+        must_be("ax must be matplotlib's axes (inputs are named by x and y)", ax, Axes)
         return ax
     import matplotlib.pyplot as plt
 

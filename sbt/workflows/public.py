@@ -22,11 +22,12 @@ from sbt.problem.distribution import (
     Uniform,
     Weibull,
 )
+from sbt.problem.metric import Metric
 from sbt.problem.parameter import Parameter
 from sbt.problem.profile import KnotProfile, RecordedProfile
 from sbt.problem.requirement import CriticalInterval, Requirement
 from sbt.problem.scenario import LogicalScenario as Scenario
-from sbt.problem.scenario import Metric, Roles
+from sbt.problem.scenario import Roles
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import FieldOfView, Trace
 from sbt.store.database import PlannedRun

@@ -1,0 +1,91 @@
+"""A safety metric: a named function of a trace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sbt import plugins
+from sbt.errors import InputError, RunError, must_be
+from sbt.problem.arrays import FARTHEST, Vector
+from sbt.problem.outcome import Status
+from sbt.problem.trace import Trace
+
+__all__ = ["Metric", "meaningful", "metric_from"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A named function of a trace.
+
+    Args:
+        name: as written in requirements and in the store (`y.<name>`).
+        function: trace to a number, inf or -inf at an end of its scale; None: a scenario without traces gives it itself.
+        unit: "" for a pure number or a flag.
+        direction: "low" where small values are critical, "high" where large ones are.
+        without: the value where there was no interaction to measure.
+        description: one sentence.
+        source: reference of the definition.
+        alone: it measures the ego alone, whoever else is there.
+        over_time: trace to (t,) values whose worst is the metric; for one that knows, of an instant, what came after it, and
+            that therefore cannot be told from the trace up to there.
+        lagged: it compares where two road users were at different times: the one may come when the other has gone.
+    """
+
+    name: str
+    function: Callable[[Trace], float] | None = None
+    unit: str = ""
+    direction: str = "low"
+    without: float = math.inf
+    description: str = ""
+    source: str = ""
+    alone: bool = False
+    over_time: Callable[[Trace], Vector] | None = None
+    lagged: bool = False
+
+    def __post_init__(self) -> None:
+        must_be("a metric's name must be text", self.name, str)
+        if self.function is not None and not callable(self.function):
+            raise InputError(f"metric {self.name} must have a function of a trace, but got {self.function!r}")
+
+    def __call__(self, trace: Trace) -> float:
+        """Return the metric of a trace.
+
+        Raises:
+            RunError: the value is no number.
+        """
+        return meaningful(self.name, self.value(trace))
+
+    def value(self, trace: Trace) -> float:
+        """Return its value on a trace, finite or not."""
+        if self.function is None:
+            raise InputError(f"metric {self.name} is given by its scenario: it cannot be measured on a trace")
+        return float(self.function(trace))
+
+
+def metric_from(given: Metric | str | Callable[[Trace], float]) -> Metric:
+    """Return a metric: itself, the installed one of this name, or a function of a trace under its own name.
+
+    Raises:
+        InputError: it is none of these.
+    """
+    if isinstance(given, Metric):
+        return given
+    if isinstance(given, str):
+        found = plugins.load("metrics", given)
+        if isinstance(found, str):
+            raise InputError(f"a metric must be a Metric or a function of a trace, but '{given}' is text")
+        return metric_from(found)
+    if not callable(given):
+        raise InputError(f"a metric must be a Metric, the name of one, or a function of a trace, but got {given!r}")
+    lines = (getattr(given, "__doc__", None) or "").strip().splitlines()
+    return Metric(getattr(given, "__name__", type(given).__name__), given, description=lines[0] if lines else "")
+
+
+def meaningful(name: str, value: float) -> float:
+    """Return a metric's value: inf, -inf, or a number whose square is still one."""
+    if abs(value) <= FARTHEST or math.isinf(value):
+        return value
+    limit = "" if math.isnan(value) else f" and within {FARTHEST:g}"
+    raise RunError(Status.FAILED, f"metric {name} must be finite{limit}, inf or -inf, but got {value}")
