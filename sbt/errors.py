@@ -64,7 +64,7 @@ def must_be(rule: str, value: object, *kinds: type) -> None:
         raise InputError(f"{rule}, but got {value!r}")
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Return the hint at the end of a message about an unknown name: the closest known one, in any case.
 
     >>> did_you_mean("Budgte", ["batch", "budget"])
@@ -72,6 +72,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     >>> did_you_mean("xyz", ["batch", "budget"])
     ''
     """
+    if not isinstance(name, str):
+        return ""
     by_lower = {each.lower(): each for each in known}
     close = get_close_matches(name.lower(), by_lower, 1)
     return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""

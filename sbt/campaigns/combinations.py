@@ -28,17 +28,20 @@ _CANDIDATES = 1024  # points of which the farthest from all runs takes the place
 def combinations_left(scenario: LogicalScenario, history: History) -> Points | None:
     """Return the feasible combinations (m, d) that were not run yet, in the inputs' units.
 
-    None where repetitions are worth a run: an input is continuous, there are more than 4,096 combinations, or equal inputs
-    gave different metrics; also for recorded tables, whose rows are never repeated.
+    None where repetitions are worth a run: an input is continuous, there are more than 4,096 combinations, equal inputs gave
+    different metrics, or all were run and noise would hardly show (`SimulatorNoise.silent`); also for recorded tables, whose
+    rows are never repeated.
     """
     space = scenario.space
     points = space.cube.combinations(space.dimension, _MOST)
-    if points is None or scenario.pool is not None or simulator_noise(history, scenario.requirement).noisy:
+    noise = simulator_noise(history, scenario.requirement)
+    if points is None or scenario.pool is not None or noise.noisy:
         return None
     x = space.from_unit(points)
     x = x[space.feasible(x)]
     gone = {tuple(row) for row in _cells(space, history.x)}
-    return x[[tuple(row) not in gone for row in _cells(space, x)]]
+    left = x[[tuple(row) not in gone for row in _cells(space, x)]]
+    return None if noise.silent and not len(left) else left
 
 
 def few(scenario: LogicalScenario, history: History, budget: int) -> bool:
@@ -93,7 +96,8 @@ def none_left(facts: Facts) -> bool:
     history, n = facts.history, facts.combinations
     if n is None or len(history) < n or len(np.unique(history.x, axis=0)) < n or not history.ok.all():
         return False
-    return simulator_noise(history, facts.requirement).noisy is False
+    noise = simulator_noise(history, facts.requirement)
+    return noise.noisy is False and not noise.silent
 
 
 def without_repetition(scenario: LogicalScenario, history: History, x: Points, *, continuous: bool = True) -> Points:

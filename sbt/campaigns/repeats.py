@@ -36,6 +36,8 @@ _FEW_VALUES, _SHARE_OF_VALUES = 3, 0.1
 """A metric has few values where there are at most three, or a tenth of the runs."""
 _DOUBT = 0.05
 """That noise in some share of the pairs was met by none of them."""
+_DOUBT_OF_FEW = 1e-3
+"""The same where a metric has few values, of each of them: one input in ten may fail with one seed in twenty."""
 _EQUAL = 1e-9
 """Relative difference up to which two values of a metric are the same: the last digits of a sum are no noise."""
 
@@ -50,6 +52,7 @@ class SimulatorNoise:
         std: pooled standard deviation of the requirement's metric at equal inputs; None: nothing was repeated.
         lost: inputs at which a run gave a metric and another one, with another seed, gave none; None: there are none.
         inputs: different inputs that were repeated; None: nothing was.
+        silent: no metric differed, but they have values there that other inputs gave too, such as 0: so few repeats agree by chance.
     """
 
     repeats: int
@@ -57,6 +60,7 @@ class SimulatorNoise:
     std: float | None
     lost: int | None = optional()
     inputs: int | None = optional()
+    silent: bool | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -80,6 +84,8 @@ class SimulatorNoise:
             missed, sure = percent(1.0 - _DOUBT ** (1.0 / n)), percent(1.0 - _DOUBT)
             at = "the only input that was" if n == 1 else "both inputs that were" if n == 2 else f"all {n} inputs that were"
             said = f"No noise was met: metrics were equal at {at} repeated with other seeds, near the critical interval or in it"
+            if self.silent:
+                said += ", with values that so many other inputs gave, too, that noise would hardly show"
             return [f"{said}; with {sure} confidence noise shows at less than {missed} of such inputs. Others were not repeated."]
         if self.std == 0.0:
             return [f"The simulator is noisy: where {again}, other metrics differed; {metric} did not."]
@@ -106,9 +112,24 @@ def simulator_noise(history: History, requirement: Requirement) -> SimulatorNois
     y = requirement.told(runs)
     inputs = int((size > 1).sum())
     if not _differs(y, group):
-        return SimulatorNoise(repeats, noisy, 0.0, inputs=inputs)
+        silent = True if not noisy and _silent(runs, group, size) else None
+        return SimulatorNoise(repeats, noisy, 0.0, inputs=inputs, silent=silent)
     std = _pooled(y, group) or _pooled(within_scale(y, requirement.critical), group)  # at times infinite, at times not
     return SimulatorNoise(repeats, noisy, std, inputs=inputs)
+
+
+def _silent(runs: History, group: NDArray[np.intp], size: NDArray[np.intp]) -> bool:
+    """Return whether repeats (`size` runs of each group, all equal) could agree by chance.
+
+    A run that depends on its seed alone agrees as often as other inputs gave the same metrics. Of few values each must be ruled
+    out for itself: where failures are certain, they may be a matter of chance elsewhere.
+    """
+    metrics = np.column_stack([runs.y(name) for name in runs.metrics])[np.unique(group, return_index=True)[1]]
+    which, count = np.unique(np.nan_to_num(metrics, nan=-np.inf), axis=0, return_inverse=True, return_counts=True)[1:]
+    value, log_share = which.reshape(-1), np.log(count / count.sum())
+    chance = np.bincount(value, (size - 1) * log_share[value], len(count))
+    few = len(count) <= max(_FEW_VALUES, _SHARE_OF_VALUES * len(value))
+    return bool(chance.max() > np.log(_DOUBT_OF_FEW) if few else chance.sum() > np.log(_DOUBT))
 
 
 def _pooled(y: Vector, group: NDArray[np.intp]) -> float:

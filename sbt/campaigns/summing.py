@@ -44,7 +44,7 @@ class Summed:
         worst: the same with failed ones as critical.
         missing: probability of the combinations that were not run.
         combinations: number of all.
-        noisy: equal inputs gave different metrics.
+        noisy: equal inputs gave different metrics, or it would hardly show if they did.
     """
 
     share: WeightedShare
@@ -157,7 +157,7 @@ def summed(log: Log, settings: Settings, requirement: Requirement | None = None)
     noise = simulator_noise(history, settings.scenario.requirement)
     return Summed(
         WeightedShare(weight, critical.astype(np.float64)), WeightedShare(weight, (critical | ~runs.ok).astype(np.float64)),
-        float(p[times == 0].sum()), len(x), noise.noisy is True,
+        float(p[times == 0].sum()), len(x), noise.noisy is True or noise.silent is True,
     )  # fmt: skip
 
 

@@ -306,7 +306,9 @@ def _not_told(found: EstimationConclusion, every: bool) -> str:
     if missed <= 0.0:
         silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"
     if every:
-        silent = "This is a sum over all combinations: none is unseen. It does not tell of noise that repeats do not show"
+        silent = "This is a sum over all combinations: none is unseen"
+        seeds = ", and what seeds decide is in its interval"
+        silent += ". It does not tell of noise that repeats do not show" if found.low == found.high else seeds
     elif found.low == 0.0 and found.hits:
         traffic, why = found.warmed_traffic, "of unequal weight"
         why = "of so few warm-ups" if traffic is not None and traffic.decides(found.cov, p) else why
@@ -336,7 +338,7 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     if worst is not None and worst - found.probability > 2.0 * PRECISE * found.probability:
         return (
             f"failed runs decide the width of the interval: its upper end, {number(found.high, 3)}, counts them as critical, and"
-            f" more runs never bring it much below {number(worst, 3)}; {why_they_fail()}"
+            f" more runs would bring it to about {number(worst, 3)}, as far as these tell; {why_they_fail()}"
         )
     if found.combinations is not None and found.low == found.high:
         return "if equal inputs may end differently, acquisition: {kind: monte_carlo} gives an interval that holds then too"

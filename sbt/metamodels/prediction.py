@@ -18,7 +18,7 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Prediction"]
+__all__ = ["Prediction", "reached_beyond"]
 
 _Matrix = NDArray[np.float64]
 _LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
@@ -168,8 +168,7 @@ class Prediction:
 
     def _open(self, critical: CriticalInterval) -> CriticalInterval:
         """Return M_c without ends that the metric does not go beyond."""
-        low = -np.inf if critical.low <= self.lowest else critical.low
-        return CriticalInterval(low, np.inf if critical.high >= self.highest else critical.high)
+        return reached_beyond(critical, self.lowest, self.highest)
 
     def probability(self, critical: CriticalInterval) -> Vector:
         """Return (n,) P(y in M_c), in [0, 1]."""
@@ -228,6 +227,12 @@ class Prediction:
         if values.shape != (len(self),):
             raise InputError(f"y must have shape ({len(self)},), one value a point, but got {values.shape}")
         return values
+
+
+def reached_beyond(critical: CriticalInterval, lowest: float, highest: float) -> CriticalInterval:
+    """Return M_c without ends that a metric in [lowest, highest] does not go beyond."""
+    low = -np.inf if critical.low <= lowest else critical.low
+    return CriticalInterval(low, np.inf if critical.high >= highest else critical.high)
 
 
 def _first_bad(std: _Matrix) -> float:

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Metamodel, Predictor, is_rate, sample_paths, sketched, with_target
+from sbt.metamodels.base import Metamodel, Predictor, Screened, is_rate, sample_paths, sketched, with_target
 from sbt.metamodels.censored import Limit, beyond
-from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.prediction import Prediction, reached_beyond
 from sbt.metamodels.warp import Warp, gap_of
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN
@@ -305,9 +306,9 @@ class Opened:
             metamodel, learned, limit = self.metamodel, centred(u, y, critical), None
         predictor = beyond(metamodel.fit(u, learned, rng), limit)
         lowest, highest = _ends(self.critical, y)
-        if critical != self.critical:  # what goes on beyond the last value is not beyond an end of M_c that no run lies beyond
-            lowest = y.min() if critical.low < self.critical.low and learned.min() < y.min() else lowest
-            highest = y.max() if critical.high > self.critical.high and learned.max() > y.max() else highest
+        if limit is not None:  # what was moved beyond the last value
+            lowest = float(y.min()) if limit.at_most.any() else lowest
+            highest = highest if limit.at_most.all() else float(y.max())
         return predictor if np.isinf([lowest, highest]).all() else Ending(predictor, lowest, highest)
 
 
@@ -333,6 +334,18 @@ class Ending:
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction at u (n, d), which knows where the metric ends."""
         return replace(self.predictor(u), lowest=self.lowest, highest=self.highest)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what else the predictor offers: left-out rows, how it compares."""
+        if name.startswith("__") or name == "predictor":
+            raise AttributeError(name)
+        return getattr(self.predictor, name)
+
+    def probability_bounds(self, u: Points, critical: CriticalInterval) -> tuple[Vector, Vector]:
+        """Return quick lower and upper bounds (n,) of P(y in M_c); 0 and 1 where the predictor has none."""
+        if isinstance(self.predictor, Screened):
+            return self.predictor.probability_bounds(u, reached_beyond(critical, self.lowest, self.highest))
+        return np.zeros(len(u)), np.ones(len(u))
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of the metric as a function, at u (m, d)."""

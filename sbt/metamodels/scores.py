@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sbt.errors import InputError
+from sbt.metamodels.ended import ended
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -54,6 +55,8 @@ def scores(
         Winkelmann et al. (2022), section IV-C, eqs. (1), (2); CRPS: Gneiting & Raftery (2007), eq. (21).
     """
     observed = np.asarray(y, dtype=np.float64)
+    if observed.shape != (len(prediction),):
+        raise InputError(f"y must have shape ({len(prediction)},), one value a point, but got {observed.shape}")
     if not np.isfinite(observed).all():
         raise InputError("scores need finite y, but got NaN or infinity")
     with np.errstate(over="ignore"):  # squares of enormous errors: -inf, which becomes None
@@ -114,8 +117,11 @@ def reliability(p: Vector, critical: Mask, bins: int = _BINS) -> tuple[Vector, V
 
 
 def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval, mask: Mask) -> dict[str, float | int | None]:
+    told, mu = ended(prediction), prediction.mu
+    error = told.mu - np.clip(y, prediction.lowest, prediction.highest)
+    y = np.where((y <= prediction.lowest) & (mu < y) | (y >= prediction.highest) & (mu > y), mu, y)  # its side alone is known
     gaussian, mixture = prediction.log_density_gaussian(y), prediction.log_density(y)
-    error, level = prediction.mu - y, prediction.cdf(y)
+    level = prediction.cdf(y)
     log_p, log_not = prediction.log_probability(critical)
     log_likelihood = _mean(gaussian)
     result = {
@@ -123,7 +129,7 @@ def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval, mask:
         "likelihood": None if log_likelihood is None else _finite(np.exp(min(log_likelihood, 709.0))),
         "log_likelihood_mixture": _mean(mixture),
         "rmse": _root(_mean(error**2)),
-        "crps": _mean(_crps(error, prediction.sigma)),
+        "crps": _mean(_crps(error, told.sigma)),
         "log_likelihood_critical": _mean(gaussian[mask]),
         "rmse_critical": _root(_mean(error[mask] ** 2)),
         **_classification(log_p, log_not, mask),

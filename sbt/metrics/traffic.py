@@ -79,7 +79,7 @@ def others_braking_max(ego: str = "ego") -> Metric:
         return float(np.nanmax(braking, initial=0.0))
 
     return Metric(
-        "others_braking_max", function, "m/s^2", "high", 0.0, "hardest braking of any vehicle but ego: how much ego relies on them"
+        "others_braking_max", function, "m/s^2", "high", 0.0, "hardest braking of other vehicles: how much ego relies on them"
     )
 
 

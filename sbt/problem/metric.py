@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
 from sbt import plugins
 from sbt.errors import InputError, RunError, must_be
@@ -46,6 +48,10 @@ class Metric:
 
     def __post_init__(self) -> None:
         must_be("a metric's name must be text", self.name, str)
+        must_be(f"metric {self.name}: a unit must be text", self.unit, str)
+        must_be(f"metric {self.name}: what stands for no interaction (without) must be a number", self.without, Real)
+        if not self.name.strip() or not self.name.isprintable():
+            raise InputError(f"a metric's name must be text on one line, but got {self.name!r}")
         if self.function is not None and not callable(self.function):
             raise InputError(f"metric {self.name} must have a function of a trace, but got {self.function!r}")
 
@@ -61,7 +67,7 @@ class Metric:
         """Return its value on a trace, finite or not."""
         if self.function is None:
             raise InputError(f"metric {self.name} is given by its scenario: it cannot be measured on a trace")
-        return float(self.function(trace))
+        return as_number(self.name, self.function(trace))
 
 
 def metric_from(given: Metric | str | Callable[[Trace], float]) -> Metric:
@@ -83,9 +89,29 @@ def metric_from(given: Metric | str | Callable[[Trace], float]) -> Metric:
     return Metric(getattr(given, "__name__", type(given).__name__), given, description=lines[0] if lines else "")
 
 
-def meaningful(name: str, value: float) -> float:
-    """Return a metric's value: inf, -inf, or a number whose square is still one."""
-    if abs(value) <= FARTHEST or math.isinf(value):
-        return value
-    limit = "" if math.isnan(value) else f" and within {FARTHEST:g}"
-    raise RunError(Status.FAILED, f"metric {name} must be finite{limit}, inf or -inf, but got {value}")
+def meaningful(name: str, value: object) -> float:
+    """Return a metric's value: inf, -inf, or a number whose square is still one.
+
+    Raises:
+        RunError: it is no such number.
+    """
+    number = as_number(name, value)
+    if abs(number) <= FARTHEST or math.isinf(number):
+        return number
+    limit = "" if math.isnan(number) else f" and within {FARTHEST:g}"
+    raise RunError(Status.FAILED, f"metric {name} must be finite{limit}, inf or -inf, but got {number}")
+
+
+def as_number(name: str, value: Any) -> float:
+    """Return a metric's value as a number; text is none.
+
+    Raises:
+        RunError: it is no number.
+    """
+    try:
+        number = None if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = None
+    if number is None:
+        raise RunError(Status.FAILED, f"metric {name} must be one number, but got {value!r}")
+    return number

@@ -320,15 +320,4 @@ def _checked(returned: Any, names: tuple[str, ...]) -> dict[str, float]:
         hint = f"; declare all of them: metrics={given}" if set(names) < set(given) else ""
         rule = f"a run must give the metrics {', '.join(names)}"
         raise RunError(Status.FAILED, f"{rule}, but gave {', '.join(given) or 'none'}{hint}")
-    return {name: _finite(name, returned[name]) for name in names}
-
-
-def _finite(name: str, value: Any) -> float:
-    """Return a metric's value as a number."""
-    try:
-        number = None if isinstance(value, str | bytes) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = None
-    if number is None:
-        raise RunError(Status.FAILED, f"metric {name} must be one number, but got {value!r}")
-    return meaningful(name, number)
+    return {name: meaningful(name, returned[name]) for name in names}

@@ -133,6 +133,13 @@ class Trace:
         for name in ("x", "y", "heading", "speed", "acceleration"):
             if getattr(self, name).shape != shape:
                 raise ValueError(f"trace.{name} must have shape {shape}, but got {getattr(self, name).shape}")
+        if len(set(self.actors)) < len(self.actors):
+            raise ValueError(f"trace.actors must have different names, but got {', '.join(map(str, self.actors))}")
+        if not (np.diff(self.time) > 0.0).all():
+            raise ValueError("trace.time must increase, but does not")
+        for name in ("length", "width"):
+            if getattr(self, name).shape != shape[1:] or not (getattr(self, name) > 0.0).all():
+                raise ValueError(f"trace.{name} must have {shape[1]} values > 0, but got {getattr(self, name)}")
         for name, values in self.signals.items():
             if values.shape != shape[:1]:
                 raise ValueError(f"trace.signals['{name}'] must have shape {shape[:1]}, but got {values.shape}")

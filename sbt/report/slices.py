@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sbt.metamodels.ended import ended
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Json
@@ -92,7 +93,8 @@ def _asked(predict: Predict, critical: CriticalInterval, u: Points) -> Vector:
         log_p, log_not = prediction.log_probability(critical)
         score = np.where(log_p < log_not, ndtri_exp(log_p), -ndtri_exp(log_not))
         score = np.clip(score, -_SCORE, _SCORE)
-        parts.append(np.stack([prediction.mu, prediction.quantile(0.05), prediction.quantile(0.95), score]))
+        told = ended(prediction)
+        parts.append(np.stack([told.mu, told.quantile(0.05), told.quantile(0.95), score]))
     return np.concatenate(parts, axis=1)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sbt import plugins
-from sbt.errors import InputError
+from sbt.errors import InputError, described
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
 from sbt.seeds import stream
@@ -120,6 +120,9 @@ class Ego:
             built: Controller = factory(rng, set_speed, **settings)
         except TypeError as error:
             raise InputError(f"ego settings must be ones that '{self.kind}' takes, but got {settings}: {error}") from None
+        except Exception as error:
+            rule = f"ego.kind '{self.kind}' must be constructed with {settings}"
+            raise InputError(f"{rule}, but it raised {described(error)}") from None
         return built
 
     def vehicle_type(self, base: VehicleType, set_speed: float) -> VehicleType:

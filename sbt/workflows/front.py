@@ -274,6 +274,7 @@ def simulate_scenario(
     """
     plugins.forget_changed()
     choice = {"kind": ego} if isinstance(ego, str) else ego
+    must_be("ego must be a kind, or a mapping of kind and settings", choice, Mapping, type(None))
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError(f"seed must be a whole number >= 0, but got {seed!r}")
     if inputs is not None and not isinstance(inputs, Mapping):

@@ -8,7 +8,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from sbt.errors import must_be
+from sbt.errors import InputError, must_be
 from sbt.loop.stages import Progress
 from sbt.plugins import OBJECT
 from sbt.problem.combination import CombinedRequirement
@@ -88,15 +88,17 @@ def as_data(keys: JsonMapping) -> tuple[Json, dict[tuple[str, str], Any]]:
         elif key == "warm_start" and isinstance(given, str | Path):
             data[key] = {"store": str(given)}
         elif key == "inputs" and isinstance(given, Mapping):
-            data[key] = {name: _input(change) for name, change in given.items()}
+            data[key] = {name: _input(name, change) for name, change in given.items()}
         else:
             data[key] = _plain(given)
     return data, objects
 
 
-def _input(change: Any) -> Any:
+def _input(name: str, change: Any) -> Any:
     """Return the change of an input as plain data: of a range, a distribution, or a whole parameter."""
     if isinstance(change, Parameter):
+        if change.name != name:
+            raise InputError(f"inputs.{name} must be a change of this input, but got the parameter {change.name}")
         distribution = {} if change.distribution is None else {"distribution": change.distribution}
         likely = dict(zip(change.choices, change.probabilities, strict=False))
         ends = {"min": change.low, "max": change.high, **distribution}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -13,6 +14,7 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean, must_be
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion
+from sbt.metamodels.ended import ended
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
@@ -148,7 +150,7 @@ class Plots:
         point = np.tile(self._point(at), (len(along), 1))
         point[:, k] = along
         drawn, critical = _axes(ax), r.scenario.requirement.critical
-        prediction = self._fitted.predict(np.clip(space.to_unit(point), 0.0, 1.0))
+        prediction = ended(self._fitted.predict(np.clip(space.to_unit(point), 0.0, 1.0)))
         ends = reach(np.concatenate([prediction.quantile(0.05), prediction.quantile(0.95)]), critical)
         shade(critical, ends, drawn, along="y")
         parameter = space.parameters[k]
@@ -258,6 +260,7 @@ class Plots:
         if at is None or isinstance(at, dict):
             values = space.values(at or {})
             return space.numbers(values)
+        must_be("at must be the index of a run, or values of inputs by name", at, Integral)
         rows = np.flatnonzero(history.index == at)
         if len(rows) == 0:
             raise InputError(f"a run must be a finished one (0 to {len(history) - 1}), but got {at}")

@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import numpy as np
 from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor
+from sbt.metamodels.ended import ended
 from sbt.metamodels.joint import JointPrediction
 from sbt.metamodels.persistence import load, read_info, save
 from sbt.plugins import Objects
@@ -128,7 +130,8 @@ def predict_inputs(
         p = predictor(u[k : k + _CHUNK])
         each = p.parts if isinstance(p, JointPrediction) else ()
         single = [one.probability(need.critical) for one, need in zip(each, requirement.parts, strict=False)]
-        parts.append([p.mu, p.sigma, p.epistemic, p.noise, p.probability(requirement.critical), *single])
+        told = ended(p)
+        parts.append([told.mu, told.sigma, told.epistemic, told.noise, p.probability(requirement.critical), *single])
     each_of = requirement.parts if requirement.combined else ()
     names = ("mu", "sigma", "epistemic", "noise", "p_critical", *(f"p_critical.{part.label}" for part in each_of))
     columns = dict(zip(names, np.concatenate(parts, axis=1), strict=True)) if parts else {n: np.empty(0) for n in names}
@@ -147,7 +150,10 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
         InputError: columns missing, values that are no numbers or outside of the range; the message names row and column.
     """
     if not hasattr(given, "keys"):
-        x = _numbers_of(given, space)
+        try:
+            x = _numbers_of(given, space)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"inputs must be a table of numbers, for {', '.join(space.names)}, but {error}") from None
         if x.ndim != 2 or x.shape[1] != space.dimension:
             names = ", ".join(space.names)
             raise InputError(f"an array of inputs must be (n, {space.dimension}), for {names}, but got {x.shape}")
@@ -174,7 +180,11 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
 def _column_of(given: Any, parameter: Parameter) -> Vector:
     """Return a column (n,) as numbers; one value is a column of one."""
     if not parameter.choices:
-        return np.atleast_1d(np.asarray(given, dtype=np.float64))
+        values = np.atleast_1d(np.asarray(given))
+        wrong = [] if values.dtype.kind in "iuf" else [v for v in values.flat if isinstance(v, bool) or not isinstance(v, Real)]
+        if values.ndim > 1 or wrong:
+            raise ValueError(f"got {wrong[0]!r}" if wrong else f"it has {values.ndim} dimensions")
+        return values.astype(np.float64)
     return np.array([parameter.number(value) for value in np.atleast_1d(np.asarray(given, dtype=object))])
 
 
@@ -191,6 +201,8 @@ def _numbers_of(given: Any, space: ParameterSpace) -> Points:
 def _column(name: str, head: list[str]) -> str:
     """Return the column of an input."""
     found = [key for key in (name, f"x.{name}") if key in head]
+    if len(found) > 1 or head.count(name) > 1:
+        raise InputError(f"an input must be one column, but {name} is more: {', '.join(head)}")
     if not found:
         short = [key.removeprefix("x.") for key in head]
         raise InputError(f"every input must be a column, but {name} is missing{did_you_mean(name, short)}; got {', '.join(head)}")
