@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,8 +14,9 @@ from sbt.campaigns.clustering import clustered_interval
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.sides import all_critical, few_of_a_side, none_critical
 from sbt.campaigns.wording import percent, plural
-from sbt.estimators.binomial import interval
+from sbt.estimators.binomial import interval, upper
 from sbt.loop.learner import changed_share
 from sbt.loop.stages import Batch, Facts, Log
 from sbt.problem.arrays import Points, Vector
@@ -69,6 +70,10 @@ class CriticalShare:
         return [f"Critical share of the parameter space: {percent(self.critical_fraction)} ({interval}){counted}."]
 
 
+_SURE = 0.95
+"""Confidence of the bound on what no run has met, before `stop.misclassified` ends a campaign."""
+
+
 @dataclass(frozen=True)
 class BatchStage:
     """Batches chosen by one rule, the first one evenly distributed.
@@ -110,16 +115,26 @@ class BatchStage:
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
             if max(moved) < stable:
                 return "stable"
-        return "misclassified" if chose and self._sure(chose[-1]) else None
+        return "misclassified" if self._sure(chose[-2:], log) else None
 
-    def _sure(self, fit: FitRecord) -> bool:
-        """Say whether so little of the space is expected on the wrong side, and held-out runs do not deny it."""
+    def _sure(self, fits: Sequence[FitRecord], log: Log) -> bool:
+        """Say whether two fits in turn expect so little of the space on the wrong side and agree, and no run denies it.
+
+        Held-out runs do not. Several runs tell of each side, or those that fill the space evenly bound what none has met.
+        """
         target = self.settings.stop.get("misclassified")
-        validation = fit.validation
-        if target is None or fit.expected_misclassified > target or validation is None or validation.error_rate is None:
+        if target is None or len(fits) < 2 or max(fit.expected_misclassified for fit in fits) > target:
+            return False
+        validation = fits[-1].validation
+        if validation is None or validation.error_rate is None or changed_share(fits[0].sides, fits[1].sides) > target:
             return False
         wrong = round(validation.error_rate * validation.n)
-        return bool(interval(wrong, validation.n)[0] <= target)
+        if interval(wrong, validation.n)[0] > target:
+            return False
+        even = log.history.where(np.isin(log.history.stage, ("initial", VALIDATION)))
+        facts = Facts.of(log.history, self.settings.scenario)
+        bounded = (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
+        return bounded or not few_of_a_side(facts)
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""

@@ -52,7 +52,7 @@ class SimulatorNoise:
         std: pooled standard deviation of the requirement's metric at equal inputs; None: nothing was repeated.
         lost: inputs at which a run gave a metric and another one, with another seed, gave none; None: there are none.
         inputs: different inputs that were repeated; None: nothing was.
-        silent: no metric differed, but they have values there that other inputs gave too, such as 0: so few repeats agree by chance.
+        silent: no metric differed, but they have values there that other inputs gave too, such as 0: repeats agree by chance.
     """
 
     repeats: int
