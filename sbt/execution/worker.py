@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -21,6 +22,9 @@ from sbt.problem.trace import Trace
 
 __all__ = ["run_at_levels", "run_job", "run_jobs", "run_traced", "versions"]
 
+_simulating = threading.RLock()
+"""SUMO has one simulation a process: threads take turns, run by run."""
+os.register_at_fork(after_in_child=lambda: _simulating._at_fork_reinit())  # type: ignore[attr-defined]
 _Measured = tuple[dict[str, float], str, str]
 """Metrics, SUMO's own collision list, and what differs between it and the contacts."""
 
@@ -50,7 +54,8 @@ def run_traced(scenario: LogicalScenario, job: Job) -> tuple[Outcome, Trace | No
     traces: list[Trace] = []
 
     def measured() -> _Measured:
-        trace = simulate(job.inputs, job.seed)
+        with _simulating:
+            trace = simulate(job.inputs, job.seed)
         if isinstance(trace, Trace):
             traces.append(trace)
         return _measured(scenario, trace)
@@ -102,7 +107,9 @@ def _together(
     try:
         if not simulate.batched:
             return None
-        found = simulate.simulate_many([(j.inputs, j.seed) for j in jobs], lambda busy: at_work([jobs[k].index for k in busy]))
+        with _simulating:
+            asked = [(j.inputs, j.seed) for j in jobs]
+            found = simulate.simulate_many(asked, lambda busy: at_work([jobs[k].index for k in busy]))
     except BaseException as error:  # whose it is, the runs show when they are run alone
         if interruption.is_interruption(error):
             raise KeyboardInterrupt from None

@@ -33,6 +33,7 @@ from sbt.store.history import History
 from sbt.workflows.earlier import EarlierCampaign
 from sbt.workflows.fidelity import COARSE_COST, stated_cost
 from sbt.workflows.mistakes import further_mistakes
+from sbt.workflows.own_campaign import checked
 from sbt.workflows.portable import place_of, where_it_is
 
 __all__ = ["RESOLVED", "Study", "changed_since"]
@@ -323,6 +324,8 @@ class Study:
             InputError: its batches are to be chosen ahead, but each needs all results before it.
         """
         found = self.kind.recipe(self.settings)
+        if not getattr(self.kind.recipe, "__module__", "").startswith("sbt."):
+            found = checked(found, self.scenario.space)
         if self.config.ahead and not any(ahead_of(stage) for stage in found.stages):
             kind, how = self.config.campaign, self.config.acquisition.kind
             raise InputError(f"batch.ahead must be 0 where each batch needs all results before it, as in {kind} by {how}")

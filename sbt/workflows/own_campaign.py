@@ -1,0 +1,105 @@
+"""A campaign of somebody's own, checked where it is used: what it proposes are runs of the scenario, and errors say whose they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sbt.errors import InputError, SbtError, described, must_be
+from sbt.loop.running import ahead_of
+from sbt.loop.stages import Batch, Campaign, Log, Stage
+from sbt.problem.space import ParameterSpace
+from sbt.store.database import PlannedPoints, PlannedRun
+
+__all__ = ["checked"]
+
+_ROOM = 1e-9
+"""Relative to the larger end of a range, by which rounding may take a value beyond it."""
+
+
+def checked(campaign: object, space: ParameterSpace) -> Campaign:
+    """Return a campaign whose stages and conclusion are checked.
+
+    Raises:
+        InputError: a recipe returned something else.
+    """
+    if not isinstance(campaign, Campaign):
+        raise InputError(f"a campaign's recipe must return a Campaign, but returned {campaign!r}")
+    return Campaign(tuple(_Checked(stage, space) for stage in campaign.stages), _concluding(campaign.conclude))
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """A stage of which every batch is checked."""
+
+    stage: Stage
+    space: ParameterSpace
+
+    @property
+    def name(self) -> str:
+        """That of the stage."""
+        return self.stage.name
+
+    @property
+    def ahead(self) -> int:
+        """Number of batches in flight that a proposal does not wait for."""
+        return ahead_of(self.stage)
+
+    def stop(self, log: Log) -> str | None:
+        """Return why the stage is over, or None."""
+        with _named(f"stage {self.name}: stop"):
+            reason = self.stage.stop(log)
+        must_be(f"stage {self.name}: stop must return why it is over, as text, or None", reason, str, type(None))
+        return reason
+
+    def propose(self, log: Log) -> Batch:
+        """Return the next batch."""
+        with _named(f"stage {self.name}: propose"):
+            batch = self.stage.propose(log)
+        must_be(f"stage {self.name}: propose must return a Batch", batch, Batch)
+        if isinstance(batch.runs, PlannedPoints):
+            return batch
+        return replace(batch, runs=tuple(self._checked(run) for run in batch.runs))
+
+    def _checked(self, run: PlannedRun) -> PlannedRun:
+        """Return a run with the inputs of the scenario, each a number in its range or one of its choices."""
+        rule = f"stage {self.name} must propose runs of the scenario's inputs ({', '.join(self.space.names)})"
+        try:
+            values = dict(run.inputs)
+        except (AttributeError, TypeError, ValueError):
+            raise InputError(f"{rule}, but proposed {run!r}") from None
+        if set(values) != set(self.space.names):
+            raise InputError(f"{rule}, but proposed {', '.join(map(str, values)) or 'none'}")
+        for parameter in self.space.parameters:
+            given = values[parameter.name]
+            number = parameter.number(given)
+            room = _ROOM * max(abs(end) for end in parameter.bounds)
+            if not (parameter.choices or parameter.low - room <= number <= parameter.high + room):
+                raise InputError(f"{rule}, {parameter.name} in {parameter.range}, but proposed {given!r}")
+        return run
+
+
+def _concluding(conclude: Callable[[Log], Any]) -> Callable[[Log], Any]:
+    def concluded(log: Log) -> Any:
+        with _named("conclude"):
+            found = conclude(log)
+        rule = "conclude must return a conclusion with to_dict() and sentences(facts), and the fitted metamodel or None"
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise InputError(f"{rule}, but returned {found!r}")
+        if not all(hasattr(found[0], name) for name in ("to_dict", "sentences")):
+            raise InputError(f"{rule}, but returned the conclusion {found[0]!r}")
+        return found
+
+    return concluded
+
+
+@contextmanager
+def _named(what: str) -> Iterator[None]:
+    try:
+        yield
+    except SbtError:
+        raise
+    except Exception as error:
+        raise SbtError(f"{what} raised {described(error)}") from error
