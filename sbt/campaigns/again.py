@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from sbt.campaigns.counting import DRAWN
+from sbt.campaigns.counting import DRAWN, Seen
 from sbt.campaigns.crude import NOMINAL
 from sbt.campaigns.known import Known
 from sbt.campaigns.records import EstimationProposal
@@ -67,6 +67,7 @@ class Reused:
         warm_up: (n,) that each draw began with, -1 without one.
         least: effective sample size below which the draws say nothing.
         exact: all combinations of inputs were run, and no noise was met: sums have no error.
+        taught: further draws from the campaign's distribution, which taught and do not count.
     """
 
     space: ParameterSpace
@@ -81,6 +82,12 @@ class Reused:
     warm_up: Vector
     least: float
     exact: bool = False
+    taught: int = 0
+
+    @property
+    def unmet(self) -> Vector:
+        """The share of each draw that is in proportion to the campaign's distribution, of those that taught as well."""
+        return np.concatenate([self.nominal, np.ones(self.taught)])
 
 
 def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
@@ -121,6 +128,7 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         history.columns["warm_up"][every], least, took_sum(log) and _exact(log, settings),
+        Seen.of(log, settings).draws - round(float(nominal.sum())) if not plainly else 0,
     )  # fmt: skip
 
 

@@ -70,7 +70,7 @@ def _from_batches(found: Reused) -> Concluded:
     low, high = combine_estimates(safe), combine_estimates(worst)
     hits, perhaps = (int(sum((b.critical[b.coefficient > 0] > 0).sum() for b in batches)) for batches in (safe, worst))
     misses = int(sum((b.coefficient > 0).sum() for b in safe)) - perhaps
-    missed = defended_bound(0, found.nominal, found.ratio, _CONFIDENCE)
+    missed = defended_bound(0, found.unmet, found.ratio, _CONFIDENCE)
 
     def bound(count: int, confidence: float) -> float:
         return defended_bound(count, found.nominal, found.ratio, confidence)
@@ -100,7 +100,7 @@ def _from_nominal(found: Reused) -> Concluded:
     batch, worst = found.batches[0], found.worst[0]
     low, high = (WeightedShare(b.coefficient, b.critical) for b in (batch, worst))
     hits = int((batch.critical[batch.coefficient > 0] > 0).sum())
-    missed = defended_bound(0, found.nominal, found.ratio, _CONFIDENCE)
+    missed = defended_bound(0, found.unmet, found.ratio, _CONFIDENCE)
     exact, warnings = None, []
     limits = Limits(low.lower, high.upper)
     if not hits:

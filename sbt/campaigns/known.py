@@ -75,6 +75,11 @@ class Known:
         return not self.critical.any() or bool(self.critical.all())
 
     @property
+    def constant(self) -> bool:
+        """Whether all runs have one metric, as where flags and speeds of impact are 0: there is nothing to follow."""
+        return not len(self.y) or bool((self.y == self.y[0]).all())
+
+    @property
     def starts(self) -> Points:
         """(k, d) normal scores of critical runs to look around, at first those of an earlier campaign."""
         found, transfer = self.z[self.critical], self.settings.transfer

@@ -140,6 +140,8 @@ class SequentialStage:
         if log.iteration == 0 and not self._spares_search and (s.prior_runs is None or len(s.prior_runs.training) < 2):
             return self._initial(min(s.initial, s.budget))
         known = Known.of(log.history, self._coordinates, s)
+        if known.constant and s.transfer is None and len(log.planned) >= _ENOUGH * s.budget:
+            return MonteCarloStage(s).propose(log)  # nothing tells where failures are: to know their share, draws must count
         log_probability = known.learn(stream(s.seed, "fit", log.iteration))
         if log_probability is not None and self._noise_decides(log, log_probability):
             return MonteCarloStage(s).propose(log)

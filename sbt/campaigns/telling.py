@@ -351,7 +351,8 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     wide, counted = too_wide(found), found.counted or n
     traffic = found.warmed_traffic
     if wide > 1.0 and traffic is not None and traffic.decides(found.cov, found.probability):
-        return _more_warm_ups(traffic.warm_ups)
+        there = int(facts.history.columns["warm_up"].max(initial=-1)) + 1  # those that no counted draw began with among them
+        return _more_warm_ups(max(traffic.warm_ups, there))
     if wide > 1.0 and counted:
         more = runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
         return more + as_many_draws(found, n)

@@ -249,13 +249,15 @@ def _stated(value: Any) -> Any:
     return {k: _stated(v) for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
 
 
-def resumed(config: Configuration, stored: JsonMapping) -> Configuration:
+def resumed(config: Configuration, stored: JsonMapping, ran: int = 0) -> Configuration:
     """Return the configuration with `initial` and `batch` as stored, where the user does not state them.
 
-    Their defaults follow the budget, which may grow when a campaign is resumed; they must not.
+    Their defaults follow the budget, which may grow when a campaign is resumed; they must not. It does not shrink below what
+    was run of it.
     """
     kept = {key: stored[key] for key in ("initial", "batch") if key not in config.model_fields_set and key in stored}
-    return config.model_copy(update=kept)
+    budget = max(config.budget, min(stored.get("budget", 0), ran))
+    return config.model_copy(update={**kept, "budget": budget})
 
 
 def schema() -> Json:

@@ -1,4 +1,4 @@
-"""A campaign of somebody's own, checked where it is used: what it proposes are runs of the scenario, and errors say whose they are."""
+"""A campaign of somebody's own, checked: what it proposes are runs of the scenario, and errors say whose they are."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class Study:
         kept = store.configuration
         if not kept:
             return self
-        return replace(self, loaded=replace(self.loaded, config=resumed(self.config, kept)), kept=kept)
+        return replace(self, loaded=replace(self.loaded, config=resumed(self.config, kept, store.end)), kept=kept)
 
     def with_store(self, folder: Path) -> Study:
         """Return the study with another store."""
