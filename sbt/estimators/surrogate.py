@@ -26,7 +26,7 @@ from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import on_side, opened_and_limit
 from sbt.metamodels.stacking import cell_shares, surely_positive
 from sbt.metamodels.tails import student_mixture
-from sbt.metamodels.warp import Warp
+from sbt.metamodels.warp import LogWarp, Warp
 from sbt.metamodels.warped import better_warp
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
@@ -287,7 +287,7 @@ def fit_log_probability(
     warp = better or Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)
     metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel
-    smallest = least / (warp.scale * float(warp.scale_at(np.array(1.0))))
+    smallest = _noise_in(warp, z, y, least)
     warped = None if limit is None else limit.moved(warp.values)
     whole = _Form(t, warp.interval(critical), warp.log_slope(y), noise=smallest, limit=warped)
     plain = _Form(y, critical, np.zeros(len(y)), noise=least, limit=limit)
@@ -308,6 +308,19 @@ def fit_log_probability(
         chosen = [forms[best]] if sure else [whole, forms[best]]
     learned = (form.fit(metamodel, u, every, rng) for form in chosen)
     return _Largest(coordinates, tuple(each.with_tails(u) if least > 0.0 and len(every) == len(y) else each for each in learned))
+
+
+def _noise_in(warp: Warp, z: Points, y: Vector, variance: float) -> float:
+    """Return a variance of noise in the unit of a warp: by its slope at the edge; of a log by what equal inputs z (n, d) gave.
+
+    A few repeats far beyond the edge, where noise is a share of the value, would decide it for the edge.
+    """
+    if variance == 0.0 or not isinstance(warp, LogWarp):
+        return variance / (warp.scale * float(warp.scale_at(np.array(1.0))))
+    group = np.unique(z, axis=0, return_inverse=True)[1].reshape(-1)
+    count = np.bincount(group)
+    warped, own = (((t - (np.bincount(group, t) / count)[group]) ** 2).sum() for t in (warp.values(y), y))
+    return variance * float(warped / own) if own > 0.0 else variance / warp.edge**2
 
 
 def _better_warp(metamodel: Metamodel, u: Points, y: Vector, critical: CriticalInterval) -> Warp | None:

@@ -74,6 +74,7 @@ _KINDS: dict[str, Any] = {
         stepped.Step,
         stepped.SteppedPredictor,
         warp.Warp,
+        warp.LogWarp,
         warped.WarpedPredictor,
     )
 }

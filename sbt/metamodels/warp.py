@@ -17,7 +17,7 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["JointWarp", "Warp", "gap_of", "warp_around"]
+__all__ = ["JointWarp", "LogWarp", "Warp", "gap_of", "warp_around"]
 
 _SPACINGS, _WIDE = 8, 8.0
 """Spacings between the values nearest to the edge on either side, and the fewest of them that a gap is as wide as: before the
@@ -135,6 +135,41 @@ class Warp:
         """Return the interval in warped values; infinite ends stay."""
         low, high = self.values(np.array([critical.low, critical.high]))
         return CriticalInterval(float(low), float(high))
+
+
+@dataclass(frozen=True)
+class LogWarp(Warp):
+    """w = log(y / edge) of a positive metric: noise that is a share of the value is the same everywhere in this unit.
+
+    >>> warp = LogWarp.around(2.0)
+    >>> warp.values(np.array([0.2, 2.0, 20.0])).round(3).tolist(), float(warp.back(np.array([0.0]))[0])
+    ([-2.303, 0.0, 2.303], 2.0)
+    """
+
+    @classmethod
+    def around(cls, edge: float) -> LogWarp:
+        """Return the warp around an edge > 0."""
+        return cls(edge, edge)
+
+    def values(self, y: Vector) -> Vector:
+        """Return the warped y, shape kept; -inf and what is not positive are very small."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            warped = np.log(np.maximum(np.asarray(y, dtype=np.float64), 0.0) / self.edge)
+        return np.asarray(np.where(np.isneginf(y), -np.inf, np.maximum(warped, -_FARTHEST)))
+
+    def back(self, warped: Vector) -> Vector:
+        """Return the y of warped values, shape kept."""
+        return np.asarray(self.edge * np.exp(np.where(np.isinf(warped), warped, np.clip(warped, -_FARTHEST, _FARTHEST))))
+
+    def moments(self, mean: Points, std: Points) -> tuple[Points, Points]:
+        """Return the median of y and half of what lies between a standard deviation on either side, shape kept."""
+        mean, std = np.clip(mean, -_FARTHEST, _FARTHEST), np.clip(std, _LEAST, _FARTHEST)
+        low, middle, high = (self.back(at) for at in (mean - std, mean, mean + std))
+        return middle, 0.5 * (high - low)
+
+    def log_slope(self, y: Vector) -> Vector:
+        """Return (n,) the logarithm of the warp's derivative at y (n,)."""
+        return -self.values(y) - math.log(self.edge)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from sbt.metamodels.base import Predictor, Screened, sample_paths, sketched
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import Bins, cell_shares
-from sbt.metamodels.warp import Warp
+from sbt.metamodels.warp import LogWarp, Warp
 from sbt.metamodels.warped_prediction import WarpedPrediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -102,11 +102,15 @@ def _warps(y: Vector, critical: CriticalInterval, gap: tuple[float, float]) -> l
     among = distance[positive & safe] if (positive & safe).any() else distance[positive]
     heavy = float(np.std(y)) > _HEAVY * float(np.median(distance))
     scales = np.unique(np.quantile(among, _QUANTILES + _SMALLER * heavy))
-    return [Warp(critical.edge, scale, gap=gap) for scale in scales.tolist()]
+    warps = [Warp(critical.edge, scale, gap=gap) for scale in scales.tolist()]
+    logs = critical.edge > 0.0 and y.min() > 0.0 and gap == (0.0, 0.0)
+    return [*warps, LogWarp.around(critical.edge)] if logs else warps
 
 
 def _steeper(warp: Warp, factor: float, critical: CriticalInterval) -> Warp:
     """Return the warp with a scale of the critical side that is so much larger; itself where it is large, or small, enough."""
+    if isinstance(warp, LogWarp):
+        return warp
     above = warp.scale if warp.above is None else warp.above
     below, above = (warp.scale * factor, above) if math.isfinite(critical.high) else (warp.scale, above * factor)
     return replace(warp, scale=below, above=above) if 1.0 / _STEEPEST <= below / above <= _STEEPEST else warp
