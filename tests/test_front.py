@@ -198,6 +198,12 @@ WRONG = {
     "out of range": (lambda s: sbt.open(s).predict({"a": 7.0, "b": 0.5}), r"\[-1, 1\]"),
     "not a number": (lambda s: sbt.open(s).predict({"a": "x", "b": 0.5}), r"must hold numbers"),
     "lengths": (lambda s: sbt.open(s).predict({"a": [0.1, 0.2], "b": [0.1, 0.2, 0.3]}), r"must have one length"),
+    "number as text": (lambda s: sbt.open(s).predict({"a": "0.5", "b": 0.5}), r"a must hold numbers, .* got '0.5'"),
+    "two columns": (lambda s: sbt.open(s).predict({"a": 0.1, "x.a": 0.2, "b": 0.5}), r"must be one column, but a is more"),
+    "no table": (lambda s: sbt.open(s).predict([[0.1, 0.2], [0.3]]), r"inputs must be a table of numbers"),
+    "no axes": (lambda s: sbt.open(s).plot.runs(5), r"ax must be matplotlib's axes"),
+    "no index": (lambda s: sbt.open(s).plot.slices(at=[1, 2]), r"at must be the index of a run, or values"),
+    "no form": (lambda s: sbt.open(s).export(5), r"but got"),
     "value": (lambda s: sbt.simulate(scenario_of(), {"a": 3}), r"input a must be in \[-1, 1\] m, but got 3"),
     "input": (lambda s: sbt.simulate(scenario_of(), {"aa": 0}), r"did you mean 'a'"),
     "seed": (lambda s: sbt.simulate(scenario_of(), seed=-1), r"seed must be a whole number >= 0"),
@@ -392,7 +398,8 @@ def test_the_check_finds_campaigns_that_remember_or_say_nothing():
         stage = sbt.campaigns.BatchStage("mine", settings, sbt.campaigns.evenly)
         return sbt.Campaign((stage,), lambda log: (object(), None))
 
-    with pytest.raises(sbt.testing.ContractError, match="a campaign must run to its end, but raised AttributeError"):
+    told = "a campaign must run to its end, but raised InputError: conclude must return a conclusion"
+    with pytest.raises(sbt.testing.ContractError, match=told):
         sbt.testing.check_campaign(sbt.CampaignKind("", silent, adaptive=False))
 
 

@@ -25,7 +25,7 @@ def plateau() -> sbt.Scenario:
     return analytic(beside_a_plateau, inputs=INPUTS, critical=(-np.inf, 0.5), name="plateau")
 
 
-@pytest.mark.parametrize("seed", [4, 22])
+@pytest.mark.parametrize("seed", [4, 3])
 def test_an_interval_reaches_what_random_draws_allow_while_few_critical_runs_are_known(seed: int, tmp_path: Path):
     """One of these stated at most a twentieth of the truth, and a gate at half of it passed."""
     result = sbt.run(

@@ -427,12 +427,54 @@ def test_streams_depend_on_seed_and_path_only():
     (lambda: _of(requirement="m"), "a requirement is needed"),
     (lambda: _of(evaluate=5), "must be a function of values and seed"),
     (lambda: sbt.simulate(_of(), [1, 2]), r"inputs must be values by name.*but got \[1, 2\]"),
+    (lambda: sbt.simulate(_of(), ego=5), "ego must be a kind, or a mapping of kind and settings, but got 5"),
+    (lambda: sbt.Parameter(5, 0, 1), "an input's name must be an identifier, but got 5"),
+    (lambda: sbt.Parameter("a", 0, 1, "m", sbt.Normal(50, 0.001)), r"must have mass in its range .*\(input a\)"),
+    (lambda: sbt.Normal("0", 1), "distribution 'normal': mean must be a number, but got '0'"),
+    (lambda: sbt.Normal(None, 1), "mean must be a number, but got None"),
+    (lambda: sbt.Requirement(["m"], high=0), r"a requirement's metric must be text, but got \['m'\]"),
+    (lambda: sbt.CriticalInterval("a", 1), "an end of a critical interval must be a number, but got 'a'"),
+    (lambda: sbt.Metric(5), "a metric's name must be text, but got 5"),
+    (lambda: sbt.Metric("m", 5), "metric m must have a function of a trace, but got 5"),
+    (lambda: sbt.Metric("m\n"), "a metric's name must be text on one line"),
+    (lambda: _of(inputs={"a": (0, 1)}), "inputs must be a list of parameters.*but got 'a'"),
+    (lambda: _of(inputs=5), "inputs must be a list of parameters, but got 5"),
+    (lambda: _of(metrics="m"), "scenario x: metrics must be a list, but got 'm'"),
+    (lambda: _of(metrics=["m", "m"]), "scenario x: metrics must have different names, but got 'm' twice"),
+    (lambda: sbt.check(5), "a scenario must be a Scenario or its name, but got 5"),
+    (lambda: sbt.open(None), "a store must be the path of a folder, but got None"),
+    (lambda: sbt.run(5), "a configuration must be the path of a file, but got 5"),
+    (lambda: sbt.list(5), "KIND must be text, but got 5"),
+    (lambda: sbt.run(campaign="coverage", scenario=_of(), progress=5), "progress must be a function, but got 5"),
+    (lambda: sbt.run(campaign="coverage", scenario=_of(), inputs={"a": sbt.Parameter("b", 0, 1)}), "but got the parameter b"),
 ])  # fmt: skip
 def test_what_is_no_such_thing_is_told_as_that(make, said):
     with pytest.raises(InputError, match=said):
         make()
 
 
-def _of(inputs=None, requirement=None, evaluate=lambda values, seed: {"m": values["a"]}):
+def test_the_ends_of_a_range_are_plain_numbers():
+    made = sbt.Parameter("g", np.float32(0.0), np.int64(3))
+    assert (type(made.low), type(made.high)) == (float, int)
+
+
+@pytest.mark.parametrize(("changed", "said"), [
+    ({"time": np.array([1.0, 0.0])}, "time must increase"),
+    ({"length": np.zeros(1)}, "length must have 1 values > 0"),
+    ({"actors": ("ego", "ego"), **{name: np.ones((2, 2)) for name in ("x", "y", "heading", "speed", "acceleration")},
+      "length": np.ones(2), "width": np.ones(2)}, "actors must have different names"),
+])  # fmt: skip
+def test_a_trace_goes_forward_with_bodies_of_different_names(changed, said):
+    states = {name: np.ones((2, 1)) for name in ("x", "y", "heading", "speed", "acceleration")}
+    with pytest.raises(ValueError, match=said):
+        Trace(**{"time": np.arange(2.0), "actors": ("ego",), **states, "length": np.ones(1), "width": np.ones(1), **changed})
+
+
+def test_text_is_no_metric():
+    with pytest.raises(RunError, match="metric m must be one number, but got '1'"):
+        Metric("m", lambda trace: "1")(Trace(np.zeros(1), (), *np.zeros((5, 1, 0)), np.zeros(0), np.zeros(0)))
+
+
+def _of(inputs=None, requirement=None, evaluate=lambda values, seed: {"m": values["a"]}, metrics=()):
     inputs = [sbt.Parameter("a", 0, 1)] if inputs is None else inputs
-    return sbt.Scenario("x", inputs, requirement or sbt.Requirement("m", high=0.0), evaluate=evaluate)
+    return sbt.Scenario("x", inputs, requirement or sbt.Requirement("m", high=0.0), evaluate=evaluate, metrics=metrics)

@@ -181,7 +181,8 @@ def _column_of(given: Any, parameter: Parameter) -> Vector:
     """Return a column (n,) as numbers; one value is a column of one."""
     if not parameter.choices:
         values = np.atleast_1d(np.asarray(given))
-        wrong = [] if values.dtype.kind in "iuf" else [v for v in values.flat if isinstance(v, bool) or not isinstance(v, Real)]
+        plain = [] if values.dtype.kind in "iuf" else values.ravel().tolist()
+        wrong = [value for value in plain if type(value) is bool or not isinstance(value, Real)]
         if values.ndim > 1 or wrong:
             raise ValueError(f"got {wrong[0]!r}" if wrong else f"it has {values.ndim} dimensions")
         return values.astype(np.float64)

@@ -1,0 +1,75 @@
+"""Metrics of few values: repeats that agree by chance prove no determinism, and what tells of nothing is not followed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt.seeds import stream
+
+INPUTS = [sbt.Parameter("n", 1, 5, kind="integer"), sbt.Parameter("k", choices={"x": 0.7, "y": 0.3})]
+
+
+def coin(rate: float, where=lambda values: True):
+    """Fails with this share of the seeds."""
+    return lambda values, seed: {"y": float(where(values) and stream(seed, "coin").random() < rate)}
+
+
+def campaign(kind: str, evaluate: Any, store: Path, *, inputs=INPUTS, budget=100, seed=0, **keys: Any) -> sbt.Result:
+    scenario = sbt.Scenario("few", inputs, sbt.Requirement("y", low=0.5), evaluate=evaluate)
+    return sbt.run(
+        campaign=kind, scenario=scenario, budget=budget, seed=seed, store=store, executor="serial", report=False, **keys
+    )
+
+
+def test_an_estimation_of_rare_flags_does_not_end_as_exact(tmp_path: Path):
+    """Ten combinations, 5 % of the seeds fail: after a run of each half of the campaigns said that P is 0, and gates passed."""
+    covered, passed = [], []
+    for seed in range(6):
+        found = campaign("estimation", coin(0.05), tmp_path / str(seed), seed=seed, gate={"probability": 0.01}).conclusion
+        covered.append(found.low <= 0.05 <= found.high)
+        passed.append(found.gate.verdict == "pass")
+        assert found.low < found.high
+    assert sum(covered) >= 5
+    assert not any(passed)
+
+
+@pytest.mark.parametrize("evaluate", [coin(0.05), coin(0.3, lambda v: v["n"] == 5 and v["k"] == "y")], ids=["any", "one"])
+def test_a_search_goes_on_while_noise_would_hardly_show(evaluate: Any, tmp_path: Path):
+    result = campaign("falsification", evaluate, tmp_path / "s")
+    assert len(result.history) >= 100
+    assert result.conclusion.critical_runs > 0
+
+
+def test_where_nothing_differs_the_conclusion_does_not_rule_noise_out(tmp_path: Path):
+    result = campaign("falsification", coin(0.0), tmp_path / "s", budget=40)
+    said = " ".join(result.sentences())
+    assert "None of all" not in said
+    assert "noise would hardly show" in said
+
+
+def test_a_flag_that_many_repeats_confirm_is_exact(tmp_path: Path):
+    found = campaign("estimation", coin(1.0, lambda v: v["n"] >= 4), tmp_path / "s").conclusion
+    assert found.low == found.high == pytest.approx(0.4)
+    assert found.counted < 100
+
+
+def test_where_all_runs_have_one_metric_draws_count(tmp_path: Path):
+    """A speed of impact in two normal inputs: two thirds of the budget searched where there is nothing to follow."""
+    inputs = [sbt.Parameter(name, -6, 6, "", sbt.Normal(0, 1)) for name in "ab"]
+    counted = []
+    for seed in range(4):
+
+        def speed(values, _):
+            return {"y": max(0.0, 5.0 * (0.5 - np.hypot(values["a"] - 0.8, values["b"] - 0.4)))}
+
+        result = campaign("estimation", speed, tmp_path / str(seed), inputs=inputs, budget=100, seed=seed, stop={"cov": None})
+        first = result.history.iteration < 2
+        if not (result.history.y("y")[first] > 0.0).any():
+            counted.append(result.conclusion.counted)
+    assert counted
+    assert min(counted) >= 70
