@@ -36,7 +36,7 @@ def ended(prediction: Prediction) -> Prediction:
         return JointPrediction.of([ended(part) for part in prediction.parts], prediction.critical)
     if isinstance(prediction, EndedPrediction) or np.isinf([prediction.lowest, prediction.highest]).all():
         return prediction
-    return EndedPrediction.of(prediction)
+    return EndedPrediction.of(prediction) if prediction.flag is None else _of_flag(prediction, prediction.flag)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class EndedPrediction(Prediction):
         """Return the prediction of y that ends where this one knows it to end."""
         mean, std = _moments(beyond.mean, beyond.std, beyond.lowest, beyond.highest)
         noise = np.minimum(beyond.noise, np.sqrt(beyond.weight @ std**2))
-        return cls(mean, std, beyond.weight, noise, beyond.lowest, beyond.highest, beyond)
+        return cls(mean, std, beyond.weight, noise, beyond.lowest, beyond.highest, beyond=beyond)
 
     @cached_property
     def _beyond(self) -> Prediction:
@@ -82,6 +82,40 @@ class EndedPrediction(Prediction):
     def quantile(self, q: float) -> Vector:
         """Return (n,) y with P(Y <= y) = q, for q in (0, 1)."""
         return np.clip(self._beyond.quantile(q), self.lowest, self.highest)
+
+
+def _of_flag(prediction: Prediction, critical: CriticalInterval) -> EndedPrediction:
+    """Return the prediction of a metric of two values, one of which is critical: it has the one with P(critical)."""
+    p = prediction.probability(critical)
+    p = p if critical.contains(np.array([prediction.highest]))[0] else 1.0 - p
+    width = prediction.highest - prediction.lowest
+    std = np.maximum(width * np.sqrt(p * (1.0 - p)), width * _LEAST)
+    noise = np.where(prediction.noise > 0.0, std, 0.0)  # what is left to chance of a rate is not told apart
+    ends = prediction.lowest, prediction.highest
+    return _Flag((prediction.lowest + width * p)[None], std[None], np.ones(1), noise, *ends, critical, beyond=prediction)
+
+
+@dataclass(frozen=True, eq=False)
+class _Flag(EndedPrediction):
+    """Of two values, the mean is by how much it is the larger one."""
+
+    @property
+    def _larger(self) -> Vector:
+        return (self.mean[0] - self.lowest) / (self.highest - self.lowest)
+
+    def take(self, index: NDArray[Any] | slice) -> EndedPrediction:
+        """Return the prediction at the points that `index` (integers, mask or slice) selects."""
+        critical = self.flag
+        return self if critical is None else _of_flag(self._beyond.take(index), critical)
+
+    def cdf(self, y: Vector) -> Vector:
+        """Return (n,) P(Y <= y) at y (n,)."""
+        y = np.asarray(y, dtype=np.float64)
+        return np.where(y >= self.highest, 1.0, np.where(y < self.lowest, 0.0, 1.0 - self._larger))
+
+    def quantile(self, q: float) -> Vector:
+        """Return (n,) the smallest y with P(Y <= y) >= q, for q in (0, 1)."""
+        return np.where(1.0 - self._larger >= q, self.lowest, self.highest)
 
 
 def _moments(mean: Points, std: Points, lowest: float, highest: float) -> tuple[Points, Points]:

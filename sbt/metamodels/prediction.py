@@ -35,6 +35,7 @@ class Prediction:
         weight: (k,) weights >= 0 that sum to 1, the same at all points.
         noise: (n,) the irreducible (aleatoric) part of `sigma`, a standard deviation >= 0.
         lowest, highest: where the metric ends: what is predicted beyond is that value, of which P(y in M_c) knows.
+        flag: an interval with one of them, where the metric has no other values.
 
     Raises:
         InputError: wrong shapes, a mean that is not finite, std <= 0, or weights that do not sum to 1.
@@ -50,6 +51,7 @@ class Prediction:
     noise: Vector
     lowest: float = -np.inf
     highest: float = np.inf
+    flag: CriticalInterval | None = None
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 2 or self.mean.shape[0] == 0:

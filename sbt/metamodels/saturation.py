@@ -46,6 +46,8 @@ _USUAL = 0.9
 _FEWEST_OTHERS, _RANKS = 3, 2.0
 """Fewest different values on the other side of M_c than the one that stands for none; log likelihoods of left-out runs that the
 square of a standard error counts (both add up over runs that tell the same)."""
+_LAST, _SHARE_LAST = 3, 0.05
+"""Inputs with the last value, at least, and their share of the runs, where the metric has no values beyond it."""
 _LEAST_WARPED, _DEEPEST = 1e-3, 3.0
 """Ends of a depth, in asinh(margin / usual margin)."""
 
@@ -309,7 +311,17 @@ class Opened:
         if limit is not None:  # what was moved beyond the last value
             lowest = float(y.min()) if limit.at_most.any() else lowest
             highest = highest if limit.at_most.all() else float(y.max())
+        two = np.unique(y).tolist()
+        if len(two) == 2 and self.critical.contains(np.array(two)).sum() == 1:  # a flag
+            return Ending(predictor, two[0], two[1], flag=self.critical)
+        lowest, highest = max(lowest, _last(u, y, y.min(), -np.inf)), min(highest, _last(u, y, y.max(), np.inf))
         return predictor if np.isinf([lowest, highest]).all() else Ending(predictor, lowest, highest)
+
+
+def _last(u: Points, y: Vector, end: float, beyond: float) -> float:
+    """Return the last value of y (n,), where it ends with it as several inputs u (n, d) have it; else `beyond`."""
+    inputs = len(np.unique(u[y == end], axis=0))
+    return float(end) if inputs >= max(_LAST, _SHARE_LAST * len(y)) else beyond
 
 
 def _ends(critical: CriticalInterval, y: Vector) -> tuple[float, float]:
@@ -324,16 +336,18 @@ class Ending:
 
     Args:
         predictor: of the metric, as if it went on.
-        lowest, highest: where it ends; one of them is infinite.
+        lowest, highest: where it ends.
+        flag: M_c, where the metric has these two values alone and one of them is critical.
     """
 
     predictor: Predictor
     lowest: float
     highest: float
+    flag: CriticalInterval | None = None
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction at u (n, d), which knows where the metric ends."""
-        return replace(self.predictor(u), lowest=self.lowest, highest=self.highest)
+        return replace(self.predictor(u), lowest=self.lowest, highest=self.highest, flag=self.flag)
 
     def __getattr__(self, name: str) -> Any:
         """Return what else the predictor offers: left-out rows, how it compares."""

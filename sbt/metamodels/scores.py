@@ -18,6 +18,8 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["precision_recall", "reliability", "scores"]
 
+_TAIL = 0.025
+"""On either side of what is covered."""
 _BINS = 15  # of the calibration, as in Guo et al. (2017), On calibration of modern neural networks
 
 
@@ -29,7 +31,7 @@ def scores(
     Keys, in the unit of y where they have one:
 
     - `log_likelihood`: mean log of the moment-matched Gaussian; `likelihood`: its exponential, eq. (1).
-    - `log_likelihood_mixture`: mean log density of the mixture itself.
+    - `log_likelihood_mixture`: mean log density of the mixture itself. Of a flag both are the mean log probability of its value.
     - `rmse`: root of the mean squared error of mu, eq. (2).
     - `crps`: mean continuous ranked probability score of the moment-matched Gaussian.
     - `log_likelihood_critical`, `rmse_critical`: the same over critical runs.
@@ -117,12 +119,17 @@ def reliability(p: Vector, critical: Mask, bins: int = _BINS) -> tuple[Vector, V
 
 
 def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval, mask: Mask) -> dict[str, float | int | None]:
+    log_p, log_not = prediction.log_probability(critical)
     told, mu = ended(prediction), prediction.mu
-    error = told.mu - np.clip(y, prediction.lowest, prediction.highest)
+    had = np.clip(y, prediction.lowest, prediction.highest)
+    error = told.mu - had
     y = np.where((y <= prediction.lowest) & (mu < y) | (y >= prediction.highest) & (mu > y), mu, y)  # its side alone is known
     gaussian, mixture = prediction.log_density_gaussian(y), prediction.log_density(y)
     level = prediction.cdf(y)
-    log_p, log_not = prediction.log_probability(critical)
+    covered = (level >= _TAIL) & (level <= 1.0 - _TAIL)
+    if prediction.flag is not None:  # its value has a probability, no density
+        gaussian = mixture = np.where(prediction.flag.contains(had), log_p, log_not)
+        covered = (told.quantile(_TAIL) <= had) & (had <= told.quantile(1.0 - _TAIL))
     log_likelihood = _mean(gaussian)
     result = {
         "log_likelihood": log_likelihood,
@@ -134,7 +141,7 @@ def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval, mask:
         "rmse_critical": _root(_mean(error[mask] ** 2)),
         **_classification(log_p, log_not, mask),
         "calibration_error": _calibration_error(np.exp(log_p), mask),
-        "coverage_95": _mean((level >= 0.025) & (level <= 0.975)),
+        "coverage_95": _mean(covered),
         "base_rate": _mean(mask),
         "error_rate": _mean((log_p >= log_not) != mask),
     }

@@ -277,7 +277,8 @@ class LogicalScenario:
 
     def measure(self, trace: Trace) -> dict[str, float]:
         """Return every metric of a trace by name."""
-        return {metric.name: metric(trace) for metric in self.metrics}
+        seen = trace.measured
+        return {metric.name: metric(seen) for metric in self.metrics}
 
     def run(self, values: Values, seed: int) -> dict[str, float]:
         """Run one concrete scenario and return its metrics.

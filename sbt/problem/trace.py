@@ -100,11 +100,12 @@ class Trace:
         parts: name to the parts of a long vehicle (`ActorTrace.parts`), NaN where it is not there.
         unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`); other doubts.
         unreacting: actors that are moved as they were recorded, whatever happens.
+        flat: actors that are driven over, such as what hides a marking: films show them, metrics do not see them.
         view: where the sensor of the first actor sees something, for films (not compared); None: unknown.
 
     In traffic road users come and go: where one is not there, all its states are NaN (`present`).
 
-    Two traces are the same where `identical` says so; as keys they count by identity.
+    Two traces are the same where `identical` says so; as keys they count by identity. States cannot be written to.
 
     Raises:
         ValueError: the arrays do not have these shapes.
@@ -127,12 +128,17 @@ class Trace:
     unconfirmed: tuple[str, ...] = ()
     unreacting: tuple[str, ...] = ()
     view: FieldOfView | None = None
+    flat: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.actors))
         for name in ("x", "y", "heading", "speed", "acceleration"):
             if getattr(self, name).shape != shape:
                 raise ValueError(f"trace.{name} must have shape {shape}, but got {getattr(self, name).shape}")
+        for name in ("time", "x", "y", "heading", "speed", "acceleration", "length", "width"):
+            kept = getattr(self, name).view()
+            kept.flags.writeable = False  # what one metric changes others would measure
+            object.__setattr__(self, name, kept)
         if len(set(self.actors)) < len(self.actors):
             raise ValueError(f"trace.actors must have different names, but got {', '.join(map(str, self.actors))}")
         if not (np.diff(self.time) > 0.0).all():
@@ -186,8 +192,18 @@ class Trace:
         signals = {name: v[i] for name, v in self.signals.items()}
         return replace(
             some, reported=self.reported, signals=signals, unconfirmed=self.unconfirmed, unreacting=self.unreacting,
-            view=self.view,
+            view=self.view, flat=self.flat,
         )  # fmt: skip
+
+    @property
+    def measured(self) -> Trace:
+        """What metrics see: the trace without what is driven over."""
+        if not self.flat:
+            return self
+        k = [name not in self.flat for name in self.actors]
+        states = {name: getattr(self, name)[:, k] for name in ("x", "y", "heading", "speed", "acceleration")}
+        names = tuple(name for name in self.actors if name not in self.flat)
+        return replace(self, actors=names, length=self.length[k], width=self.width[k], flat=(), **states)
 
     def signal(self, name: str) -> Vector:
         """Return the (t,) values of one signal.
@@ -208,7 +224,7 @@ class Trace:
         same = same and all(np.array_equal(values, other.signals[name]) for name, values in self.signals.items())
         same = same and self.ways.keys() == other.ways.keys()
         same = same and all(np.array_equal(way, other.ways[name], equal_nan=True) for name, way in self.ways.items())
-        texts = ("actors", "ended", "reported", "unconfirmed", "unreacting")
+        texts = ("actors", "ended", "reported", "unconfirmed", "unreacting", "flat")
         same = same and all(getattr(self, name) == getattr(other, name) for name in texts)
         return same and self.parts.keys() == other.parts.keys() and self._part_states() == other._part_states()
 

@@ -74,7 +74,7 @@ def bars(values: Mapping[str, float]) -> tuple[Obstacle, ...]:
     placed = []
     for k, (s, left) in enumerate(BARS, start=1):
         x, y = ROAD.offset_points(np.array([BEFORE + s]), left)[0]
-        placed.append(Obstacle(f"bar_{k}", (float(x), float(y), math.radians(values[f"theta_obs_{k}"])), *BAR))
+        placed.append(Obstacle(f"bar_{k}", (float(x), float(y), math.radians(values[f"theta_obs_{k}"])), *BAR, solid=False))
     return tuple(placed)
 
 

@@ -175,12 +175,14 @@ class Obstacle:
         name: unique in the scene, also the id of the polygon in SUMO.
         pose: of its centre.
         length, width: along and across its heading (m).
+        solid: it is something to drive into; else it is driven over, and metrics do not see it.
     """
 
     name: str
     pose: Pose
     length: float
     width: float
+    solid: bool = True
 
     @property
     def corners(self) -> tuple[tuple[float, float], ...]:

@@ -85,7 +85,8 @@ class SumoRun:
             if k == 0:
                 for state in states:
                     by_name[state.name]
-                refuse_overlap_at_start(states[0], (*states[1:], *map(_standing, scene.obstacles)), _START_REMEDY)
+                standing = [_standing(obstacle) for obstacle in scene.obstacles if obstacle.solid]
+                refuse_overlap_at_start(states[0], (*states[1:], *standing), _START_REMEDY)
             touched = touching(k, solid if look is None else look.near(k))
             if touched is not None:
                 self._judge(sumo, prefix, t, touched)
@@ -151,6 +152,7 @@ class SumoRun:
             tuple(self._collisions),
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
             unconfirmed=self._unconfirmed,
+            flat=tuple(o.name for o in scene.obstacles if not o.solid),
             view=view_of(actors[0].driver, float(actors[0].type.length), float(actors[0].type.width)),
         )
 

@@ -1,0 +1,144 @@
+"""Metrics that tell little: flags, speeds of impact, noise that is a share of the value. Is what is concluded so?
+
+    python benchmarks/few_values.py combinations [--seeds 20]      # ten combinations of whole numbers and choices, noisy flags
+    python benchmarks/few_values.py estimation [--seeds 8]         # normal and uniform inputs, 150 runs, no stop rule
+    python benchmarks/few_values.py logarithms [--seeds 12]        # the same problem as y and as log y, 200 runs
+
+Campaigns with the product's defaults. Combinations: how many falsifications of 100 runs meet a failure, and how many of as many
+random runs do; how many intervals of an estimation cover, and how many gates pass that should not. Estimation: error and half
+width of the interval over those of crude Monte Carlo of as many runs, intervals that cover.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.special import ndtr
+from scipy.stats import norm
+
+import sbt
+from sbt.problem.arrays import Points, Vector
+from sbt.seeds import stream
+
+Evaluate = Callable[[dict, int], dict[str, float]]
+
+
+def campaign(kind: str, inputs: list[sbt.Parameter], low: float, evaluate: Evaluate, seed: int, **keys: object) -> sbt.Result:
+    scenario = sbt.Scenario("few", inputs, sbt.Requirement("y", low=low), evaluate=evaluate)
+    with tempfile.TemporaryDirectory() as folder:
+        result = sbt.run(
+            campaign=kind, scenario=scenario, seed=seed, store=Path(folder) / "s", executor="serial", report=False, **keys
+        )
+        _ = result.conclusion, result.history
+    return result
+
+
+def coin(rate: float, where: Callable[[dict], bool] = lambda values: True) -> Evaluate:
+    return lambda values, seed: {"y": float(where(values) and stream(seed, "coin").random() < rate)}
+
+
+def impact(values: dict, seed: int) -> dict[str, float]:
+    return {"y": max(0.0, values["n"] - 8.0 + 4.0 * stream(seed, "impact").standard_normal())}
+
+
+TEN = [sbt.Parameter("n", 1, 5, kind="integer"), sbt.Parameter("k", choices={"x": 0.7, "y": 0.3})]
+COMBINATIONS: dict[str, tuple[Evaluate, float]] = {
+    "5 % of the seeds": (coin(0.05), 0.05), "2 % of the seeds": (coin(0.02), 0.02),
+    "30 % at one of ten": (coin(0.3, lambda values: values["n"] == 5 and values["k"] == "y"), 0.018),
+    "93 % of the seeds": (coin(0.93), 0.93), "a speed of impact": (impact, float(norm.sf((8.5 - np.arange(1, 6)) / 4.0).mean())),
+    "deterministic": (coin(1.0, lambda values: values["n"] >= 4), 0.4),
+}  # fmt: skip
+
+
+def combinations(seeds: range) -> Iterator[str]:
+    yield "| metric | P | a failure met | by random runs | covered | false passes | runs of the estimation |"
+    for name, (evaluate, p) in COMBINATIONS.items():
+        met = random = covered = passed = 0
+        runs = []
+        for seed in seeds:
+            met += campaign("falsification", TEN, 0.5, evaluate, seed, budget=100).conclusion.critical_runs > 0
+            rng = stream(seed, "random")
+            drawn = [({"n": int(rng.integers(1, 6)), "k": "xy"[rng.integers(2)]}, int(rng.integers(2**31))) for _ in range(100)]
+            random += any(evaluate(*each)["y"] >= 0.5 for each in drawn)
+            result = campaign("estimation", TEN, 0.5, evaluate, seed, budget=150, gate={"probability": 0.5 * p})
+            found = result.conclusion
+            covered += found.low - 1e-9 <= p <= found.high + 1e-9
+            passed += found.gate.verdict == "pass"
+            runs.append(found.counted)
+        n = len(seeds)
+        yield f"| {name} | {p:.3g} | {met} of {n} | {random} | {covered} | {passed} | {int(np.median(runs))} |"
+
+
+SHAPES: dict[str, Callable[[Points], Vector]] = {
+    "ball": lambda u: np.sqrt(((u - 0.7) ** 2).sum(axis=1)),
+    "two": lambda u: np.minimum(np.sqrt(((u - 0.7) ** 2).sum(axis=1)), np.sqrt(((u - 0.2) ** 2).sum(axis=1))),
+    "half": lambda u: 1.0 - u.mean(axis=1),
+    "corner": lambda u: 1.0 - u[:, :2].min(axis=1),
+    "wave": lambda u: 1.0 - u.mean(axis=1) + 0.1 * np.sin(9.0 * u[:, 0]),
+}
+KINDS: dict[str, tuple[Callable[[Vector], Vector], float]] = {
+    "flag": (lambda margin: (margin <= 0.0).astype(float), 0.0), "speed": (lambda margin: np.maximum(-10.0 * margin, 0.0), 0.0),
+    "noisy flag": (lambda margin: (margin <= 0.0).astype(float), 0.3),
+}  # fmt: skip
+
+
+def estimation(seeds: range) -> Iterator[str]:
+    yield "| metric | region | inputs | P | error / crude | half width / crude | covered |"
+    for kind, (metric, noise) in KINDS.items():
+        for k, (shape, distance) in enumerate(SHAPES.items()):
+            d, normal, target = 2 + k % 3, k % 2 == 0, (0.01, 0.02, 0.05)[k % 3]
+            draws = stream(k, "draws").standard_normal((400_000, d))
+            far = distance(ndtr(draws))
+            edge, scale = float(np.quantile(far, target)), float(far.std())
+            drawn = stream(k, "noise").standard_normal(len(draws))
+            p = float((far / scale + noise * drawn <= edge / scale).mean())
+
+            def evaluate(values, seed, d=d, normal=normal, distance=distance, edge=edge, scale=scale, metric=metric, noise=noise):
+                x = np.array([list(values.values())])
+                margin = (distance(ndtr(x) if normal else x) - edge) / scale
+                return {"y": float(metric(margin + noise * stream(seed, "seed").standard_normal())[0])}
+
+            inputs = [sbt.Parameter(n, -6, 6, "", sbt.Normal(0, 1)) if normal else sbt.Parameter(n, 0, 1) for n in "abcd"[:d]]
+            runs = [campaign("estimation", inputs, 1e-9, evaluate, s, budget=150, stop={"cov": None}).conclusion for s in seeds]
+            crude, value = math.sqrt(p * (1.0 - p) / 150), np.array([found.probability or 0.0 for found in runs])
+            width = np.median([found.high - found.low for found in runs]) / 2.0 / 1.96 / crude
+            covered = sum(found.low <= p <= found.high for found in runs)
+            error = math.sqrt(np.mean((value - p) ** 2)) / crude
+            told = f"{d} {'normal' if normal else 'uniform'} | {p:.4f} | {error:.2f} | {width:.2f} | {covered} of {len(runs)} |"
+            yield f"| {kind} | {shape} | {told}"
+
+
+def logarithms(seeds: range) -> Iterator[str]:
+    yield "| metric | P | error / P | crude | covered |"
+    p, inputs = float(norm.sf(math.log(20.0) / math.sqrt(1.34))), [sbt.Parameter(n, -6, 6, "", sbt.Normal(0, 1)) for n in "ab"]
+    for name, unit in (("y", math.exp), ("log y", float)):
+
+        def evaluate(values: dict, seed: int, unit: Callable[[float], float] = unit) -> dict[str, float]:
+            return {"y": unit(values["a"] + 0.5 * values["b"] + 0.3 * float(stream(seed, "seed").standard_normal()))}
+
+        low = 20.0 if name == "y" else math.log(20.0)
+        runs = [campaign("estimation", inputs, low, evaluate, s, budget=200, stop={"cov": None}).conclusion for s in seeds]
+        error = math.sqrt(np.mean([((found.probability or 0.0) / p - 1.0) ** 2 for found in runs]))
+        covered = sum(found.low <= p <= found.high for found in runs)
+        yield f"| {name} | {p:.4f} | {error:.2f} | {math.sqrt((1.0 - p) / p / 200):.2f} | {covered} of {len(runs)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("combinations", "estimation", "logarithms"))
+    parser.add_argument("--seeds", type=int, default=8)
+    given = parser.parse_args()
+    rows = {"combinations": combinations, "estimation": estimation, "logarithms": logarithms}[given.what](range(given.seeds))
+    for k, row in enumerate(rows):
+        print(row, flush=True)
+        if k == 0:
+            print("|" + "---|" * (row.count("|") - 1), flush=True)
+
+
+if __name__ == "__main__":
+    main()
