@@ -41,6 +41,7 @@ SMALLEST = {
     "asked_again.py": "--seeds 1 --table {folder}/again.jsonl",
     "ahead.py": "--seeds 1 --budget 40",
     "fuzz.py": "--configurations 2 --scenarios 1",
+    "few_values.py": "logarithms --seeds 1",
     "jumps.py": "--problems disc_count --seeds 1 --budget 30",
     "kernels.py": "--problems metaball --runs 40 --seeds 1",
     "least_values.py": "--problems flat --seeds 1 --budget 20",

@@ -317,6 +317,26 @@ def test_stops_where_little_is_expected_on_the_wrong_side(tmp_path: Path):
     assert result["conclusion"]["expected_misclassified"] <= 0.012
 
 
+CONE = """
+import math
+import sbt
+
+def _cone(values, seed):
+    return {"y": max(0.0, 30.0 * (0.12 - math.hypot(values["a"] - 0.7, values["b"] - 0.2)))}
+
+SCENARIO = sbt.Scenario("cone", [sbt.Parameter(n, 0, 1) for n in "abc"], sbt.Requirement("y", low=1.0), evaluate=_cone)
+"""
+
+
+def test_does_not_stop_while_few_runs_tell_of_a_side(tmp_path: Path):
+    """2.3 % is critical: four of nine campaigns ended after 40 runs without a critical one, with as much on the wrong side."""
+    (tmp_path / "cone.py").write_text(CONE)
+    for seed in (0, 1):
+        keys = {"scenario": f"'{tmp_path / 'cone.py'}:SCENARIO'", "budget": 140, "initial": 20, "batch": 20, "seed": seed}
+        result = run(tmp_path / str(seed), **keys, stop="{misclassified: 0.02}")
+        assert result["stopped"] == "budget" or result["conclusion"]["critical_fraction"] > 0.015
+
+
 def test_crossings_lie_on_the_boundary():
     u = stream(5, "cross").random((3000, 3))
     found = crossings(lambda v: 1 / (1 + np.exp(-40 * (v.sum(axis=1) - 2.2))), u, 100)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 import sbt
@@ -51,7 +52,7 @@ def broken(log):
 
 
 def test_what_it_proposes_is_run(tmp_path):
-    result = run(tmp_path, Mine([GOOD, {"gap": 5, "kind": "truck"}]))
+    result = run(tmp_path, Mine([GOOD, {"gap": np.int64(5), "kind": "truck"}]))
     assert result.frame["x.gap"].tolist() == [30.0, 5.0]
     assert result.conclusion.to_dict() == {"runs": 2}
 

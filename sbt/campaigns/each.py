@@ -163,7 +163,8 @@ def estimates_words(estimates: tuple[RequirementEstimate, ...] | None, confidenc
     if not estimates:
         return []
     each = "; ".join(f"{e.name} {number(e.probability)} ({number(e.low)} to {number(e.high)})" for e in estimates)
-    return [f"Of each requirement, from the same draws ({percent(confidence)} intervals): {each}."]
+    alone = ", each estimated for itself, so that errors may make one larger than of any"
+    return [f"Of each requirement, from the same draws{alone} ({percent(confidence)} intervals): {each}."]
 
 
 def shares_words(shares: Mapping[str, CriticalShare] | None) -> list[str]:

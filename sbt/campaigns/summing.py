@@ -45,6 +45,8 @@ class Summed:
         missing: probability of the combinations that were not run.
         combinations: number of all.
         noisy: equal inputs gave different metrics, or it would hardly show if they did.
+        repeats: runs beyond the first one of a combination. A gate asks for as many as there are combinations: a verdict for a
+            release must not rest on two.
     """
 
     share: WeightedShare
@@ -52,6 +54,7 @@ class Summed:
     missing: float
     combinations: int
     noisy: bool
+    repeats: int = 0
 
     @property
     def hits(self) -> int:
@@ -106,7 +109,7 @@ class SummingStage:
             return None
         found, target = summed(log, s), s.stop.get("cov")
         if not found.noisy:
-            return ALL_RUN
+            return None if s.gate is not None and found.repeats < found.combinations else ALL_RUN
         precise = target is not None and found.hits >= FEWEST_HITS and found.std_error <= target * found.share.value
         return "cov" if precise else None
 
@@ -157,7 +160,7 @@ def summed(log: Log, settings: Settings, requirement: Requirement | None = None)
     noise = simulator_noise(history, settings.scenario.requirement)
     return Summed(
         WeightedShare(weight, critical.astype(np.float64)), WeightedShare(weight, (critical | ~runs.ok).astype(np.float64)),
-        float(p[times == 0].sum()), len(x), noise.noisy is True or noise.silent is True,
+        float(p[times == 0].sum()), len(x), noise.noisy is True or noise.silent is True, noise.repeats,
     )  # fmt: skip
 
 

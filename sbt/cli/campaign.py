@@ -174,7 +174,7 @@ def _progress_line(found: Mapping[str, Any]) -> str:
     told = f"{found['store']}: {found['state']}, {done:,}"
     told += f" of {budget:,} runs" if budget is not None and done <= budget else " runs"
     if budget is not None and done > budget:
-        told += f" ({budget:,} budgeted, {done - budget:,} that confirm failures)"
+        told += f" ({budget:,} budgeted, {done - budget:,} beside them, such as those that confirm failures)"
     if found["rate"] is not None:
         told += f", {found['rate']:.3g} a second"
     return told + (f", {duration(found['remaining'])} left" if found["remaining"] is not None else "")

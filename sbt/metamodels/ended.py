@@ -1,11 +1,11 @@
-"""A prediction of a metric that ends, such as a speed of impact that is 0 wherever nothing touches.
+"""A prediction of a metric within the values that it has, such as a speed of impact that is 0 wherever nothing touches.
 
-What is learned goes on beyond such an end, as P(y in M_c) is known better so; the metric itself never lies there.
+What is learned goes on beyond an end, and comes between steps, as P(y in M_c) is known better so; the metric itself never does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,33 +15,48 @@ from scipy.special import ndtr
 
 from sbt.errors import InputError
 from sbt.metamodels.joint import JointPrediction
-from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.prediction import Prediction, Scale
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["EndedPrediction", "ended"]
+__all__ = ["EndedPrediction", "as_learned", "ended", "scale_of"]
 
 _LEAST = 1e-9
 """Standard deviation of what surely lies beyond an end, over that of what is learned."""
 
 
 def ended(prediction: Prediction) -> Prediction:
-    """Return the prediction of the metric itself, none of which lies beyond its ends; of a combination that of its margin.
+    """Return the prediction of the metric itself, within its values; of a combination that of its margin.
 
-    >>> told = ended(Prediction(np.array([[-5.0, 5.0]]), np.ones((1, 2)), np.ones(1), np.zeros(2), lowest=0.0))
+    >>> scale = Scale(low=0.0)
+    >>> told = ended(Prediction(np.array([[-5.0, 5.0]]), np.ones((1, 2)), np.ones(1), np.zeros(2), scale=scale))
     >>> told.mu.round(6).tolist(), told.quantile(0.95).round(2).tolist()
     ([0.0, 5.0], [0.0, 6.64])
     """
     if isinstance(prediction, JointPrediction) and prediction.critical is not None:
         return JointPrediction.of([ended(part) for part in prediction.parts], prediction.critical)
-    if isinstance(prediction, EndedPrediction) or np.isinf([prediction.lowest, prediction.highest]).all():
+    if isinstance(prediction, EndedPrediction):
         return prediction
-    return EndedPrediction.of(prediction) if prediction.flag is None else _of_flag(prediction, prediction.flag)
+    scale = scale_of(prediction)
+    if scale == Scale():
+        return prediction
+    return EndedPrediction.of(prediction, scale) if scale.flag is None else _Flag.of(prediction, scale)
+
+
+def scale_of(prediction: Prediction) -> Scale:
+    """Return which values the metric has: none beyond an end of M_c either that it ends at."""
+    scale = prediction.scale or Scale()
+    return replace(scale, low=max(scale.low, prediction.lowest), high=min(scale.high, prediction.highest))
+
+
+def as_learned(scale: Scale, y: Vector) -> Vector:
+    """Return where values y (n,) of the metric lie among what is predicted."""
+    return _at_steps(y, tuple((value, at) for at, value in scale.steps))
 
 
 @dataclass(frozen=True, eq=False)
 class EndedPrediction(Prediction):
-    """A prediction of y whose mean and standard deviation are the moments of y cut off at its ends.
+    """A prediction of y whose mean and standard deviation are the moments of y cut off at its ends, at its steps.
 
     Args:
         beyond: the same as if y went on.
@@ -50,72 +65,88 @@ class EndedPrediction(Prediction):
     beyond: Prediction | None = None
 
     @classmethod
-    def of(cls, beyond: Prediction) -> EndedPrediction:
-        """Return the prediction of y that ends where this one knows it to end."""
-        mean, std = _moments(beyond.mean, beyond.std, beyond.lowest, beyond.highest)
+    def of(cls, beyond: Prediction, scale: Scale) -> EndedPrediction:
+        """Return the prediction of y with this scale."""
+        mean, std = beyond.mean, beyond.std
+        if scale.steps:
+            low, mean, high = (_at_steps(beyond.mean + k * beyond.std, scale.steps) for k in (-1.0, 0.0, 1.0))
+            std = np.maximum(0.5 * (high - low), _LEAST * beyond.std)
+        mean, std = _moments(mean, std, scale.low, scale.high)
         noise = np.minimum(beyond.noise, np.sqrt(beyond.weight @ std**2))
-        return cls(mean, std, beyond.weight, noise, beyond.lowest, beyond.highest, beyond=beyond)
+        return cls(mean, std, beyond.weight, noise, beyond.lowest, beyond.highest, scale, beyond)
 
     @cached_property
-    def _beyond(self) -> Prediction:
-        if self.beyond is None:
-            raise InputError("a prediction that ends needs what is predicted beyond, but got none")
-        return self.beyond
+    def _both(self) -> tuple[Prediction, Scale]:
+        if self.beyond is None or self.scale is None:
+            raise InputError("a prediction that ends needs what is predicted beyond, and its scale, but got none")
+        return self.beyond, self.scale
 
     def take(self, index: NDArray[Any] | slice) -> EndedPrediction:
         """Return the prediction at the points that `index` (integers, mask or slice) selects."""
-        return EndedPrediction.of(self._beyond.take(index))
+        beyond, scale = self._both
+        return type(self).of(beyond.take(index), scale)
 
     def log_density(self, y: Vector) -> Vector:
         """Return (n,) log density at y (n,), of an end as if y went on."""
-        return self._beyond.log_density(y)
+        beyond, scale = self._both
+        return beyond.log_density(as_learned(scale, y))
 
     def cdf(self, y: Vector) -> Vector:
         """Return (n,) P(Y <= y) at y (n,)."""
+        beyond, scale = self._both
         y = np.asarray(y, dtype=np.float64)
-        return np.where(y >= self.highest, 1.0, np.where(y < self.lowest, 0.0, self._beyond.cdf(y)))
+        return np.where(y >= scale.high, 1.0, np.where(y < scale.low, 0.0, beyond.cdf(as_learned(scale, y))))
 
     def log_probability(self, critical: CriticalInterval) -> tuple[Vector, Vector]:
         """Return (n,) log P(y in M_c) and (n,) log P(y not in M_c)."""
-        return self._beyond.log_probability(critical)
+        return self._both[0].log_probability(critical)
 
     def quantile(self, q: float) -> Vector:
         """Return (n,) y with P(Y <= y) = q, for q in (0, 1)."""
-        return np.clip(self._beyond.quantile(q), self.lowest, self.highest)
-
-
-def _of_flag(prediction: Prediction, critical: CriticalInterval) -> EndedPrediction:
-    """Return the prediction of a metric of two values, one of which is critical: it has the one with P(critical)."""
-    p = prediction.probability(critical)
-    p = p if critical.contains(np.array([prediction.highest]))[0] else 1.0 - p
-    width = prediction.highest - prediction.lowest
-    std = np.maximum(width * np.sqrt(p * (1.0 - p)), width * _LEAST)
-    noise = np.where(prediction.noise > 0.0, std, 0.0)  # what is left to chance of a rate is not told apart
-    ends = prediction.lowest, prediction.highest
-    return _Flag((prediction.lowest + width * p)[None], std[None], np.ones(1), noise, *ends, critical, beyond=prediction)
+        beyond, scale = self._both
+        return np.clip(_at_steps(beyond.quantile(q), scale.steps), scale.low, scale.high)
 
 
 @dataclass(frozen=True, eq=False)
 class _Flag(EndedPrediction):
-    """Of two values, the mean is by how much it is the larger one."""
+    """Of two values, one of which is critical: it has the larger one with a probability."""
+
+    @classmethod
+    def of(cls, beyond: Prediction, scale: Scale) -> _Flag:
+        """Return the prediction of the flag."""
+        if scale.flag is None:
+            raise InputError("a flag needs an interval with one of its values, but got none")
+        p = beyond.probability(scale.flag)
+        p = p if scale.flag.contains(np.array([scale.high]))[0] else 1.0 - p
+        width = scale.high - scale.low
+        std = np.maximum(width * np.sqrt(p * (1.0 - p)), width * _LEAST)
+        noise = np.where(beyond.noise > 0.0, std, 0.0)  # what is left to chance of a rate is not told apart
+        mean = scale.low + width * p
+        return cls(mean[None], std[None], np.ones(1), noise, beyond.lowest, beyond.highest, scale, beyond)
 
     @property
-    def _larger(self) -> Vector:
-        return (self.mean[0] - self.lowest) / (self.highest - self.lowest)
-
-    def take(self, index: NDArray[Any] | slice) -> EndedPrediction:
-        """Return the prediction at the points that `index` (integers, mask or slice) selects."""
-        critical = self.flag
-        return self if critical is None else _of_flag(self._beyond.take(index), critical)
+    def _lower(self) -> Vector:
+        scale = self._both[1]
+        return (scale.high - self.mean[0]) / (scale.high - scale.low)
 
     def cdf(self, y: Vector) -> Vector:
         """Return (n,) P(Y <= y) at y (n,)."""
-        y = np.asarray(y, dtype=np.float64)
-        return np.where(y >= self.highest, 1.0, np.where(y < self.lowest, 0.0, 1.0 - self._larger))
+        scale, y = self._both[1], np.asarray(y, dtype=np.float64)
+        return np.where(y >= scale.high, 1.0, np.where(y < scale.low, 0.0, self._lower))
 
     def quantile(self, q: float) -> Vector:
         """Return (n,) the smallest y with P(Y <= y) >= q, for q in (0, 1)."""
-        return np.where(1.0 - self._larger >= q, self.lowest, self.highest)
+        scale = self._both[1]
+        return np.where(self._lower >= q, scale.low, scale.high)
+
+
+def _at_steps(y: Points, steps: tuple[tuple[float, float], ...]) -> Points:
+    """Return y, shape kept, what lies at and between steps moved to their values, and what lies beyond as far as the last."""
+    if not steps:
+        return y
+    at, value = np.array(steps).T
+    outside = np.where(y < at[0], value[0] - at[0], value[-1] - at[-1])
+    return np.where((y < at[0]) | (y > at[-1]), y + outside, np.interp(y, at, value))
 
 
 def _moments(mean: Points, std: Points, lowest: float, highest: float) -> tuple[Points, Points]:

@@ -18,11 +18,27 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Prediction", "reached_beyond"]
+__all__ = ["Prediction", "Scale", "reached_beyond"]
 
 _Matrix = NDArray[np.float64]
 _LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
 _NEWTON_STEPS, _ROUNDING = 100, 1e-13  # of a quantile: at most, and the relative step at which it ends
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Which values a metric has; what is predicted may lie beyond (`sbt.metamodels.ended`).
+
+    Args:
+        low, high: its ends.
+        steps: (predicted, value) pairs, increasing: where a metric comes in steps, those at the edge were learned elsewhere.
+        flag: an interval with one of the ends, where there are no other values.
+    """
+
+    low: float = -np.inf
+    high: float = np.inf
+    steps: tuple[tuple[float, float], ...] = ()
+    flag: CriticalInterval | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +51,7 @@ class Prediction:
         weight: (k,) weights >= 0 that sum to 1, the same at all points.
         noise: (n,) the irreducible (aleatoric) part of `sigma`, a standard deviation >= 0.
         lowest, highest: where the metric ends: what is predicted beyond is that value, of which P(y in M_c) knows.
-        flag: an interval with one of them, where the metric has no other values.
+        scale: which values the metric has, for what is told of it; None: any.
 
     Raises:
         InputError: wrong shapes, a mean that is not finite, std <= 0, or weights that do not sum to 1.
@@ -51,7 +67,7 @@ class Prediction:
     noise: Vector
     lowest: float = -np.inf
     highest: float = np.inf
-    flag: CriticalInterval | None = None
+    scale: Scale | None = None
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 2 or self.mean.shape[0] == 0:

@@ -18,7 +18,7 @@ from scipy.special import log_ndtr
 
 from sbt.metamodels.base import Metamodel, Predictor, Screened, is_rate, sample_paths, sketched, with_target
 from sbt.metamodels.censored import Limit, beyond
-from sbt.metamodels.prediction import Prediction, reached_beyond
+from sbt.metamodels.prediction import Prediction, Scale, reached_beyond
 from sbt.metamodels.warp import Warp, gap_of
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN
@@ -306,16 +306,38 @@ class Opened:
             metamodel, (learned, limit) = with_target(self.metamodel, critical), opened_and_limit(u, y, critical, rng)
         else:
             metamodel, learned, limit = self.metamodel, centred(u, y, critical), None
+        steps = _steps(y, learned) if limit is None else ()
         predictor = beyond(metamodel.fit(u, learned, rng), limit)
         lowest, highest = _ends(self.critical, y)
-        if limit is not None:  # what was moved beyond the last value
-            lowest = float(y.min()) if limit.at_most.any() else lowest
-            highest = highest if limit.at_most.all() else float(y.max())
-        two = np.unique(y).tolist()
-        if len(two) == 2 and self.critical.contains(np.array(two)).sum() == 1:  # a flag
-            return Ending(predictor, two[0], two[1], flag=self.critical)
-        lowest, highest = max(lowest, _last(u, y, y.min(), -np.inf)), min(highest, _last(u, y, y.max(), np.inf))
-        return predictor if np.isinf([lowest, highest]).all() else Ending(predictor, lowest, highest)
+        if critical != self.critical:  # what goes on beyond the last value is not beyond an end of M_c that no run lies beyond
+            lowest = y.min() if critical.low < self.critical.low and learned.min() < y.min() else lowest
+            highest = y.max() if critical.high > self.critical.high and learned.max() > y.max() else highest
+        scale = _scale(u, y, self.critical, steps, limit)
+        known = scale is not None or np.isfinite([lowest, highest]).any()
+        return Ending(predictor, lowest, highest, scale) if known else predictor
+
+
+def _scale(
+    u: Points, y: Vector, critical: CriticalInterval, steps: tuple[tuple[float, float], ...], limit: Limit | None
+) -> Scale | None:
+    """Return which values the metric has, as far as its runs tell; None: any."""
+    two = np.unique(y).tolist()
+    if len(two) == 2 and critical.contains(np.array(two)).sum() == 1:
+        return Scale(two[0], two[1], flag=critical)
+    low, high = _last(u, y, y.min(), -np.inf), _last(u, y, y.max(), np.inf)
+    if limit is not None:  # what was moved beyond the last value
+        low, high = y.min() if limit.at_most.any() else low, high if limit.at_most.all() else y.max()
+    return Scale(float(low), float(high), steps) if steps or np.isfinite([low, high]).any() else None
+
+
+def _steps(y: Vector, learned: Vector) -> tuple[tuple[float, float], ...]:
+    """Return (learned, value) pairs of the values y (n,) that were moved, and of their neighbours; none where nothing was."""
+    moved = np.unique(y[learned != y])
+    if not len(moved):
+        return ()
+    near = [v for v in (y[y < moved[0]].max(initial=-np.inf), y[y > moved[-1]].min(initial=np.inf)) if np.isfinite(v)]
+    pairs = {(float(learned[y == v][0]), float(v)) for v in (*near, *moved)}
+    return tuple(sorted(pairs))
 
 
 def _last(u: Points, y: Vector, end: float, beyond: float) -> float:
@@ -336,18 +358,18 @@ class Ending:
 
     Args:
         predictor: of the metric, as if it went on.
-        lowest, highest: where it ends.
-        flag: M_c, where the metric has these two values alone and one of them is critical.
+        lowest, highest: where it ends, at an end of M_c.
+        scale: which values it has, for what is told; None: any.
     """
 
     predictor: Predictor
     lowest: float
     highest: float
-    flag: CriticalInterval | None = None
+    scale: Scale | None = None
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction at u (n, d), which knows where the metric ends."""
-        return replace(self.predictor(u), lowest=self.lowest, highest=self.highest, flag=self.flag)
+        return replace(self.predictor(u), lowest=self.lowest, highest=self.highest, scale=self.scale)
 
     def __getattr__(self, name: str) -> Any:
         """Return what else the predictor offers: left-out rows, how it compares."""

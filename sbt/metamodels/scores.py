@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sbt.errors import InputError
-from sbt.metamodels.ended import ended
+from sbt.metamodels.ended import as_learned, ended, scale_of
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -120,15 +120,17 @@ def reliability(p: Vector, critical: Mask, bins: int = _BINS) -> tuple[Vector, V
 
 def _scores(prediction: Prediction, y: Vector, critical: CriticalInterval, mask: Mask) -> dict[str, float | int | None]:
     log_p, log_not = prediction.log_probability(critical)
-    told, mu = ended(prediction), prediction.mu
-    had = np.clip(y, prediction.lowest, prediction.highest)
+    told, mu, scale = ended(prediction), prediction.mu, scale_of(prediction)
+    had = np.clip(y, scale.low, scale.high)
     error = told.mu - had
-    y = np.where((y <= prediction.lowest) & (mu < y) | (y >= prediction.highest) & (mu > y), mu, y)  # its side alone is known
+    y = as_learned(scale, y)
+    y = np.where((y <= scale.low) & (mu < y) | (y >= scale.high) & (mu > y), mu, y)  # its side alone is known
     gaussian, mixture = prediction.log_density_gaussian(y), prediction.log_density(y)
     level = prediction.cdf(y)
     covered = (level >= _TAIL) & (level <= 1.0 - _TAIL)
-    if prediction.flag is not None:  # its value has a probability, no density
-        gaussian = mixture = np.where(prediction.flag.contains(had), log_p, log_not)
+    if scale.flag is not None:  # its value has a probability, no density
+        gaussian = mixture = np.where(scale.flag.contains(had), log_p, log_not)
+    if scale.flag is not None or scale.steps:
         covered = (told.quantile(_TAIL) <= had) & (had <= told.quantile(1.0 - _TAIL))
     log_likelihood = _mean(gaussian)
     result = {

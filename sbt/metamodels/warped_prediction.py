@@ -53,7 +53,8 @@ class WarpedPrediction(Prediction):
 
     def _like(self, warped: Prediction) -> WarpedPrediction:
         """Return the prediction by another one of the warped metric; it ends where this one does."""
-        return replace(WarpedPrediction.of(warped, self._both[1]), lowest=self.lowest, highest=self.highest, flag=self.flag)
+        kept = {name: getattr(self, name) for name in ("lowest", "highest", "scale")}
+        return replace(WarpedPrediction.of(warped, self._both[1]), **kept)
 
     def take(self, index: NDArray[Any] | slice) -> WarpedPrediction:
         """Return the prediction at the points that `index` (integers, mask or slice) selects."""

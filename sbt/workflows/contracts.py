@@ -271,7 +271,8 @@ def _measured(metric: Metric, trace: Trace) -> float:
     try:
         value = float(metric(trace))
     except Exception as error:
-        raise ContractError(f"a metric must measure every trace, but {metric.name} raised {error!r}") from error
+        rule = "not change the trace" if "read-only" in str(error) else "measure every trace"
+        raise ContractError(f"a metric must {rule}, but {metric.name} raised {error!r}") from error
     _require(math.isfinite(value), "a metric must be finite", f"{value} of {metric.name}")
     return value
 

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from sbt.errors import InputError, SbtError, described, must_be
 from sbt.loop.running import ahead_of
 from sbt.loop.stages import Batch, Campaign, Log, Stage
@@ -78,7 +80,7 @@ class _Checked:
             room = _ROOM * max(abs(end) for end in parameter.bounds)
             if not (parameter.choices or parameter.low - room <= number <= parameter.high + room):
                 raise InputError(f"{rule}, {parameter.name} in {parameter.range}, but proposed {given!r}")
-        return run
+        return replace(run, inputs={name: v.item() if isinstance(v, np.generic) else v for name, v in values.items()})
 
 
 def _concluding(conclude: Callable[[Log], Any]) -> Callable[[Log], Any]:
