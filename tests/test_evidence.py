@@ -17,6 +17,7 @@ from sbt.cli import app
 from sbt.execution.worker import run_job
 from sbt.metrics.geometry import contact_index, corners, rectangle_distance, rectangles
 from sbt.metrics.longitudinal import COLLISION, encounter
+from sbt.problem.metric import Metric
 from sbt.problem.outcome import LISTED_ONLY, UNCONFIRMED, Job
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
@@ -325,3 +326,17 @@ def test_row_report_and_conclusion_tell_an_unconfirmed_contact_apart_and_show_it
     assert f"sumo-sbt replay runs {run} --gif {run}.gif" in page
     assert CliRunner().invoke(app, ["replay", "runs", str(run), "--gif", f"{run}.gif"]).exit_code == 0
     assert Path(f"{run}.gif").stat().st_size > 1000
+
+
+def test_an_ego_that_moves_as_no_vehicle_can_is_told(tmp_path: Path):
+    braking = np.array([[0.0], [-60.0], [1.0]])
+    trace = Trace(np.arange(3.0), ("ego",), *np.zeros((4, 3, 1)), braking, np.full(1, 4.5), np.full(1, 1.8))
+    scenario = LogicalScenario(
+        "brick", [sbt.Parameter("a", 0, 1)], sbt.Requirement("m", high=0.0), simulate=lambda values, seed: trace,
+        metrics=[Metric("m", lambda trace: 1.0)],
+    )  # fmt: skip
+    outcome = run_job(scenario, Job(0, {"a": 0.5}, 1))
+    assert outcome.status == "ok"
+    assert outcome.unconfirmed == "as no vehicle can: -60 m/s^2 of ego at 1.000 s"
+    result = sbt.run(campaign="coverage", scenario=scenario, budget=4, store=tmp_path / "s", executor="serial", report=False)
+    assert any("In 4 of 4 runs the ego moves as no vehicle can" in said for said in result.sentences())

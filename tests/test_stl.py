@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import sbt
 from sbt.errors import InputError, RunError
 from sbt.metrics.longitudinal import d_min, ttc_min
 from sbt.metrics.signals import ACTOR_SIGNALS, PAIR_SIGNALS, check_signal, signal
@@ -271,3 +272,13 @@ def test_signal_names():
     check_signal("a.b.speed")
     with pytest.raises(InputError, match="one of time, gap"):
         signal(trace(), "co.time")
+
+
+@pytest.mark.parametrize("name", ["roundabout_entry", "highway_merge", "unprotected_left_turn", "crossing_pedestrian"])
+def test_bare_signals_of_traffic_are_the_worst_over_all(name: str, tmp_path):
+    """They asked for an actor `co`, which no run had: every run failed."""
+    result = sbt.run(
+        campaign="coverage", scenario=name, budget=2, seed=1, store=tmp_path / "s", executor="serial", report=False,
+        requirement={"stl": "G[0,20](distance > 1)"},
+    )  # fmt: skip
+    assert (result.frame["status"] == "ok").all()

@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
+from sbt.problem.outcome import Doubt
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -121,6 +122,10 @@ class Facts:
 def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     """Return the sentences of a conclusion, and what a metric of the requirement is that has no unit, where that is known."""
     said = conclusion.sentences(facts)
+    odd = int(facts.history.doubtful(Doubt.IMPOSSIBLE).sum())
+    if said and odd:
+        which = f"In {odd:,} of {len(facts.history):,} runs the ego moves as no vehicle can"
+        said = [*said, f"{which}: what its controller commands is done, however much (column unconfirmed)."]
     bare = [part.metric for part in facts.requirement.parts if not facts.units.get(part.metric)]
     return said and [*said, *(f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings)]
 

@@ -8,16 +8,18 @@ from enum import StrEnum
 
 from sbt.problem.plain import Values
 
-__all__ = ["LISTED_ONLY", "OTHER_LEVEL", "STRUCK", "UNCONFIRMED", "Doubt", "Job", "Outcome", "Status", "doubts"]
+__all__ = ["IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STRUCK", "UNCONFIRMED", "Doubt", "Job", "Outcome", "Status", "doubts"]
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
 """How the text begins of a contact that SUMO's own list does not have, and of an entry of that list without a contact."""
 STRUCK, OTHER_LEVEL = "hit from behind by ", "on another level: "
 """How the text begins of a contact with a recorded road user from behind, and of one on a road taken for a bridge."""
+IMPOSSIBLE = "as no vehicle can: "
+"""How the text begins of a motion of the ego that no tyre holds: what its controller commands is done."""
 
 
 class Doubt(StrEnum):
-    """What is doubtful about the contacts of a run, as a table says it."""
+    """What is doubtful about a run, mostly its contacts, as a table says it."""
 
     UNCONFIRMED = "unconfirmed"
     """a contact that SUMO's own list does not have"""
@@ -27,10 +29,13 @@ class Doubt(StrEnum):
     """a recorded road user drove into the ego from behind"""
     OTHER_LEVEL = "taken for another level"
     """bodies overlap in the plane, on roads that are taken for bridges, since the network has no heights"""
+    IMPOSSIBLE = "ego moves as no vehicle can"
+    """it accelerates or brakes by more than tyres hold"""
 
 
 _BEGINNINGS = {
     UNCONFIRMED: Doubt.UNCONFIRMED, LISTED_ONLY: Doubt.LISTED_ONLY, STRUCK: Doubt.STRUCK, OTHER_LEVEL: Doubt.OTHER_LEVEL,
+    IMPOSSIBLE: Doubt.IMPOSSIBLE,
 }  # fmt: skip
 
 

@@ -133,5 +133,5 @@ SCENARIO = LogicalScenario(
     ),
     metrics=(ttc_path_min(), nearest_distance(), any_collision(), any_impact_speed()),
     requirement=Requirement("ttc_path_min", high=0.5),
-    roles=Roles(not_judged="the other is a pedestrian: the models are of vehicles"),
+    roles=Roles(other=None, not_judged="the other is a pedestrian: the models are of vehicles"),
 )

@@ -121,5 +121,5 @@ SCENARIO = LogicalScenario(
         others_braking_max(),
     ),
     requirement=Requirement("ttc_path_min", high=2.0),
-    roles=Roles(not_judged="ego itself changes lanes: the reference drivers keep theirs"),
+    roles=Roles(other=None, not_judged="ego itself changes lanes: the reference drivers keep theirs"),
 )

@@ -144,5 +144,5 @@ SCENARIO = LogicalScenario(
         others_braking_max(),
     ),
     requirement=Requirement("pet_ego_first", high=FOLLOW_UP),
-    roles=Roles(not_judged="ego gives way at a junction: the reference drivers drive along a lane"),
+    roles=Roles(other=None, not_judged="ego gives way at a junction: the reference drivers drive along a lane"),
 )

@@ -128,5 +128,5 @@ SCENARIO = LogicalScenario(
         others_braking_max(),
     ),
     requirement=Requirement("pet_ego_first", high=1.5),
-    roles=Roles(not_judged="ego turns across the others' way: the reference drivers drive along a lane"),
+    roles=Roles(other=None, not_judged="ego turns across the others' way: the reference drivers drive along a lane"),
 )
