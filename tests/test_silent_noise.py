@@ -73,3 +73,22 @@ def test_where_all_runs_have_one_metric_draws_count(tmp_path: Path):
             counted.append(result.conclusion.counted)
     assert counted
     assert min(counted) >= 70
+
+
+def test_draws_that_count_end_where_values_come_that_can_be_followed(tmp_path: Path):
+    """A metric with a cap that nothing comes below in the first fifth of the budget: 1 of 240 draws was critical."""
+    centre, exact = np.array([1.2, -0.8, 0.6]), 0.003305
+    inputs = [sbt.Parameter(name, -6, 6, "", sbt.Normal(0, 1)) for name in "abc"]
+
+    def near(values, _):
+        return {"y": min(float(np.linalg.norm(np.array(list(values.values())) - centre)) - 0.35, 0.25)}
+
+    scenario = sbt.Scenario("well", inputs, sbt.Requirement("y", high=0.0), evaluate=near)
+    result = sbt.run(
+        campaign="estimation", scenario=scenario, budget=300, seed=7, store=tmp_path / "s", executor="serial", report=False,
+        stop={"cov": None},
+    )  # fmt: skip
+    stages = set(result.history.stage)
+    assert {"monte_carlo", "estimation"} <= stages
+    assert result.conclusion.probability == pytest.approx(exact, rel=0.1)
+    assert result.conclusion.low <= exact <= result.conclusion.high

@@ -112,7 +112,8 @@ class Seen:
         history = log.history
         critical = settings.scenario.requirement.critical_runs(history)
         drawn = np.isin(history.stage, (DRAWN, LEARNED))
-        rows, surprising = [np.empty(0, dtype=np.intp)], [np.empty(0, dtype=np.bool_)]
+        plain = np.flatnonzero(history.stage == "monte_carlo")  # until values came that can be followed
+        rows, surprising = [plain], [np.zeros(len(plain), dtype=np.bool_)]
         for batch in log.iterations:
             proposal = batch.read(EstimationProposal)
             nominal = proposal.nominal

@@ -96,8 +96,9 @@ class SubsetStage:
 
 
 def took_monte_carlo(log: Log) -> bool:
-    """Return whether draws from the inputs' distribution count: crude Monte Carlo from some batch on."""
-    return any(p.phase == COUNT and p.method == "monte_carlo" for p in (b.read(EstimationProposal) for b in log.iterations))
+    """Return whether draws from the inputs' distribution count: crude Monte Carlo from some batch on, until now."""
+    last = log.last(EstimationProposal)
+    return last is not None and last.phase == COUNT and last.method == "monte_carlo"
 
 
 def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:

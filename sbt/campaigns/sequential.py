@@ -15,7 +15,7 @@ from scipy.special import gammainccinv, gammaincinv
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN
-from sbt.campaigns.crude import MonteCarloStage, took_monte_carlo
+from sbt.campaigns.crude import NOMINAL, MonteCarloStage, took_monte_carlo
 from sbt.campaigns.known import SURE_NOISE, Known, metamodel_of
 from sbt.campaigns.pools import SKETCH, Frame, Proposal, draw_batch, draw_pool, fit_proposal, planned
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, EstimationProposal
@@ -128,12 +128,19 @@ class SequentialStage:
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""
         with threadpool_limits(1):
-            if took_monte_carlo(log):
+            if took_monte_carlo(log) and not self._tells_now(log):
                 return MonteCarloStage(self.settings).propose(log)
             s, left = self.settings, self.settings.budget - len(log.planned)
             again = repeats_wanted(log.planned, s.scenario, left - 1)
             batch = self._proposed(log, max(min(s.batch, left) - len(again), 1))
             return replace(batch, runs=(*batch.runs, *again))
+
+    def _tells_now(self, log: Log) -> bool:
+        """Return whether the draws that count have met the first values to follow, and none that is critical: a slope, a cap."""
+        known = Known.of(log.history, self._coordinates, self.settings)
+        before = log.history.stage != NOMINAL
+        first = Known.of(log.history.where(before), self._coordinates, self.settings)
+        return first.constant and not known.constant and known.one_sided
 
     def _proposed(self, log: Log, size: int) -> Batch:
         s = self.settings
