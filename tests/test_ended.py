@@ -18,6 +18,8 @@ from sbt.metamodels.persistence import load, save
 from sbt.metamodels.prediction import Prediction, Scale
 from sbt.metamodels.saturation import Opened
 from sbt.metamodels.scores import scores
+from sbt.metamodels.warp import Warp
+from sbt.metamodels.warped_prediction import WarpedPrediction
 from sbt.problem.combination import any_of
 from sbt.problem.requirement import CriticalInterval, Requirement
 
@@ -51,6 +53,16 @@ def test_moments_are_those_of_values_that_are_cut_off(lowest: float, highest: fl
 
 
 KINDS = {"auto": Auto(), "gp": GaussianProcess(nu=2.5, input_noise=False), "et": ExtraTrees()}
+
+
+def test_what_lies_far_below_in_another_unit_is_told_at_the_end():
+    """Mean and standard deviation in the unit of the metric were -350 and 320: as a Gaussian a tenth of it lies above 0."""
+    rng, warp = np.random.default_rng(0), Warp(5.0, 12.0)
+    warped = Prediction(np.array([[-4.1, -0.3, 1.0]]), np.array([[0.9, 0.4, 0.1]]), np.ones(1), np.zeros(3))
+    told = ended(replace(WarpedPrediction.of(warped, warp), scale=Scale(low=0.0)))
+    y = np.maximum(warp.back(warped.mean[0] + warped.std[0] * rng.standard_normal((400_000, 3))), 0.0)
+    assert told.mu == pytest.approx(y.mean(axis=0), rel=0.02, abs=0.01)
+    assert told.sigma == pytest.approx(y.std(axis=0), rel=0.1, abs=0.05)
 
 
 @pytest.mark.parametrize("metamodel", KINDS.values(), ids=KINDS)

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from sbt.errors import InputError
 from sbt.metamodels.joint import JointPrediction
 from sbt.metamodels.prediction import Prediction, Scale
+from sbt.metamodels.warped_prediction import WarpedPrediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -23,6 +24,8 @@ __all__ = ["EndedPrediction", "as_learned", "ended", "scale_of"]
 
 _LEAST = 1e-9
 """Standard deviation of what surely lies beyond an end, over that of what is learned."""
+_NODES = 32
+"""Quantiles whose mean is that of a component in another unit."""
 
 
 def ended(prediction: Prediction) -> Prediction:
@@ -67,11 +70,7 @@ class EndedPrediction(Prediction):
     @classmethod
     def of(cls, beyond: Prediction, scale: Scale) -> EndedPrediction:
         """Return the prediction of y with this scale."""
-        mean, std = beyond.mean, beyond.std
-        if scale.steps:
-            low, mean, high = (_at_steps(beyond.mean + k * beyond.std, scale.steps) for k in (-1.0, 0.0, 1.0))
-            std = np.maximum(0.5 * (high - low), _LEAST * beyond.std)
-        mean, std = _moments(mean, std, scale.low, scale.high)
+        mean, std = _of_values(beyond, scale) if isinstance(beyond, WarpedPrediction) else _of_gaussians(beyond, scale)
         noise = np.minimum(beyond.noise, np.sqrt(beyond.weight @ std**2))
         return cls(mean, std, beyond.weight, noise, beyond.lowest, beyond.highest, scale, beyond)
 
@@ -147,6 +146,30 @@ def _at_steps(y: Points, steps: tuple[tuple[float, float], ...]) -> Points:
     at, value = np.array(steps).T
     outside = np.where(y < at[0], value[0] - at[0], value[-1] - at[-1])
     return np.where((y < at[0]) | (y > at[-1]), y + outside, np.interp(y, at, value))
+
+
+def _of_gaussians(beyond: Prediction, scale: Scale) -> tuple[Points, Points]:
+    """Return mean and standard deviation (k, n) of Gaussians within a scale."""
+    mean, std = beyond.mean, beyond.std
+    if scale.steps:
+        low, mean, high = (_at_steps(beyond.mean + k * beyond.std, scale.steps) for k in (-1.0, 0.0, 1.0))
+        std = np.maximum(0.5 * (high - low), _LEAST * beyond.std)
+    return _moments(mean, std, scale.low, scale.high)
+
+
+def _of_values(beyond: WarpedPrediction, scale: Scale) -> tuple[Points, Points]:
+    """Return mean and standard deviation (k, n) of what components in another unit are within a scale, without far tails.
+
+    In the unit of the metric they are no Gaussians: most of one far below an end may seem to lie above it.
+    """
+    warped, back = beyond.in_unit
+    first, second = np.zeros_like(beyond.mean), np.zeros_like(beyond.mean)
+    middle = np.clip(_at_steps(back(warped.mean), scale.steps), scale.low, scale.high)
+    for z in ndtri((np.arange(_NODES) + 0.5) / _NODES):
+        off = np.clip(_at_steps(back(warped.mean + z * warped.std), scale.steps), scale.low, scale.high) - middle
+        first, second = first + off / _NODES, second + off**2 / _NODES
+    variance = np.maximum(second - first**2, (_LEAST * beyond.std) ** 2)
+    return middle + first, np.sqrt(variance)
 
 
 def _moments(mean: Points, std: Points, lowest: float, highest: float) -> tuple[Points, Points]:

@@ -6,7 +6,7 @@ values on both sides of it, which no Gaussian in the unit of the metric has.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["WarpedPrediction"]
@@ -50,6 +50,12 @@ class WarpedPrediction(Prediction):
         if self.warped is None or self.warp is None:
             raise InputError("a warped prediction needs what is predicted of the warped metric, and the warp, but got none")
         return self.warped, self.warp
+
+    @property
+    def in_unit(self) -> tuple[Prediction, Callable[[Points], Points]]:
+        """What is predicted of the warped y, and the way back to y."""
+        warped, warp = self._both
+        return warped, warp.back
 
     def _like(self, warped: Prediction) -> WarpedPrediction:
         """Return the prediction by another one of the warped metric; it ends where this one does."""
