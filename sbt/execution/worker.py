@@ -24,7 +24,8 @@ __all__ = ["run_at_levels", "run_job", "run_jobs", "run_traced", "versions"]
 
 _simulating = threading.RLock()
 """SUMO has one simulation a process: threads take turns, run by run."""
-os.register_at_fork(after_in_child=lambda: _simulating._at_fork_reinit())  # type: ignore[attr-defined]
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=lambda: _simulating._at_fork_reinit())  # type: ignore[attr-defined]
 _TYRES, _PERSON = 15.0, 1.0
 """Acceleration that no tyre holds (m/s^2), half again what dry asphalt does; length below which the ego is a person (m)."""
 _Measured = tuple[dict[str, float], str, str]
