@@ -23,6 +23,7 @@ from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.running import run_stages
 from sbt.loop.stages import Batch, Campaign, Log, Progress
+from sbt.metamodels.ended import ended
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Value
@@ -242,7 +243,8 @@ def _write_predictions(folder: Path, learner: _ReferenceLearner, fitted: FittedM
     for k in range(0, len(u), _CHUNK):
         part = fitted.predict(u[k : k + _CHUNK])
         log_p, log_not = part.log_probability(critical)
-        columns.append(np.stack([part.mu, part.sigma, np.exp(log_p), log_p - log_not]))
+        told = ended(part)
+        columns.append(np.stack([told.mu, told.sigma, np.exp(log_p), log_p - log_not]))
     mu, sigma, p, odds = np.concatenate(columns, axis=1)
     ends = [critical.low, critical.high]
     content = io.BytesIO()

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from sbt.campaigns.counting import DRAWN, Seen
-from sbt.campaigns.crude import NOMINAL
+from sbt.campaigns.counting import DRAWN, NOMINAL, Seen
 from sbt.campaigns.known import Known
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings

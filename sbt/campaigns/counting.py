@@ -19,10 +19,12 @@ from sbt.problem.requirement import Requirement
 from sbt.store.history import History
 from sbt.store.records import Iteration
 
-__all__ = ["DRAWN", "FEW_KNOWN", "LEARNED", "Seen", "counted_batches", "counted_iterations", "held", "with_event"]
+__all__ = ["DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "Seen", "counted_batches", "counted_iterations", "held", "with_event"]
 
 DRAWN = "estimation"
 """Stage of runs that were drawn with a known density."""
+NOMINAL = "monte_carlo"
+"""Stage of runs that were drawn from the inputs' distribution."""
 LEARNED = "learn"
 """Stage of draws that only teach."""
 FEW_KNOWN = 10
@@ -112,7 +114,7 @@ class Seen:
         history = log.history
         critical = settings.scenario.requirement.critical_runs(history)
         drawn = np.isin(history.stage, (DRAWN, LEARNED))
-        plain = np.flatnonzero(history.stage == "monte_carlo")  # until values came that can be followed
+        plain = np.flatnonzero(history.stage == NOMINAL)  # until values came that can be followed
         rows, surprising = [plain], [np.zeros(len(plain), dtype=np.bool_)]
         for batch in log.iterations:
             proposal = batch.read(EstimationProposal)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.campaigns.clustering import spread_of_share
+from sbt.campaigns.counting import NOMINAL
 from sbt.campaigns.records import COUNT, EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.estimators.monte_carlo import Proportion
@@ -19,10 +20,8 @@ from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 from sbt.store.records import Iteration
 
-__all__ = ["NOMINAL", "NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of", "took_monte_carlo"]
+__all__ = ["NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of", "took_monte_carlo"]
 
-NOMINAL = "monte_carlo"
-"""Stage of runs that were drawn from the inputs' distribution."""
 NOMINAL_STAGES = (NOMINAL, "subset level 0")
 """Stages of runs that are drawn from the inputs' distribution, whatever the results."""
 _REPEATS = 5  # independent runs of subset simulation: their spread is the error

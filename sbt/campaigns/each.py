@@ -163,7 +163,7 @@ def estimates_words(estimates: tuple[RequirementEstimate, ...] | None, confidenc
     if not estimates:
         return []
     each = "; ".join(f"{e.name} {number(e.probability)} ({number(e.low)} to {number(e.high)})" for e in estimates)
-    alone = ", each estimated for itself, so that errors may make one larger than of any"
+    alone = ", each estimated for itself, so that they need not fit together exactly"
     return [f"Of each requirement, from the same draws{alone} ({percent(confidence)} intervals): {each}."]
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sbt.campaigns.clustering import Spread
-from sbt.campaigns.counting import DRAWN, FEW_KNOWN, Seen, counted_batches, counted_iterations, held
-from sbt.campaigns.crude import NOMINAL, MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
+from sbt.campaigns.counting import DRAWN, FEW_KNOWN, NOMINAL, Seen, counted_batches, counted_iterations, held
+from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict

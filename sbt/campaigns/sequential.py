@@ -14,8 +14,8 @@ import numpy as np
 from scipy.special import gammainccinv, gammaincinv
 from threadpoolctl import threadpool_limits
 
-from sbt.campaigns.counting import DRAWN
-from sbt.campaigns.crude import NOMINAL, MonteCarloStage, took_monte_carlo
+from sbt.campaigns.counting import DRAWN, NOMINAL
+from sbt.campaigns.crude import MonteCarloStage, took_monte_carlo
 from sbt.campaigns.known import SURE_NOISE, Known, metamodel_of
 from sbt.campaigns.pools import SKETCH, Frame, Proposal, draw_batch, draw_pool, fit_proposal, planned
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, EstimationProposal

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
-from sbt.campaigns.counting import counted_batches
-from sbt.campaigns.crude import NOMINAL
+from sbt.campaigns.counting import NOMINAL, counted_batches
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import plural
 from sbt.loop.stages import Log

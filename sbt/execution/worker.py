@@ -16,6 +16,7 @@ import numpy as np
 
 from sbt import interruption
 from sbt.errors import InputError, RunError, described
+from sbt.metrics.physics import beyond_tyres
 from sbt.problem.outcome import IMPOSSIBLE, Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
@@ -26,8 +27,6 @@ _simulating = threading.RLock()
 """SUMO has one simulation a process: threads take turns, run by run."""
 if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
     os.register_at_fork(after_in_child=lambda: _simulating._at_fork_reinit())  # type: ignore[attr-defined]
-_TYRES, _PERSON = 15.0, 1.0
-"""Acceleration that no tyre holds (m/s^2), half again what dry asphalt does; length below which the ego is a person (m)."""
 _Measured = tuple[dict[str, float], str, str]
 """Metrics, SUMO's own collision list, and what differs between it and the contacts."""
 
@@ -156,20 +155,9 @@ def _measured(scenario: LogicalScenario, trace: Trace | BaseException) -> _Measu
     if not isinstance(trace, Trace):
         raise RunError(Status.FAILED, f"simulate must return a Trace, but returned a {type(trace).__name__}")
     _check_trace(trace)
-    doubts = (*trace.unconfirmed, *_impossible(trace, scenario.roles.ego))
+    ego = scenario.roles.ego
+    doubts = [*trace.unconfirmed, *(f"{IMPOSSIBLE}{a:.3g} m/s^2 of {ego} at {t:.3f} s" for a, t in beyond_tyres(trace, ego))]
     return scenario.measure(trace), " ".join(trace.reported), " | ".join(doubts)
-
-
-def _impossible(trace: Trace, ego: str) -> tuple[str, ...]:
-    """Return in words where the ego accelerates or brakes by more than tyres hold; persons do as they like."""
-    if ego not in trace.actors or len(trace.time) < 2:
-        return ()
-    k = trace.actors.index(ego)
-    size = np.abs(trace.acceleration[1:, k])
-    worst = int(np.nanargmax(size)) if np.isfinite(size).any() else 0
-    if not size[worst] > _TYRES or trace.length[k] < _PERSON:
-        return ()
-    return (f"{IMPOSSIBLE}{trace.acceleration[worst + 1, k]:.3g} m/s^2 of {ego} at {trace.time[worst + 1]:.3f} s",)
 
 
 def _check_trace(trace: Trace) -> None:

@@ -354,7 +354,7 @@ def _ends(critical: CriticalInterval, y: Vector) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Ending:
-    """A predictor of a metric that ends at one end of M_c.
+    """A predictor of a metric that ends at an end of M_c, or has a scale of its own.
 
     Args:
         predictor: of the metric, as if it went on.

@@ -18,7 +18,7 @@ from sbt.metrics.geometry import rectangle_distance
 from sbt.problem.arrays import Mask
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["LAWS", "Breach", "Law", "breaches", "worst"]
+__all__ = ["LAWS", "Breach", "Law", "beyond_tyres", "breaches", "persons", "worst"]
 
 LATERAL_WINDOW, JERK_WINDOW = 0.5, 0.2
 """Times over which lateral accelerations and jerks are averaged (s)."""
@@ -28,6 +28,8 @@ DRIFT = 1.5
 """Largest speed across the lane beyond it (m/s), as in a change to a lane 3.5 m beside within 2.3 s."""
 START = 0.1
 """Collisions that SUMO reports up to this time belong to the start (s)."""
+_TYRES = 15.0
+"""Acceleration that no tyre holds (m/s^2): half again what dry asphalt lets it."""
 _PERSON = 1.0
 _AHEAD, _BESIDE = 60.0, 7.0
 
@@ -112,6 +114,18 @@ def worst(trace: Trace, law: str, scripted: Sequence[str] = ()) -> tuple[float, 
 def persons(trace: Trace) -> Mask:
     """Return (m,) booleans: the road user is so small that it must be a person."""
     return np.asarray((trace.length < _PERSON) & (trace.width < _PERSON))
+
+
+def beyond_tyres(trace: Trace, actor: str) -> list[tuple[float, float]]:
+    """Return the largest acceleration of a vehicle (m/s^2) and when (s), where no tyre holds it; empty elsewhere."""
+    if actor not in trace.actors or len(trace.time) < 2:
+        return []
+    k = trace.actors.index(actor)
+    size = np.nan_to_num(np.abs(trace.acceleration[1:, k]))
+    worst = int(size.argmax()) + 1
+    if size[worst - 1] <= _TYRES or persons(trace)[k]:
+        return []
+    return [(float(trace.acceleration[worst, k]), float(trace.time[worst]))]
 
 
 def longitudinal(trace: Trace) -> Table:

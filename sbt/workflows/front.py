@@ -79,8 +79,7 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
         StoreError: the store cannot be written.
     """
     plugins.forget_changed()
-    if config is not None:
-        must_be("a configuration must be the path of a file", config, str, Path)
+    must_be("a configuration must be the path of a file", config, str, Path, type(None))
     known = (*CampaignKeys.__annotations__, "campaign")
     for name in keys:
         if name not in known:
