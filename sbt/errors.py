@@ -6,12 +6,13 @@ folder of a campaign; `RunError` ends one run and becomes a row of the store, ne
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 __all__ = [
     "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean", "must_be",
-    "place_of",
+    "naming", "place_of",
 ]  # fmt: skip
 
 
@@ -86,6 +87,21 @@ def described(error: BaseException) -> str:
     except BaseException:  # an exception of a user's own
         message = "(its message cannot be read)"
     return f"{type(error).__name__}{': ' if message else ''}{message} ({place_of(error)})"
+
+
+@contextmanager
+def naming(rule: str) -> Iterator[None]:
+    """Return a context in which an error of somebody's own code names the rule that it breaks, and its line.
+
+    Raises:
+        SbtError: in place of an error that is not one of this package's.
+    """
+    try:
+        yield
+    except SbtError:
+        raise
+    except Exception as error:
+        raise SbtError(f"{rule}, but raised {described(error)}") from error
 
 
 def place_of(error: BaseException) -> str:

@@ -74,7 +74,7 @@ def test_runs_that_are_none_of_the_scenario_are_refused(inputs, said, tmp_path):
 @pytest.mark.parametrize(("conclude", "said"), [
     (lambda log: None, "conclude must return a conclusion .* but returned None"),
     (lambda log: ({"runs": 1}, None), r"but returned the conclusion \{'runs': 1\}"),
-    (broken, "conclude raised AttributeError.*nothing.*test_own_campaign.py"),
+    (broken, "conclude must return a conclusion .* but raised AttributeError.*nothing.*test_own_campaign.py"),
     (None, "a campaign's recipe must return a Campaign, but returned"),
 ])  # fmt: skip
 def test_what_is_no_conclusion_is_refused(conclude, said, tmp_path):

@@ -25,13 +25,13 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError, SbtError, described, did_you_mean
+from sbt.errors import InputError, SbtError, did_you_mean, naming
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -229,20 +229,9 @@ def _rule(declared: str, value: Any, stated: Iterable[Any]) -> str:
     return "true or false" if declared == "bool" and not isinstance(value, bool) else ""
 
 
-@contextmanager
-def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
-    """Return a context in which an error of a metamodel's own code names the metamodel, its n rows and the line.
-
-    Raises:
-        SbtError: in place of an error that is not one of this package's.
-    """
-    try:
-        yield
-    except SbtError:
-        raise
-    except Exception as error:
-        name = type(metamodel).__name__
-        raise SbtError(f"metamodel {name} must learn from {n} rows and predict, but raised {described(error)}") from error
+def named_errors(metamodel: Metamodel, n: int) -> AbstractContextManager[None]:
+    """Return a context in which an error of a metamodel's own code names the metamodel, its n rows and the line (`naming`)."""
+    return naming(f"metamodel {type(metamodel).__name__} must learn from {n} rows and predict")
 
 
 def check_prediction(prediction: Prediction, n: int) -> Prediction:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from sbt.errors import InputError, SbtError, described, must_be
+from sbt.errors import InputError, must_be, naming
 from sbt.loop.running import ahead_of
 from sbt.loop.stages import Batch, Campaign, Log, Stage
 from sbt.problem.space import ParameterSpace
@@ -51,16 +50,18 @@ class _Checked:
 
     def stop(self, log: Log) -> str | None:
         """Return why the stage is over, or None."""
-        with _named(f"stage {self.name}: stop"):
+        rule = f"stage {self.name}: stop must return why it is over, as text, or None"
+        with naming(rule):
             reason = self.stage.stop(log)
-        must_be(f"stage {self.name}: stop must return why it is over, as text, or None", reason, str, type(None))
+        must_be(rule, reason, str, type(None))
         return reason
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
-        with _named(f"stage {self.name}: propose"):
+        rule = f"stage {self.name}: propose must return a Batch"
+        with naming(rule):
             batch = self.stage.propose(log)
-        must_be(f"stage {self.name}: propose must return a Batch", batch, Batch)
+        must_be(rule, batch, Batch)
         if isinstance(batch.runs, PlannedPoints):
             return batch
         return replace(batch, runs=tuple(self._checked(run) for run in batch.runs))
@@ -85,9 +86,9 @@ class _Checked:
 
 def _concluding(conclude: Callable[[Log], Any]) -> Callable[[Log], Any]:
     def concluded(log: Log) -> Any:
-        with _named("conclude"):
-            found = conclude(log)
         rule = "conclude must return a conclusion with to_dict() and sentences(facts), and the fitted metamodel or None"
+        with naming(rule):
+            found = conclude(log)
         if not isinstance(found, tuple) or len(found) != 2:
             raise InputError(f"{rule}, but returned {found!r}")
         if not all(hasattr(found[0], name) for name in ("to_dict", "sentences")):
@@ -95,13 +96,3 @@ def _concluding(conclude: Callable[[Log], Any]) -> Callable[[Log], Any]:
         return found
 
     return concluded
-
-
-@contextmanager
-def _named(what: str) -> Iterator[None]:
-    try:
-        yield
-    except SbtError:
-        raise
-    except Exception as error:
-        raise SbtError(f"{what} raised {described(error)}") from error
