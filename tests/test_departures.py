@@ -291,6 +291,8 @@ def test_an_ego_that_the_scenario_inserts_right_before_traffic_is_no_run(place: 
     states = {"ego": ego, "c": behind}
 
     class Near:
+        jumped = frozenset()
+
         def __init__(self):
             self.states = states
 

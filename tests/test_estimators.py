@@ -13,12 +13,13 @@ from scipy.special import gammaincinv, log_ndtr, ndtr
 from scipy.stats import binomtest
 
 from sbt.campaigns.pools import Frame, draw_pool, fit_proposal
+from sbt.campaigns.stopping import spared
 from sbt.campaigns.teaching import select_teaching
 from sbt.estimators.binomial import interval, lower, upper
 from sbt.estimators.choices import log_normal
 from sbt.estimators.events import FailingLogProbability, events
 from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch, stated
-from sbt.estimators.intervals import CountedBatch, combine_estimates
+from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
 from sbt.estimators.mixture import Mixture, Near, Normals, fit_mixture, particles, wide_scales
 from sbt.estimators.monte_carlo import Proportion
 from sbt.estimators.subset import SubsetRun, combine_repeats
@@ -287,6 +288,30 @@ def test_the_nominal_draws_are_the_first_and_their_share_is_exact():
     first = np.concatenate([d.rows[: d.nominal] for d in drawn])
     expected = float(plan.nominal_probability @ (z[:, 0] > 1.0))
     assert (z[first, 0] > 1.0).mean() == pytest.approx(expected, abs=0.02)  # as in the inputs' distribution
+
+
+def right(z):
+    """A metamodel that knows the line x1 = 2 but for a hundredth."""
+    return log_ndtr((z[:, 0] - 2.0) / 0.01), log_ndtr((2.0 - z[:, 0]) / 0.01)
+
+
+def test_precision_beyond_what_is_asked_goes_to_the_inputs_distribution():
+    z, stratum = H.sample(3000, stream(13, "spared"))
+    log_h = H.log_density(z)
+    given = log_normal(z) - log_h, log_normal(z, WIDE) - log_h, stratum
+    plan = plan_batch(*right(z), *given)
+    shares = spared(plan, SHARES, 65.0, 0.1)
+    assert sum(shares) == pytest.approx(1.0)
+    assert shares[2:] == SHARES[2:]
+    assert shares[1] > 0.45
+    moved, again = plan.moved(shares[1] - SHARES[1]), plan_batch(*right(z), *given, shares)
+    assert moved.probability == pytest.approx(again.probability, rel=1e-9, abs=1e-15)
+    assert (moved.nominal, moved.anticipated) == pytest.approx((again.nominal, again.anticipated))
+    assert again.anticipated > plan.anticipated  # it is precision that is spent, and not all of it
+    assert math.sqrt(again.anticipated / 65.0) < 0.05 * again.predicted
+    assert 65.0 * again.hits >= FEWEST_HITS
+    for draws, target in [(65.0, 1e-4), (15.0, 0.1)]:  # what was asked is not reached; too few critical draws would be left
+        assert spared(plan, SHARES, draws, target) == SHARES
 
 
 def test_runs_that_teach_leave_less_doubt_far_from_a_run_than_draws_and_keep_the_nominal_share():

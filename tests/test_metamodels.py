@@ -21,6 +21,7 @@ from sbt.metamodels.gp_fit import Objective
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.scores import scores
 from sbt.problem.requirement import CriticalInterval
+from sbt.seeds import stream
 from sbt.testing import ContractError, check_metamodel
 
 JAYWALKING = Path(__file__).resolve().parents[2] / "shared" / "data" / "dsiod_jaywalking"
@@ -251,6 +252,17 @@ def test_a_deterministic_metric_is_learned_without_noise_and_a_noisy_one_with_it
     assert np.sqrt(np.mean((exact(new).mu - y) ** 2)) < 0.005
     wide = GaussianProcess(nu=2.5, input_noise=False).fit(*noisy, np.random.default_rng(0))
     assert wide.scale * np.sqrt(wide.hyper.noise) == pytest.approx(0.3, rel=0.2)
+
+
+@pytest.mark.parametrize("seed", [2, 5, 6])
+def test_what_bends_between_few_rows_is_not_taken_for_noise(seed):
+    """Whole numbers in no order: L-BFGS from long length scales ended with noise of a third of the variance."""
+    rng = stream(seed, "permuted")
+    a, b, c, x = rng.integers(0, 13, 120), rng.integers(0, 10, 120), rng.integers(0, 2, 120), rng.random(120)
+    u, y = np.column_stack([a / 12, b / 9, c, x]), np.arcsinh((7 * a) % 13 + 0.6 * b + 2 * c + x - 3.0)
+    predictor = GaussianProcess(nu=2.5, input_noise=False).fit(u, y, rng)
+    assert predictor.hyper.noise < 1e-4
+    assert np.abs(predictor(u).mu - y).max() < 1e-2
 
 
 def test_repetitions_of_a_deterministic_run_teach_nothing():

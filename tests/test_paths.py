@@ -170,3 +170,18 @@ def test_the_tail_of_what_turns_touches_only_what_it_hits(gap):
     else:
         assert distance.min() > 0.0
         assert (times > 1.4).all(), "what comes after the recording goes straight on"
+
+
+@pytest.mark.parametrize("gap", [0.4, 0.7, 3.0])
+@pytest.mark.parametrize("step", [20, 33])
+def test_who_changes_lanes_within_a_step_cuts_no_corner(gap, step):
+    """Ego is clear ahead of the lead, and faster, when SUMO moves it sideways: at no instant its path leads through the lead."""
+    x = 13.0 * T
+    ego = np.where(T[step] > T, 3.2, 0.0)
+    lead = 10.0 * T + x[step] - 4.0 - gap - 10.0 * T[step]  # at that instant `gap` is between the bumpers
+    still = np.zeros_like(T)
+    states = (np.stack([a, b], axis=1) for a, b in ((x, lead), (ego, still), (still, still), (still + 13.0, still + 10.0)))
+    trace = Trace(T, ("ego", "co"), *states, np.zeros((len(T), 2)), np.full(2, 4.0), np.full(2, 2.0))
+    assert ttc_on_paths(trace).min() == 5.0
+    nearer = replace(trace, x=trace.x - [[0.0, -gap - 0.5]])  # half a metre too early: it hits the lead sideways
+    assert 0.0 < ttc_on_paths(nearer)[step - 5] < 1.0

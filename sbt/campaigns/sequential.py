@@ -21,7 +21,17 @@ from sbt.campaigns.pools import SKETCH, Frame, Proposal, draw_batch, draw_pool, 
 from sbt.campaigns.records import COUNT, EXPLORE, LEARN, EstimationProposal
 from sbt.campaigns.repeats import repeats_wanted, simulator_noise
 from sbt.campaigns.settings import Settings
-from sbt.campaigns.stopping import count_begins, is_precise, pools_of, relative_error, relative_error_of, steadier
+from sbt.campaigns.stopping import (
+    count_begins,
+    draws_that_count,
+    is_precise,
+    pools_of,
+    relative_error,
+    relative_error_of,
+    spared,
+    steadier,
+    trusts_search,
+)
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, to_cube
 from sbt.estimators.importance import SHARES
 from sbt.estimators.mixture import wide_scales
@@ -118,12 +128,12 @@ class SequentialStage:
         return self.settings.ahead
 
     def stop(self, log: Log) -> str | None:
-        """Return `budget` once it is used up, `cov` where the estimate is precise enough."""
+        """Return `budget` once it is used up, `cov` where the estimate is precise enough and a gate need not trust the search."""
         if took_monte_carlo(log):
             return MonteCarloStage(self.settings).stop(log)
         if log.iterations and len(log.planned) >= self.settings.budget:
             return "budget"
-        return "cov" if is_precise(log, self.settings) else None
+        return "cov" if is_precise(log, self.settings) and not trusts_search(log, self.settings) else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""
@@ -252,13 +262,15 @@ class SequentialStage:
         """Return draws from a fresh pool, and search picks."""
         s, rng = self.settings, stream(self.settings.seed, "draw", log.iteration)
         one_sided = known.one_sided
-        shares = _BLIND if one_sided else SHARES if s.transfer is None else _TRANSFERRED
+        shares: tuple[float, ...] = _BLIND if one_sided else SHARES if s.transfer is None else _TRANSFERRED
         proposal = self._proposal(log_probability, known, shares, rng)
         fallback = self._fallback(log, known, relative_error(proposal.pilot.anticipated, proposal.pilot.predicted))
         if fallback is not None:
             proposal = self._proposal(fallback, known, shares, rng)
-        pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng, min(len(known.y), MOST_LEARNED), size)
         counts = count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
+        if counts and not one_sided:
+            shares = spared(proposal.pilot, shares, draws_that_count(log, s, size, 1.0 - _SEARCH_SHARE[True]), s.stop.get("cov"))
+        pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng, min(len(known.y), MOST_LEARNED), size)
         aimless = not len(known.y) or self._common(log_probability, log.iteration)
         searching = _SEARCH_BLIND if one_sided else _SEARCH_SHARE[counts]
         searched = 0 if aimless else min(round(searching * size), size - 1)

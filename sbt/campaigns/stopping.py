@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from sbt.campaigns.clustering import spread_of_draws
 from sbt.campaigns.counting import Seen, counted_batches
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
+from sbt.estimators.importance import Plan
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST, combine_estimates
 from sbt.loop.stages import Log
 from sbt.store.records import Iteration
 
-__all__ = ["FEWEST_BATCHES", "count_begins", "is_precise", "pools_of", "relative_error", "relative_error_of", "steadier"]
+__all__ = [
+    "FEWEST_BATCHES", "count_begins", "draws_that_count", "is_precise", "pools_of", "relative_error", "relative_error_of",
+    "spared", "steadier", "trusts_search",
+]  # fmt: skip
 
 _LATEST = (0.6, 0.8)
 """The count begins at the latest after this share of the budget: fewer batches would say little about their own spread. After the
@@ -34,6 +40,9 @@ _FEWEST_NOMINAL = 15
 """Draws from the inputs' distribution before a campaign by transfer may end early: from scratch there are more by then."""
 FEWEST_BATCHES = 4
 """Batches that must count before their spread is taken for a measure of the error."""
+_SPARED, _LEAST_GUIDED, _SURPLUS, _HITS_LEFT = 0.05, 0.15, 0.4, 1.1
+"""Steps in which guided draws give way to draws from the inputs' distribution, and the share that stays guided; what is left is
+expected to have this share of the coefficient of variation that is good enough, and so many times the critical draws that are."""
 _LOST, _MEMORY, _EXACT = 10.0, 4, 0.01
 """An earlier metamodel is preferred to the newest one after a loss of precision by this factor against one of so many batches
 before, of which the anticipated coefficient of variation of one draw is taken for at least the last value."""
@@ -70,6 +79,45 @@ def count_begins(log: Log, settings: Settings, size: int, drawn_share: float) ->
     return errors[-1] <= (_TARGET if target is None else target)
 
 
+def draws_that_count(log: Log, settings: Settings, size: int, drawn_share: float) -> float:
+    """Return how many draws will have counted when the campaign may end: one batch more than the fewest, or the budget's.
+
+    Args:
+        log: of the campaign.
+        settings: of the campaign.
+        size: runs of the next batch.
+        drawn_share: share of the further runs that count.
+    """
+    counted = sum(len(batch.critical) for batch in counted_batches(log, settings))
+    left = settings.budget - len(log.planned)
+    if settings.stop.get("cov") is not None:
+        left = min(left, max((FEWEST_BATCHES + 1) * size - round(counted / drawn_share), size))
+    return counted + drawn_share * left
+
+
+def spared(pilot: Plan, shares: tuple[float, ...], draws: float, target: float | None) -> tuple[float, ...]:
+    """Return the shares of the next draws: precision beyond what was asked goes to draws from the inputs' distribution.
+
+    They bound what no run has met, and what a metamodel denies weighs the less the more of them there are. A pilot pool decides,
+    never the pool that is drawn from.
+
+    Args:
+        pilot: the plan of a pilot pool with these shares.
+        shares: guided, nominal, of the pool, wide.
+        draws: how many will count.
+        target: coefficient of variation that is good enough; None: `stop.cov` sets none.
+    """
+    enough = _SURPLUS * (_TARGET if target is None else target)
+    hits = min(_HITS_LEFT * FEWEST_HITS, draws * pilot.hits)
+    best = 0.0
+    for share in np.arange(_SPARED, shares[0] - _LEAST_GUIDED, _SPARED):
+        plan = pilot.moved(float(share))
+        if relative_error(plan.anticipated, plan.predicted) > enough * math.sqrt(draws) or draws * plan.hits < hits:
+            break
+        best = float(share)
+    return (shares[0] - best, shares[1] + best, *shares[2:])
+
+
 def is_precise(log: Log, settings: Settings) -> bool:
     """Return whether the estimate has the coefficient of variation at which `stop.cov` ends the campaign.
 
@@ -88,6 +136,15 @@ def is_precise(log: Log, settings: Settings) -> bool:
     if settings.transfer is not None and Seen.of(log, settings).draws < _FEWEST_NOMINAL:
         return False
     return hits >= FEWEST_HITS and found.std_error <= target * found.value and half <= WIDEST * target * found.value
+
+
+def trusts_search(log: Log, settings: Settings) -> bool:
+    """Return whether a gate would pass while what no run has met may hold more than is allowed: it would trust the search."""
+    gate, counted = settings.gate, counted_batches(log, settings, failed_critical=True)
+    if gate is None or not counted or combine_estimates(counted).limit(gate.confidence, side=1) > gate.probability:
+        return False
+    seen = Seen.of(log, settings)
+    return seen.most(seen.surprises, gate.confidence) > gate.probability
 
 
 def steadier(log: Log, error: float) -> int | None:

@@ -95,6 +95,18 @@ class Plan:
     guided: Vector
     guided_share: float
 
+    def moved(self, share: float) -> Plan:
+        """Return the plan with this share of all draws taken from the guided ones and made from the nominal distribution."""
+        probability = self.probability + share * (self.nominal_probability - self.guided)
+        moved = replace(self, nominal=self.nominal + share, guided_share=self.guided_share - share)
+        return moved.drawn_with(np.maximum(probability, 0.0))
+
+    @property
+    def hits(self) -> float:
+        """Share of the draws that are critical, if the metamodel is right."""
+        second = self.moment if self.form == "meta" else self.control_variate
+        return float(self.probability @ second)
+
     def drawn_with(self, probability: Vector) -> Plan:
         """Return the same plan with other probabilities r (N,) of the pool points."""
         corrected = (self.weight**2 * self.moment / np.maximum(probability, _LEAST_DRAWN)).sum()

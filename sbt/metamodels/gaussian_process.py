@@ -152,13 +152,15 @@ class GaussianProcess:
             )  # fmt: skip
             return _condition(self, hyper, u[training], z[training], ones, None, shift, scale)
         rows = rng.permutation(len(z))[: self.fit_rows]
-        objective = Objective(self.nu, u[rows], z[rows], np.ones(len(rows)), device, noise_mode=self._noise_mode)
+        objective = Objective(
+            self.nu, u[rows], z[rows], np.ones(len(rows)), device, noise_mode=self._noise_mode, certain=gives_different(u, y)
+        )
         if self.kernels == 1 or self._noise_mode is not None or len(rows) < _FEWEST_FOR_TWO or u.shape[1] == 1:
             hyper = fit_posterior(objective)
         else:
             objective, hyper = fit_kernels(objective)
         if self._noise_mode is None:
-            objective, hyper = fit_noise(objective, hyper, certain=gives_different(u, y))
+            objective, hyper = fit_noise(objective, hyper)
         if not self.input_noise or len(z) < _FEWEST_FOR_NOISE:
             return _condition(self, hyper, u, z, np.ones(len(z)), None, shift, scale)
         spread, at_rows = _fit_noise_spread(hyper, u, z, rng, device)

@@ -26,6 +26,8 @@ _NO_NOISE = math.log(NOISE_FLOOR)  # of a deterministic metric
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
 _LEAST_NOISE = 1e-4  # where there is certainly noise
 _FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
+_DOUBTFUL_NOISE = 1e-3  # variance from which on a start without it competes, rougher than what was found:
+_ROUGH_LENGTH, _ROUGH_NOISE = 0.1, 1e-4
 _HEAVY_LENGTH, _HEAVY_START = 0.6, 0.5  # the same where noise is heavy: from short ones the fit takes noise for structure
 _FIRST_LENGTHS, _FIRST_SCALES = (1.5, 0.4), (1.0, 0.2)  # the same of two kernels, and their variances
 _SCALE_BOUNDS = (_BOUNDS[0], math.log(100.0))  # with larger ones the least noise would be lost in rounding
@@ -53,6 +55,7 @@ class Objective:
         device: where it is computed.
         noise_mode: log variance about which the noise is expected; None: there may be none.
         kernels: q, the number of kernels whose sum is fitted.
+        certain: equal rows differ: there is noise.
 
     Source:
         Rasmussen & Williams (2006), algorithm 2.1, eqs. (4.17), (5.9); priors: Hvarfner et al. (2024), as in BoTorch
@@ -66,6 +69,7 @@ class Objective:
     device: torch.device
     noise_mode: float | None = None
     kernels: int = 1
+    certain: bool = False
 
     @property
     def floor(self) -> float:
@@ -144,9 +148,23 @@ def fit_posterior(objective: Objective, start: Hyperparameters | None = None) ->
 
 
 def _fitted(objective: Objective, start: Hyperparameters | None = None) -> tuple[Hyperparameters, float]:
-    """Return the hyperparameters of largest posterior density, and its logarithm."""
-    if start is None:
-        start = _first(objective)
+    """Return the hyperparameters of largest posterior density, and its logarithm.
+
+    What may be noise may as well be a function that bends between few rows, and L-BFGS stays where it starts: where it finds
+    noise that no equal rows show, a rough start without noise competes.
+    """
+    if start is not None:
+        return _from(objective, start)
+    found, density = _from(objective, _first(objective))
+    if objective.noise_mode is not None or objective.certain or found.noise < _DOUBTFUL_NOISE:
+        return found, density
+    start = replace(found, lengthscale=np.minimum(found.lengthscale, _ROUGH_LENGTH * math.sqrt(objective.u.shape[1])))
+    other, by_other = _from(objective, replace(start, noise=_ROUGH_NOISE))
+    return (other, by_other) if by_other > density + _CLEARLY else (found, density)
+
+
+def _from(objective: Objective, start: Hyperparameters) -> tuple[Hyperparameters, float]:
+    """Return the hyperparameters that L-BFGS finds from a start, and their log posterior density."""
     first, scales = objective.vector(start), [_SCALE_BOUNDS] * objective.kernels if objective.kernels > 1 else []
     found = minimize(
         objective, first, jac=True, method="L-BFGS-B",
@@ -182,21 +200,20 @@ def fit_kernels(objective: Objective) -> tuple[Objective, Hyperparameters]:
     return objective, one if n <= _COMPARED else fit_posterior(objective)
 
 
-def fit_noise(objective: Objective, hyper: Hyperparameters, *, certain: bool) -> tuple[Objective, Hyperparameters]:
+def fit_noise(objective: Objective, hyper: Hyperparameters) -> tuple[Objective, Hyperparameters]:
     """Return the objective and its hyperparameters, or those of one kernel and heavy noise, whichever has the larger density.
 
     Noise can as well be taken for a function that bends between any two rows, and L-BFGS stays where it starts: 100 rows that
     were noise alone were learned with length scales of .05 of the space, and P(critical) was worse than its mean.
 
     Args:
-        objective: without a mode of the noise.
+        objective: without a mode of the noise. Where equal rows differ heavy noise is taken unless the other density is clearly
+            larger. Otherwise it is only tried where the rows are explained hardly better than by noise alone.
         hyper: fitted to it.
-        certain: equal rows differ: heavy noise is taken unless the other density is clearly larger. Otherwise it is only tried
-            where the rows are explained hardly better than by noise alone.
     """
     n, plain = len(objective.z), -float(objective(objective.vector(hyper))[0]) * len(objective.z)
-    if not certain and plain > _EXPLAINED - n * (0.5 + _LOG_ROOT):
+    if not objective.certain and plain > _EXPLAINED - n * (0.5 + _LOG_ROOT):
         return objective, hyper
     heavy = replace(objective, kernels=1, noise_mode=HEAVY_NOISE)
     found, density = _fitted(heavy)
-    return (heavy, found) if density > plain - _CLEARLY * certain else (objective, hyper)
+    return (heavy, found) if density > plain - _CLEARLY * objective.certain else (objective, hyper)

@@ -8,7 +8,10 @@ from enum import StrEnum
 
 from sbt.problem.plain import Values
 
-__all__ = ["IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STRUCK", "UNCONFIRMED", "Doubt", "Job", "Outcome", "Status", "doubts"]
+__all__ = [
+    "IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STRUCK", "TELEPORTED", "UNCONFIRMED", "Doubt", "Job", "Outcome", "Status",
+    "doubts",
+]  # fmt: skip
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
 """How the text begins of a contact that SUMO's own list does not have, and of an entry of that list without a contact."""
@@ -16,6 +19,8 @@ STRUCK, OTHER_LEVEL = "hit from behind by ", "on another level: "
 """How the text begins of a contact with a recorded road user from behind, and of one on a road taken for a bridge."""
 IMPOSSIBLE = "as no vehicle can: "
 """How the text begins of a motion of the ego that no tyre holds: what its controller commands is done."""
+TELEPORTED = "teleported: "
+"""How the text begins of a road user near the ego that SUMO moved to another place."""
 
 
 class Doubt(StrEnum):
@@ -31,11 +36,13 @@ class Doubt(StrEnum):
     """bodies overlap in the plane, on roads that are taken for bridges, since the network has no heights"""
     IMPOSSIBLE = "ego moves as no vehicle can"
     """it accelerates or brakes by more than tyres hold"""
+    TELEPORTED = "somebody near the ego was teleported"
+    """SUMO moved a road user to another place, such as out of a jam"""
 
 
 _BEGINNINGS = {
     UNCONFIRMED: Doubt.UNCONFIRMED, LISTED_ONLY: Doubt.LISTED_ONLY, STRUCK: Doubt.STRUCK, OTHER_LEVEL: Doubt.OTHER_LEVEL,
-    IMPOSSIBLE: Doubt.IMPOSSIBLE,
+    IMPOSSIBLE: Doubt.IMPOSSIBLE, TELEPORTED: Doubt.TELEPORTED,
 }  # fmt: skip
 
 

@@ -38,6 +38,7 @@ class _Surroundings(Protocol):
     """What is read of the recorded road users."""
 
     states: dict[str, State]
+    jumped: set[str]
 
     def __len__(self) -> int: ...
     def newcomers(self) -> list[str]: ...
@@ -81,6 +82,7 @@ class AppearanceMonitor:
         self._sumo, self._ego, self._departures = sumo, ego, departures
         self._unparked: frozenset[str] = frozenset()
         self._unparked_before: frozenset[str] = frozenset()
+        self._jumped: frozenset[str] = frozenset()
 
     def after_step(self, near: _Surroundings, departed: frozenset[str]) -> None:
         """Check a step that has been recorded.
@@ -94,6 +96,7 @@ class AppearanceMonitor:
         """
         simulation = self._sumo.simulation
         self._unparked_before, self._unparked = self._unparked, frozenset()
+        moved, self._jumped = self._jumped, frozenset(near.jumped)
         if simulation.getParkingEndingVehiclesNumber():
             self._unparked = frozenset(simulation.getParkingEndingVehiclesIDList())
         new = near.newcomers()
@@ -106,7 +109,7 @@ class AppearanceMonitor:
                 self._refuse_close(near, [name for name in new if name not in self._departures.asked], place, remedy)
         elif new:
             persons = frozenset(simulation.getDepartedPersonIDList())
-            appeared = departed | persons | frozenset(simulation.getEndingTeleportIDList())
+            appeared = departed | persons | moved | frozenset(simulation.getEndingTeleportIDList())
             self._check(near, [name for name in new if name in appeared])
 
     def refuse_contact(self, name: str) -> None:

@@ -17,12 +17,12 @@ import numpy as np
 
 from sbt.errors import RunError
 from sbt.metrics.geometry import contact_part, rectangle_distance
-from sbt.problem.outcome import OTHER_LEVEL, Status
+from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
 from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
-from sbt.sumo.overlaps import deepest_overlap, instant, state_in_sumo
+from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, path_behind
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
@@ -37,12 +37,10 @@ _VERY_LONG = 20.0
 """Length from which on a vehicle may be near although its front is not within the radius (m)."""
 _LONGEST = 30.0
 """Length up to which others on another level are compared with the ego (m)."""
-_SLACK = 1e-6
-"""Below this distance (m) of two rectangles the quick separation test does not decide, but the exact one."""
+_JUMP = 150.0
+"""A road user whose position changes faster was moved to another place (m/s)."""
 
 _Row = tuple[float, ...]
-_Rectangle = tuple[float, float, float, float, float]
-"""x, y (m), heading (rad), length and width (m)."""
 
 
 class Surroundings:
@@ -60,6 +58,7 @@ class Surroundings:
         present: names of those that are there now, the ego first.
         rigid: vehicles that are moved by poses; their bodies are rectangles, however long.
         placed: road users that are moved by position, as they are in the next step to be recorded.
+        jumped: who was moved to another place in this step: left out at this instant, so that nothing takes it for motion.
     """
 
     def __init__(self, sumo: Any, ego: str, within: float, named: Iterable[str], dt: float):
@@ -79,6 +78,9 @@ class Surroundings:
         self.present: list[str] = []
         self.rigid: set[str] = set()
         self.placed: Mapping[str, Placed] = {}
+        self.jumped: set[str] = set()
+        self._teleported: dict[str, str] = {}
+        self._ending: Sequence[str] = ()
         self._unreacting: set[str] = set()
         self._other_level: dict[tuple[str, str], str] = {}
         self.levels = levels_of(sumo)
@@ -134,6 +136,8 @@ class Surroundings:
             near = {**near, **self._placed_near(near[ego][_POSITION])}
         row: dict[str, _Row] = {}
         parts: dict[str, int] = {}
+        simulation, self.jumped = self._sumo.simulation, set()
+        self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
         height = near[ego][_POSITION][2]
@@ -150,7 +154,9 @@ class Surroundings:
         for name in sorted(self._named_present - set(near) - set(row)):
             self._record(row, parts, before, name, self._read(name))
         for name in self.present:
-            if name not in row:
+            if name in self.jumped:
+                self._ways.pop(name, None)
+            elif name not in row:
                 self._keep_way(name)
         self.present = list(row)
         self._rows.append(row)
@@ -220,10 +226,24 @@ class Surroundings:
         last = before.get(name)
         state.acceleration = 0.0 if last is None else (speed - last[3]) / self._dt
         state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed
+        moved = 0.0 if last is None else math.hypot(state.x - last[0], state.y - last[1])
+        if moved > _JUMP * self._dt or (last is not None and name in self._ending):
+            self._note_jump(name, moved)
+            return
         row[name] = (state.x, state.y, state.heading, speed, state.acceleration)
         if name in self._bodies and name not in self.rigid:
             lane = self._sumo.vehicle.getLaneID(name)
             parts[name] = self._bodies[name].move((x, y), state.cos, state.sin, lane, speed * self._dt)
+
+    def _note_jump(self, name: str, moved: float) -> None:
+        """Leave out a road user that was moved to another place; the ego must not be."""
+        t = len(self._rows) * self._dt
+        if name == self._ego:
+            rule = f"the ego '{name}' must stay on its way"
+            raise RunError(Status.INVALID, f"{rule}, but was moved by {moved:.0f} m within a step at {t:.3f} s")
+        self.jumped.add(name)
+        text = f"{TELEPORTED}'{name}' at {t:.3f} s: it was moved by {moved:.0f} m, and its track is interrupted"
+        self._teleported.setdefault(name, text)
 
     def _note_level(self, road: str, other: str, name: str, ego: tuple[float, ...], variables: Mapping[int, Any]) -> None:
         """Note a contact in the plane that is none, as the network has no heights and the roads are taken for bridges."""
@@ -285,12 +305,12 @@ class Surroundings:
         before = before if name in self._rows[before] else now
         own_0, own, other_0, other = (self._rectangles(who, k) for who in (self._ego, name) for k in (before, now))
         return any(
-            not _separate(a, b, a_0, b_0)
+            not separate(a, b, a_0, b_0)
             for a, a_0 in zip(own, own_0, strict=True)
             for b, b_0 in zip(other, other_0, strict=True)
         )
 
-    def _rectangles(self, name: str, k: int) -> list[_Rectangle]:
+    def _rectangles(self, name: str, k: int) -> list[Rectangle]:
         """Return the rectangles of a road user at an instant."""
         state, poses = self.states[name], self._poses(name, k)
         return [(x, y, heading, state.length / len(poses), state.width) for x, y, heading in poses.tolist()]
@@ -338,7 +358,8 @@ class Surroundings:
             np.array([self.states[n].length for n in names]), np.array([self.states[n].width for n in names]),
             ended, tuple(reported), ways={name: ways[0] for name, ways in self._ways.items()},
             parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
-            unconfirmed=(*unconfirmed, *self._other_level.values()), unreacting=tuple(n for n in names if n in self._unreacting),
+            unconfirmed=(*unconfirmed, *self._other_level.values(), *self._teleported.values()),
+            unreacting=tuple(n for n in names if n in self._unreacting),
         )  # fmt: skip
 
     def _bent(self) -> list[str]:
@@ -362,21 +383,3 @@ def _parts(poses: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, lengt
         ActorTrace(poses[:, j, 0], poses[:, j, 1], poses[:, j, 2], speed, acceleration, length, width)
         for j in range(poses.shape[1])
     )
-
-
-def _separate(a: _Rectangle, b: _Rectangle, a_0: _Rectangle, b_0: _Rectangle) -> bool:
-    """Return whether an axis of one rectangle separates both during a whole step, from the states _0 on."""
-    dx, dy, dx_0, dy_0 = b[0] - a[0], b[1] - a[1], b_0[0] - a_0[0], b_0[1] - a_0[1]
-    turn = b[2] - a[2]
-    c, s = abs(math.cos(turn)), abs(math.sin(turn))
-    for one, other in ((a, b), (b, a)):
-        cos, sin = math.cos(one[2]), math.sin(one[2])
-        reach = 0.5 * (one[3] + c * other[3] + s * other[4]) + _SLACK
-        along, along_0 = dx * cos + dy * sin, dx_0 * cos + dy_0 * sin
-        if (along > reach and along_0 > reach) or (along < -reach and along_0 < -reach):
-            return True
-        reach = 0.5 * (one[4] + s * other[3] + c * other[4]) + _SLACK
-        left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
-        if (left > reach and left_0 > reach) or (left < -reach and left_0 < -reach):
-            return True
-    return False
