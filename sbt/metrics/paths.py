@@ -169,6 +169,8 @@ def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -
             beyond = np.where(beyond > 0.0, np.nan, 0.0) if course.leaves else np.maximum(beyond, 0.0)
             x, y = x + beyond * np.cos(heading[-1]), y + beyond * np.sin(heading[-1])
         parts.append((x, y, np.interp(travelled, way, heading)))
+        if course.moved > 0.0:
+            travelled = np.interp(travelled, way, course.arc) + np.maximum(travelled - way[-1], 0.0)
         paces.append(travelled[:, 1] - travelled[:, 0])
         sizes.append(np.broadcast_to([course.actor.length, course.actor.width], (end - begin, 2)))
     x, y, headings = (np.concatenate(column) for column in zip(*parts, strict=True))
