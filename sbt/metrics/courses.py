@@ -21,7 +21,8 @@ _SLACK = 1e-6
 """By how much farther apart than necessary those must be who are passed over (m)."""
 _SLIP, _MOVED, _TURN, _UNEVEN = 0.5, 0.5, 0.1, 0.05
 """A vehicle is moved sideways, as by SUMO when it changes lanes, where that is more than this share of what it drives forward,
-and so many metres, in a step in which it turns by less than this (rad): no tyre slips by 27 degrees. Steps that differ by less than the last (m) hide none."""
+and so many metres, in a step in which it turns by less than this (rad): no tyre slips by 27 degrees.
+Steps that differ by less than the last (m) hide none."""
 _STRIDE = 5
 """Steps that are passed over at once."""
 
