@@ -118,7 +118,7 @@ class BatchStage:
         return "misclassified" if self._sure(chose[-2:], log) else None
 
     def _sure(self, fits: Sequence[FitRecord], log: Log) -> bool:
-        """Say whether two fits in turn expect so little of the space on the wrong side and agree, and no run denies it.
+        """Say whether three fits in turn expect so little of the space on the wrong side and agree, and no run denies it.
 
         Held-out runs do not. Several runs tell of each side, or those that fill the space evenly bound what none has met.
         """
@@ -134,7 +134,12 @@ class BatchStage:
         even = log.history.where(np.isin(log.history.stage, ("initial", VALIDATION)))
         facts = Facts.of(log.history, self.settings.scenario)
         bounded = (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
-        return bounded or not few_of_a_side(facts)
+        if not bounded and few_of_a_side(facts):
+            return False
+        learned = None if self.settings.learner is None else self.settings.learner.fit(log.history)
+        if learned is None or learned.record.expected_misclassified > target:
+            return False  # the newest runs, which no fit has learned from yet, deny it
+        return changed_share(fits[1].sides, learned.record.sides) <= target
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
