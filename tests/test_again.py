@@ -29,7 +29,7 @@ def linear(mean: float = 0.0, std: float = 1.0, beta: float = 3.5) -> float:
 def estimated(tmp_path_factory: pytest.TempPathFactory) -> sbt.Result:
     folder = tmp_path_factory.mktemp("again") / "store"
     keys: dict[str, Any] = {"budget": 140, "initial": 14, "batch": 14, "stop": {"cov": None}, "executor": "serial"}
-    return sbt.run(campaign="estimation", scenario="testbed:linear_d2", seed=1, store=folder, report=False, **keys)
+    return sbt.run(campaign="estimation", scenario="testbed:linear_d2", seed=2, store=folder, report=False, **keys)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,16 @@ def test_other_distributions(estimated, mean, std):
     found = estimated.estimate({"x1": sbt.Normal(mean, std)})
     assert found.low <= linear(mean, std) <= found.high
     assert found.probability == pytest.approx(linear(mean, std), rel=0.15)
+
+
+def test_few_known_critical_runs_leave_the_bound_of_random_draws(estimated):
+    """What the campaign itself says where critical runs are known at fewer than ten inputs."""
+    history = estimated.history
+    y = np.sort(history.y(history.metrics[0])[history.ok])
+    found = estimated.estimate(critical=(-np.inf, 0.5 * (y[5] + y[6])))
+    assert any("critical runs are known at" in said for said in found.warnings)
+    assert found.high > 0.02
+    assert found.high < 0.1
 
 
 def test_another_threshold(estimated):

@@ -67,6 +67,8 @@ class Reused:
         least: effective sample size below which the draws say nothing.
         exact: all combinations of inputs were run, and no noise was met: sums have no error.
         taught: further draws from the campaign's distribution, which taught and do not count.
+        met: of all draws from the campaign's distribution, those that were critical or failed.
+        known: different inputs of critical runs.
     """
 
     space: ParameterSpace
@@ -82,6 +84,8 @@ class Reused:
     least: float
     exact: bool = False
     taught: int = 0
+    met: int = 0
+    known: int = 0
 
     @property
     def unmet(self) -> Vector:
@@ -121,13 +125,13 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         tuple(_batch(history, space, outcomes, d.rows, said[k]) for d, said in zip(draws, predicted, strict=True))
         for k, outcomes in enumerate((hits, hits | ~history.ok))
     )
-    nominal = np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws])
+    nominal, seen = np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws]), Seen.of(log, settings)
     return Reused(
         space, batches, worst, int((~history.ok[every]).sum()), nominal,
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         history.columns["warm_up"][every], least, took_sum(log) and _exact(log, settings),
-        Seen.of(log, settings).draws - round(float(nominal.sum())) if not plainly else 0,
+        seen.draws - round(float(nominal.sum())) if not plainly else 0, seen.hits + seen.failed, seen.known,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from sbt.campaigns.again import Reused
 from sbt.campaigns.clustering import spread_of_batches
+from sbt.campaigns.counting import FEW_KNOWN
 from sbt.campaigns.estimation import Concluded, EstimationConclusion, on_warm_ups
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.wording import plural
@@ -89,6 +90,10 @@ def _from_batches(found: Reused) -> Concluded:
     elif hits == 0:
         limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), bound(perhaps, c)))
         warnings.append("no counted draw was critical: only an upper bound is given")
+    elif found.known < FEW_KNOWN:
+        limits = limits.reaching(lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
+        draws = f"the upper end is at least that of {round(float(found.unmet.sum()))} draws from the campaign's distribution"
+        warnings.append(f"critical runs are known at {plural(found.known, 'input')}, fewer than {FEW_KNOWN}: {draws}")
     elif few_low or few_high:
         met = f"{plural(hits, 'counted draw')} critical" if hits < FEW_HITS else f"{plural(misses, 'counted draw')} safe"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
