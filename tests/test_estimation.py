@@ -246,6 +246,21 @@ def test_a_gate_that_passes_says_what_it_cannot_exclude(undetected, told):
     assert ("could hold up to 0.12" in verdict.statement) == told
 
 
+def test_a_gate_goes_on_while_its_pass_would_trust_the_search(tmp_path):
+    """The estimate is precise long before what no run has met is known to be less than what is allowed."""
+    keys = {"campaign": "estimation", "scenario": "testbed:linear_d2", "budget": 240, "seed": 3, "executor": "serial"}
+    without, gated = (
+        sbt.run(**keys, store=tmp_path / name, report=False, **more)
+        for name, more in (("without", {}), ("gated", {"gate": {"probability": 0.002}}))
+    )
+    assert without.finished == "cov"
+    assert (gated.finished, len(gated.history)) == ("budget", 240)
+    assert gated.conclusion.gate.verdict == "pass"
+    assert gated.conclusion.gate.statement.startswith("if the search has met whatever is critical")
+    assert gated.conclusion.undetected_mass_bound < 0.6 * without.conclusion.undetected_mass_bound
+    assert (gated.frame["x.x1"][: len(without.history)] == without.frame["x.x1"]).all()
+
+
 @pytest.mark.parametrize(("probability", "code", "verdict"), [(0.9, 0, "pass"), (0.05, 3, "fail"), (0.28, 3, "undecided")])
 def test_the_gate_is_an_exit_code_and_junit(configured: Callable[..., Path], tmp_path, probability, code, verdict):
     config = configured(**QUICK | {"acquisition": {"kind": "monte_carlo"}, "budget": 100, "gate": {"probability": probability}})

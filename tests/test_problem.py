@@ -354,6 +354,11 @@ def test_expressions_equal_python(number, other, comparison, joint):
                 assert found == pytest.approx(expected, rel=1e-12)
 
 
+def test_a_word_of_python_is_no_name_in_a_formula():
+    with pytest.raises(InputError, match="'lambda' is a word of Python"):
+        Expression("2 * lambda + 1")
+
+
 def test_expressions_know_their_functions_and_names():
     x = np.array([0.25, 1.0])
     for name, function in {"sqrt": np.sqrt, "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos}.items():

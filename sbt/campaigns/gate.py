@@ -92,7 +92,7 @@ def gate_verdict(
         verdict, statement = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {allowed}"
         if undetected > gate.probability:
             unmet = f"a critical region that no run has met, or failures that few seeds show, could hold up to {undetected:.2g}"
-            statement += f"; it trusts the search: {unmet}"
+            statement = f"if the search has met whatever is critical, {statement}; {unmet}"
     elif low > gate.probability:
         verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:

@@ -40,7 +40,7 @@ _FEWEST_NOMINAL = 15
 """Draws from the inputs' distribution before a campaign by transfer may end early: from scratch there are more by then."""
 FEWEST_BATCHES = 4
 """Batches that must count before their spread is taken for a measure of the error."""
-_SPARED, _LEAST_GUIDED, _SURPLUS, _HITS_LEFT = 0.05, 0.15, 0.4, 1.1
+_SPARED, _LEAST_GUIDED, _SURPLUS, _HITS_LEFT = 0.05, 0.3, 0.4, 1.1
 """Steps in which guided draws give way to draws from the inputs' distribution, and the share that stays guided; what is left is
 expected to have this share of the coefficient of variation that is good enough, and so many times the critical draws that are."""
 _LOST, _MEMORY, _EXACT = 10.0, 4, 0.01

@@ -8,7 +8,9 @@
 from __future__ import annotations
 
 import ast
+import keyword
 import operator
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import reduce
@@ -39,6 +41,7 @@ _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "cos": (1, np.cos), "min": (2, np.minimum), "max": (2, np.maximum),
 }  # fmt: skip
 """name: number of arguments, and what it computes"""
+_WORDS = ("and", "or", "not")
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,8 @@ class Expression:
             return ast.parse(self.text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             reason = getattr(error, "msg", None) or str(error) or "nested too deeply"
+            words = [word for word in re.findall(r"[A-Za-z_]\w*", self.text) if keyword.iskeyword(word) and word not in _WORDS]
+            reason = f"'{words[0]}' is a word of Python, and no name for an input of a formula" if words else reason
             raise InputError(f"an expression must be a formula, but got '{self.text}' ({reason})") from None
 
     def names(self) -> tuple[str, ...]:

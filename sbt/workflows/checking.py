@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +20,7 @@ from sbt.execution.warming import keeping_states
 from sbt.metrics.physics import breaches
 from sbt.metrics.stl import FORMULA
 from sbt.metrics.stl_grammar import horizon, parse
-from sbt.problem.outcome import Status
+from sbt.problem.outcome import TELEPORTED, Status
 from sbt.problem.plain import Value, Values, written
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.space import ParameterSpace
@@ -46,6 +47,8 @@ _INSTANTLY = "; SUMO changes lanes within a step unless its option lanechange.du
 _MOVED = "; SUMO moves walkers, and who parks or rides, from one place to another within a step"
 _STEP = 1.0
 """How much shorter than a formula's horizon a run may be (s): a step of SUMO at most."""
+_SLOW, _TIMES, _DRAWN = 1.0, 4, 20
+"""A run from which on it is said how long checking takes (s); how often centre and corners are run, and further runs, about."""
 _WARNINGS = 8
 """Most warnings of the simulator that are shown."""
 _FEWEST_CHANGED, _MOST_CHANGED, _MOST_CORNERS = 3, 8, 17
@@ -58,13 +61,14 @@ _WORKER_DEADLINE = 300.0
 
 @dataclass(frozen=True)
 class _Run:
-    """One run as plain data: its metrics, a digest and the length (s) of its trace, laws of motion it breaks; or a problem."""
+    """One run as plain data: metrics, digest and length (s) of its trace, laws of motion it breaks, teleports; or a problem."""
 
     metrics: tuple[tuple[str, float], ...] = ()
     digest: str = ""
     breaches: tuple[str, ...] = ()
     problem: str = ""
     length: float = math.inf
+    teleports: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,10 +109,12 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     points = list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
     drawn = covariates_first(asked, jobs)
+    begun = time.perf_counter()
     other = _elsewhere(spec, jobs)
     if isinstance(other, _Lost) and other.for_good:
         yield Finding(_ALL_RUN, ok=False, detail=other.why)
         return
+    yield from _slow((time.perf_counter() - begun) / len(jobs), len(jobs))
     first = _runs(spec, jobs)
     run = _all_ok(first, points)
     yield run
@@ -129,6 +135,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     yield from snapshot_findings(spec, points, seed, _digest)
     yield from fidelity_findings(spec, asked, seed)
     yield from _physics(first, points, spec)
+    yield from _teleports(first)
     yield _sides([run for run in first if not run.problem], asked)
     for name, said in compared_times(asked, jobs):
         yield Finding(f"for information: {name}", ok=True, detail=said)
@@ -200,7 +207,8 @@ def _run(scenario: LogicalScenario, execute: Callable[[], Trace | dict[str, floa
             return _Run(tuple(result.items()))
         broken = tuple(map(str, breaches(result, (scenario.roles.other or "",))))
         length = float(result.time[-1] - result.time[0])
-        return _Run(tuple(scenario.measure(result).items()), _digest(result), broken, length=length)
+        moved = tuple(text.removeprefix(TELEPORTED) for text in result.unconfirmed if text.startswith(TELEPORTED))
+        return _Run(tuple(scenario.measure(result).items()), _digest(result), broken, length=length, teleports=moved)
     except RunError as error:
         return _Run(problem=f"{error.status}: {error.reason}")
     except BaseException as error:
@@ -338,6 +346,23 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]], spec: ScenarioSpe
     if any(name.startswith("walking") for name in first):
         detail += _MOVED
     return [Finding("for information: laws of motion are broken", ok=True, detail=f"in {share}: {detail}")]
+
+
+def _slow(seconds: float, points: int) -> list[Finding]:
+    """Return how long it takes to check this scenario, where that is long."""
+    if seconds < _SLOW:
+        return []
+    runs = _TIMES * points + _DRAWN
+    detail = f"a run takes {seconds:.1f} s here, and all checks make about {runs} of them: {seconds * runs / 60.0:.0f} minutes"
+    return [Finding("for information: the scenario is slow", ok=True, detail=detail)]
+
+
+def _teleports(runs: list[_Run]) -> list[Finding]:
+    """Return that SUMO teleported road users near the ego; none where it did not."""
+    moved = [run.teleports[0] for run in runs if run.teleports]
+    what = "metrics see who is teleported leave and come (option time-to-teleport)"
+    detail = f"in {len(moved)} of {len(runs)} runs, such as {moved[0]}; {what}" if moved else ""
+    return [Finding("for information: SUMO teleports road users near the ego", ok=True, detail=detail)] if moved else []
 
 
 def _sides(runs: list[_Run], scenario: LogicalScenario) -> Finding:
