@@ -253,8 +253,8 @@ def test_a_gate_goes_on_while_its_pass_would_trust_the_search(tmp_path):
         sbt.run(**keys, store=tmp_path / name, report=False, **more)
         for name, more in (("without", {}), ("gated", {"gate": {"probability": 0.002}}))
     )
-    assert without.finished == "cov"
-    assert (gated.finished, len(gated.history)) == ("budget", 240)
+    assert len(without.history) < 220
+    assert len(gated.history) == 240
     assert gated.conclusion.gate.verdict == "pass"
     assert gated.conclusion.gate.statement.startswith("if the search has met whatever is critical")
     assert gated.conclusion.undetected_mass_bound < 0.6 * without.conclusion.undetected_mass_bound

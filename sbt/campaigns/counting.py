@@ -98,6 +98,7 @@ class Seen:
         failed: failed ones of these draws.
         surprises: critical ones of these draws to which the metamodel gave next to no probability.
         known: different inputs of critical runs; where any of several requirements is enough, of the one that is known by fewest.
+        surprised: number of the last batch that had a surprise; -1: none had.
     """
 
     critical: int
@@ -107,6 +108,7 @@ class Seen:
     failed: int
     surprises: int
     known: int
+    surprised: int = -1
 
     @classmethod
     def of(cls, log: Log, settings: Settings) -> Seen:
@@ -115,7 +117,7 @@ class Seen:
         critical = settings.scenario.requirement.critical_runs(history)
         drawn = np.isin(history.stage, (DRAWN, LEARNED))
         plain = np.flatnonzero(history.stage == NOMINAL)  # until values came that can be followed
-        rows, surprising = [plain], [np.zeros(len(plain), dtype=np.bool_)]
+        rows, surprising, surprised = [plain], [np.zeros(len(plain), dtype=np.bool_)], -1
         for batch in log.iterations:
             proposal = batch.read(EstimationProposal)
             nominal = proposal.nominal
@@ -123,11 +125,12 @@ class Seen:
                 first = np.flatnonzero(drawn & (history.iteration == batch.number))[: len(nominal.pi)]
                 rows.append(first)
                 surprising.append(np.array(nominal.pi)[: len(first)] < _denied(proposal))
+                surprised = batch.number if (critical[first] & surprising[-1]).any() else surprised
         mine, denied = np.concatenate(rows), np.concatenate(surprising)
         return cls(
             int(critical.sum()), int((history.ok & ~critical).sum()), len(mine), int(critical[mine].sum()),
             int((~history.ok[mine]).sum()), int((critical[mine] & denied).sum()),
-            _known(settings.scenario.requirement, history),
+            _known(settings.scenario.requirement, history), surprised,
         )  # fmt: skip
 
     def most(self, hits: int, confidence: float) -> float:

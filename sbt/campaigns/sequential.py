@@ -25,6 +25,7 @@ from sbt.campaigns.stopping import (
     count_begins,
     draws_that_count,
     is_precise,
+    only_unseen,
     pools_of,
     relative_error,
     relative_error_of,
@@ -69,6 +70,9 @@ _SEARCH_BLIND = 0.4
 _BLIND = (0.0, 0.75, 0.1, 0.15)
 """Shares of the draws (`SHARES`) until then; they only teach: what would count then is rarely met, and weighs much if it is."""
 
+_NOMINAL = (0.0, 1.0, 0.0, 0.0)
+"""Shares where a gate lacks nothing but a bound on what no run has met: draws from the inputs' distribution, which do not count,
+as few of them would tell of the boundary."""
 _TRANSFERRED = (0.48, 0.35, 0.05, 0.12)
 """Shares of a campaign that knows another setup's: it is short, and its draws from the inputs' distribution alone meet what the
 other one did not have."""
@@ -267,17 +271,20 @@ class SequentialStage:
         fallback = self._fallback(log, known, relative_error(proposal.pilot.anticipated, proposal.pilot.predicted))
         if fallback is not None:
             proposal = self._proposal(fallback, known, shares, rng)
-        counts = count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True])
-        if counts and not one_sided:
+        counts, unseen = count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True]), only_unseen(log, s)
+        if unseen:
+            counts, shares = False, _NOMINAL
+        elif counts and not one_sided:
             shares = spared(proposal.pilot, shares, draws_that_count(log, s, size, 1.0 - _SEARCH_SHARE[True]), s.stop.get("cov"))
         pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng, min(len(known.y), MOST_LEARNED), size)
-        aimless = not len(known.y) or self._common(log_probability, log.iteration)
+        aimless = unseen or not len(known.y) or self._common(log_probability, log.iteration)
         searching = _SEARCH_BLIND if one_sided else _SEARCH_SHARE[counts]
         searched = 0 if aimless else min(round(searching * size), size - 1)
         noisy = simulator_noise(log.history, s.scenario.requirement).noisy is True
         runs, kept = draw_batch(
             s.scenario.space, pool, size - searched, rng, counts=counts, once=not noisy, fallback=fallback is not None,
-            phase=EXPLORE if one_sided else LEARN, existing=np.vstack([known.z, s.scenario.space.to_normal(log.planned.x)]),
+            phase=EXPLORE if one_sided else LEARN,
+            existing=None if unseen else np.vstack([known.z, s.scenario.space.to_normal(log.planned.x)]),
         )  # fmt: skip
         return Batch((*runs, *self._runs(self._search_modes(known, log, searched), SEARCHED)), kept)
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sbt.campaigns.clustering import spread_of_draws
-from sbt.campaigns.counting import Seen, counted_batches
+from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
@@ -18,8 +18,8 @@ from sbt.loop.stages import Log
 from sbt.store.records import Iteration
 
 __all__ = [
-    "FEWEST_BATCHES", "count_begins", "draws_that_count", "is_precise", "pools_of", "relative_error", "relative_error_of",
-    "spared", "steadier", "trusts_search",
+    "FEWEST_BATCHES", "count_begins", "draws_that_count", "is_precise", "only_unseen", "pools_of", "relative_error",
+    "relative_error_of", "spared", "steadier", "trusts_search",
 ]  # fmt: skip
 
 _LATEST = (0.6, 0.8)
@@ -145,6 +145,13 @@ def trusts_search(log: Log, settings: Settings) -> bool:
         return False
     seen = Seen.of(log, settings)
     return seen.most(seen.surprises, gate.confidence) > gate.probability
+
+
+def only_unseen(log: Log, settings: Settings) -> bool:
+    """Return whether a gate lacks nothing but draws that bound what no run has met: none since the last count was a surprise."""
+    if settings.gate is None or not is_precise(log, settings) or not trusts_search(log, settings):
+        return False
+    return Seen.of(log, settings).surprised <= counted_iterations(log)[-1]
 
 
 def steadier(log: Log, error: float) -> int | None:
