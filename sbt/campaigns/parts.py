@@ -113,7 +113,7 @@ class BatchStage:
         if stable is not None and len(chose) >= 3:
             sides = [fit.sides for fit in chose[-3:]]
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
-            if max(moved) < stable:
+            if max(moved) < stable and _both_sides_known(log, s.scenario, stable):
                 return "stable"
         return "misclassified" if self._sure(chose[-2:], log) else None
 
@@ -131,10 +131,7 @@ class BatchStage:
         wrong = round(validation.error_rate * validation.n)
         if interval(wrong, validation.n)[0] > target:
             return False
-        even = log.history.where(np.isin(log.history.stage, ("initial", VALIDATION)))
-        facts = Facts.of(log.history, self.settings.scenario)
-        bounded = (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
-        if not bounded and few_of_a_side(facts):
+        if not _both_sides_known(log, self.settings.scenario, target):
             return False
         learned = None if self.settings.learner is None else self.settings.learner.fit(log.history)
         if learned is None or learned.record.expected_misclassified > target:
@@ -160,6 +157,13 @@ class BatchStage:
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)
         return Batch((*chosen, *again, *random) if again or random else chosen, proposal, fitted)
+
+
+def _both_sides_known(log: Log, scenario: LogicalScenario, target: float) -> bool:
+    """Return whether several runs tell of each side, or those that fill space bound what is missing by so much of it."""
+    even, facts = log.history.where(np.isin(log.history.stage, ("initial", VALIDATION))), Facts.of(log.history, scenario)
+    bounded = (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
+    return bounded or not few_of_a_side(facts)
 
 
 def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun]:
