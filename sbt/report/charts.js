@@ -16,9 +16,9 @@ const look = layout => {
 };
 const axisOf = column => {
   const axis = { title: { text: safe(titled(column)) } };
-  return column.choices.length
-    ? { ...axis, tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(safe), range: [-0.5, column.choices.length - 0.5] }
-    : axis;
+  if (column.choices.length)
+    return { ...axis, tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(safe), range: [-0.5, column.choices.length - 0.5] };
+  return column.whole && column.high - column.low < 12 ? { ...axis, tick0: Math.ceil(column.low), dtick: 1 } : axis;
 };
 // Values of a column; whole numbers and choices are spread around their value, so that runs do not hide each other.
 const spread = (column, rows, index, step) => rows.map(row =>

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from textwrap import shorten
 from typing import Any
 
 from sbt.campaigns.failures import FalsificationConclusion
@@ -190,7 +191,7 @@ def _about_runs(found: Findings) -> list[str]:
         reason, times = Counter(map(str, reasons)).most_common(1)[0]
         sentences.append(
             f"{len(failed):,} of {len(history):,} runs failed ({percent(len(failed) / len(history))}) and tell nothing"
-            f" about safety. Most frequent reason ({times:,} times): {reason[:200]}"
+            f" about safety. Most frequent reason ({times:,} times): {shorten(reason, 200, placeholder=' ...')}"
         )
     sentences += _about_far_side(found)
     if history.ok.any() and not found.critical.any():
