@@ -65,3 +65,32 @@ def test_who_is_teleported_past_the_ego_has_not_touched_it(jammed: sbt.Scenario)
 def test_a_conclusion_tells_of_teleports(jammed: sbt.Scenario, tmp_path: Path):
     result = sbt.run(campaign="coverage", scenario=jammed, budget=2, store=tmp_path / "s", executor="serial", report=False)
     assert any("In 2 of 2 runs SUMO teleported a road user near the ego" in said for said in result.sentences())
+
+
+LANES = """<routes><route id="r" edges="cd"/><vehicle id="ego" route="r" depart="0" departSpeed="10" departLane="0"/>
+<vehicle id="g" route="r" depart="0" departPos="60" departSpeed="2" departLane="0"><param key="tau" value="${tau}"/></vehicle></routes>
+"""
+LOOP = """
+def simulate(sumo, values, rng):
+    while True:
+        sumo.simulationStep()
+        if abs(sumo.simulation.getTime() - 1.0) < 1e-6:
+            sumo.vehicle.changeLane("ego", 1, 5.0)
+"""
+
+
+def test_a_change_of_lanes_within_the_shortest_step_is_no_teleport(tmp_path: Path):
+    (tmp_path / "n.nod.xml").write_text(NODES)
+    (tmp_path / "e.edg.xml").write_text('<edges><edge id="cd" from="c" to="d" numLanes="2"/></edges>')
+    run_program(tmp_path, "netconvert", "-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.net.xml")
+    (tmp_path / "my.rou.xml").write_text(LANES)
+    (tmp_path / "my.sumocfg").write_text(
+        '<configuration><net-file value="net.net.xml"/><route-files value="my.rou.xml"/><step-length value="0.01"/></configuration>'
+    )
+    (tmp_path / "mine.py").write_text(LOOP)
+    (tmp_path / "scenario.yaml").write_text(YAML.replace("sumo: my.sumocfg", "sumo: my.sumocfg\nsimulate: mine.py:simulate").replace("25", "3"))
+    trace = ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve().simulate({"tau": 1.0}, 1)
+    y = trace.actor("ego").y
+    assert np.abs(np.diff(y)).max() > 3.0
+    assert not np.isnan(y).any()
+    assert not trace.unconfirmed

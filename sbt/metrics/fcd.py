@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sbt.errors import InputError
+from sbt.metrics.geometry import farthest
 from sbt.metrics.pairwise import without_overtaking
 from sbt.plugins import load, names
 from sbt.problem.arrays import Vector
@@ -35,8 +36,6 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
-_MAX_SPEED = 150.0
-"""A road user whose position changes faster was teleported (m/s); its trace is split there."""
 _COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width")
 _REQUIRED = ("time", "id", "x", "y", "angle", "speed")
 _KINDS = ("vehicle", "person")
@@ -282,7 +281,7 @@ def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
     rows = np.stack([at_ego + spans[0].start, at_other + spans[1].start], axis=1)  # (t, 2)
     time = recording.time[steps]
     moved = np.hypot(np.diff(recording.x[rows], axis=0), np.diff(recording.y[rows], axis=0)).max(axis=1)
-    cut = (np.diff(steps) > 1) | (moved > _MAX_SPEED * np.diff(time))
+    cut = (np.diff(steps) > 1) | (moved > farthest(np.diff(time)))
     who = [ego, other]
     for part in np.split(np.arange(len(steps)), np.flatnonzero(cut) + 1):
         if len(part) > 1:

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ __all__ = [
     "contact_part",
     "contact_share",
     "corners",
+    "farthest",
     "overlap_depth",
     "part_pairs",
     "rectangle_distance",
@@ -32,6 +34,17 @@ __all__ = [
     "swept_contact",
     "time_to_contact",
 ]  # fmt: skip
+
+
+_MAX_SPEED, _LANE_CHANGE = 150.0, 8.0
+
+
+def farthest(elapsed: Any) -> Any:
+    """Return how far (m) a road user may move within a time (s), of any shape, without being teleported: its track is cut there.
+
+    At 150 m/s, but no less than 8 m: SUMO changes lanes within a step, however short.
+    """
+    return np.maximum(_MAX_SPEED * elapsed, _LANE_CHANGE)
 
 
 @dataclass(frozen=True, eq=False)

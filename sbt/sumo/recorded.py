@@ -16,6 +16,7 @@ import numpy as np
 
 from sbt.errors import InputError, RunError, did_you_mean
 from sbt.metrics.fcd import Recording
+from sbt.metrics.geometry import farthest
 from sbt.metrics.tracks import read_recording
 from sbt.plugins import kept, noted
 from sbt.problem.arrays import Vector
@@ -32,8 +33,8 @@ _KEEP_ROUTE = 2
 """keepRoute of moveToXY that keeps the pose exactly, on or off the lanes."""
 _GAP = 1.5
 """A track is interrupted where two of its instants are further apart than so many of its usual steps."""
-_TELEPORT = 150.0
-"""A road user whose position changes faster was teleported (m/s); its track is interrupted there."""
+_FASTEST = 150.0
+"""Largest speed of a recorded vehicle in SUMO (m/s)."""
 _SLACK = 1e-6
 _UNRECORDED = 1.0
 """A run may begin so long before a recording, and end so long after it (s)."""
@@ -94,7 +95,7 @@ def _tracks(recording: Recording, k: int) -> list[Track]:
     x, y = recording.x[rows] + half * np.cos(heading), recording.y[rows] + half * np.sin(heading)
     elapsed = np.diff(time)
     usual = float(np.median(elapsed)) if len(elapsed) else 0.0
-    cut = (elapsed > _GAP * usual) | (np.hypot(np.diff(x), np.diff(y)) > _TELEPORT * elapsed)
+    cut = (elapsed > _GAP * usual) | (np.hypot(np.diff(x), np.diff(y)) > farthest(elapsed))
     parts = np.split(np.arange(len(time)), np.flatnonzero(cut) + 1)
     return [
         Track(f"{recording.names[k]}#{i}" if i else recording.names[k], kind, length, float(recording.width[k]),
@@ -183,7 +184,7 @@ class _Replay:
         sumo.route.add(_TYPE, [self._edge])
         sumo.vehicletype.copy("DEFAULT_VEHTYPE", _TYPE)
         sumo.vehicletype.setVehicleClass(_TYPE, "ignoring")
-        sumo.vehicletype.setMaxSpeed(_TYPE, _TELEPORT)
+        sumo.vehicletype.setMaxSpeed(_TYPE, _FASTEST)
 
     def before_step(self, t: float | None) -> None:
         """Move everybody to where they were at the end of the step."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import RunError
-from sbt.metrics.geometry import contact_part, rectangle_distance
+from sbt.metrics.geometry import contact_part, farthest, rectangle_distance
 from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
@@ -37,8 +37,6 @@ _VERY_LONG = 20.0
 """Length from which on a vehicle may be near although its front is not within the radius (m)."""
 _LONGEST = 30.0
 """Length up to which others on another level are compared with the ego (m)."""
-_JUMP = 150.0
-"""A road user whose position changes faster was moved to another place (m/s)."""
 
 _Row = tuple[float, ...]
 
@@ -79,6 +77,7 @@ class Surroundings:
         self.rigid: set[str] = set()
         self.placed: Mapping[str, Placed] = {}
         self.jumped: set[str] = set()
+        self._farthest = float(farthest(dt))
         self._teleported: dict[str, str] = {}
         self._ending: Sequence[str] = ()
         self._unreacting: set[str] = set()
@@ -227,7 +226,7 @@ class Surroundings:
         state.acceleration = 0.0 if last is None else (speed - last[3]) / self._dt
         state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed
         moved = 0.0 if last is None else math.hypot(state.x - last[0], state.y - last[1])
-        if moved > _JUMP * self._dt or (last is not None and name in self._ending):
+        if moved > self._farthest or (last is not None and name in self._ending):
             self._note_jump(name, moved)
             return
         row[name] = (state.x, state.y, state.heading, speed, state.acceleration)
