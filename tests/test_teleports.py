@@ -64,7 +64,7 @@ def test_who_is_teleported_past_the_ego_has_not_touched_it(jammed: sbt.Scenario)
 
 def test_a_conclusion_tells_of_teleports(jammed: sbt.Scenario, tmp_path: Path):
     result = sbt.run(campaign="coverage", scenario=jammed, budget=2, store=tmp_path / "s", executor="serial", report=False)
-    assert any("In 2 of 2 runs SUMO teleported a road user near the ego" in said for said in result.sentences())
+    assert any("In 2 of 2 runs a road user near the ego was teleported" in said for said in result.sentences())
 
 
 LANES = """<routes><route id="r" edges="cd"/><vehicle id="ego" route="r" depart="0" departSpeed="10" departLane="0"/>

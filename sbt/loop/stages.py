@@ -128,8 +128,8 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
         said = [*said, f"{which}: what its controller commands is done, however much (column unconfirmed)."]
     moved = int(facts.history.doubtful(Doubt.TELEPORTED).sum())
     if said and moved:
-        which = f"In {moved:,} of {len(facts.history):,} runs SUMO teleported a road user near the ego"
-        said = [*said, f"{which}: metrics see it leave and come, not move (column unconfirmed; option time-to-teleport)."]
+        which = f"In {moved:,} of {len(facts.history):,} runs a road user near the ego was teleported"
+        said = [*said, f"{which}: metrics see it leave and come, not move (column unconfirmed; SUMO's time-to-teleport)."]
     bare = [part.metric for part in facts.requirement.parts if not facts.units.get(part.metric)]
     return said and [*said, *(f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings)]
 
