@@ -73,6 +73,8 @@ _BLIND = (0.0, 0.75, 0.1, 0.15)
 _NOMINAL = (0.0, 1.0, 0.0, 0.0)
 """Shares where a gate lacks nothing but a bound on what no run has met: draws from the inputs' distribution, which do not count,
 as few of them would tell of the boundary."""
+_AT_ONCE = 4
+"""Batches that such draws are made in at once: where they lie does not depend on what was learned."""
 _TRANSFERRED = (0.48, 0.35, 0.05, 0.12)
 """Shares of a campaign that knows another setup's: it is short, and its draws from the inputs' distribution alone meet what the
 other one did not have."""
@@ -273,7 +275,8 @@ class SequentialStage:
             proposal = self._proposal(fallback, known, shares, rng)
         counts, unseen = count_begins(log, s, size, 1.0 - _SEARCH_SHARE[True]), only_unseen(log, s)
         if unseen:
-            counts, shares = False, _NOMINAL
+            left = s.budget - len(log.planned)
+            counts, shares, size = False, _NOMINAL, min(_AT_ONCE * size, left - min(s.batch, left) + size)
         elif counts and not one_sided:
             shares = spared(proposal.pilot, shares, draws_that_count(log, s, size, 1.0 - _SEARCH_SHARE[True]), s.stop.get("cov"))
         pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng, min(len(known.y), MOST_LEARNED), size)
