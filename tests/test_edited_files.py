@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from test_doors import files_of
 
 import sbt
 from sbt.errors import InputError
+from sbt.execution.code_print import code_print
 
 FUNCTION = """import sbt
 SCENARIO = sbt.Scenario('s', [sbt.Parameter('a', 0, 1, 'm')], sbt.Requirement('gap', high=0.0),
@@ -68,3 +72,49 @@ def test_a_change_that_only_some_runs_show_is_refused_every_time(tmp_path):
     file.write_text(FUNCTION.format("values['a'] * 1.0"))
     os.utime(file, (later, later))
     assert len(sbt.run(budget=14, **study).history) == 14
+
+
+def _scenario(function):
+    inputs = [sbt.Parameter(name, 0, 1) for name in "ab"]
+    return sbt.Scenario("cell", inputs, sbt.Requirement("y", high=0.2), evaluate=function)
+
+
+CELL = """
+def helper(x):
+    return {0}
+def evaluate(values, seed):
+    return {{"y": helper(values["a"]) + values["b"] in {{1.0, 2.0}} or helper(values["a"])}}
+"""
+
+
+def _cell(text: str):
+    """Return the function that a cell of a notebook defines."""
+    names: dict = {"__name__": "__main__"}
+    exec(compile(CELL.format(text), "<cell>", "exec"), names)
+    return names["evaluate"]
+
+
+def test_a_changed_function_of_a_notebook_is_tried_at_more_runs(tmp_path):
+    """The first and the last run do not depend on what it calls; a cell that is run again as it was changes nothing."""
+    keys = {"campaign": "coverage", "seed": 3, "store": tmp_path / "s", "executor": "serial", "report": False}
+    first = sbt.run(**keys, scenario=_scenario(_cell("x")), budget=40)
+    a = first.frame["x.a"]
+    assert not a.iloc[[0, -1]].between(0.3, 0.6).any()
+    assert len(sbt.run(**keys, scenario=_scenario(_cell("x")), budget=44).history) == 44
+    with pytest.raises(InputError, match=r"must give the runs of .* again to go on"):
+        sbt.run(**keys, scenario=_scenario(_cell("x if not 0.3 < x < 0.6 else -1.0")), budget=50)
+    assert len(sbt.open(tmp_path / "s", scenario=_scenario(_cell("x"))).history) == 44
+
+
+def test_a_print_of_code_is_that_of_any_process():
+    text = "import sbt, sys; sys.path.insert(0, 'tests'); from test_edited_files import _cell, _scenario; "
+    text += "from sbt.execution.code_print import code_print; print(code_print(_scenario(_cell('x'))))"
+    prints = {
+        subprocess.run(
+            [sys.executable, "-c", text], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True, check=True,
+            cwd=Path(__file__).parents[1],
+        ).stdout
+        for seed in "12"
+    }  # fmt: skip
+    assert prints == {f"{code_print(_scenario(_cell('x')))}\n"}
+    assert code_print(_scenario(_cell("x"))) != code_print(_scenario(_cell("x + 0.0")))

@@ -11,6 +11,7 @@ import numpy as np
 
 from sbt.config.load import differences, dump
 from sbt.errors import InputError
+from sbt.execution.code_print import code_print
 from sbt.execution.protocol import Executor
 from sbt.execution.warming import warm_up
 from sbt.execution.worker import run_traced, versions
@@ -37,8 +38,10 @@ from sbt.workflows.study import RESOLVED, Study, changed_since
 __all__ = ["Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
 
 _TRIED = 20
-"""Runs that are tried again before a campaign goes on whose files were changed since, evenly spread over those that are there."""
-_MAY_CHANGE = {COARSE_COST, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
+"""Runs that are tried again, spread over those that are there, before a campaign goes on whose files or code were changed."""
+CODE = "code"
+"""Key under which a store remembers a print of the code of the user's own that its runs depend on."""
+_MAY_CHANGE = {CODE, COARSE_COST, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
 
@@ -110,12 +113,13 @@ def run_study(
         _check_earlier(study)
     with Store.open(Path(study.config.store)) as store:
         study = study.stored_in(store)
-        campaign, snapshot = study.campaign, study.snapshot(shard)
+        campaign, snapshot = study.campaign, study.snapshot(shard) | _code_of(study)
         if shard is not None:
             check_shard(campaign)
         store.begin(snapshot)
         _check_same(store, snapshot)
-        changed = (store.folder / RESOLVED).is_file() and bool(changed_since(store.folder))
+        before = store.configuration.get(CODE, snapshot.get(CODE))
+        changed = (store.folder / RESOLVED).is_file() and (bool(changed_since(store.folder)) or before != snapshot.get(CODE))
         if not changed:  # else what is written is newer, so that the runs are tried before
             keep_configuration(store, study, snapshot)
         common: Json = {
@@ -150,11 +154,16 @@ def _tell(store: Store, study: Study, listener: Callable[[Progress], None], acti
     listener(Progress(*counts, activity))
 
 
+def _code_of(study: Study) -> Json:
+    """Return what a store remembers of the code of the user's own; nothing where there is none."""
+    return {CODE: code_print(study.scenario)} if _own_code(study) else {}
+
+
 def _check_code(store: Store, study: Study, executor: Executor, *, changed: bool) -> None:
     """Refuse to go on with a store whose runs the user's code and files would not give again.
 
-    The first and the last with metrics are tried, where files were changed since as many as `_TRIED` of all, and the first that
-    could not be run: code may change just what is invalid.
+    The first and the last with metrics are tried, where files or code were changed since as many as `_TRIED` of all, and the
+    first that could not be run: code may change just what is invalid.
     """
     history = store.history()
     if not _own_code(study):
