@@ -253,3 +253,21 @@ def test_the_conflict_type_is_side_and_course_wherever_north_is(side, course, of
     assert conflict_type()(trace) == conflict_type()(standing) - 16 == 4 * side + course
     assert conflict_type("nobody")(trace) == 4 * side + course
     assert conflict_type()(replace(trace, x=np.where([True, False, False], xs, np.nan))) == -1
+
+
+@pytest.mark.parametrize(("outer", "touch"), [(11.5, False), (9.5, True)])
+@pytest.mark.parametrize("phase", np.linspace(0.0, 1.0, 7))
+def test_who_turns_on_an_arc_within_a_step_touches_only_who_is_there(outer, touch, phase):
+    """Two cars on concentric arcs, one step of a second: on chords with the last heading they would be turned into each other."""
+    angle = -1.1 * np.arange(3) - phase
+
+    def car(radius, lead):
+        at = angle + lead
+        still = np.zeros(3)
+        return ActorTrace(-radius * np.sin(at), radius * np.cos(at), at, still + 1.1 * radius, still, 5.0, 1.8)
+
+    leads = np.linspace(-0.5, 0.5, 9)
+    met = [contact_index(car(8.0, 0.0), car(outer, lead)) is not None for lead in leads]
+    assert any(met) == touch
+    if touch:
+        assert met[4]

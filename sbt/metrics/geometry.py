@@ -37,6 +37,9 @@ __all__ = [
 
 
 _MAX_SPEED, _LANE_CHANGE = 150.0, 8.0
+_DRIVES, _TURNED, _ARCS = 0.5, 0.05, 16
+"""A step of who drives (m/s) in which a corner moves by more than this (m) because its rectangle turns is one along an arc, of so
+many parts."""
 
 
 def farthest(elapsed: Any) -> Any:
@@ -200,8 +203,45 @@ def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
         return None
     first = max(int(near[0]) - 1, 0)
     i = slice(first, int(near[-1]) + 1)
-    hits = np.flatnonzero(np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i))))
-    return first + int(hits[0]) if hits.size else None
+    hits = first + np.flatnonzero(np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i))))
+    return next((k for k in hits.tolist() if not (_turns(a, k) or _turns(b, k)) or _touch_on_arcs(a, b, k)), None)
+
+
+def _turns(actor: ActorTrace, k: int) -> bool:
+    """Return whether a rectangle that drives turns so much in the step before an instant that a corner moves noticeably."""
+    if k == 0 or not max(abs(actor.speed[k]), abs(actor.speed[k - 1])) > _DRIVES:  # nor where it was not there before
+        return False
+    turn = abs(math.remainder(float(actor.heading[k] - actor.heading[k - 1]), math.tau))
+    return turn * 0.5 * math.hypot(actor.length, actor.width) > _TURNED
+
+
+def _touch_on_arcs(a: ActorTrace, b: ActorTrace, k: int) -> bool:
+    """Return whether rectangles touch in the step before an instant if they turn evenly, on arcs, from one state to the next.
+
+    On the chord with the heading at its end a car that turns within a step of a second touches what it drives around.
+    """
+    (x, y, one), (u, v, other) = (_on_arc(each, k) for each in (a, b))
+    return bool(np.isfinite(contact_share(one, other, u - x, v - y)).any())
+
+
+def _on_arc(actor: ActorTrace, k: int) -> tuple[Vector, Vector, Rectangles]:
+    """Return a rectangle at the ends of the parts of a step, and where its centre was at their begins.
+
+    The centre drives a cubic from one instant to the next, along the headings at both.
+    """
+    s = np.linspace(0.0, 1.0, _ARCS + 1)
+    before = k - 1 if k and not np.isnan(actor.x[k - 1]) else k
+    old, turn = float(actor.heading[before]), math.remainder(float(actor.heading[k] - actor.heading[before]), math.tau)
+    dx, dy = actor.x[k] - actor.x[before], actor.y[k] - actor.y[before]
+    half = 0.5 * turn
+    length = math.hypot(dx, dy) * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
+    length = math.copysign(length, dx * math.cos(old + half) + dy * math.sin(old + half))  # it may drive backwards
+    out, into = s * (1.0 - s) ** 2 * length, -s * s * (1.0 - s) * length
+    come = s * s * (3.0 - 2.0 * s)
+    x = actor.x[before] + come * dx + out * math.cos(old) + into * math.cos(old + turn)
+    y = actor.y[before] + come * dy + out * math.sin(old) + into * math.sin(old + turn)
+    size = np.full(_ARCS, actor.length), np.full(_ARCS, actor.width)
+    return x[:-1], y[:-1], Rectangles(x[1:], y[1:], old + s[1:] * turn, *size)
 
 
 def select_instants(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:
