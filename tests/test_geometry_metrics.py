@@ -12,7 +12,19 @@ from hypothesis import strategies as st
 
 from sbt.metrics.conflict_types import conflict_type
 from sbt.metrics.geometry import contact_index, corners, rectangle_distance, swept_contact
-from sbt.metrics.longitudinal import BESIDE, HORIZON, OVERTAKEN, collision, d_min, drac_max, impact_speed, thw_min, ttc_min
+from sbt.metrics.longitudinal import (
+    BESIDE,
+    FAR,
+    HORIZON,
+    OVERTAKEN,
+    collision,
+    d_min,
+    drac_max,
+    encounter,
+    impact_speed,
+    thw_min,
+    ttc_min,
+)
 from sbt.problem.trace import ActorTrace, Trace
 
 shapely = pytest.importorskip("shapely", reason="geometry is compared with shapely, which is not installed")
@@ -271,3 +283,36 @@ def test_who_turns_on_an_arc_within_a_step_touches_only_who_is_there(outer, touc
     assert any(met) == touch
     if touch:
         assert met[4]
+
+
+@given(pose, pose, size, size)
+@settings(max_examples=100)
+def test_gap_and_path_are_those_of_the_corners_whatever_the_headings(one, other, length, width):
+    """Who stands across the lane begins where its side is, not half of its length before its middle."""
+    a, b = box([one, one]), box([other, other], length, width)
+    trace = Trace(
+        np.arange(2.0), ("ego", "co"), *(np.stack([getattr(c, n) for c in (a, b)], axis=1) for n in ("x", "y", "heading")),
+        np.zeros((2, 2)), np.zeros((2, 2)), np.array([LENGTH, length]), np.array([WIDTH, width]),
+    )  # fmt: skip
+    away = corners(b)[0] - [one[0], one[1]]
+    along = away @ [math.cos(one[2]), math.sin(one[2])]
+    left = away @ [-math.sin(one[2]), math.cos(one[2])]
+    found = encounter(trace)
+    assert found.gap[0] == pytest.approx(along.min() - 0.5 * LENGTH, abs=1e-9)
+    clear = max(left.min() - 0.5 * WIDTH, -0.5 * WIDTH - left.max())
+    assume(abs(clear) > 1e-9)
+    assert bool((found.ahead | found.beside)[0]) <= (clear < 0)
+    if found.contact is None and along.min() > 0.5 * LENGTH:
+        assert bool(found.ahead[0]) == (clear < 0)
+
+
+def test_a_part_in_the_path_behind_the_ego_is_not_beside_it():
+    """Of a long vehicle in a turn, whose front is level with the ego but not in its path, and whose tail is in it, far behind."""
+    still = np.zeros(2)
+    front, tail = (ActorTrace(still + x, still + y, still, still, still, 6.0, 2.5) for x, y in ((0.0, 8.0), (-20.0, 0.0)))
+    x, y, none = np.array([[0.0, -5.0]] * 2), np.array([[0.0, 4.0]] * 2), np.zeros((2, 2))
+    size = np.array([4.5, 12.0]), np.array([1.8, 2.5])
+    trace = Trace(np.arange(2.0), ("ego", "co"), x, y, none, none, none, *size, parts={"co": (front, tail)})
+    assert not encounter(trace).beside.any()
+    assert ttc_min()(trace) == HORIZON
+    assert d_min()(trace) == FAR

@@ -55,6 +55,15 @@ def test_another_version_needs_few_runs_and_none_of_the_old_ones(old, tmp_path):
     assert warm.conclusion.undetected_mass_bound <= 0.19  # 15 draws from the inputs' distribution before it may end
 
 
+def test_a_critical_interval_with_two_ends_may_be_transferred(old, tmp_path):
+    """Before the first run there is no value that could stand for none."""
+    which = scenario("after", LATER)
+    need = sbt.Requirement("y", low=-50.0, high=0.0)
+    which = sbt.Scenario("after", inputs=which.space.parameters, evaluate=which.evaluate, requirement=need)
+    found = run(tmp_path / "two", which, warm_start={"store": str(old), "transfer": True}, budget=30)
+    assert found.history.ok.all()
+
+
 def test_a_gate_searches_for_what_the_earlier_setup_did_not_have(old, tmp_path):
     warm = {"store": str(old), "transfer": True}
     asked = run(tmp_path / "gate", scenario("after", LATER), warm_start=warm, budget=30, gate={"probability": 0.01})

@@ -277,7 +277,7 @@ class SequentialStage:
         if unseen:
             left = s.budget - len(log.planned)
             counts, shares, size = False, _NOMINAL, min(_AT_ONCE * size, left - min(s.batch, left) + size)
-        elif counts and not one_sided:
+        elif counts and not one_sided and s.transfer is None:
             shares = spared(proposal.pilot, shares, draws_that_count(log, s, size, 1.0 - _SEARCH_SHARE[True]), s.stop.get("cov"))
         pool = draw_pool(s.scenario.space, self._frame, proposal, shares, rng, min(len(known.y), MOST_LEARNED), size)
         aimless = unseen or not len(known.y) or self._common(log_probability, log.iteration)

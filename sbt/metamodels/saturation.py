@@ -178,7 +178,7 @@ def on_side(u: Points, y: Vector, critical: CriticalInterval) -> Vector:
     >>> on_side(u, np.array([0.0, 0.6, 1.2, 1.8, 2.0, 2.5, -1.0, -1.0]), CriticalInterval(0.0, 1.5)).tolist()
     [0.0, 0.6, 1.2, 1.8, 2.0, 2.5, 2.75, 2.75]
     """
-    if critical.one_sided:
+    if critical.one_sided or len(y) == 0:
         return y
     for last, there, to in ((y.min(), y > critical.high, np.inf), (y.max(), y < critical.low, -np.inf)):
         away = (y == last) & ~critical.contains(y)

@@ -83,15 +83,16 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
     a, b = trace.actor(ego), trace.actor(other)
     seen = [_sighting(rectangles(a)[0], part, a.length, margin) for part in rectangles(b)]
     gap, turn, in_path, behind = seen[0] if len(seen) == 1 else _nearest_in_path(seen)
+    passed = np.logical_and.reduce([part[3] for part in seen])
     contact = first_contact(trace, ego, other)
     if contact is not None:  # nothing counts after the first contact
         in_path[contact + 1 :] = False
-        behind[contact + 1 :] = behind[contact]
+        behind[contact + 1 :], passed[contact + 1 :] = behind[contact], passed[contact]
     ahead = in_path & (gap >= 0)
     rear_end = contact is not None and (bool(ahead[contact]) or (contact > 0 and bool(ahead[contact - 1])))
     return Encounter(
         gap, a.speed - b.speed * turn, in_path, ahead, in_path & (gap < 0) & ~behind, a.speed,
-        contact, rear_end, bool(behind[-1]),
+        contact, rear_end, bool(passed[-1]),
     )  # fmt: skip
 
 
@@ -103,10 +104,12 @@ def _sighting(a: ActorTrace, b: ActorTrace, length: float, margin: float) -> _Si
     """Return the relation of a rectangle b to the ego's front rectangle a, the ego being of this length (m)."""
     cos, sin = np.cos(a.heading), np.sin(a.heading)
     dx, dy = b.x - a.x, b.y - a.y
-    turn = np.cos(b.heading - a.heading)
-    gap = dx * cos + dy * sin - 0.5 * (a.length + b.length)
+    turn, aside = np.cos(b.heading - a.heading), np.abs(np.sin(b.heading - a.heading))
+    reach = b.length * np.abs(turn) + b.width * aside  # along the ego's heading: who stands across is as long as it is wide
+    broad = b.length * aside + b.width * np.abs(turn)
+    gap = dx * cos + dy * sin - 0.5 * (a.length + reach)
     offset = np.abs(-dx * sin + dy * cos)
-    return gap, turn, offset < 0.5 * (a.width + b.width) + margin, gap <= -(length + b.length)
+    return gap, turn, offset < 0.5 * (a.width + broad) + margin, gap <= -(length + reach)
 
 
 def _nearest_in_path(seen: list[_Sighting]) -> _Sighting:
@@ -116,7 +119,9 @@ def _nearest_in_path(seen: list[_Sighting]) -> _Sighting:
     rank = np.where(behind, 1e6 + last, gap) + np.where(in_path, 0.0, 1e9)
     nearest = rank.argmin(axis=0)[None]
     first_gap, first_turn = (np.take_along_axis(values, nearest, 0)[0] for values in (gap, turn))
-    return first_gap, first_turn, np.logical_or.reduce(in_path), np.logical_and.reduce(behind)
+    shared = np.logical_or.reduce(in_path)
+    last_behind = np.take_along_axis(behind, nearest, 0)[0]  # of the part in the path, where there is one
+    return first_gap, first_turn, shared, np.where(shared, last_behind, np.logical_and.reduce(behind))
 
 
 def time_to_collision(e: Encounter) -> Vector:
