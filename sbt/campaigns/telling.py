@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sbt.campaigns.combinations import none_left
+from sbt.campaigns.counting import NOMINAL
 from sbt.campaigns.lost import (
     decides_bound,
     decides_share,
@@ -290,11 +291,11 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         if found.counted and not found.hits and found.combinations is None:
             guess = f"no draw that counts was critical, and {number(found.probability, 3)} is the metamodel's own guess"
             said = f"The probability of {subject} is at most {number(found.high, 3)} ({confidence} interval from 0): {guess}"
-        silent = _not_told(found, every)
+        silent = _not_told(found, facts, every)
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
 
 
-def _not_told(found: EstimationConclusion, every: bool) -> str:
+def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
     """Return what an estimate does not tell; `every` combination of the inputs was run."""
     confidence, p = percent(found.confidence), found.probability or 0.0
     missed = min(found.undetected_mass_bound, 1.0 - p)
@@ -303,6 +304,8 @@ def _not_told(found: EstimationConclusion, every: bool) -> str:
         f" {confidence} confidence they hold at most {number(missed, 3)} more, which bounds the unseen and is no second"
         " estimate"
     )
+    if found.counted and found.counted == int((facts.history.stage == NOMINAL).sum()):
+        silent = "This trusts no search: the interval is that of random draws, and covers what none of them has met"
     if missed <= 0.0:
         silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"
     if every:
