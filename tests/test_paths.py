@@ -172,16 +172,42 @@ def test_the_tail_of_what_turns_touches_only_what_it_hits(gap):
         assert (times > 1.4).all(), "what comes after the recording goes straight on"
 
 
+def changing(*lines: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Trace:
+    """Cars of 4 x 2 m that head east, at x and y, and their speeds: a change of lanes is one step."""
+    x, y, speed = (np.stack([line[k] for line in lines], axis=1) for k in range(3))
+    names = ("ego", *(f"co_{k}" for k in range(len(lines) - 1)))
+    none = np.zeros_like(x)
+    return Trace(T, names, x, y, none, speed, none, np.full(len(lines), 4.0), np.full(len(lines), 2.0))
+
+
 @pytest.mark.parametrize("gap", [0.4, 0.7, 3.0])
 @pytest.mark.parametrize("step", [20, 33])
 def test_who_changes_lanes_within_a_step_cuts_no_corner(gap, step):
     """Ego is clear ahead of the lead, and faster, when SUMO moves it sideways: at no instant its path leads through the lead."""
-    x = 13.0 * T
+    x, still = 13.0 * T, np.zeros_like(T)
     ego = np.where(T[step] > T, 3.2, 0.0)
     lead = 10.0 * T + x[step] - 4.0 - gap - 10.0 * T[step]  # at that instant `gap` is between the bumpers
+    clear = changing((x, ego, still + 13.0), (lead, still, still + 10.0))
+    assert ttc_on_paths(clear, "ego", "co_0").min() == 5.0
+    nearer = changing((x, ego, still + 13.0), (lead + gap + 0.5, still, still + 10.0))  # too early: it hits it sideways
+    assert ttc_on_paths(nearer, "ego", "co_0")[step] == 0.0
+
+
+@pytest.mark.parametrize("step", [1, 2, 9])
+def test_who_swerves_within_a_step_would_have_hit_what_was_ahead(step):
     still = np.zeros_like(T)
-    states = (np.stack([a, b], axis=1) for a, b in ((x, lead), (ego, still), (still, still), (still + 13.0, still + 10.0)))
-    trace = Trace(T, ("ego", "co"), *states, np.zeros((len(T), 2)), np.full(2, 4.0), np.full(2, 2.0))
-    assert ttc_on_paths(trace).min() == 5.0
-    nearer = replace(trace, x=trace.x - [[0.0, -gap - 0.5]])  # half a metre too early: it hits the lead sideways
-    assert 0.0 < ttc_on_paths(nearer)[step - 5] < 1.0
+    ego = (20.0 * T, np.where(T[step] > T, 0.0, 3.2), still + 20.0)
+    found = ttc_on_paths(changing(ego, (still + 34.0, still, still)), "ego", "co_0")
+    assert found[:step] == pytest.approx(1.5 - T[:step])
+    assert (found[step:] == 5.0).all()
+
+
+def test_who_waits_until_somebody_has_passed_is_in_no_conflict_with_it():
+    """Ego brakes behind what stands, and changes lanes when the other is gone: at its first speed it would have met it."""
+    x, speed = np.where(T > 4.0, 20.0, 10.0 * T - 1.25 * T**2), np.maximum(10.0 - 2.5 * T, 0.0)
+    waits = (x, np.where(T > 5.0, 3.2, 0.0), speed)
+    passes = (12.0 * T - 20.0, np.full_like(T, 3.2), np.full_like(T, 12.0))
+    stands = (np.full_like(T, 24.5), np.zeros_like(T), np.zeros_like(T))
+    trace = changing(waits, passes, stands)
+    assert ttc_on_paths(trace, "ego", "co_0").min() == 5.0
+    assert 0.5 < ttc_on_paths(trace, "ego", "co_1").min() < 3.0  # what stands is ahead of it, in its lane

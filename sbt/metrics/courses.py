@@ -19,10 +19,6 @@ __all__ = ["Course", "near_steps"]
 
 _SLACK = 1e-6
 """By how much farther apart than necessary those must be who are passed over (m)."""
-_SLIP, _MOVED, _TURN, _UNEVEN = 0.5, 0.5, 0.1, 0.05
-"""A vehicle is moved sideways, as by SUMO when it changes lanes, where that is more than this share of what it drives forward,
-and so many metres, in a step in which it turns by less than this (rad): no tyre slips by 27 degrees.
-Steps that differ by less than the last (m) hide none."""
 _STRIDE = 5
 """Steps that are passed over at once."""
 
@@ -49,28 +45,10 @@ class Course:
         return np.unwrap(self._joined(2, self.actor.heading))
 
     @cached_property
-    def arc(self) -> Vector:
-        """Length of the path (m)."""
+    def way(self) -> Vector:
+        """Distance along the path (m)."""
         x, y = self.x, self.y
         return np.concatenate([[0.0], np.cumsum(np.hypot(x[1:] - x[:-1], y[1:] - y[:-1]))])
-
-    @cached_property
-    def way(self) -> Vector:
-        """Distance driven along the path (m): where it is moved sideways within a step of SUMO, the forward part alone."""
-        steps = np.diff(self.arc)
-        if len(steps) < 2 or np.abs(np.diff(steps)).max() < _UNEVEN:  # a step sideways is longer than its neighbours
-            return self.arc
-        dx, dy, turn = np.diff(self.x), np.diff(self.y), np.diff(self.heading)
-        cos, sin = np.cos(self.heading[1:] - 0.5 * turn), np.sin(self.heading[1:] - 0.5 * turn)
-        forward, sideways = np.abs(dx * cos + dy * sin), np.abs(dy * cos - dx * sin)
-        slips = (sideways > _SLIP * forward) & (sideways > _MOVED) & (np.abs(turn) < _TURN)
-        slips[len(self.actor.x) - 1 :] = False  # the way after the record is that of lanes
-        return np.concatenate([[0.0], np.cumsum(np.where(slips, forward, steps))]) if slips.any() else self.arc
-
-    @property
-    def moved(self) -> float:
-        """By how much longer the path is than what is driven along it (m)."""
-        return float(self.arc[-1] - self.way[-1])
 
     @cached_property
     def leaves(self) -> bool:
@@ -128,7 +106,7 @@ def _near_instants(pairs: Sequence[tuple[Course, Course]], horizon: float) -> tu
     found = []
     for k, (one, other) in enumerate(pairs):
         a, b = one.actor, other.actor
-        reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + one.moved + other.moved
+        reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width))
         pace = np.abs(a.speed) + np.abs(b.speed)
         (instants,) = (np.hypot(b.x - a.x, b.y - a.y) <= horizon * pace + reach).nonzero()
         found.append((np.full(len(instants), k), instants, np.full(len(instants), reach), pace[instants]))

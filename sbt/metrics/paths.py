@@ -17,6 +17,7 @@ from sbt.metrics.courses import Course, near_steps
 from sbt.metrics.geometry import Rectangles, contact_share, rectangles
 from sbt.metrics.intervals import joint_intervals
 from sbt.metrics.longitudinal import first_contact
+from sbt.metrics.own_lanes import between_changes
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, Trace
 
@@ -27,10 +28,9 @@ HORIZON = 5.0
 _STEP, _STRIDES = 0.2, 5
 """Step of the prediction (s), in which centres move on straight lines, with the headings at its end; and strides of steps."""
 _TURNED = 0.02
-"""A step in which a corner moves by more than this because its rectangle turns, or its path bends (m), is divided ..."""
+"""A step in which a corner moves by more than this because its rectangle turns (m) is divided ..."""
 _SPLIT, _FINEST = 4, 0.02
-"""... by so much, down to this (s): else the tail of a truck that turns seems to touch what it passes, and who changes lanes
-within a step of SUMO seems to cut through the one beside whom it drives."""
+"""... by so much, down to this (s): else the tail of a truck that turns seems to touch what it passes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str | None = "co") -> Ve
     """
     met = list(_together(trace, ego, other))
     times = np.full(len(trace.time), HORIZON)
-    for instants, found in _predicted_contacts(met):
+    for instants, found in _predicted_contacts(_on_own_lanes(met)):
         np.minimum.at(times, instants, found)
     for one in met:
         if one.contact is not None:
@@ -76,7 +76,7 @@ def smallest_ttc_on_paths(trace: Trace, ego: str = "ego") -> float:
     met = list(_together(trace, ego, None))
     if any(one.contact is not None for one in met if one.trace is not trace):
         return 0.0
-    return min((float(found.min()) for _, found in _predicted_contacts(met, only_smallest=True)), default=HORIZON)
+    return min((float(found.min()) for _, found in _predicted_contacts(_on_own_lanes(met), only_smallest=True)), default=HORIZON)
 
 
 def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
@@ -91,6 +91,15 @@ def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
         else:
             for instants, part in joint_intervals(trace, ego, name):
                 yield _Together(instants.start, part, "ego", "co")
+
+
+def _on_own_lanes(met: Sequence[_Together]) -> list[_Together]:
+    """Return those who are there together, in stretches without a change of lanes within a step; see `sbt.metrics.own_lanes`."""
+    found = []
+    for one in met:
+        stretches = [_Together(one.first + at, part, "ego", "co") for at, part in between_changes(one.trace, one.ego, one.other)]
+        found += stretches or [one]
+    return found
 
 
 def _predicted_contacts(met: Sequence[_Together], *, only_smallest: bool = False) -> Iterator[tuple[np.ndarray, Vector]]:
@@ -149,15 +158,12 @@ def _contact_times(pairs: Sequence[tuple[Course, Course]], rows: np.ndarray, sta
 
 
 _Motion = tuple[tuple[Vector, Vector], Rectangles, Vector]
-"""x and y before a step, the rectangles after it, and how far corners move because they turn, or paths bend (m), (n,) each.
-
-Whoever drives a path of length s between two points that are c apart is nowhere farther from that line than sqrt(s^2 - c^2).
-"""
+"""x and y before a step, the rectangles after it, and how far their corners move because they turn (m), (n,) each."""
 
 
 def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -> _Motion:
     """Return how n rectangles move between two times (s), `after` (n, 2), after n instants; NaN once one has left the road."""
-    parts, sizes, paces = [], [], []
+    parts, sizes = [], []
     ends = [k + 1 for k in range(len(courses) - 1) if courses[k] is not courses[k + 1]]
     for begin, end in pairwise([0, *ends, len(courses)]):
         course = courses[begin]
@@ -169,17 +175,13 @@ def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -
             beyond = np.where(beyond > 0.0, np.nan, 0.0) if course.leaves else np.maximum(beyond, 0.0)
             x, y = x + beyond * np.cos(heading[-1]), y + beyond * np.sin(heading[-1])
         parts.append((x, y, np.interp(travelled, way, heading)))
-        if course.moved > 0.0:
-            travelled = np.interp(travelled, way, course.arc) + np.maximum(travelled - way[-1], 0.0)
-        paces.append(travelled[:, 1] - travelled[:, 0])
         sizes.append(np.broadcast_to([course.actor.length, course.actor.width], (end - begin, 2)))
     x, y, headings = (np.concatenate(column) for column in zip(*parts, strict=True))
     size = np.concatenate(sizes)
     turned = np.abs(headings[:, 1] - headings[:, 0]) * (0.5 * np.hypot(size[:, 0], size[:, 1]))
-    straight = (x[:, 1] - x[:, 0]) ** 2 + (y[:, 1] - y[:, 0]) ** 2
-    turned = np.fmax(turned, np.sqrt(np.maximum(np.concatenate(paces) ** 2 - straight, 0.0)))
     now = Rectangles(x[:, 1], y[:, 1], headings[:, 1], size[:, 0], size[:, 1])
     return (x[:, 0], y[:, 0]), now, turned
+
 
 
 def path_of(actor: ActorTrace) -> tuple[Vector, Vector, Vector]:
