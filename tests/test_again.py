@@ -61,8 +61,7 @@ def test_few_known_critical_runs_leave_the_bound_of_random_draws(estimated):
     y = np.sort(history.y(history.metrics[0])[history.ok])
     found = estimated.estimate(critical=(-np.inf, 0.5 * (y[5] + y[6])))
     assert any("critical runs are known at" in said for said in found.warnings)
-    assert found.high > 0.02
-    assert found.high < 0.1
+    assert 0.02 < found.high < 0.2
 
 
 def test_another_threshold(estimated):
