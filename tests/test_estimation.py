@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from scipy.stats import norm
 from studies import run_loaded, settings_of
 from typer.testing import CliRunner
 
@@ -259,6 +260,23 @@ def test_a_gate_goes_on_while_its_pass_would_trust_the_search(tmp_path):
     assert gated.conclusion.gate.statement.startswith("if the search has met whatever is critical")
     assert gated.conclusion.undetected_mass_bound < 0.6 * without.conclusion.undetected_mass_bound
     assert (gated.frame["x.x1"][: len(without.history)] == without.frame["x.x1"]).all()
+
+
+def test_a_failure_that_was_denied_after_the_last_count_is_in_the_interval(tmp_path):
+    """A box of 1 % in which the metric jumps: the estimate knows nothing of it when random draws for the gate meet it."""
+
+    def evaluate(values, seed):
+        smooth = min(3.6 - values["a"] - 0.3 * values["b"], 5.0)
+        return {"ttc": 0.0 if max(abs(values["x"] - 0.7), abs(values["y"] - 0.35)) < 0.05 else smooth}
+
+    inputs = [sbt.Parameter(each, -5.0, 5.0, "", sbt.Normal(0, 1)) for each in "ab"]
+    inputs += [sbt.Parameter(each, 0.0, 1.0) for each in "xy"]
+    scenario = sbt.Scenario("box", inputs, sbt.Requirement("ttc", high=0.5), evaluate=evaluate, metrics=["ttc"])
+    keys = {"budget": 230, "seed": 0, "executor": "serial", "gate": {"probability": 0.003}}
+    found = sbt.run(campaign="estimation", scenario=scenario, store=tmp_path / "s", report=False, **keys).conclusion
+    assert any("after the last one that counts was critical" in said for said in found.warnings)
+    assert found.gate.verdict == "undecided"
+    assert found.low <= 0.01 + 0.99 * norm.sf(3.1 / np.sqrt(1.09)) <= found.high
 
 
 @pytest.mark.parametrize(("probability", "code", "verdict"), [(0.9, 0, "pass"), (0.05, 3, "fail"), (0.28, 3, "undecided")])

@@ -258,7 +258,13 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         met = f"{few} counted draw{' was' if few == 1 else 's were'} {what}"
         draws = f"{plural(seen.draws, 'draw')} from the inputs' distribution"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: so small a number, or {draws}, set the interval")
-    if few_low or few_high:
+    late = hits > 0 and misses > 0 and seen.surprised > counted_iterations(log)[-1]
+    if late:
+        limits = limits.reaching(seen.most_critical)
+        said = "a draw after the last one that counts was critical where the metamodel denied it"
+        draws = f"the upper end is at least that of {plural(seen.draws, 'draw')} from the inputs' distribution"
+        warnings.append(f"{said}: {draws}")
+    if (few_low or few_high) and not late:
         limits = limits.within(seen.limits, value, max(_clipped(high.value), value))
     warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
     return _conclusion(
