@@ -292,7 +292,8 @@ def _convergence(log: Log, safe: list[CountedBatch], critical: list[CountedBatch
 def _uncounted(log: Log, settings: Settings) -> Concluded:
     """Return what is known before any draw counts: the bound by the draws there are."""
     seen = Seen.of(log, settings)
-    few = f"no draw counts: {len(log.history)} runs are too few to search, to learn and to count"
+    n = len(log.history)
+    few = f"no draw counts: {plural(n, 'run')} {'is' if n == 1 else 'are'} too few to search, to learn and to count"
     if seen.critical:
         limits = Limits(lambda _: 0.0, lambda _: 1.0)
         return _conclusion(None, limits, warnings=(few,)), limits

@@ -282,7 +282,8 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
             silent = "This does not tell how probable they are: the critical runs were chosen by results, or only taught"
     elif found.probability is None:
         said = f"The probability of {subject} is not known yet: no draw counts"
-        silent = "The critical runs so far were chosen by results, so their share is no estimate"
+        how = "only fill the space" if (facts.history.stage == "initial").all() else "were chosen by results"
+        silent = f"The critical runs so far {how}, so their share is no estimate"
     else:
         ends = f"{confidence} interval {number(found.low, 3)} to {number(found.high, 3)}"
         if every and found.low == found.high:
