@@ -49,7 +49,6 @@ def too_wide(found: EstimationConclusion) -> float:
     if value <= 0.0:
         return few
     error, half = (found.cov or 0.0) / PRECISE, 0.5 * (found.high - found.low) / (PRECISE * value)
-    few = few if half > 2.0 else 0.0  # an interval as narrow as asked has the few critical draws in it
     return max(error, few, half / 2.0 if half > WIDEST else 0.0)
 
 
