@@ -26,7 +26,7 @@ _NO_NOISE = math.log(NOISE_FLOOR)  # of a deterministic metric
 _BOUNDS = (-12.0, 8.0)  # of the logarithm of every hyperparameter: beyond, the covariance cannot be factored
 _LEAST_NOISE = 1e-4  # where there is certainly noise
 _FIRST_LENGTH, _FIRST_NOISE = 0.3, 0.02  # where L-BFGS starts: length scales in sqrt(d), noise variance
-_DOUBTFUL_NOISE = 1e-3  # variance from which on a start without it competes, rougher than what was found:
+_DOUBTFUL_NOISE = 0.02  # variance from which on a start without it competes, rougher than what was found:
 _ROUGH_LENGTH, _ROUGH_NOISE = 0.1, 1e-4
 _HEAVY_LENGTH, _HEAVY_START = 0.6, 0.5  # the same where noise is heavy: from short ones the fit takes noise for structure
 _FIRST_LENGTHS, _FIRST_SCALES = (1.5, 0.4), (1.0, 0.2)  # the same of two kernels, and their variances
@@ -144,22 +144,22 @@ def _log_prior_of_noise(log_noise: float, mode: float | None) -> tuple[float, fl
 
 def fit_posterior(objective: Objective, start: Hyperparameters | None = None) -> Hyperparameters:
     """Return the hyperparameters of largest posterior density, by L-BFGS on their logarithms."""
-    return _fitted(objective, start)[0]
+    if start is not None:
+        return _from(objective, start)[0]
+    return _without_doubtful_noise(objective, *_from(objective, _first(objective)))[0]
 
 
-def _fitted(objective: Objective, start: Hyperparameters | None = None) -> tuple[Hyperparameters, float]:
-    """Return the hyperparameters of largest posterior density, and its logarithm.
+def _without_doubtful_noise(objective: Objective, found: Hyperparameters, density: float) -> tuple[Hyperparameters, float]:
+    """Return the hyperparameters, or those of one kernel found from a rough start without noise, and their density.
 
     What may be noise may as well be a function that bends between few rows, and L-BFGS stays where it starts: where it finds
-    noise that no equal rows show, a rough start without noise competes.
+    noise that no equal rows show, the rough start competes.
     """
-    if start is not None:
-        return _from(objective, start)
-    found, density = _from(objective, _first(objective))
     if objective.noise_mode is not None or objective.certain or found.noise < _DOUBTFUL_NOISE:
         return found, density
-    start = replace(found, lengthscale=np.minimum(found.lengthscale, _ROUGH_LENGTH * math.sqrt(objective.u.shape[1])))
-    other, by_other = _from(objective, replace(start, noise=_ROUGH_NOISE))
+    one = replace(objective, kernels=1)
+    rough = np.minimum(found.lengthscale.min(axis=0, keepdims=True), _ROUGH_LENGTH * math.sqrt(objective.u.shape[1]))
+    other, by_other = _from(one, Hyperparameters(objective.nu, rough, np.ones(1), _ROUGH_NOISE))
     return (other, by_other) if by_other > density + _CLEARLY else (found, density)
 
 
@@ -192,12 +192,13 @@ def fit_kernels(objective: Objective) -> tuple[Objective, Hyperparameters]:
     """
     n = len(objective.z)
     some = replace(objective, u=objective.u[:_COMPARED], z=objective.z[:_COMPARED], spread=objective.spread[:_COMPARED])
-    one, by_one = _fitted(some)
-    two, by_two = _fitted(replace(some, kernels=2))
-    if by_two > by_one + _CLEARLY:
-        chosen = replace(objective, kernels=2)
-        return chosen, two if n <= _COMPARED else fit_posterior(chosen, two)
-    return objective, one if n <= _COMPARED else fit_posterior(objective)
+    one, by_one = _from(some, _first(some))
+    pair = replace(some, kernels=2)
+    two, by_two = _from(pair, _first(pair))
+    better = by_two > by_one + _CLEARLY
+    found, _ = _without_doubtful_noise(some, *((two, by_two) if better else (one, by_one)))
+    chosen = replace(objective, kernels=len(found.lengthscale))
+    return chosen, found if n <= _COMPARED else fit_posterior(chosen, None if found is one else found)
 
 
 def fit_noise(objective: Objective, hyper: Hyperparameters) -> tuple[Objective, Hyperparameters]:
@@ -215,5 +216,5 @@ def fit_noise(objective: Objective, hyper: Hyperparameters) -> tuple[Objective, 
     if not objective.certain and plain > _EXPLAINED - n * (0.5 + _LOG_ROOT):
         return objective, hyper
     heavy = replace(objective, kernels=1, noise_mode=HEAVY_NOISE)
-    found, density = _fitted(heavy)
+    found, density = _from(heavy, _first(heavy))
     return (heavy, found) if density > plain - _CLEARLY * objective.certain else (objective, hyper)
