@@ -87,7 +87,7 @@ def encounter(trace: Trace, ego: str = "ego", other: str = "co", margin: float =
     contact = first_contact(trace, ego, other)
     if contact is not None:  # nothing counts after the first contact
         in_path[contact + 1 :] = False
-        behind[contact + 1 :], passed[contact + 1 :] = behind[contact], passed[contact]
+        passed[contact + 1 :] = passed[contact]
     ahead = in_path & (gap >= 0)
     rear_end = contact is not None and (bool(ahead[contact]) or (contact > 0 and bool(ahead[contact - 1])))
     return Encounter(
@@ -119,9 +119,7 @@ def _nearest_in_path(seen: list[_Sighting]) -> _Sighting:
     rank = np.where(behind, 1e6 + last, gap) + np.where(in_path, 0.0, 1e9)
     nearest = rank.argmin(axis=0)[None]
     first_gap, first_turn = (np.take_along_axis(values, nearest, 0)[0] for values in (gap, turn))
-    shared = np.logical_or.reduce(in_path)
-    last_behind = np.take_along_axis(behind, nearest, 0)[0]  # of the part in the path, where there is one
-    return first_gap, first_turn, shared, np.where(shared, last_behind, np.logical_and.reduce(behind))
+    return first_gap, first_turn, np.logical_or.reduce(in_path), np.take_along_axis(behind, nearest, 0)[0]
 
 
 def time_to_collision(e: Encounter) -> Vector:

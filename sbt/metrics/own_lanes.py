@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from sbt.metrics.cache import per_trace
-from sbt.problem.trace import States, Trace
+from sbt.problem.trace import ActorTrace, States, Trace
 
 __all__ = ["between_changes"]
 
@@ -24,24 +24,26 @@ _UNEVEN = 0.05
 """Steps that differ by less (m) hide none: one with a move is longer than its neighbours."""
 
 
-def between_changes(trace: Trace, ego: str, other: str) -> Iterator[tuple[int, Trace]]:
-    """Yield the first instant and the trace (actors `ego` and `co`) of every stretch without a change of lanes of the two.
+def between_changes(trace: Trace, ego: str, other: str) -> Iterator[tuple[int, ActorTrace, ActorTrace]]:
+    """Yield the first instant of every stretch without a change of lanes of the two, and these in it.
 
-    Where they go on afterwards is the path that was driven, beside itself by the changes. Nothing where there is no change.
+    Where they go on afterwards is the path that was driven, beside itself by the changes.
 
     Args:
         trace: of t instants at which both are there.
         ego: one of them.
         other: the other.
     """
-    moves = {name: _moves(trace, name) for name in (ego, other)}
-    found = [np.flatnonzero(np.abs(move).any(axis=1)) for move in moves.values() if move is not None]
+    one, two = trace.actor(ego), trace.actor(other)
+    moves = _moves(trace, ego), _moves(trace, other)
+    found = [np.flatnonzero(np.abs(move).any(axis=1)) for move in moves if move is not None]
     if not found:
+        yield 0, one, two
         return
     edges = [0, *(np.unique(np.concatenate(found)) + 1).tolist(), len(trace.time)]
     for begin, end in pairwise(edges):
-        part = trace.select(slice(begin, end), {ego: "ego", other: "co"})
-        yield begin, _beside(part, {"ego": moves[ego], "co": moves[other]}, end)
+        first, second = (_stretch(actor, begin, end, move) for actor, move in zip((one, two), moves, strict=True))
+        yield begin, first, second
 
 
 @per_trace
@@ -61,23 +63,18 @@ def _moves(trace: Trace, name: str) -> States | None:
     return np.where(changes[:, None], np.stack([-sin * left, cos * left], axis=1), 0.0)
 
 
-def _beside(part: Trace, moves: dict[str, States | None], end: int) -> Trace:
-    """Return a stretch that ends before instant `end`, its ways beside themselves by the moves from there on."""
-    ways, parts = dict(part.ways), dict(part.parts)
-    for name, move in moves.items():
-        if move is None:
-            continue
-        offset = np.cumsum(move[end - 1 :], axis=0)
-        if name in ways:
-            ways[name] = _shifted(ways[name], offset)
-        if name in parts:
-            parts[name] = tuple(p if p.way is None else replace(p, way=_shifted(p.way, offset)) for p in parts[name])
-    return replace(part, ways=ways, parts=parts)
+def _stretch(actor: ActorTrace, begin: int, end: int, move: States | None) -> ActorTrace:
+    """Return a road user from one instant to before another, its ways beside themselves by its moves from there on."""
+    found = actor.during(slice(begin, end))
+    if move is None or not len(rest := move[end - 1 :]):
+        return found
+    offset = np.cumsum(rest, axis=0)
+    return replace(_beside(found, offset), parts=tuple(_beside(part, offset) for part in found.parts))
 
 
-def _shifted(way: States, offset: States) -> States:
-    """Return a way (k, 3) of which the first points were recorded, each less what its road user was moved until then (m, 2)."""
-    if not len(offset):
-        return way
-    rows = np.minimum(np.arange(len(way)), len(offset) - 1)
-    return np.column_stack([way[:, :2] - offset[rows], way[:, 2]])
+def _beside(actor: ActorTrace, offset: States) -> ActorTrace:
+    """Return a road user whose way begins with recorded points, each less what it was moved until then (m, 2)."""
+    if actor.way is None:
+        return actor
+    rows = np.minimum(np.arange(len(actor.way)), len(offset) - 1)
+    return replace(actor, way=np.column_stack([actor.way[:, :2] - offset[rows], actor.way[:, 2]]))

@@ -61,7 +61,7 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str | None = "co") -> Ve
     """
     met = list(_together(trace, ego, other))
     times = np.full(len(trace.time), HORIZON)
-    for instants, found in _predicted_contacts(_on_own_lanes(met)):
+    for instants, found in _predicted_contacts(met):
         np.minimum.at(times, instants, found)
     for one in met:
         if one.contact is not None:
@@ -76,7 +76,7 @@ def smallest_ttc_on_paths(trace: Trace, ego: str = "ego") -> float:
     met = list(_together(trace, ego, None))
     if any(one.contact is not None for one in met if one.trace is not trace):
         return 0.0
-    return min((float(found.min()) for _, found in _predicted_contacts(_on_own_lanes(met), only_smallest=True)), default=HORIZON)
+    return min((float(found.min()) for _, found in _predicted_contacts(met, only_smallest=True)), default=HORIZON)
 
 
 def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
@@ -93,15 +93,6 @@ def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
                 yield _Together(instants.start, part, "ego", "co")
 
 
-def _on_own_lanes(met: Sequence[_Together]) -> list[_Together]:
-    """Return those who are there together, in stretches without a change of lanes within a step; see `sbt.metrics.own_lanes`."""
-    found = []
-    for one in met:
-        stretches = [_Together(one.first + at, part, "ego", "co") for at, part in between_changes(one.trace, one.ego, one.other)]
-        found += stretches or [one]
-    return found
-
-
 def _predicted_contacts(met: Sequence[_Together], *, only_smallest: bool = False) -> Iterator[tuple[np.ndarray, Vector]]:
     """Yield (n,) instants, and (n,) times until two rectangles touch on their paths from then on (s), at most the horizon.
 
@@ -109,15 +100,17 @@ def _predicted_contacts(met: Sequence[_Together], *, only_smallest: bool = False
         met: who is there together.
         only_smallest: larger times than the smallest one need not be exact, or be there.
     """
-    own: dict[int, list[Course]] = {}
     pairs: list[tuple[Course, Course]] = []
     first: list[int] = []
+    own: dict[tuple[int, int, int], list[Course]] = {}  # by trace and stretch
     for one in met:
-        if id(one.trace) not in own:
-            own[id(one.trace)] = [Course(each) for each in rectangles(one.trace.actor(one.ego))]
-        others = [Course(each) for each in rectangles(one.trace.actor(one.other))]
-        pairs += [(a, b) for a in own[id(one.trace)] for b in others]
-        first += [one.first] * (len(pairs) - len(first))
+        for at, ego, other in between_changes(one.trace, one.ego, one.other):
+            stretch = id(one.trace), at, len(ego.x)
+            if stretch not in own:
+                own[stretch] = [Course(each) for each in rectangles(ego)]
+            others = [Course(each) for each in rectangles(other)]
+            pairs += [(a, b) for a in own[stretch] for b in others]
+            first += [one.first + at] * (len(pairs) - len(first))
     begins, least = np.array(first), HORIZON
     for begin, pair, rows, steps in near_steps(pairs, _STEP, _STRIDES):
         if only_smallest and begin >= least:

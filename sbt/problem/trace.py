@@ -45,6 +45,12 @@ class ActorTrace:
     parts: tuple[ActorTrace, ...] = ()
     way: States | None = None
 
+    def during(self, i: slice) -> ActorTrace:
+        """Return it at some instants; how it goes on afterwards becomes its way, and that of its parts."""
+        states = self.x[i], self.y[i], self.heading[i], self.speed[i], self.acceleration[i]
+        parts = tuple(part.during(i) for part in self.parts)
+        return ActorTrace(*states, self.length, self.width, parts, _way_after(self, i))
+
 
 def select_parts(parts: tuple[ActorTrace, ...], i: slice | NDArray[Any]) -> tuple[ActorTrace, ...]:
     """Return the parts of an actor at some instants only."""
@@ -181,7 +187,7 @@ class Trace:
         names = self.actors if actors is None else tuple(actors)
         at: slice | list[int] = slice(None) if actors is None else [self.actors.index(name) for name in names]
         new = dict(zip(names, names, strict=True)) if actors is None else actors
-        parts = {new[n]: tuple(_selected(p, i) for p in self.parts[n]) for n in names if n in self.parts}
+        parts = {new[n]: tuple(p.during(i) for p in self.parts[n]) for n in names if n in self.parts}
         ways = {new[name]: way for name in names if (way := _way_after(self.actor(name), i)) is not None}
         some = Trace(
             self.time[i], tuple(new.values()), self.x[i][:, at], self.y[i][:, at], self.heading[i][:, at], self.speed[i][:, at],
@@ -245,10 +251,6 @@ class Trace:
             for k, name in enumerate(self.actors)
             if present[i, k]
         ]  # fmt: skip
-
-
-def _selected(part: ActorTrace, i: slice) -> ActorTrace:
-    return replace(select_parts((part,), i)[0], way=_way_after(part, i))
 
 
 def _way_after(actor: ActorTrace, i: slice) -> States | None:

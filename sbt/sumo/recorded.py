@@ -33,8 +33,6 @@ _KEEP_ROUTE = 2
 """keepRoute of moveToXY that keeps the pose exactly, on or off the lanes."""
 _GAP = 1.5
 """A track is interrupted where two of its instants are further apart than so many of its usual steps."""
-_FASTEST = 150.0
-"""Largest speed of a recorded vehicle in SUMO (m/s)."""
 _SLACK = 1e-6
 _UNRECORDED = 1.0
 """A run may begin so long before a recording, and end so long after it (s)."""
@@ -184,7 +182,7 @@ class _Replay:
         sumo.route.add(_TYPE, [self._edge])
         sumo.vehicletype.copy("DEFAULT_VEHTYPE", _TYPE)
         sumo.vehicletype.setVehicleClass(_TYPE, "ignoring")
-        sumo.vehicletype.setMaxSpeed(_TYPE, _FASTEST)
+        sumo.vehicletype.setMaxSpeed(_TYPE, float(farthest(1.0)))
 
     def before_step(self, t: float | None) -> None:
         """Move everybody to where they were at the end of the step."""
