@@ -24,6 +24,8 @@ import sbt
 from sbt import plugins
 from sbt.campaigns.settings import PlainConclusion
 from sbt.cli import app
+from sbt.problem.expression import Expression
+from sbt.problem.space import ParameterSpace
 
 matplotlib = pytest.importorskip("matplotlib")
 matplotlib.use("agg")
@@ -406,3 +408,12 @@ def test_the_check_finds_campaigns_that_remember_or_say_nothing():
 def test_a_result_of_another_folder_is_the_same(store, tmp_path):
     shutil.copytree(store, tmp_path / "moved")
     assert sbt.open(tmp_path / "moved").frame.equals(sbt.open(store).frame)
+
+
+def test_a_scenario_whose_constraints_leave_no_corner_is_checked():
+    rules = tuple((text, Expression(text)) for text in ("a > 0.7", "a < 0.8"))
+    space = ParameterSpace((sbt.Parameter("a", 0, 1),), constraints=rules)
+    scenario = sbt.Scenario("cut", space, sbt.Requirement("y", high=0.2), evaluate=lambda values, seed: {"y": values["a"]})
+    found = sbt.check(scenario)
+    assert not found.ok
+    assert [finding.detail for finding in found.findings][:1] == ["0 runs"]

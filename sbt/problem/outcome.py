@@ -20,7 +20,7 @@ STRUCK, OTHER_LEVEL = "hit from behind by ", "on another level: "
 IMPOSSIBLE = "as no vehicle can: "
 """How the text begins of a motion of the ego that no tyre holds: what its controller commands is done."""
 TELEPORTED = "teleported: "
-"""How the text begins of a road user near the ego that SUMO moved to another place."""
+"""How the text begins of a road user near the ego that was moved to another place."""
 
 
 class Doubt(StrEnum):
@@ -37,7 +37,7 @@ class Doubt(StrEnum):
     IMPOSSIBLE = "ego moves as no vehicle can"
     """it accelerates or brakes by more than tyres hold"""
     TELEPORTED = "somebody near the ego was teleported"
-    """SUMO moved a road user to another place, such as out of a jam"""
+    """a road user was moved to another place, such as by SUMO out of a jam"""
 
 
 _BEGINNINGS = {

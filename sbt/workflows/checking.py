@@ -109,13 +109,13 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
     points = list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
     drawn = covariates_first(asked, jobs)
-    begun = time.perf_counter()
     other = _elsewhere(spec, jobs)
     if isinstance(other, _Lost) and other.for_good:
         yield Finding(_ALL_RUN, ok=False, detail=other.why)
         return
-    yield from _slow((time.perf_counter() - begun) / len(jobs), len(jobs))
+    begun = time.perf_counter()
     first = _runs(spec, jobs)
+    yield from _slow(time.perf_counter() - begun, len(jobs))
     run = _all_ok(first, points)
     yield run
     yield _finite(first, asked)
@@ -348,12 +348,12 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]], spec: ScenarioSpe
     return [Finding("for information: laws of motion are broken", ok=True, detail=f"in {share}: {detail}")]
 
 
-def _slow(seconds: float, points: int) -> list[Finding]:
-    """Return how long it takes to check this scenario, where that is long."""
-    if seconds < _SLOW:
+def _slow(seconds: float, runs: int) -> list[Finding]:
+    """Return how long it takes to check this scenario, where so many runs took long."""
+    if seconds < _SLOW * max(runs, 1):
         return []
-    runs = _TIMES * points + _DRAWN
-    detail = f"a run takes {seconds:.1f} s here, and all checks make about {runs} of them: {seconds * runs / 60.0:.0f} minutes"
+    each, every = seconds / max(runs, 1), _TIMES * runs + _DRAWN
+    detail = f"a run takes {each:.1f} s here, and all checks make about {every} of them: {each * every / 60.0:.0f} minutes"
     return [Finding("for information: the scenario is slow", ok=True, detail=detail)]
 
 
