@@ -54,8 +54,8 @@ def first_contacts(trace: Trace, ego: str) -> dict[str, int]:
     """Return the index of the first contact with everyone who touches the ego, by name."""
     seen = around(trace, ego)
     moved = np.hypot(seen.dx[1:] - seen.dx[:-1], seen.dy[1:] - seen.dy[:-1])
-    least = 0.5 * (seen.apart[1:] + seen.apart[:-1] - moved)  # no distance in the step is smaller
-    near = np.asarray((np.concatenate([seen.apart[:1], least]) <= seen.reach).any(axis=0))
+    least = np.concatenate([seen.apart[:1], 0.5 * (seen.apart[1:] + seen.apart[:-1] - moved)])  # none in the step is smaller
+    near = np.asarray((np.where(np.isnan(least), seen.apart, least) <= seen.reach).any(axis=0))  # NaN: who comes has no step
     found = ((trace.actors[k], first_contact(trace, ego, trace.actors[k])) for k in seen.others if near[k])
     return {name: k for name, k in found if k is not None}
 

@@ -37,9 +37,9 @@ __all__ = [
 
 
 _MAX_SPEED, _LANE_CHANGE = 150.0, 8.0
-_DRIVES, _TURNED, _ARCS = 0.5, 0.05, 16
+_DRIVES, _TURNED, _SWINGS, _ARCS = 0.5, 0.05, 0.3, 16
 """A step of who drives (m/s) in which a corner moves by more than this (m) because its rectangle turns is one along an arc, of so
-many parts."""
+many parts; by more than the second, also where nothing touches on the chord."""
 
 
 def farthest(elapsed: Any) -> Any:
@@ -203,16 +203,19 @@ def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
         return None
     first = max(int(near[0]) - 1, 0)
     i = slice(first, int(near[-1]) + 1)
-    hits = first + np.flatnonzero(np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i))))
-    return next((k for k in hits.tolist() if not (_turns(a, k) or _turns(b, k)) or _touch_on_arcs(a, b, k)), None)
+    touch = np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i)))
+    swing = np.fmax(_swing(a, i), _swing(b, i))
+    possible = first + np.flatnonzero(touch | (swing > _SWINGS))
+    return next((k for k in possible.tolist() if not swing[k - first] > _TURNED or _touch_on_arcs(a, b, k)), None)
 
 
-def _turns(actor: ActorTrace, k: int) -> bool:
-    """Return whether a rectangle that drives turns so much in the step before an instant that a corner moves noticeably."""
-    if k == 0 or not max(abs(actor.speed[k]), abs(actor.speed[k - 1])) > _DRIVES:  # nor where it was not there before
-        return False
-    turn = abs(math.remainder(float(actor.heading[k] - actor.heading[k - 1]), math.tau))
-    return turn * 0.5 * math.hypot(actor.length, actor.width) > _TURNED
+def _swing(actor: ActorTrace, i: slice) -> Vector:
+    """Return by how much (m) a corner moves because its rectangle turns, in the steps before some instants; 0 where it stands."""
+    before = slice(max(i.start - 1, 0), i.stop)
+    heading, drives = actor.heading[before], np.abs(actor.speed[before]) > _DRIVES
+    turn = np.abs(np.remainder(heading[1:] - heading[:-1] + math.pi, math.tau) - math.pi)
+    swing = np.where(drives[1:] | drives[:-1], turn * 0.5 * math.hypot(actor.length, actor.width), 0.0)
+    return swing if i.start else np.concatenate([[0.0], swing])  # nothing is known before the first instant
 
 
 def _touch_on_arcs(a: ActorTrace, b: ActorTrace, k: int) -> bool:

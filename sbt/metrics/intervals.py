@@ -16,8 +16,7 @@ __all__ = ["joint_intervals"]
 def joint_intervals(trace: Trace, ego: str, other: str) -> tuple[tuple[slice, Trace], ...]:
     """Return the instants and the trace (actors `ego` and `co`) of every interval in which both are present.
 
-    A single instant is an interval only if the trace has no other. Where one of them goes on while the other is gone is its
-    way (`Trace.ways`).
+    An interval may be a single instant. Where one of them goes on while the other is gone is its way (`Trace.ways`).
     """
     return tuple(_joint_intervals(trace, ego, other))
 
@@ -27,6 +26,4 @@ def _joint_intervals(trace: Trace, ego: str, other: str) -> Iterator[tuple[slice
     present = trace.present[:, columns].all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
     for first, last in edges.reshape(-1, 2).tolist():
-        if last - first > 1 or len(trace.time) == 1:
-            instants = slice(first, last)
-            yield instants, trace.select(instants, {ego: "ego", other: "co"})
+        yield slice(first, last), trace.select(slice(first, last), {ego: "ego", other: "co"})

@@ -19,9 +19,12 @@ __all__ = ["between_changes"]
 
 _SLIP, _MOVED, _TURN = 0.5, 0.5, 0.1
 """A vehicle is moved sideways, as by SUMO when it changes lanes, where that is more than this share of what it drives forward,
-and so many metres, in a step in which it turns by less than this (rad): no tyre slips by 27 degrees."""
-_UNEVEN = 0.05
-"""Steps that differ by less (m) hide none: one with a move is longer than its neighbours."""
+and so many metres, in a step in which it turns by less than this (rad): no tyre slips by 27 degrees ..."""
+_LANE, _OFF_TRACK, _BEND = 1.5, 0.25, 0.8
+"""... or more than so many metres, and this share of its length for each radian of a turn, less than so many: in bends and
+where it drives far in a step. Of SUMO's 5,641 changes at steps of .1 to 1 s, 67 are not told; of 1.5 million other steps 842 are,
+mostly where lanes do not meet."""
+_NOWHERE: States = np.full((1, 3), np.nan)
 
 
 def between_changes(trace: Trace, ego: str, other: str) -> Iterator[tuple[int, ActorTrace, ActorTrace]]:
@@ -35,8 +38,8 @@ def between_changes(trace: Trace, ego: str, other: str) -> Iterator[tuple[int, A
         other: the other.
     """
     one, two = trace.actor(ego), trace.actor(other)
-    moves = _moves(trace, ego), _moves(trace, other)
-    found = [np.flatnonzero(np.abs(move).any(axis=1)) for move in moves if move is not None]
+    moves = [_moves(trace).get(name) for name in (ego, other)]
+    found = [np.flatnonzero(move[: len(trace.time) - 1].any(axis=1)) for move in moves if move is not None]
     if not found:
         yield 0, one, two
         return
@@ -47,20 +50,31 @@ def between_changes(trace: Trace, ego: str, other: str) -> Iterator[tuple[int, A
 
 
 @per_trace
-def _moves(trace: Trace, name: str) -> States | None:
-    """Return by how much (m) a road user is moved sideways in each step (t - 1, 2), without driving there; None: in none."""
-    actor = trace.actor(name)
-    dx, dy = np.diff(actor.x), np.diff(actor.y)
-    steps = np.hypot(dx, dy)
-    if len(steps) < 2 or np.abs(np.diff(steps)).max() < _UNEVEN:
-        return None
-    turn = np.diff(np.unwrap(actor.heading))
-    cos, sin = np.cos(actor.heading[1:] - 0.5 * turn), np.sin(actor.heading[1:] - 0.5 * turn)
-    forward, left = dx * cos + dy * sin, dy * cos - dx * sin
-    changes = (np.abs(left) > _SLIP * np.abs(forward)) & (np.abs(left) > _MOVED) & (np.abs(turn) < _TURN)
+def _moves(trace: Trace) -> dict[str, States]:
+    """Return by how much (m) who is moved sideways, without driving there, is in each step of its path and its way (n - 1, 2)."""
+    paths = [_path(trace, k) for k in range(len(trace.actors))]
+    counts = [len(path) for path in paths]
+    x, y, heading = np.concatenate(paths).T
+    dx, dy = x[1:] - x[:-1], y[1:] - y[:-1]
+    turn = np.remainder(heading[1:] - heading[:-1] + np.pi, 2.0 * np.pi) - np.pi
+    cos, sin = np.cos(heading[1:] - 0.5 * turn), np.sin(heading[1:] - 0.5 * turn)
+    forward, left = np.abs(dx * cos + dy * sin), dy * cos - dx * sin
+    aside, turned = np.abs(left), np.abs(turn)
+    slips = (aside > _SLIP * forward) & (aside > _MOVED) & (turned < _TURN)
+    changes = slips | ((aside > _LANE + _OFF_TRACK * np.repeat(trace.length, counts)[1:] * turned) & (turned < _BEND))
     if not changes.any():
-        return None
-    return np.where(changes[:, None], np.stack([-sin * left, cos * left], axis=1), 0.0)
+        return {}
+    move = np.where(changes[:, None], np.stack([-sin * left, cos * left], axis=1), 0.0)
+    begins = np.cumsum([0, *counts])
+    each = {name: move[begins[k] : begins[k + 1] - 2] for k, name in enumerate(trace.actors)}
+    return {name: found for name, found in each.items() if found.any()}
+
+
+def _path(trace: Trace, k: int) -> States:
+    """Return (n, 3) x, y and heading of an actor while it is there, where it goes on, and a last row of NaN."""
+    recorded = np.stack([trace.x[:, k], trace.y[:, k], trace.heading[:, k]], axis=1)
+    way = trace.ways.get(trace.actors[k])
+    return np.concatenate([recorded, *([] if way is None else [way]), _NOWHERE])
 
 
 def _stretch(actor: ActorTrace, begin: int, end: int, move: States | None) -> ActorTrace:

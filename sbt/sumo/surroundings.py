@@ -24,7 +24,7 @@ from sbt.sumo.guided import Placed
 from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
 from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
-from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, path_behind
+from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
 
 __all__ = ["Surroundings"]
@@ -67,6 +67,7 @@ class Surroundings:
         self._very_long: dict[str, float] = {}
         self._centre_offsets: dict[str, float] = {}
         self._bodies: dict[str, TrailingBody] = {}
+        self._lanes = Lanes(sumo)
         self._rows: list[dict[str, _Row]] = []
         self._parts: list[dict[str, int]] = []
         self._last_poses: dict[tuple[str, int], np.ndarray] = {}
@@ -172,7 +173,7 @@ class Surroundings:
     def _keep_way(self, name: str) -> None:
         """Keep where a vehicle goes on that is recorded no more: its rectangle, and the parts of a long one.
 
-        Persons, and who is moved by poses or teleported, have no known way.
+        Persons, and who is moved by poses or teleported, also out of the radius, have no known way.
         """
         self._ways.pop(name, None)
         if self.is_person(name) or name in self.rigid:
@@ -180,8 +181,12 @@ class Surroundings:
         if name in self._arrived:
             self._ways[name] = (LEFT_THE_ROAD,) * (1 + (self._bodies[name].count if name in self._bodies else 0))
             return
-        ahead = line_ahead(self._sumo, name)
-        state, poses = self.states[name], self._poses(name, len(self._rows) - 1)
+        state, now = self.states[name], self._sumo.vehicle.getPosition(name)
+        moved = math.dist(now, (state.x + 0.5 * state.length * state.cos, state.y + 0.5 * state.length * state.sin))
+        if now[0] != INVALID_DOUBLE and moved > self._farthest:
+            self._note_jump(name, moved)
+            return
+        ahead, poses = line_ahead(self._sumo, name), self._poses(name, len(self._rows) - 1)
         size = state.length / len(poses)
         reach = 0.5 * size * np.stack([np.cos(poses[::-1, 2]), np.sin(poses[::-1, 2])], axis=1)
         behind = np.vstack([poses[::-1, :2] - reach, poses[:1, :2] + reach[-1]])
@@ -236,7 +241,7 @@ class Surroundings:
 
     def _note_jump(self, name: str, moved: float) -> None:
         """Leave out a road user that was moved to another place; the ego must not be."""
-        t = len(self._rows) * self._dt
+        t = len(self._rows) * self._dt  # of the row that is being made
         if name == self._ego:
             rule = f"the ego '{name}' must stay on its way"
             raise RunError(Status.INVALID, f"{rule}, but was moved by {moved:.0f} m within a step at {t:.3f} s")
@@ -262,7 +267,8 @@ class Surroundings:
         state = self.states[name] = State(name, float(domain.getLength(name)), float(domain.getWidth(name)), self._dt)
         self._centre_offsets[name] = 0.0 if person else 0.5 * state.length
         if not person and state.length > LONGEST_RIGID:
-            self._bodies[name] = TrailingBody(state.length, path_behind(self._sumo, name, front, state.length))
+            behind = path_behind(self._sumo, name, front, state.length)
+            self._bodies[name] = TrailingBody(state.length, behind, self._lanes.leads_to)
         return state
 
     def touching(self) -> list[tuple[str, ActorTrace, ActorTrace]]:

@@ -8,13 +8,13 @@ bus would be. So the rear parts follow the path of the front. The body at first 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-__all__ = ["LONGEST_RIGID", "TrailingBody", "path_behind"]
+__all__ = ["LONGEST_RIGID", "Lanes", "TrailingBody", "path_behind"]
 
 LONGEST_RIGID = 6.0
 """Length up to which a vehicle is one rectangle (m); above, no part is longer than 5 m, unless that takes too many."""
@@ -28,6 +28,7 @@ _JUMP = 3.0
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
 """x, y (m) and heading (rad) of the middle of a rectangle."""
+_LeadsTo = Callable[[str, str, float], bool]
 _Instant = tuple[int, int, float, float, float, float]
 """Number of the path, of its points, x and y of the front (m), cosine and sine of the heading."""
 
@@ -38,15 +39,17 @@ class TrailingBody:
     Args:
         length: of the vehicle (m).
         behind: points of the path behind its front at first sight, the nearest first; straight on beyond the last one.
+        leads_to: whether a lane leads to another within some metres (`Lanes.leads_to`).
     """
 
-    def __init__(self, length: float, behind: Sequence[Point] = ()):
+    def __init__(self, length: float, behind: Sequence[Point] = (), leads_to: _LeadsTo | None = None):
         self.count = min(_MOST_PARTS, math.ceil(length / _PART))
         self.part_length = length / self.count
         self._kept = math.ceil(length / _SPACING) + 2
         self._paths = [_Path(behind[::-1])]
         self._instants: list[_Instant] = []
         self._lane = ""
+        self._leads_to = leads_to
 
     def move(self, front: Point, cos: float, sin: float, lane: str, travelled: float) -> int:
         """Note a step, and return the number by which `poses` knows it.
@@ -55,7 +58,7 @@ class TrailingBody:
             front: middle of the front bumper (m).
             cos: of the vehicle's heading.
             sin: likewise.
-            lane: id; another lane of the same edge is a change of lanes, which moves the whole body sideways.
+            lane: id; one to which the last one does not lead is a change of lanes, which moves the whole body sideways.
             travelled: speed times step (m).
         """
         previous, self._lane = self._lane, lane
@@ -63,9 +66,17 @@ class TrailingBody:
             x, y = self._instants[-1][2:4]
             if (x, y) == front and previous == lane:
                 return len(self._instants) - 1
-            self._drive((x, y), front, cos, sin, changed=_beside(previous, lane), travelled=travelled)
+            self._drive((x, y), front, cos, sin, changed=self._changes(previous, lane, travelled), travelled=travelled)
         self._instants.append((len(self._paths) - 1, len(self._paths[-1].x), *front, cos, sin))
         return len(self._instants) - 1
+
+    def _changes(self, lane: str, other: str, travelled: float) -> bool:
+        """Return whether who was on one lane and is on another has changed lanes: on one edge, or while it entered one."""
+        if lane == other or not lane or not other:
+            return False
+        if lane.rpartition("_")[0] == other.rpartition("_")[0]:
+            return True
+        return self._leads_to is not None and not self._leads_to(lane, other, travelled)
 
     def _drive(self, before: Point, front: Point, cos: float, sin: float, *, changed: bool, travelled: float) -> None:
         """Extend the path from the last front to the new one."""
@@ -152,9 +163,30 @@ class _Path:
         return np.stack([0.5 * (ahead_x + jx), 0.5 * (ahead_y + jy), np.arctan2(ahead_y - jy, ahead_x - jx)], axis=2)
 
 
-def _beside(lane: str, other: str) -> bool:
-    """Return whether these are two lanes of one edge."""
-    return lane != other and lane.rpartition("_")[0] == other.rpartition("_")[0] != ""
+class Lanes:
+    """Which lanes of a network lead to which others; looked up once.
+
+    Args:
+        sumo: libsumo or traci.
+    """
+
+    def __init__(self, sumo: Any):
+        self._lane = sumo.lane
+        self._known: dict[tuple[str, str, float], bool] = {}
+
+    def leads_to(self, lane: str, other: str, travelled: float) -> bool:
+        """Return whether one leads to the other, over lanes that are no longer together than what is driven (m)."""
+        room = math.ceil(1.5 * travelled) + 1.0
+        if (lane, other, room) not in self._known:
+            self._known[lane, other, room] = self._found(lane, other, room)
+        return self._known[lane, other, room]
+
+    def _found(self, lane: str, other: str, room: float) -> bool:
+        following = {name for link in self._lane.getLinks(lane) for name in (link[0], link[4]) if name}
+        if other in following:
+            return True
+        rooms = {name: room - self._lane.getLength(name) for name in following}
+        return any(left >= 0.0 and self._found(name, other, left) for name, left in rooms.items())
 
 
 def path_behind(sumo: Any, name: str, front: Point, length: float) -> list[Point]:
