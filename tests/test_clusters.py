@@ -124,6 +124,21 @@ def test_requirements_and_the_rule_of_precision_know_of_the_spread_between_warm_
         assert after.high - after.low > 1.2 * (before.high - before.low)
 
 
+def test_traffic_is_said_to_differ_only_where_it_does_beyond_chance():
+    """Runs that do not depend on their warm-ups: at most 1 % of the campaigns say so, and nearly all where traffic decides."""
+    rng, told = np.random.default_rng(0), {0.0: 0, 0.3: 0}
+    warm_up = np.arange(200) % 20
+    for spread in told:
+        for _ in range(200):
+            share = 0.4 + spread * rng.choice([-1.0, 1.0], 20)
+            critical = (rng.random(200) < share[warm_up]).astype(float)
+            found = spread_of_batches(warm_up, [CountedBatch(0.0, 0.0, 0.0, np.ones(200), np.zeros(200), critical)])
+            told[spread] += found.differs
+            assert found.differs or not found.decides(found.std_error_apart / 0.4, 0.4)
+    assert told[0.0] <= 8
+    assert told[0.3] >= 190
+
+
 def test_the_upper_end_has_the_spread_of_failed_runs_too():
     """Five critical draws in as many warm-ups, and four that fail in one: failed as critical that one stands out."""
     n, warm_up = 160, np.arange(160) % 20

@@ -56,6 +56,8 @@ def test_an_interval_is_as_narrow_as_asked_by_the_rule_that_ends_a_campaign(wide
     """Ten hits, and a half width of at most three coefficients of variation."""
     assert "narrow enough" not in _next(**wide)
     assert "more runs (budget" in _next(**wide)
+    told = "until 10 critical draws count" if "hits" in wide else "give it to"
+    assert told in _next(**wide), "what more runs give"
 
 
 @pytest.mark.parametrize("campaign", ["coverage", "boundary", "falsification", "estimation"])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from sbt.campaigns.counting import DRAWN, counted_iterations
 from sbt.campaigns.gate import Limits
@@ -21,6 +22,7 @@ from sbt.store.records import optional
 __all__ = ["Spread", "clustered_interval", "spread_of_batches", "spread_of_draws", "spread_of_share"]
 
 Batches = Sequence[CountedBatch]
+_CHANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,21 @@ class Spread:
         warm_ups: number of those that counted runs began with.
         std_error: of the estimate, from the spread between warm-ups; None: it is not known from one, or from repeats.
         std_error_failed: of that with failed runs as critical; None: no run failed.
+        std_error_apart: as if no two runs had a warm-up in common.
     """
 
     warm_ups: int
     std_error: float | None
     std_error_failed: float | None = optional()
+    std_error_apart: float | None = optional()
+
+    @property
+    def differs(self) -> bool:
+        """Whether the error between warm-ups is beyond what chance makes of runs that do not depend on them (F, at 1 %)."""
+        if not self.std_error or self.std_error_apart is None:
+            return False
+        df = self.warm_ups - 1.0
+        return self.std_error**2 > self.std_error_apart**2 * float(chdtri(df, _CHANCE)) / df
 
     def widened(self, limits: Limits, value: float | None, worst: float | None = None) -> Limits:
         """Return limits that are at least as far from the estimate as the spread says; `worst` has failed runs as critical."""
@@ -55,8 +67,8 @@ class Spread:
         return f"The result is conditional on the traffic of {plural(self.warm_ups, 'warm-up')}; {spread}."
 
     def decides(self, cov: float | None, value: float | None) -> bool:
-        """Return whether the coefficient of variation of an estimate is that by the spread, as the draws' own is smaller."""
-        return cov is not None and self.std_error is not None and bool(value and self.std_error / value >= cov)
+        """Return whether the coefficient of variation of an estimate is that by the spread, as warm-ups differ."""
+        return self.differs and cov is not None and bool(value and (self.std_error or 0.0) / value >= cov)
 
     def exceeds(self, cov: float, value: float) -> bool:
         """Return whether the coefficient of variation is above a limit by the spread alone."""
@@ -124,4 +136,4 @@ def _spread(cluster: Vector, terms: Vector, failed: Vector | None) -> Spread | N
     if not (cluster >= 0).any():
         return None
     worst = None if failed is None else clustered_error(failed, cluster)
-    return Spread(len(np.unique(cluster)), clustered_error(terms, cluster), worst)
+    return Spread(len(np.unique(cluster)), clustered_error(terms, cluster), worst, float(np.sqrt((terms**2).sum())))

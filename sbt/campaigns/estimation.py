@@ -197,7 +197,7 @@ def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread | N
     limits, tail = traffic.widened(limits, value, found.failed_as_critical), 0.5 * (1.0 + _CONFIDENCE)
     cov = found.cov if not value or error is None else max(found.cov or 0.0, error / value)
     warnings = found.warnings
-    if value and error is not None and error / value > (found.cov or 0.0):
+    if value and error is not None and traffic.differs and error / value > (found.cov or 0.0):
         more = "more warm-ups (warm_up.seeds) narrow the interval, more runs hardly do"
         warnings = (*warnings, f"traffic differs from warm-up to warm-up: {more}")
     elif error is None and traffic.warm_ups == 1:

@@ -13,7 +13,7 @@ from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 if TYPE_CHECKING:
     from sbt.campaigns.estimation import EstimationConclusion
 
-__all__ = ["NO_BETTER", "PRECISE", "as_many_draws", "cautions", "rounded", "runs_for_precision", "too_wide"]
+__all__ = ["NO_BETTER", "PRECISE", "as_many_draws", "cautions", "rounded", "runs_for_precision", "too_wide", "width"]
 
 PRECISE = 0.1
 """Coefficient of variation that is asked for by default."""
@@ -32,10 +32,20 @@ def as_many_draws(found: EstimationConclusion, n: int) -> str:
     return better if found.high > NO_BETTER * crude else ""
 
 
-def runs_for_precision(more: float, made: int, *, known: bool) -> str:
-    """Return how many more runs, beside those that were made, give the estimate its precision; `known`: it is not 0."""
+def runs_for_precision(more: float, made: int, *, known: bool, narrow: bool = False) -> str:
+    """Return how many more runs, beside those that were made, give the estimate its precision.
+
+    Args:
+        more: so many.
+        made: so many.
+        known: the estimate is not 0.
+        narrow: its interval is as narrow as asked; only few critical draws count.
+    """
     if not known or more > _FAR * made:
         return f"a larger budget: ten times {made:,} runs tell how many it takes, since too few critical draws count now"
+    if narrow:
+        budget = f"about {rounded(more):,} more runs (budget: {rounded(made + more):,})"
+        return f"{budget}, until {FEWEST_HITS} critical draws count: its interval is narrow, but of fewer"
     return (
         f"about {rounded(more):,} more runs (budget: {rounded(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
         " fewer where a metamodel goes on to learn"
@@ -44,12 +54,17 @@ def runs_for_precision(more: float, made: int, *, known: bool) -> str:
 
 def too_wide(found: EstimationConclusion) -> float:
     """Return how many times too large the error is, by the rule that ends a campaign; up to 1: narrow as asked."""
-    value = found.probability or 0.0
     few = 0.0 if found.combinations is not None else math.sqrt(FEWEST_HITS / max(found.hits, 1))
+    return max(few, width(found))
+
+
+def width(found: EstimationConclusion) -> float:
+    """Return how many times too large the error is, however few critical draws it is of; 0: not known."""
+    value = found.probability or 0.0
     if value <= 0.0:
-        return few
+        return 0.0
     error, half = (found.cov or 0.0) / PRECISE, 0.5 * (found.high - found.low) / (PRECISE * value)
-    return max(error, few, half / 2.0 if half > WIDEST else 0.0)
+    return max(error, half / 2.0 if half > WIDEST else 0.0)
 
 
 def rounded(value: float) -> int:

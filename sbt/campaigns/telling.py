@@ -23,7 +23,7 @@ from sbt.campaigns.lost import (
     why_they_fail,
 )  # fmt: skip
 from sbt.campaigns.modes import single
-from sbt.campaigns.precision import NO_BETTER, PRECISE, as_many_draws, rounded, runs_for_precision, too_wide
+from sbt.campaigns.precision import NO_BETTER, PRECISE, as_many_draws, rounded, runs_for_precision, too_wide, width
 from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
@@ -358,7 +358,8 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         there = int(facts.history.columns["warm_up"].max(initial=-1)) + 1  # those that no counted draw began with among them
         return _more_warm_ups(max(traffic.warm_ups, there))
     if wide > 1.0 and counted:
-        more = runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=bool(found.probability))
+        known, narrow = bool(found.probability), bool(found.probability) and width(found) <= 1.0
+        more = runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=known, narrow=narrow)
         return more + as_many_draws(found, n)
     unseen = 3.0 / max(found.probability, 1e-300)
     if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
