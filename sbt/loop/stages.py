@@ -130,6 +130,10 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     if said and moved:
         which = f"In {moved:,} of {len(facts.history):,} runs a road user near the ego was teleported"
         said = [*said, f"{which}: metrics see it leave and come, not move (column unconfirmed; SUMO's time-to-teleport)."]
+    dead = int(facts.history.doubtful(Doubt.STOPPED).sum())
+    if said and dead:
+        which = f"In {dead:,} of {len(facts.history):,} runs a road user near the ego brakes as no vehicle can"
+        said = [*said, f"{which}: SUMO stops one dead before a red light or where its lane ends (column unconfirmed)."]
     bare = [part.metric for part in facts.requirement.parts if not facts.units.get(part.metric)]
     return said and [*said, *(f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings)]
 

@@ -128,6 +128,20 @@ def beyond_tyres(trace: Trace, actor: str) -> list[tuple[float, float]]:
     return [(float(trace.acceleration[worst, k]), float(trace.time[worst]))]
 
 
+def stopped_dead(trace: Trace, ego: str) -> list[tuple[str, float, float]]:
+    """Return who else brakes hardest (m/s^2) and when (s), where no tyre holds it; empty elsewhere.
+
+    SUMO stops who would drive over a red light or the end of its lane, however fast. Persons halt in one step, and who is moved
+    as it was recorded has the noise of its track.
+    """
+    others = ~persons(trace) & [name != ego and name not in trace.unreacting for name in trace.actors]
+    braking = np.nan_to_num(np.where(others, -trace.acceleration[1:], 0.0))
+    if not braking.size or braking.max() <= _TYRES:
+        return []
+    at, k = np.unravel_index(braking.argmax(), braking.shape)
+    return [(trace.actors[k], float(braking[at, k]), float(trace.time[at + 1]))]
+
+
 def longitudinal(trace: Trace) -> Table:
     """Return the absolute accelerations of vehicles over each step (m/s^2)."""
     return _table(trace, np.abs(trace.acceleration[1:]), ~persons(trace))

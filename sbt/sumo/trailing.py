@@ -82,16 +82,16 @@ class TrailingBody:
         """Extend the path from the last front to the new one."""
         dx, dy = front[0] - before[0], front[1] - before[1]
         path = self._paths[-1]
+        u, v = path.direction(before) or (cos, sin)
         if changed:  # sideways at once, and the body with it
-            u, v = path.direction(before) or (cos, sin)
             along = dx * u + dy * v
             shift_x, shift_y = dx - along * u, dy - along * v
             kept = zip(path.x[-self._kept :], path.y[-self._kept :], strict=True)
             path = _Path([(x + shift_x, y + shift_y) for x, y in kept])
             self._paths.append(path)
             before = before[0] + shift_x, before[1] + shift_y
-        elif dx * cos + dy * sin < -0.1 or math.hypot(dx, dy) > 1.5 * travelled + _JUMP:
-            self._paths.append(_Path())  # backwards, or moved: straight as SUMO turns it
+        elif max(dx * cos + dy * sin, dx * u + dy * v) < -0.1 or math.hypot(dx, dy) > 1.5 * travelled + _JUMP:
+            self._paths.append(_Path())  # backwards (in a tight turn the front drives against the chord), or moved: straight
             return
         path.extend(before, _SPACING)
 

@@ -15,17 +15,38 @@ __all__ = ["further_mistakes"]
 
 _AT_KEY = re.compile(r"(?:--set |.*?:\d+:\d+: )(?P<key>\w+)")
 """The key at the top that an error of a configuration is about."""
+_ANY, _OF_ANY = "falsification", ("scenario", "metamodel", "inputs", "metrics", "requirement", "ego")
+"""A campaign in place of one that is not there, and what means the same in any."""
 
 
 def further_mistakes(path: Path, overrides: Sequence[str], error: ConfigError) -> list[str]:
     """Return what only the scenario can tell to be wrong with a configuration, beside what is wrong with its keys."""
-    keys = {found["key"] for found in map(_AT_KEY.match, error.errors) if found}
-    if not keys or keys & {"campaign", "scenario"}:
+    wrong = _keys(error)
+    if not wrong or "scenario" in wrong:
         return []
+    of = _OF_ANY if "campaign" in wrong else None
+    given = [*overrides, f"campaign={_ANY}"] if of else overrides
+    known = wrong - {"campaign"}
+    while True:
+        try:
+            loaded = parse(read_text(path), given, name=str(path), folder=path.resolve().parent, without=known)
+        except ConfigError as more:  # what is compared with the default of a wrong key: nobody wrote that
+            if _keys(more) <= known:
+                return []
+            known |= _keys(more)
+            continue
+        except SbtError:
+            return []
+        break
     try:
-        check(parse(read_text(path), overrides, name=str(path), folder=path.resolve().parent, without=keys))
+        check(loaded)
     except ConfigError as more:
-        return [line for line in more.errors if line not in error.errors]
+        found = [(line, _AT_KEY.match(line)) for line in more.errors if line not in error.errors]
+        return [line for line, at in found if of is None or (at and at["key"] in of)]
     except SbtError:
-        return []
+        pass
     return []
+
+
+def _keys(error: ConfigError) -> set[str]:
+    return {found["key"] for found in map(_AT_KEY.match, error.errors) if found}
