@@ -178,7 +178,9 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         traffic = warmed_traffic(log, settings)
         found, limits = on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
-        asked, unseen, met = settings.gate, found.undetected_mass_bound, Seen.of(log, settings).surprises
+        asked, met = settings.gate, Seen.of(log, settings).surprises
+        sure = found.combinations is not None or found.counted == int((log.history.stage == NOMINAL).sum()) > 0
+        unseen = 0.0 if sure else found.undetected_mass_bound  # the limits of random draws, and of sums, have it
         gate = None if asked is None else gate_verdict(limits, asked, unseen, met, found.cov)
         each = each_estimate(log, settings)
         return replace(

@@ -14,7 +14,7 @@ from sbt.campaigns.levels import ScreeningTold
 from sbt.campaigns.likeness import EarlierTold
 from sbt.campaigns.linking import Link, LinksTold, Way, doubtful, pairs_joined, ways_between
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
-from sbt.campaigns.modes import FailureMode, Mode, critical_groups, describe, modes_of, single, violations
+from sbt.campaigns.modes import FailureMode, Mode, critical_groups, describe, modes_of, most_often, single, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.rates import LocalRates, local_rates
@@ -128,6 +128,12 @@ class FalsificationConclusion:
     raced: int | None = optional()
     links: LinksTold | None = optional()
     earlier: EarlierTold | None = optional()
+
+    @property
+    def look_at(self) -> int | None:
+        """The failure to look at first: that of the first mode, or of one that came back clearly more often; None without one."""
+        mode = most_often(self.failure_modes)
+        return None if mode is None else mode.representative
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -371,8 +377,10 @@ def _more(found: FalsificationConclusion, facts: Facts) -> list[str]:
     """Return what of the statement the first sentences of the conclusion do not say."""
     bound, runs, said = found.bound, search_runs(facts.history), []
     if bound is not None and (sobol := bound.space_filling_runs - bound.random_runs):
-        of = f"{sobol} of the {bound.space_filling_runs} space-filling runs"
-        said.append(f"The bound is that of random runs, and approximate, as {of} are scrambled Sobol points.")
+        every = sobol == bound.space_filling_runs
+        of = f"{'the' if every else f'{sobol} of the'} {plural(bound.space_filling_runs, 'space-filling run')}"
+        are = "is a scrambled Sobol point" if every and sobol == 1 else "are scrambled Sobol points"
+        said.append(f"The bound is that of random runs, and approximate, as {of} {are}.")
     failed = int((~runs.ok).sum())
     if found.critical_runs and found.critical_runs == len(runs) - failed:
         said.append("Every run that gave a metric was critical: no boundary was met.")

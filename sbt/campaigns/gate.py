@@ -71,7 +71,7 @@ def gate_verdict(
     Args:
         limits: of the probability.
         gate: what was asked.
-        undetected: what no run has met may hold: a `pass` says so where it is more than is allowed.
+        undetected: what no run has met may hold beside the limits: a `pass` says so where both are more than is allowed.
         surprises: draws from the inputs' distribution that were critical where the metamodel denied it.
         cov: coefficient of variation of the estimate; None: there is no estimate, or the limits are exact.
     """
@@ -90,9 +90,10 @@ def gate_verdict(
         )
     elif high <= gate.probability:
         verdict, statement = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {allowed}"
-        if undetected > gate.probability:
-            unmet = f"a critical region that no run has met, or failures that few seeds show, could hold up to {undetected:.2g}"
-            statement = f"if the search has met whatever is critical, {statement}; {unmet}"
+        if high + undetected > gate.probability:
+            unmet = "a critical region that no run has met, or failures that few seeds show, could hold up to"
+            more = "" if undetected > gate.probability else " more"
+            statement = f"if the search has met whatever is critical, {statement}; {unmet} {undetected:.2g}{more}"
     elif low > gate.probability:
         verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:

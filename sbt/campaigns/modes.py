@@ -23,7 +23,7 @@ from sbt.store.records import Judgement, optional
 
 __all__ = [
     "FailureMode", "FailureRate", "Mode", "NearestSafe", "RunPoint", "critical_groups", "describe", "modes_of",
-    "representative_of", "single", "violations",
+    "most_often", "representative_of", "single", "violations",
 ]  # fmt: skip
 
 _MOST = 200  # critical runs that are compared with each other; further ones join the nearest
@@ -272,3 +272,14 @@ def _change(value: Value, other: Value) -> Value | None:
     if isinstance(value, str) or isinstance(other, str):
         return None if other == value else other
     return other - value if abs(other - value) > _NOT_WITHIN * abs(value) else None
+
+
+def most_often(modes: Sequence[FailureMode]) -> FailureMode | None:
+    """Return the first mode, or one whose repetitions came back clearly more often: the interval lies above the first's share."""
+
+    def least(mode: FailureMode) -> float:
+        n = mode.confirmation_runs
+        return float(interval(round((mode.confirmed or 0.0) * n), n)[0])
+
+    above = [mode for mode in modes[1:] if least(mode) > (modes[0].confirmed or 0.0)]
+    return max(above, key=lambda mode: mode.confirmed or 0.0) if above else next(iter(modes), None)

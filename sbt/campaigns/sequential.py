@@ -219,8 +219,9 @@ class SequentialStage:
     def _modes_while_searching(self, log: Log, known: Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
-        It ends with a quarter of the budget, after three batches without a new mode, and where failures are common:
-        draws from the inputs' distribution meet every region that counts.
+        It ends with a quarter of the budget, after three batches without a new mode, and where the simulator is noisy and failures
+        are common: draws from the inputs' distribution meet what counts, as precisely as noise lets it be known. Elsewhere they
+        are too few for that: the metamodel is soon so precise that a second region of a tenth of P decides the error.
         """
         if self._spares_search and not known.one_sided:
             return None
@@ -230,7 +231,8 @@ class SequentialStage:
         modes = [p.modes or 0 for p in proposals if p.phase == EXPLORE] + [known.modes(log_probability)]
         if modes[-1] > 0 and len(modes) > _QUIET and modes[-1] <= modes[-1 - _QUIET]:
             return None
-        return None if modes[-1] > 0 and self._common(log_probability, log.iteration) else modes[-1]
+        noisy = simulator_noise(log.history, self.settings.scenario.requirement).noisy is True
+        return None if modes[-1] > 0 and noisy and self._common(log_probability, log.iteration) else modes[-1]
 
     def _common(self, log_probability: LogProbability | None, iteration: int) -> bool:
         """Return whether the metamodel takes more than 1 in 50 draws from the inputs' distribution to be critical."""

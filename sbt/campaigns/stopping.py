@@ -139,12 +139,13 @@ def is_precise(log: Log, settings: Settings) -> bool:
 
 
 def trusts_search(log: Log, settings: Settings) -> bool:
-    """Return whether a gate would pass while what no run has met may hold more than is allowed: it would trust the search."""
+    """Return whether a gate would pass while what no run has met may hold more than is left of what is allowed."""
     gate, counted = settings.gate, counted_batches(log, settings, failed_critical=True)
-    if gate is None or not counted or combine_estimates(counted).limit(gate.confidence, side=1) > gate.probability:
+    left = -1.0 if gate is None or not counted else gate.probability - combine_estimates(counted).limit(gate.confidence, side=1)
+    if gate is None or left < 0.0:
         return False
     seen = Seen.of(log, settings)
-    return seen.most(seen.surprises, gate.confidence) > gate.probability
+    return seen.most(seen.surprises, gate.confidence) > left
 
 
 def only_unseen(log: Log, settings: Settings) -> bool:

@@ -22,7 +22,7 @@ from sbt.campaigns.lost import (
     repetitions,
     why_they_fail,
 )  # fmt: skip
-from sbt.campaigns.modes import single
+from sbt.campaigns.modes import most_often, single
 from sbt.campaigns.precision import NO_BETTER, PRECISE, as_many_draws, rounded, runs_for_precision, too_wide, width
 from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
@@ -165,7 +165,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         return _nothing_found(found, facts)
     modes = found.failure_modes
     worst = f"; {_worst(modes[0], facts)}" if modes else ""
-    often = _most_often(modes)
+    often = most_often(modes)
     if often is not None and often is not modes[0]:
         n, lost = often.confirmation_runs, often.confirmations_lost or 0
         again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
@@ -194,17 +194,6 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     rest = "every combination of the inputs was run" if exhausted else "a larger budget looks for more modes"
     more = f"{look}campaign: estimation says how probable failures are, {rest}"
     return [said, f"{silent}.", f"Next: {more}."]
-
-
-def _most_often(modes: tuple[FailureMode, ...]) -> FailureMode | None:
-    """Return the first mode, or one whose repetitions came back clearly more often: the interval lies above the first's share."""
-
-    def least(mode: FailureMode) -> float:
-        n = mode.confirmation_runs
-        return float(interval(round((mode.confirmed or 0.0) * n), n)[0])
-
-    above = [mode for mode in modes[1:] if least(mode) > (modes[0].confirmed or 0.0)]
-    return max(above, key=lambda mode: mode.confirmed or 0.0) if above else next(iter(modes), None)
 
 
 def _worst(mode: FailureMode, facts: Facts) -> str:

@@ -185,7 +185,7 @@ def report(folder: Folder, *, trust: Trust = False) -> None:
     with clean_stdout():
         from sbt.workflows.running import rebuild_report
 
-        path = rebuild_report(with_store(folder, trust=trust))
+        path = rebuild_report(with_store(folder, trust=trust), told=lambda note: print(f"warning: {note}", file=sys.stderr))
     print(path)
     next_command("sumo-sbt", "export", str(folder), "--format", "csv")
 

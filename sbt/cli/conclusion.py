@@ -76,6 +76,7 @@ def _answer(result: Mapping[str, Any]) -> list[str]:
 
 def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str:
     """Return a failure mode on one line."""
+    from sbt.campaigns.wording import plural
 
     def measured(name: str, value: Any) -> str:
         return f"{name} {_short(value)} {_unit(units.get(name, ''))}".rstrip()
@@ -83,7 +84,7 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
     inputs = list(mode["inputs"].items())
     told = [measured(name, value) for name, value in inputs[:_MOST_INPUTS]]
     if len(inputs) > _MOST_INPUTS:
-        told.append(f"and {len(inputs) - _MOST_INPUTS} more inputs")
+        told.append(f"and {plural(len(inputs) - _MOST_INPUTS, 'more input')}")
     said = [f"run {mode['representative']}, {measured(metric, mode['metric'])}, at {', '.join(told)}"]
     said += [str(mode["conflict"])] if mode.get("conflict") else []
     violating = ", ".join(name if n == mode["size"] else f"{name} in {n}" for name, n in (mode.get("violates") or {}).items())
@@ -146,8 +147,9 @@ def _record(item: Mapping[str, Any]) -> str:
 
 
 def _next(result: Mapping[str, Any]) -> list[str]:
-    """Return the command that shows most: the film of the deepest failure, else of the closest run."""
+    """Return the command that shows most: the film of the failure that the sentences name, else of the closest run."""
     conclusion, folder = result.get("conclusion", {}), shlex.quote(str(result["store"]))
-    modes = conclusion.get("failure_modes") or ()
-    run = modes[0]["representative"] if modes else (conclusion.get("closest") or {}).get("run")
+    modes, run = conclusion.get("failure_modes") or (), result.get("look_at")
+    if run is None:
+        run = modes[0]["representative"] if modes else (conclusion.get("closest") or {}).get("run")
     return [] if run is None else [f"next: sumo-sbt replay {folder} {run}"]

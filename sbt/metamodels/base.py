@@ -25,14 +25,14 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 
 from sbt.errors import InputError, SbtError, did_you_mean, naming
-from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.prediction import Prediction, PredictionError
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
@@ -229,9 +229,15 @@ def _rule(declared: str, value: Any, stated: Iterable[Any]) -> str:
     return "true or false" if declared == "bool" and not isinstance(value, bool) else ""
 
 
-def named_errors(metamodel: Metamodel, n: int) -> AbstractContextManager[None]:
+@contextmanager
+def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
     """Return a context in which an error of a metamodel's own code names the metamodel, its n rows and the line (`naming`)."""
-    return naming(f"metamodel {type(metamodel).__name__} must learn from {n} rows and predict")
+    name = type(metamodel).__name__
+    with naming(f"metamodel {name} must learn from {n} rows and predict"):
+        try:
+            yield
+        except PredictionError as error:
+            raise InputError(f"metamodel {name}, fitted to {n} rows: {error}") from error
 
 
 def check_prediction(prediction: Prediction, n: int) -> Prediction:

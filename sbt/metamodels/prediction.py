@@ -18,7 +18,7 @@ from sbt.errors import InputError
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["Prediction", "Scale", "reached_beyond"]
+__all__ = ["Prediction", "PredictionError", "Scale", "reached_beyond"]
 
 _Matrix = NDArray[np.float64]
 _LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
@@ -39,6 +39,10 @@ class Scale:
     high: float = np.inf
     steps: tuple[tuple[float, float], ...] = ()
     flag: CriticalInterval | None = None
+
+
+class PredictionError(InputError):
+    """A prediction that is none: of a wrong shape, not finite, without a spread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +75,19 @@ class Prediction:
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 2 or self.mean.shape[0] == 0:
-            raise InputError(f"mean must have shape (k, n) with k >= 1, but got {self.mean.shape}")
+            raise PredictionError(f"mean must have shape (k, n) with k >= 1, but got {self.mean.shape}")
         k, n = self.mean.shape
         for name, shape in (("std", (k, n)), ("weight", (k,)), ("noise", (n,))):
             if getattr(self, name).shape != shape:
-                raise InputError(f"{name} must have shape {shape}, but got {getattr(self, name).shape}")
+                raise PredictionError(f"{name} must have shape {shape}, but got {getattr(self, name).shape}")
         if not np.isfinite(self.mean).all():
-            raise InputError("mean must be finite, but got NaN or infinity")
+            raise PredictionError("mean must be finite, but got NaN or infinity")
         if not ((self.std > 0) & (self.std < np.inf)).all():
-            raise InputError(f"std must be finite and > 0, but got {_first_bad(self.std)}")
+            raise PredictionError(f"std must be finite and > 0, but got {_first_bad(self.std)}")
         if not ((self.noise >= 0) & (self.noise < np.inf)).all():
-            raise InputError("noise must be finite and >= 0, but got NaN, infinity or a negative value")
+            raise PredictionError("noise must be finite and >= 0, but got NaN, infinity or a negative value")
         if not ((self.weight >= 0).all() and abs(self.weight.sum() - 1.0) < 1e-9):
-            raise InputError(f"weight must be >= 0 and sum to 1, but got the sum {self.weight.sum()}")
+            raise PredictionError(f"weight must be >= 0 and sum to 1, but got the sum {self.weight.sum()}")
 
     @classmethod
     def gaussian(cls, mu: ArrayLike, sigma: ArrayLike, noise: ArrayLike | None = None) -> Prediction:

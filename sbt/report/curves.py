@@ -166,9 +166,8 @@ def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
     hatches = ["", "//", "", "..", "", "xx"]
     planned = [int((history.stage == stage).sum()) for stage in stages]
     names = [f"{stage}: {n[-1]:,} of {all_:,}" for stage, n, all_ in zip(stages, found, planned, strict=True)]
-    bands = ax.stackplot(
-        at + 1, *found, labels=[label(n) for n in names], edgecolor="white", linewidth=0.3, step="post"
-    )
+    steps, heights = np.append(at + 1, len(history) + 1), [np.append(n, n[-1]) for n in found]  # the last is as wide
+    bands = ax.stackplot(steps, *heights, labels=[label(n) for n in names], edgecolor="white", linewidth=0.3, step="post")
     for k, band in enumerate(bands):
         band.set(facecolor=shades[k % 6], hatch=hatches[k % 6])
     held = history.held_out
@@ -185,7 +184,7 @@ def plot_progress(history: History, requirement: Requirement, ax: Axes) -> Axes:
             label=f"all runs at random: {rate * ends[1]:,.0f} ({least:,.0f} to {most:,.0f})",
         )
     ax.locator_params(axis="y", integer=True)
-    ax.set(xlabel="number of runs", ylabel="critical runs so far", xlim=(0, len(history)))
+    ax.set(xlabel="number of runs", ylabel="critical runs so far", xlim=(0, len(history) + 1))
     ax.set_ylim(bottom=0, top=None if critical.any() else 1)
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2 if len(names) < 4 else 3, fontsize="small")
     return ax

@@ -39,6 +39,7 @@ Filming = Callable[[Mapping[int, str]], tuple[Sequence[Film], str]]
 def write_report(
     store: Store, scenario: LogicalScenario, predict: Predict | None, conclusion: Conclusion | None, *,
     folder: Path | None = None, sensitivity: Sequence[Sensitivity] = (), film: Filming | None = None,
+    note: str = "",
 ) -> Path:  # fmt: skip
     """Write `report.html` and `figures/*.svg`; works at any moment of a campaign, and gives the same bytes twice.
 
@@ -50,6 +51,7 @@ def write_report(
         folder: where to write; None: the store's folder.
         sensitivity: of an estimated probability to the parameters of the distributions.
         film: makes films of runs; None: the page shows none.
+        note: what the page leaves out, and why; "": nothing.
 
     Returns:
         The path of the page.
@@ -68,6 +70,9 @@ def write_report(
     coarse = store.history(level=None) if store.coarse else None
     coarse = None if coarse is None else coarse.where(coarse.columns["level"] > 0)
     drawings = draw(found, scenario.space, fits, predict, order)
+    for old in set() if folder is not None else set((target / "figures").glob("*.svg")):
+        if old.stem not in {drawing.name for drawing in drawings}:
+            old.unlink()  # of a report before, which no longer holds
     for drawing in drawings:
         write_atomically(target / "figures" / f"{drawing.name}.svg", drawing.svg)
     page = render("template.html", {
@@ -75,7 +80,7 @@ def write_report(
         "description": "\n".join(scenario.description.strip().splitlines()[1:]).strip(),
         "facts": _facts(found, scenario, store),
         "conclusion": conclusion_sentences(found),
-        "warnings": warnings_for(found),
+        "warnings": [*([note] if note else []), *warnings_for(found)],
         "scores": _scores(found),
         "drawings": [_inline(drawing) for drawing in drawings],
         "modes": mode_table(found, scenario.space),

@@ -31,7 +31,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.workflows.checking import Finding, findings_of
-from sbt.workflows.keywords import CampaignKeys, Setting, as_data
+from sbt.workflows.keywords import CampaignKeys, Setting, as_data, check_listener
 from sbt.workflows.result import Result
 from sbt.workflows.running import run_study
 from sbt.workflows.study import Study
@@ -85,8 +85,7 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
         if name not in known:
             raise InputError(f"run takes the keys of a configuration, but got '{name}'{did_you_mean(name, known)}")
     progress, report, workers = keys.pop("progress", None), keys.pop("report", True), keys.pop("workers", None)
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress must be a function, but got {progress!r}")
+    check_listener(progress)
     data, objects = as_data(keys)
     if config is not None:
         overrides = [] if workers is None else [f"executor.workers={int(workers)}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
@@ -20,7 +21,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["CampaignKeys", "Setting", "as_data"]
+__all__ = ["CampaignKeys", "Setting", "as_data", "check_listener"]
 
 Setting = str | JsonMapping
 
@@ -55,6 +56,20 @@ class CampaignKeys(TypedDict, total=False):
     workers: int
     report: bool
     progress: Callable[[Progress], None] | None
+
+
+def check_listener(progress: object) -> None:
+    """Refuse a `progress` that cannot be called with where the campaign stands; None: there is none."""
+    if progress is None:
+        return
+    if not callable(progress):
+        raise InputError(f"progress must be a function, but got {progress!r}")
+    try:
+        inspect.signature(progress).bind(None)
+    except TypeError as error:
+        raise InputError(f"progress must take one argument, where the campaign stands, but: {error}") from None
+    except ValueError:
+        pass  # one that is built in tells no signature
 
 
 def as_data(keys: JsonMapping) -> tuple[Json, dict[tuple[str, str], Any]]:

@@ -241,6 +241,8 @@ class Plots:
     def _pair(self, x: str | None, y: str | None, held: tuple[int, ...] = ()) -> tuple[int, int]:
         """Return the columns of two inputs: those named, the most influential ones that are not held for the rest."""
         named = [None if name is None else self._column(name) for name in (x, y)]
+        if x is not None and x == y:
+            raise InputError(f"x and y must be two inputs, but got '{x}' twice")
         rest = (int(k) for k in np.argsort(-self._influence, kind="stable") if int(k) not in (*named, *held))
         if named == [None, None]:
             first, second = sorted((next(rest), next(rest)))

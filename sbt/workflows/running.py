@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sbt.config.load import differences, dump
-from sbt.errors import InputError
+from sbt.errors import InputError, PluginError
 from sbt.execution.code_print import code_print
 from sbt.execution.protocol import Executor
 from sbt.execution.warming import warm_up
@@ -63,6 +63,7 @@ class Summary:
         sentences: the same in plain words.
         metric: that of the requirement, or what stands for it in a formula or a combination.
         units: of inputs and metrics, by name.
+        look_at: the run to look at first, as the sentences say; None: they name none.
     """
 
     campaign: str
@@ -82,6 +83,7 @@ class Summary:
     sentences: tuple[str, ...] = ()
     metric: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
+    look_at: int | None = None
 
     def to_dict(self) -> Json:
         """Return what `run --json` prints."""
@@ -228,17 +230,20 @@ def summarise(store: Store, study: Study, finished: Finished) -> Summary:
         int(np.count_nonzero(critical & history.unconfirmed)), int(np.count_nonzero(critical & history.doubtful(Doubt.STRUCK))),
         int(np.count_nonzero(history.doubtful(Doubt.OTHER_LEVEL))),
         tuple(sentences_of(finished.conclusion, Facts.of(history, scenario))),
-        scenario.requirement.told_as, scenario.units,
+        scenario.requirement.told_as, scenario.units, getattr(finished.conclusion, "look_at", None),
     )  # fmt: skip
 
 
-def rebuild_report(folder: Path, *, objects: Objects | None = None, target: Path | None = None) -> Path:
+def rebuild_report(
+    folder: Path, *, objects: Objects | None = None, target: Path | None = None, told: Callable[[str], None] | None = None
+) -> Path:  # fmt: skip
     """Write the report of a store again, also while its campaign runs; without a metamodel whose code is not at hand.
 
     Args:
         folder: of the store.
         objects: what was given in Python when it was made.
         target: folder to write to; None: the store's.
+        told: called with what the report leaves out, and why, if it does; it says so itself, too.
 
     Raises:
         StoreError: the folder holds no campaign.
@@ -246,19 +251,35 @@ def rebuild_report(folder: Path, *, objects: Objects | None = None, target: Path
     with Store.read(folder) as store:
         study, ended = Study.from_store(store, objects=objects), store.conclusion
         conclusion = None if ended is None else study.conclusion(ended["conclusion"])
-        return _report(store, study, conclusion, study.fit(store.history()) if study.learns else None, target)
+        note = _left_out(study)
+        if note and told is not None:
+            told(note)
+        return _report(store, study, conclusion, study.fit(store.history()) if study.learns else None, target, note)
+
+
+def _left_out(study: Study) -> str:
+    """Return why a report has nothing of the metamodel; "" where it has, or there is none."""
+    choice = study.config.metamodel
+    if choice is None or study.learns:
+        return ""
+    try:
+        study.loaded.scope.load("metamodels", choice.kind)
+    except PluginError as error:
+        return f"The figures of the metamodel are left out: {error}"
+    return ""
 
 
 def _report(
-    store: Store, study: Study, conclusion: Conclusion | None, fitted: FittedMetamodel | None, target: Path | None = None
-) -> Path:
+    store: Store, study: Study, conclusion: Conclusion | None, fitted: FittedMetamodel | None, target: Path | None = None,
+    note: str = "",
+) -> Path:  # fmt: skip
     from sbt.report.html import write_report
 
     log = Log(store.history(), tuple(store.iterations()), ())
     told = sensitivities_in(study, log) if getattr(conclusion, "probability", None) else ()
     predict = None if fitted is None else fitted.predict
     film = partial(film_runs, study, store.history())
-    return write_report(store, study.scenario, predict, conclusion, folder=target, sensitivity=told, film=film)
+    return write_report(store, study.scenario, predict, conclusion, folder=target, sensitivity=told, film=film, note=note)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,9 +339,11 @@ def bundle_store(folder: Path, target: Path) -> list[Path]:
     The first run that went well is executed again, so that all files are known that a run reads.
 
     Raises:
-        InputError: the code is not approved, does not give the run again, or names files absolutely.
+        InputError: the code is not approved, does not give the run again, or names files absolutely; no folder for the target.
         StoreError: the folder holds no campaign.
     """
+    if not target.absolute().parent.is_dir():
+        raise InputError(f"a bundle must be written into a folder that is there, but got '{target}'")
     forget_files()
     with Store.read(folder) as store:
         study, history = Study.from_store(store), store.history()
