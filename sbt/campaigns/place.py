@@ -186,11 +186,12 @@ def _with(point: Vector, axis: int, value: float) -> Vector:
 
 
 def _cut(probability: Probability, log_success: LogOdds | None, line: Vector, axes: list[int], space: ParameterSpace) -> Cut:
-    """Return the critical stretches of the first axis through a point."""
+    """Return the critical stretches of the first axis through a point, as far as constraints admit them; none of all of that."""
     t = np.linspace(0.0, 1.0, _CELLS + 1)
     points = np.repeat(line[None], len(t), axis=0)
     points[:, axes[0]] = t
-    p, ok = probability(points), succeeding(log_success, points)
+    p, admitted = probability(points), space.feasible(space.from_unit(points))
+    ok = succeeding(log_success, points) & admitted & ~(not admitted.all() and bool((p > 0.5)[admitted].all()))
     x = space.parameters[axes[0]].from_unit(t)
     ends = np.flatnonzero(np.diff(np.concatenate([[0], ((p > 0.5) & ok).astype(int), [0]]))).reshape(-1, 2).tolist()
     sure = succeeding(log_success, points, _GIVES)

@@ -219,9 +219,9 @@ class SequentialStage:
     def _modes_while_searching(self, log: Log, known: Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
-        It ends with a quarter of the budget, after three batches without a new mode, and where the simulator is noisy and failures
-        are common: draws from the inputs' distribution meet what counts, as precisely as noise lets it be known. Elsewhere they
-        are too few for that: the metamodel is soon so precise that a second region of a tenth of P decides the error.
+        It ends with a quarter of the budget, after three batches without a new mode, and where the simulator is noisy and
+        failures are common: draws from the inputs' distribution meet what counts, as precisely as noise lets it be known.
+        Elsewhere they are too few: the metamodel is soon so precise that a second region of a tenth of P decides the error.
         """
         if self._spares_search and not known.one_sided:
             return None

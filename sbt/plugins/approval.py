@@ -69,8 +69,8 @@ def check_approved(path: Path) -> None:
         return
     if store is not None and not is_trusted(store):
         raise UntrustedError(
-            f"the code that a store names must be approved before it runs, but {store} names {path}, which nobody has,"
-            f" as it is now: read it, then say --trust (in Python sbt.open(..., trust=True); for a machine of CI {TRUST}=1, or folders)"
+            f"the code that a store names must be approved before it runs, but {store} names {path}, which nobody has, as it is"
+            f" now: read it, then say --trust (in Python sbt.open(..., trust=True); for a machine of CI {TRUST}=1, or folders)"
         )
     _approve(digest, path)
 

@@ -88,7 +88,8 @@ class Summary:
     def to_dict(self) -> Json:
         """Return what `run --json` prints."""
         plain = {"seconds": dict(self.seconds), "units": dict(self.units), "sentences": list(self.sentences)}
-        return {**vars(self), **plain, "conclusion": self.conclusion.to_dict()}
+        found = {**vars(self), **plain, "conclusion": self.conclusion.to_dict()}
+        return {key: value for key, value in found.items() if value is not None}
 
 
 def run_study(
