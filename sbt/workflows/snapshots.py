@@ -66,7 +66,9 @@ def snapshot_findings(spec: ScenarioSpec, points: Sequence[Values], seed: int, d
         yield Finding(rule, ok=False, detail=str(error) or f"the process gave no answer within {_DEADLINE:g} s")
         return
     differing = [written(values) for (values, _), a, b in zip(jobs, forked, loaded, strict=True) if a != b]
-    yield Finding(rule, ok=not differing, detail=f"they differ at {'; '.join(differing)}" if differing else "bit-equal")
+    why = "; known of persons beside an ego that is a <trip>, where ways are equally long: a <vehicle> with a <route> mends that"
+    said = f"they differ at {'; '.join(differing)}{why}; isolation: fresh simulates all traffic" if differing else "bit-equal"
+    yield Finding(rule, ok=not differing, detail=said)
     differ = _digests(spec, [(jobs[0][0], another)], digest)[0] != forked[0]
     said = "they differ" if differ else "they give one run: in this traffic nothing is drawn after the warm-up"
     yield Finding("for information: two seeds from one warm-up", ok=True, detail=said, numbers={"differ": float(differ)})
