@@ -4,9 +4,10 @@
 
 A smooth time to collision in two normal inputs is at most 0.5 s with P = 1.7e-3. Beside it the metric jumps to 0 in a box of two
 further inputs that holds 1 or 3 % of the space (as behind an occlusion), falls to it on a slope that a sixth of the space shows,
-or is 0 for 1.5 % of the seeds, wherever the inputs are. `none` has no such thing. The gate allows 3e-3. Campaigns with default
-settings, through the public way. Finished cells are lines of the table: run again to go on, or split seeds over processes
-(`resumed.py`).
+or is 0 for 1.5 % of the seeds, wherever the inputs are. `none` has no such thing. The gate allows 3e-3. `hills` has two smooth
+regions in three inputs, P .0514, of which the smaller one holds .0027 and shows in a sixtieth of the space; its gate allows
+.0507. Campaigns with default settings, through the public way. Finished cells are lines of the table: run again to go on, or
+split seeds over processes (`resumed.py`).
 """
 
 from __future__ import annotations
@@ -22,14 +23,32 @@ from scipy.stats import norm
 
 import sbt
 
-ALLOWED = 3e-3
+ALLOWED, HILLS_ALLOWED = 3e-3, 0.0507
+HILLS = 0.0514
+"""P of `hills`, by 4e6 random points (standard error 1e-4)."""
 _SMOOTH = float(norm.sf(3.1 / np.sqrt(1.09)))
 _BOXES = {"none": 0.0, "box_1": 0.01, "box_3": 0.03, "slope": 0.01, "seeds": 0.0}
 _SEEDS = 0.015
 
 
+def hills() -> sbt.Scenario:
+    """Return two Gaussian hills, of which the smaller one is easily missed."""
+
+    def hill(at: np.ndarray, centre: tuple[float, ...], width: float, height: float) -> float:
+        return float(height * np.exp(-((at - centre) ** 2).sum() / (2.0 * width**2)))
+
+    def evaluate(values: dict[str, float], seed: int) -> dict[str, float]:
+        at = np.array([values[name] for name in "abc"])
+        return {"ttc": 1.0 - hill(at, (0.25, 0.25, 0.3), 0.22, 1.7) - hill(at, (0.8, 0.78, 0.7), 0.08, 1.8)}
+
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+    return sbt.Scenario("hills", inputs, sbt.Requirement("ttc", high=0.0), evaluate=evaluate, metrics=["ttc"])
+
+
 def problem(name: str) -> tuple[sbt.Scenario, float]:
     """Return a problem and its probability of a critical run."""
+    if name == "hills":
+        return hills(), HILLS
     half = 0.5 * np.sqrt(_BOXES[name])
 
     def evaluate(values: dict[str, float], seed: int) -> dict[str, float]:
@@ -53,7 +72,7 @@ def campaign(problem_name: str, seed: int, budget: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         found = sbt.run(
             campaign="estimation", scenario=scenario, seed=seed, budget=budget, store=f"{folder}/store", executor="serial",
-            report=False, gate={"probability": ALLOWED},
+            report=False, gate={"probability": HILLS_ALLOWED if problem_name == "hills" else ALLOWED},
         )  # fmt: skip
         told = found.conclusion
         return {
@@ -76,7 +95,7 @@ def show(name: str, rows: list[dict]) -> None:
 def main() -> None:
     """Run what is missing, and print the table."""
     parser = arguments(__doc__, "runs/gates.jsonl", 20)
-    parser.add_argument("--problems", default=",".join(_BOXES))
+    parser.add_argument("--problems", default=",".join([*_BOXES, "hills"]))
     parser.add_argument("--budget", type=int, default=500)
     args = parser.parse_args()
     print("| problem | P | seeds | runs | pass, undecided, fail | covered | RMSE / crude | unseen, at most |")

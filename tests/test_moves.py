@@ -87,8 +87,8 @@ def test_what_a_tail_sweeps_within_a_step_is_touched():
 
 NODES = '<nodes><node id="a" x="0" y="0"/><node id="b" x="200" y="0"/><node id="c" x="400" y="0"/><node id="d" x="800" y="0"/></nodes>'
 EDGES = "<edges>{}</edges>".format("".join(f'<edge id="{a}{b}" from="{a}" to="{b}" numLanes="3"/>' for a, b in ("ab", "bc", "cd")))
-ROUTES = """<routes><vType id="truck" length="16.5" width="2.5"/><route id="r" edges="ab bc cd"/>
-<vehicle id="ego" route="r" depart="0" departPos="162" departSpeed="${speed}" departLane="0"/>
+ROUTES = """<routes><vType id="truck" length="16.5" width="{width}"/><route id="r" edges="ab bc cd"/>
+<vehicle id="ego" route="r" depart="0" departPos="162" departSpeed="${{speed}}" departLane="0"/>
 <vehicle id="g" type="truck" route="r" depart="0" departPos="180" departSpeed="10" departLane="1"/></routes>
 """
 LOOP = """
@@ -116,13 +116,13 @@ requirement: {metric: ttc_path_min, critical: [-.inf, 0.5]}
 """
 
 
-def simulated(folder: Path, what: str) -> Trace:
+def simulated(folder: Path, what: str, *, step: float = 0.1, width: float = 2.5) -> Trace:
     (folder / "n.nod.xml").write_text(NODES)
     (folder / "e.edg.xml").write_text(EDGES)
     run_program(folder, "netconvert", "-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.net.xml")
-    files = '<net-file value="net.net.xml"/><route-files value="my.rou.xml"/><step-length value="0.1"/>'
+    files = f'<net-file value="net.net.xml"/><route-files value="my.rou.xml"/><step-length value="{step}"/>'
     (folder / "my.sumocfg").write_text(f"<configuration>{files}</configuration>")
-    (folder / "my.rou.xml").write_text(ROUTES)
+    (folder / "my.rou.xml").write_text(ROUTES.format(width=width))
     (folder / "mine.py").write_text(LOOP.format(what=what))
     (folder / "scenario.yaml").write_text(YAML)
     trace: Trace = ScenarioSpec(str(folder / "scenario.yaml")).resolve().simulate({"speed": 12.0}, 1)
@@ -145,3 +145,33 @@ def test_who_is_moved_out_of_sight_has_no_way_there(tmp_path: Path):
     assert not trace.present[-1, 1]
     assert trace.actor("g").way is None
     assert "teleported: 'g' at " in trace.unconfirmed[0]
+
+
+@pytest.mark.sumo
+def test_who_drives_on_while_a_contact_is_judged_is_not_teleported(tmp_path: Path):
+    """SUMO lists no contact with a load that is as wide as two lanes, and is given a second for it: everybody drives on."""
+    trace = simulated(tmp_path, "drive", step=0.05, width=5.0)
+    assert trace.ended == "collision"
+    assert not [said for said in trace.unconfirmed if said.startswith("teleported")]
+    assert trace.actor("g").way is not None
+
+
+@pytest.mark.sumo
+def test_a_long_vehicle_that_sumo_turns_at_once_has_not_moved(tmp_path: Path):
+    """In a U-turn a bus of 12 m is turned round within a step: its front moves by less than it drives, its middle by 12 m."""
+    (tmp_path / "n.nod.xml").write_text('<nodes><node id="a" x="0" y="0"/><node id="b" x="60" y="0"/></nodes>')
+    (tmp_path / "e.edg.xml").write_text('<edges><edge id="ab" from="a" to="b"/><edge id="ba" from="b" to="a"/></edges>')
+    run_program(tmp_path, "netconvert", "-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.net.xml")
+    (tmp_path / "my.rou.xml").write_text(
+        """<routes><vType id="bus" length="12" width="2.5"/><route id="r" edges="ab ba"/>
+<vehicle id="ego" depart="0" departPos="25" departSpeed="0"><route edges="ba"/><stop lane="ba_0" endPos="28" duration="100"/></vehicle>
+<vehicle id="g" type="bus" route="r" depart="0" departPos="30" departSpeed="${speed}"/></routes>"""
+    )
+    files = '<net-file value="net.net.xml"/><route-files value="my.rou.xml"/><step-length value="0.05"/>'
+    (tmp_path / "my.sumocfg").write_text(f"<configuration>{files}</configuration>")
+    (tmp_path / "scenario.yaml").write_text(YAML.replace("simulate: mine.py:simulate\n", "").replace("min: 10", "min: 3").replace("duration: 4", "duration: 20"))
+    trace = ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve().simulate({"speed": 4.0}, 1)
+    heading = np.unwrap(trace.actor("g").heading)
+    assert np.nanmax(heading) - np.nanmin(heading) > 3.0, "it turns round"
+    assert not [said for said in trace.unconfirmed if said.startswith("teleported")]
+    assert trace.present[:, 1].sum() == len(trace.time)

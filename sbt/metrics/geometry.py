@@ -205,8 +205,8 @@ def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
     i = slice(first, int(near[-1]) + 1)
     touch = np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i)))
     swing = np.fmax(_swing(a, i), _swing(b, i))
-    possible = first + np.flatnonzero(touch | (swing > _SWINGS))
-    return next((k for k in possible.tolist() if not swing[k - first] > _TURNED or _touch_on_arcs(a, b, k)), None)
+    found = (k for k in (first + np.flatnonzero(touch | (swing > _SWINGS))).tolist())
+    return next((k for k in found if _touch_in(a, b, k, turning=swing[k - first] > _TURNED, slid=bool(touch[k - first]))), None)
 
 
 def _swing(actor: ActorTrace, i: slice) -> Vector:
@@ -218,19 +218,26 @@ def _swing(actor: ActorTrace, i: slice) -> Vector:
     return swing if i.start else np.concatenate([[0.0], swing])  # nothing is known before the first instant
 
 
-def _touch_on_arcs(a: ActorTrace, b: ActorTrace, k: int) -> bool:
-    """Return whether rectangles touch in the step before an instant if they turn evenly, on arcs, from one state to the next.
+def _touch_in(a: ActorTrace, b: ActorTrace, k: int, *, turning: bool, slid: bool) -> bool:
+    """Return whether rectangles touch in the step before an instant; `slid`: they do on chords, with the headings at their ends.
 
-    On the chord with the heading at its end a car that turns within a step of a second touches what it drives around.
+    Where one is turning, they turn evenly, on arcs: on the chord with the heading at its end a car that turns within a step of a
+    second touches what it drives around. Where they do not touch there, they must on the chord, too, with headings that change
+    evenly: parts of long vehicles move beside their headings.
     """
-    (x, y, one), (u, v, other) = (_on_arc(each, k) for each in (a, b))
-    return bool(np.isfinite(contact_share(one, other, u - x, v - y)).any())
+    if not turning:
+        return slid
+    for bend in (1.0,) if slid else (1.0, 0.0):
+        (x, y, one), (u, v, other) = (_on_arc(each, k, bend) for each in (a, b))
+        if not np.isfinite(contact_share(one, other, u - x, v - y)).any():
+            return False
+    return True
 
 
-def _on_arc(actor: ActorTrace, k: int) -> tuple[Vector, Vector, Rectangles]:
+def _on_arc(actor: ActorTrace, k: int, bend: float) -> tuple[Vector, Vector, Rectangles]:
     """Return a rectangle at the ends of the parts of a step, and where its centre was at their begins.
 
-    The centre drives a cubic from one instant to the next, along the headings at both.
+    The centre drives a cubic from one instant to the next, along the headings at both; with a bend of 0 the chord.
     """
     s = np.linspace(0.0, 1.0, _ARCS + 1)
     before = k - 1 if k and not np.isnan(actor.x[k - 1]) else k
@@ -239,8 +246,8 @@ def _on_arc(actor: ActorTrace, k: int) -> tuple[Vector, Vector, Rectangles]:
     half = 0.5 * turn
     length = math.hypot(dx, dy) * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
     length = math.copysign(length, dx * math.cos(old + half) + dy * math.sin(old + half))  # it may drive backwards
-    out, into = s * (1.0 - s) ** 2 * length, -s * s * (1.0 - s) * length
-    come = s * s * (3.0 - 2.0 * s)
+    out, into = bend * s * (1.0 - s) ** 2 * length, -bend * s * s * (1.0 - s) * length
+    come = s + bend * (s * s * (3.0 - 2.0 * s) - s)
     x = actor.x[before] + come * dx + out * math.cos(old) + into * math.cos(old + turn)
     y = actor.y[before] + come * dy + out * math.sin(old) + into * math.sin(old + turn)
     size = np.full(_ARCS, actor.length), np.full(_ARCS, actor.width)

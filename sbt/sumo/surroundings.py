@@ -79,6 +79,7 @@ class Surroundings:
         self.placed: Mapping[str, Placed] = {}
         self.jumped: set[str] = set()
         self._farthest = float(farthest(dt))
+        self._recorded_at = 0.0
         self._teleported: dict[str, str] = {}
         self._ending: Sequence[str] = ()
         self._unreacting: set[str] = set()
@@ -158,7 +159,7 @@ class Surroundings:
                 self._ways.pop(name, None)
             elif name not in row:
                 self._keep_way(name)
-        self.present = list(row)
+        self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
 
@@ -183,7 +184,8 @@ class Surroundings:
             return
         state, now = self.states[name], self._sumo.vehicle.getPosition(name)
         moved = math.dist(now, (state.x + 0.5 * state.length * state.cos, state.y + 0.5 * state.length * state.sin))
-        if now[0] != INVALID_DOUBLE and moved > self._farthest:
+        elapsed = max(self._sumo.simulation.getTime() - self._recorded_at, self._dt)  # a run is judged after its last instant
+        if now[0] != INVALID_DOUBLE and moved > float(farthest(elapsed)):
             self._note_jump(name, moved)
             return
         ahead, poses = line_ahead(self._sumo, name), self._poses(name, len(self._rows) - 1)
@@ -231,6 +233,8 @@ class Surroundings:
         state.acceleration = 0.0 if last is None else (speed - last[3]) / self._dt
         state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed
         moved = 0.0 if last is None else math.hypot(state.x - last[0], state.y - last[1])
+        if last is not None and half and moved > self._farthest:  # SUMO turns a long vehicle at once: where was its front?
+            moved = min(moved, math.hypot(x - last[0] - half * math.cos(last[2]), y - last[1] - half * math.sin(last[2])))
         if moved > self._farthest or (last is not None and name in self._ending):
             self._note_jump(name, moved)
             return
