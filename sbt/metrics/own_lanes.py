@@ -25,8 +25,8 @@ _LANE, _OFF_TRACK, _BEND = 1.5, 0.25, 0.8
 """... or more than so many metres, and this share of its length for each radian of a turn, less than so many: in bends, or where
 it drives far in a step."""
 _SURPLUS = 1.0
-"""Its front is moved by more than the former (m), and so much farther than it drives, where it enters an edge on another lane: SUMO
-turns it until its rear is there, too. Of 4,846 changes of cars at steps of .1 to 1 s, 107 are not told; of .9 million other
+"""Its front is moved by more than the former (m), and so much farther than it drives, where it enters an edge on another lane:
+SUMO turns it until its rear is there. Of 4,846 changes of cars at steps of .1 to 1 s, 107 are not told; of .9 million other
 steps 526 are, mostly where lanes do not meet."""
 _NOWHERE: States = np.full((1, 4), np.nan)
 
@@ -84,7 +84,7 @@ def _along(x: Vector, y: Vector, cos: Vector, sin: Vector) -> tuple[Vector, Vect
 
 
 def _path(trace: Trace, k: int) -> tuple[States, float]:
-    """Return (n, 4) x, y, heading and what it drives in the step to there (m), of an actor and where it goes on, and its length (m).
+    """Return (n, 4) x, y, heading and what it drives in the step to there (m), of an actor and its way, and its length (m).
 
     A last row is NaN. Of a long vehicle it is the front part: SUMO turns its straight rectangle at once.
     """
