@@ -50,6 +50,29 @@ def test_who_swerves_within_a_step_would_have_hit_what_was_ahead_whatever_the_st
     assert (found[swerves:] == 5.0).all()
 
 
+def entering(time: np.ndarray, speed: float, swerves: int) -> np.ndarray:
+    """Return the states of a car whose front is on another lane from one step on, and whose rear is when it gets there, as in SUMO."""
+    front = np.stack([speed * time, np.where(np.arange(len(time)) >= swerves, LANE, 0.0)], axis=1)
+    rear_x = front[:, 0] - 5.0
+    heading = np.arctan2(front[:, 1] - np.where(rear_x >= front[swerves, 0], LANE, 0.0), 5.0)
+    middle = front - 2.5 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return np.column_stack([middle, heading, np.full_like(time, speed)])
+
+
+@pytest.mark.parametrize(("step", "speed"), [(0.05, 10.0), (0.1, 9.0), (0.2, 13.0)])
+def test_who_enters_an_edge_on_another_lane_would_have_hit_what_was_ahead_in_its_own(step: float, speed: float):
+    """SUMO turns it by 33 degrees, until its rear is there, too: what it drives meanwhile beside its heading is no change of lanes."""
+    time = np.arange(0.0, 8.0, step)
+    swerves = int(np.argmax(time > 4.9))
+    own = entering(time, speed, swerves)
+    before, ahead = np.array([own[swerves - 1, 0] + 0.8 * speed + 5.0, 0.0, 0.0, 0.0]), np.array([200.0, 0.0, 0.0, 0.0])
+    found = ttc_on_paths(cars(time, own, before), "ego", "co_1")
+    assert found[swerves - 1] == pytest.approx(0.8, abs=0.2)
+    assert ttc_on_paths(cars(time, own, ahead), "ego", "co_1").min() == 5.0
+    beside = np.array([own[swerves - 1, 0] + 0.8 * speed + 5.0, LANE, 0.0, 0.0])
+    assert ttc_on_paths(cars(time, own, beside), "ego", "co_1")[swerves - 1] == 5.0, "that lane is none of its path yet"
+
+
 def test_a_change_of_lanes_after_the_other_has_gone_is_none_of_the_path():
     """Who stands in the other lane is recorded until before ego changes: ego's way as it was would not have led there."""
     time = np.arange(0.0, 6.0, 0.1)

@@ -70,6 +70,9 @@ def _moves(trace: Trace) -> dict[str, States]:
     entering = (np.abs(front) > _LANE) & (np.hypot(ahead, front) > driven + _SURPLUS) & (turned < _BEND) & ~changes
     if not (changes | entering).any():
         return {}
+    for k in np.flatnonzero(entering):  # until its rear is there it drives beside its heading
+        after = slice(k + 1, k + 1 + int(np.searchsorted(np.cumsum(np.hypot(forward, left)[k + 1 : k + 200]), 2.0 * half[k])))
+        changes[after] &= aside[after] > _LANE
     by = np.where(changes, left, np.where(entering, front, 0.0))
     move = np.where(by[:, None] != 0.0, np.stack([-sin * by, cos * by], axis=1), 0.0)
     begins = np.cumsum([0, *counts])
