@@ -108,6 +108,17 @@ def test_what_a_tail_sweeps_within_a_step_is_touched():
         assert (contact_index(trace.actor("ego"), trace.actor("co")) is not None) == hit
 
 
+def test_who_comes_where_a_turn_has_just_been_is_not_touched():
+    """Ego turns away from the place at which somebody is seen for the first time an instant later: both were never there at once."""
+    time = np.arange(4.0)
+    own = np.column_stack([around(8.0, 6.0 * time), np.full_like(time, 6.0)])
+    comes = np.full((4, 4), np.nan)
+    comes[2:] = [*around(8.0, 4.5), 0.0]
+    assert contact_index(*(cars(time, own, comes).actor(name) for name in ("ego", "co_1"))) is None
+    comes[1] = comes[2]
+    assert contact_index(*(cars(time, own, comes).actor(name) for name in ("ego", "co_1"))) == 1
+
+
 NODES = '<nodes><node id="a" x="0" y="0"/><node id="b" x="200" y="0"/><node id="c" x="400" y="0"/><node id="d" x="800" y="0"/></nodes>'
 EDGES = "<edges>{}</edges>".format("".join(f'<edge id="{a}{b}" from="{a}" to="{b}" numLanes="3"/>' for a, b in ("ab", "bc", "cd")))
 ROUTES = """<routes><vType id="truck" length="16.5" width="{width}"/><route id="r" edges="ab bc cd"/>

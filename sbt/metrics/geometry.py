@@ -225,7 +225,7 @@ def _touch_in(a: ActorTrace, b: ActorTrace, k: int, *, turning: bool, slid: bool
     second touches what it drives around. Where they do not touch there, they must on the chord, too, with headings that change
     evenly: parts of long vehicles move beside their headings.
     """
-    if not turning:
+    if not turning or k == 0 or np.isnan(a.x[k - 1] + b.x[k - 1]):  # who comes has no step before: the end counts alone
         return slid
     for bend in (1.0,) if slid else (1.0, 0.0):
         (x, y, one), (u, v, other) = (_on_arc(each, k, bend) for each in (a, b))
@@ -240,7 +240,7 @@ def _on_arc(actor: ActorTrace, k: int, bend: float) -> tuple[Vector, Vector, Rec
     The centre drives a cubic from one instant to the next, along the headings at both; with a bend of 0 the chord.
     """
     s = np.linspace(0.0, 1.0, _ARCS + 1)
-    before = k - 1 if k and not np.isnan(actor.x[k - 1]) else k
+    before = k - 1
     old, turn = float(actor.heading[before]), math.remainder(float(actor.heading[k] - actor.heading[before]), math.tau)
     dx, dy = actor.x[k] - actor.x[before], actor.y[k] - actor.y[before]
     half = 0.5 * turn
