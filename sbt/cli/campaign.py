@@ -204,7 +204,7 @@ def export(
         from sbt.workflows.exporting import export_store, limits_of
 
         store = with_store(folder, trust=trust)
-        path, limits = export_store(store, form), limits_of(store, form)
+        limits, path = limits_of(store, form), export_store(store, form)  # in this order: runs may come meanwhile
     print(path)
     for limit in limits:
         print(f"note: {limit}", file=sys.stderr)

@@ -117,7 +117,11 @@ class Campaigns:
 
     def listed(self) -> list[Json]:
         """Return the campaigns, running ones first, then the newest."""
-        rows = sorted((self.status(key) for key in self._known()), key=lambda row: (row["state"] != "running", -row["changed"]))
+        rows = []
+        for key in self._known():
+            with suppress(InputError):  # its folder has gone meanwhile
+                rows.append(self.status(key))
+        rows.sort(key=lambda row: (row["state"] != "running", -row["changed"]))
         if rows and not self._ready:
             self._ready = True  # what a first look imports is there when one is asked for
             threading.Thread(target=_look, args=(self[rows[0]["key"]].folder,), daemon=True).start()
