@@ -76,7 +76,7 @@ def others_braking_max(ego: str = "ego") -> Metric:
         walking = persons(trace)
         others = [k for k, name in enumerate(trace.actors) if name != ego and not walking[k]]
         braking = -trace.acceleration[:, others]
-        return float(np.nanmax(braking, initial=0.0))
+        return float(np.nanmax(braking, initial=0.0)) + 0.0  # no -0
 
     return Metric(
         "others_braking_max", function, "m/s^2", "high", 0.0, "hardest braking of other vehicles: how much ego relies on them"

@@ -60,10 +60,11 @@ def _as_csv(store: Store, study: Study) -> Path:
 
 
 def limits_of(folder: Path, form: str) -> list[str]:
-    """Return in sentences what a reader of a file that will be exported must know: runs are missing, or were not chosen for it."""
+    """Return in sentences what a reader of an exported file must know: that runs are missing, or were not chosen for it."""
     found = read_status(folder)
     kind, runs = found["campaign"], found["done"]
-    said = [] if found["state"] == "finished" else [f"the campaign has not concluded: these are the runs so far, at least {runs:,}"]
+    so_far = f"the campaign has not concluded: these are the runs so far, at least {runs:,}"
+    said = [] if found["state"] == "finished" else [so_far]
     if form == "boundary" and kind != "boundary":
         said.append(f"the runs of this campaign ({kind}) were not chosen to find the boundary, which may lie elsewhere")
     return said
