@@ -16,15 +16,20 @@ instruction on, and ignored once it has begun.
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
 import queue
+import re
 import signal
 import sys
 import threading
 import time
 from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
+from sbt.errors import InputError
 from sbt.execution.starting import TERMINAL_SIGNALS, start_apart
 from sbt.execution.streams import SteadyStream, open_missing
 from sbt.processes import SCRATCH, ProcessId
@@ -35,6 +40,8 @@ T = TypeVar("T")
 
 _THREADS = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
 _PR_SET_PDEATHSIG = 1
+_ABANDONED = 3600.0
+"""Age of a semaphore (s) from which on its process is taken for ended where there is none of that number."""
 
 
 def open_pool(workers: int, folder: str) -> Any:
@@ -48,12 +55,29 @@ def open_pool(workers: int, folder: str) -> Any:
 
     from sbt.execution.loky_context import Context
 
+    if multiprocessing.current_process().daemon:
+        rule = "worker processes need a process that may start some, but this is a daemonic one, such as of multiprocessing.Pool"
+        raise InputError(f"{rule}: executor serial runs in it, concurrent.futures.ProcessPoolExecutor has others")
+    _remove_semaphores(os.getpid())
     return start_apart(
         lambda: ProcessPoolExecutor(
             max_workers=workers, context=Context(), timeout=None, env={**_THREADS, SCRATCH: folder},
             initializer=_begin, initargs=(ProcessId.current(),),
         )
     )  # fmt: skip
+
+
+@cache
+def _remove_semaphores(pid: int) -> None:
+    """Remove the semaphores of this user's pools whose processes were killed all at once, with what would have removed them."""
+    with suppress(OSError), os.scandir("/dev/shm") as entries:
+        for entry in entries:
+            match = re.fullmatch(r"sem\.loky-(\d+)-\w+", entry.name)
+            with suppress(OSError):
+                state = entry.stat(follow_symlinks=False)
+                old = time.time() - state.st_mtime > _ABANDONED
+                if match and old and state.st_uid == os.getuid() and not ProcessId(int(match[1]), 0).alive:
+                    Path(entry.path).unlink()
 
 
 def close_pool(pool: Any) -> None:
@@ -83,6 +107,8 @@ def _begin(driver: ProcessId) -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if not _has_driver(driver):
         os._exit(1)
+    with suppress(OSError, AttributeError):  # what a run sends to its process group reaches neither driver nor other workers
+        os.setpgid(0, 0)
     threading.Thread(target=_watch, args=(driver,), name="sbt-driver-watch", daemon=True).start()
     for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)

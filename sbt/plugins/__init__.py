@@ -23,8 +23,8 @@ from sbt.plugins.approval import check_approved, modules_of, named_by
 from sbt.plugins.source import FromSource, import_from_source
 
 __all__ = [
-    "KINDS", "OBJECT", "Objects", "Scope", "forget_changed", "forget_files", "kept", "load", "names", "newer", "noted",
-    "read_files",
+    "KINDS", "OBJECT", "Objects", "Scope", "check_read", "forget_changed", "forget_files", "kept", "load", "names", "newer",
+    "noted", "read_files",
 ]  # fmt: skip
 
 OBJECT = "object:"
@@ -81,6 +81,26 @@ def read_files() -> list[Path]:
     """Return the user's files that this process has read, and the modules beside them that they import."""
     found = {path.resolve() for path in _stamps if path.is_file()}
     return sorted({file for path in found for file in (modules_of(path) if path.suffix == ".py" else (path,))})
+
+
+def check_read() -> Callable[[], None]:
+    """Return a function that refuses to go on where the user's code or scenario files are no longer as this process read them.
+
+    A worker that starts later, or a module that a run imports, would be of what they are then.
+    """
+    read = {path.resolve(): state for path, state in _stamps.items()}
+    states = {path: read.get(path, _stamp(path)) for path in read_files() if path.suffix in (".py", ".yaml", ".yml")}
+    contents = {path: path.read_bytes() for path in states}
+
+    def check() -> None:
+        for path in [path for path, state in states.items() if _stamp(path) != state]:
+            now = path.read_bytes() if path.is_file() else None
+            if now != contents[path]:
+                rule = "code and scenario files must stay as they are while a campaign runs"
+                raise InputError(f"{rule}, but {path} was changed: put it back and run again, or choose another store")
+            states[path] = _stamp(path)
+
+    return check
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -174,6 +194,8 @@ def _module(path: str) -> Any:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     import_from_source(Path(path).parent)
+    if (folder := str(Path(path).resolve().parent)) not in sys.path:  # modules beside it, after all that are installed
+        sys.path.append(folder)
     try:
         _guarded(
             partial(spec.loader.exec_module, module),

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-from sbt.errors import InputError
+from sbt.errors import InputError, SbtError
 from sbt.files import move_atomically, scratch_in
 from sbt.loop.running import run_stages
 from sbt.loop.stages import Shard
@@ -20,8 +20,8 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import JsonMapping
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import Record
-from sbt.workflows.running import Summary, keep_configuration, rebuild_report, summarise
-from sbt.workflows.study import RESOLVED, Study
+from sbt.workflows.running import Summary, check_code, keep_configuration, rebuild_report, summarise
+from sbt.workflows.study import RESOLVED, Study, changed_since
 
 __all__ = ["merge_shards"]
 
@@ -67,6 +67,7 @@ def merge_shards(folders: Sequence[Path], into: Path, *, report: bool = True) ->
     _check_whole(parts)
     with Store.read(parts[0].folder) as first:
         study = Study.from_store(first).with_store(into)
+    _check_files(parts, study)
     into.mkdir(parents=True, exist_ok=True)
     with scratch_in(into, "merge") as folder:
         result = _run(study, parts, Path(folder))
@@ -108,6 +109,18 @@ def _check_same(parts: Sequence[_Part]) -> None:
     if len(found) > 1:
         differing = "; ".join(f"{versions} in {folder}" for versions, folder in found.items())
         raise InputError(f"shards must have been run with the same versions, but got {differing}")
+
+
+def _check_files(parts: Sequence[_Part], study: Study) -> None:
+    """Refuse a shard whose runs would not come again from code and files that were changed after it began, if they are there."""
+    try:
+        study.spec.resolve()
+    except SbtError:
+        return
+    for part in parts:
+        if changed_since(part.folder):
+            with Store.read(part.folder) as store, study.executor() as executor:
+                check_code(store, study, executor, changed=True)
 
 
 def _check_whole(parts: Sequence[_Part]) -> None:

@@ -19,7 +19,7 @@ from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.running import Finished, check_shard, run_shard, run_stages
 from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard, sentences_of
-from sbt.plugins import OBJECT, Objects, forget_files
+from sbt.plugins import OBJECT, Objects, check_read, forget_files
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Doubt, Job, Outcome, Status
@@ -35,7 +35,10 @@ from sbt.workflows.judging import judge_campaign
 from sbt.workflows.portable import write_bundle
 from sbt.workflows.study import RESOLVED, Study, changed_since
 
-__all__ = ["Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise"]
+__all__ = [
+    "Replay", "Summary", "bundle_store", "check_code", "keep_configuration", "rebuild_report", "replay_run", "run_study",
+    "summarise",
+]  # fmt: skip
 
 _TRIED = 20
 """Runs that are tried again, spread over those that are there, before a campaign goes on whose files or code were changed."""
@@ -132,7 +135,8 @@ def run_study(
         executor = study.executor()  # at the isolation level that the store remembers
         warm_up(study.spec, study.config.executor.workers, partial(_tell, store, study, common["listener"]))
         with executor:
-            _check_code(store, study, executor, changed=changed)
+            common["check"] = check_read()
+            check_code(store, study, executor, changed=changed)
             if changed:
                 keep_configuration(store, study, snapshot)
             if shard is None:
@@ -162,7 +166,7 @@ def _code_of(study: Study) -> Json:
     return {CODE: code_print(study.scenario)} if _own_code(study) else {}
 
 
-def _check_code(store: Store, study: Study, executor: Executor, *, changed: bool) -> None:
+def check_code(store: Store, study: Study, executor: Executor, *, changed: bool) -> None:
     """Refuse to go on with a store whose runs the user's code and files would not give again.
 
     The first and the last with metrics are tried, where files or code were changed since as many as `_TRIED` of all, and the

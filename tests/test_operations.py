@@ -1,0 +1,110 @@
+"""What happens around a campaign while it runs: code is edited, shards differ, a run signals its group."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+import sbt
+from sbt.config.load import load
+from sbt.errors import InputError
+from sbt.loop.stages import Shard
+from sbt.plugins import forget_changed
+from sbt.workflows.merging import merge_shards
+from sbt.workflows.running import run_study
+from sbt.workflows.study import Study
+
+SCENARIO = """import os, signal
+import pathlib, time
+import sbt
+{imports}
+K = {k}
+def f(values, seed):
+    {first}
+    time.sleep({seconds})
+    return {{"y": values["a"] * K}}
+S = sbt.Scenario("own", [sbt.Parameter("a", 0, 1)], sbt.Requirement("y", high=0.1), evaluate=f)
+"""
+
+
+def write(folder: Path, *, k: str = "1.0", first: str = "", imports: str = "", seconds: float = 0.0) -> Path:
+    """Write a scenario of one's own, and the configuration of a coverage."""
+    (folder / "own.py").write_text(SCENARIO.format(k=k, first=first or "pass", imports=imports, seconds=seconds))
+    path = folder / "c.yaml"
+    path.write_text("campaign: coverage\nscenario: own.py:S\nbudget: 24\nbatch: 6\nseed: 5\nexecutor: {kind: serial}\nstore: s\n")
+    return path
+
+
+def study(path: Path, *overrides: str) -> Study:
+    return Study(load(path, [f"store={path.parent / 's'}", *overrides]))
+
+
+def test_no_row_is_of_code_that_was_edited_while_the_campaign_ran(tmp_path: Path):
+    """What was run until then is kept, and the campaign goes on to the same rows where the code is as it was."""
+    edit = 'p = pathlib.Path(__file__); seed % 5 == 0 and p.write_text(p.read_text().replace("K = 1.0", "K = 2.0"))'
+    path = write(tmp_path, first=edit, seconds=0.02)
+    before = (tmp_path / "own.py").read_text()
+    with pytest.raises(InputError, match=r"must stay as they are while a campaign runs, but .*own.py was changed: put it back"):
+        run_study(study(path), report=False)
+    kept = sbt.open(tmp_path / "s", trust=True).frame
+    assert 0 < len(kept) < 24
+    assert (kept["y.y"] == kept["x.a"]).all()
+    (tmp_path / "own.py").write_text(before.replace("seed % 5 == 0 and ", "False and "))
+    forget_changed()  # as where a command begins
+    run_study(study(path), report=False)
+    frame = sbt.open(tmp_path / "s", trust=True).frame
+    assert len(frame) == 24
+    assert (frame["y.y"] == frame["x.a"]).all()
+
+
+def test_a_file_that_is_written_again_as_it_was_stops_nothing(tmp_path: Path):
+    path = write(tmp_path, first="p = pathlib.Path(__file__); p.write_text(p.read_text())")
+    assert run_study(study(path), report=False).runs == 24
+
+
+def test_shards_of_code_that_was_edited_between_them_are_not_merged(tmp_path: Path):
+    path = write(tmp_path)
+    folders = [tmp_path / f"shard-{k}" for k in (1, 2)]
+    run_study(study(path, f"store={folders[0]}"), report=False, shard=Shard(1, 2))
+    later = time.time() + 5.0
+    write(tmp_path, k="2.0")
+    os.utime(tmp_path / "own.py", (later, later))
+    forget_changed()  # as where a command begins
+    run_study(study(path, f"store={folders[1]}"), report=False, shard=Shard(2, 2))
+    with pytest.raises(InputError, match=r"must give the runs of .*shard-1 again"):
+        merge_shards(folders, tmp_path / "whole", report=False)
+    assert not (tmp_path / "whole" / "campaign.sqlite").exists()
+
+
+@pytest.mark.parametrize("signal", ["SIGKILL", "SIGINT", "SIGTERM"])
+def test_a_run_that_signals_its_process_group_costs_itself_only(tmp_path: Path, signal: str):
+    path = write(tmp_path, first=f'values["a"] > 0.9 and os.killpg(0, signal.{signal})')
+    found = run_study(study(path, "executor.kind=local", "executor.workers=2", "executor.timeout=20"), report=False)
+    assert found.runs == 24
+    frame = sbt.open(tmp_path / "s", trust=True).frame
+    assert (frame.loc[frame["x.a"] <= 0.9, "status"] == "ok").all()
+
+
+def test_own_code_imports_the_modules_beside_it(tmp_path: Path):
+    (tmp_path / "beside_it.py").write_text("k = 3.0\n")
+    path = write(tmp_path, imports="from beside_it import k", k="k")
+    found = run_study(study(path, "executor.kind=local", "executor.workers=1"), report=False)
+    assert found.ok == 24
+
+
+def _in_a_pool(folder: str) -> str:
+    try:
+        run_study(study(Path(folder) / "c.yaml", "executor.kind=local", "executor.workers=1"), report=False)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def test_a_daemonic_process_is_told_that_it_starts_none(tmp_path: Path):
+    write(tmp_path)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert "worker processes need a process that may start some" in pool.map(_in_a_pool, [str(tmp_path)])[0]
