@@ -15,7 +15,7 @@ from sbt.errors import InputError
 from sbt.loop.stages import Shard
 from sbt.plugins import forget_changed
 from sbt.workflows.merging import merge_shards
-from sbt.workflows.running import run_study
+from sbt.workflows.running import rebuild_report, run_study
 from sbt.workflows.study import Study
 
 SCENARIO = """import os, signal
@@ -108,3 +108,32 @@ def test_a_daemonic_process_is_told_that_it_starts_none(tmp_path: Path):
     write(tmp_path)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         assert "worker processes need a process that may start some" in pool.map(_in_a_pool, [str(tmp_path)])[0]
+
+
+METAMODEL = """import numpy as np
+from sbt.metamodels.prediction import Prediction
+
+class Nearest:
+    def fit(self, u, y, rng):
+        def predict(points):
+            distance = np.linalg.norm(points[:, None] - u, axis=2)
+            return Prediction.gaussian(y[distance.argmin(axis=1)], 0.1 + distance.min(axis=1))
+        return predict
+"""
+
+
+def test_a_report_says_what_it_leaves_out_and_leaves_no_old_figures(tmp_path: Path):
+    path = write(tmp_path)
+    (tmp_path / "mine.py").write_text(METAMODEL)
+    path.write_text(path.read_text() + "metamodel: {kind: 'mine.py:Nearest'}\n")
+    run_study(study(path, "campaign=boundary", "initial=10"))
+    page, figure = tmp_path / "s" / "report.html", tmp_path / "s" / "figures" / "probability.svg"
+    assert figure.is_file()
+    assert "metamodel are left out" not in page.read_text()
+    (tmp_path / "mine.py").unlink()
+    forget_changed()
+    told: list[str] = []
+    rebuild_report(tmp_path / "s", told=told.append)
+    assert told[0].startswith("The figures of the metamodel are left out: a plug-in file must exist")
+    assert "The figures of the metamodel are left out" in page.read_text()
+    assert not figure.exists()

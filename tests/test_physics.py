@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 from scenario_points import sobol
 
+import sbt
 from sbt.execution.spec import ScenarioSpec
-from sbt.metrics.physics import breaches
+from sbt.execution.worker import run_job
+from sbt.metrics.physics import breaches, stopped_dead
 from sbt.plugins import load, names
+from sbt.problem.outcome import Doubt, Job, doubts
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
 from sbt.problem.trace import Trace
 from sbt.sumo.actors import State
 from sbt.sumo.drivers import Braking
@@ -162,3 +167,23 @@ def test_check_tells_a_user_which_laws_an_own_scenario_breaks(tmp_path: Path) ->
     check_physics(scenario.simulate({"aside": 0.0}, 0))
     with pytest.raises(ContractError, match=r"sideways must be <= 1\.5 m/s, but ego has 31 m/s at 1\.10 s"):
         check_physics(scenario.simulate({"aside": 3.5}, 0))
+
+
+def test_who_is_stopped_dead_near_the_ego_is_told_in_the_row() -> None:
+    """SUMO stops who would drive over a red light; a walker halts in one step, and who is moved as recorded has noise."""
+    time = 0.1 * np.arange(20.0)
+    speed = np.stack([np.full(20, 10.0), np.where(time > 0.95, 0.0, 10.0)], axis=1)
+    x = np.cumsum(0.1 * speed, axis=0) + np.array([0.0, 60.0])
+    acceleration = np.diff(speed, prepend=speed[:1], axis=0) / 0.1
+    size = np.array([5.0, 5.0]), np.array([1.8, 1.8])
+    trace = Trace(time, ("ego", "co"), x, 0.0 * x, 0.0 * x, speed, acceleration, *size)
+    assert stopped_dead(trace, "ego") == [("co", pytest.approx(100.0), pytest.approx(1.0))]
+    assert stopped_dead(dataclasses.replace(trace, unreacting=("co",)), "ego") == []
+    walker = dataclasses.replace(trace, length=np.array([5.0, 0.2]), width=np.array([1.8, 0.5]))
+    assert stopped_dead(walker, "ego") == []
+    scenario = sbt.Scenario(
+        "stops", [Parameter("a", 0, 1)], Requirement("d_min", high=1.0), simulate=lambda values, seed: trace, metrics=["d_min"]
+    )  # fmt: skip
+    outcome = run_job(scenario, Job(0, {"a": 0.5}, 1))
+    assert outcome.unconfirmed == "stopped dead: 'co' at 1.000 s, by 100 m/s^2"
+    assert doubts(outcome.unconfirmed) == (Doubt.STOPPED,)

@@ -62,6 +62,25 @@ def test_the_place_of_a_boundary_is_where_it_is_and_names_what_matters():
         assert boundary_place(lambda u, p=side: np.full(len(u), p), scenario, seed=1) is None
 
 
+def test_the_place_of_a_boundary_is_admissible():
+    """Critical where a < 4 + 0.3 b; what constraints exclude is no part of a stretch, and a line critical all along is none."""
+    constraints = (("a >= 3", lambda c: c["a"] >= 3.0), ("a - b <= 4", lambda c: c["a"] - c["b"] <= 4.0))
+    space = ParameterSpace((Parameter("a", 0, 10), Parameter("b", -5, 5)), constraints=constraints)
+    scenario = LogicalScenario("s", space, Requirement("y", high=0.0), evaluate=lambda v, s: {"y": 0.0})
+
+    def log_odds(u):
+        x = space.from_unit(u)
+        return 20 * (4.0 + 0.3 * x[:, 1] - x[:, 0])
+
+    found = boundary_place(log_odds, scenario, seed=1)
+    assert found.cuts
+    for cut in found.cuts:
+        (stretch,) = cut.critical
+        assert stretch.low == pytest.approx(3.0, abs=0.03)
+        assert stretch.high == pytest.approx(4.0 + 0.3 * cut.at, abs=0.03)
+        assert stretch.high <= 4.0 + cut.at + 0.03, "admissible"
+
+
 @pytest.mark.parametrize("campaign", ["coverage", "boundary", "falsification", "estimation"])
 def test_every_campaign_leads_with_its_answer_and_says_it_the_same_everywhere(tmp_path, campaign):
     kind = {"metamodel": {"kind": "gp"}} if campaign == "boundary" else {}
