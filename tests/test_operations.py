@@ -43,19 +43,22 @@ def study(path: Path, *overrides: str) -> Study:
     return Study(load(path, [f"store={path.parent / 's'}", *overrides]))
 
 
+RECYCLED = ("executor.kind=local", "executor.workers=1", "executor.recycle=6")
+
+
 def test_no_row_is_of_code_that_was_edited_while_the_campaign_ran(tmp_path: Path):
-    """What was run until then is kept, and the campaign goes on to the same rows where the code is as it was."""
+    """Workers that are replaced would load it: what was run is kept, and goes on to the same rows with the code as it was."""
     edit = 'p = pathlib.Path(__file__); seed % 5 == 0 and p.write_text(p.read_text().replace("K = 1.0", "K = 2.0"))'
-    path = write(tmp_path, first=edit, seconds=0.02)
+    path = write(tmp_path, first=edit)
     before = (tmp_path / "own.py").read_text()
-    with pytest.raises(InputError, match=r"must stay as they are while a campaign runs, but .*own.py was changed: put it back"):
-        run_study(study(path), report=False)
+    with pytest.raises(InputError, match=r"new workers must load .* began with, but .*own.py was changed: put it back"):
+        run_study(study(path, *RECYCLED), report=False)
     kept = sbt.open(tmp_path / "s", trust=True).frame
     assert 0 < len(kept) < 24
     assert (kept["y.y"] == kept["x.a"]).all()
     (tmp_path / "own.py").write_text(before.replace("seed % 5 == 0 and ", "False and "))
     forget_changed()  # as where a command begins
-    run_study(study(path), report=False)
+    run_study(study(path, *RECYCLED), report=False)
     frame = sbt.open(tmp_path / "s", trust=True).frame
     assert len(frame) == 24
     assert (frame["y.y"] == frame["x.a"]).all()
@@ -63,7 +66,7 @@ def test_no_row_is_of_code_that_was_edited_while_the_campaign_ran(tmp_path: Path
 
 def test_a_file_that_is_written_again_as_it_was_stops_nothing(tmp_path: Path):
     path = write(tmp_path, first="p = pathlib.Path(__file__); p.write_text(p.read_text())")
-    assert run_study(study(path), report=False).runs == 24
+    assert run_study(study(path, *RECYCLED), report=False).runs == 24
 
 
 def test_shards_of_code_that_was_edited_between_them_are_not_merged(tmp_path: Path):

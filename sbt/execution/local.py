@@ -19,7 +19,7 @@ import struct
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from enum import Enum, auto
@@ -34,6 +34,7 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.execution.starting import start_apart
 from sbt.execution.streams import open_missing
 from sbt.execution.worker import run_at_levels
+from sbt.plugins import check_read
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.processes import scratch
@@ -86,6 +87,7 @@ class LocalExecutor:
         self._memory, self._recycle = memory, recycle
         self._started = 0  # runs since the workers were
         self._pool: Any = None
+        self._check: Callable[[], None] = lambda: None
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._seconds = _TARGET
 
@@ -97,6 +99,7 @@ class LocalExecutor:
         (folder / _SCENARIO).write_bytes(pickle.dumps((self._spec, self._timeout)))
         (folder / _LIMIT).write_text(str(self._memory or 0))
         (folder / _MARKS).mkdir()
+        self._check = check_read()
         try:
             self._start()
         except BaseException:
@@ -254,6 +257,7 @@ class LocalExecutor:
         return {runs[0]: _Cause.LATE for runs, _ in late if len(runs) == 1}  # of several: repeated alone
 
     def _restart(self) -> None:
+        self._check()  # new workers would load what files are now
         self._stop()
         for path in Path(self._folder, _MARKS).iterdir():
             path.unlink()

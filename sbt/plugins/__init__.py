@@ -96,7 +96,7 @@ def check_read() -> Callable[[], None]:
         for path in [path for path, state in states.items() if _stamp(path) != state]:
             now = path.read_bytes() if path.is_file() else None
             if now != contents[path]:
-                rule = "code and scenario files must stay as they are while a campaign runs"
+                rule = "new workers must load the code and scenario files that the campaign began with"
                 raise InputError(f"{rule}, but {path} was changed: put it back and run again, or choose another store")
             states[path] = _stamp(path)
 

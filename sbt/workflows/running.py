@@ -135,7 +135,8 @@ def run_study(
         executor = study.executor()  # at the isolation level that the store remembers
         warm_up(study.spec, study.config.executor.workers, partial(_tell, store, study, common["listener"]))
         with executor:
-            common["check"] = check_read()
+            if study.config.executor.kind == "dask":  # whose workers may come at any time
+                common["check"] = check_read()
             check_code(store, study, executor, changed=changed)
             if changed:
                 keep_configuration(store, study, snapshot)
