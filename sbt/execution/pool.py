@@ -25,6 +25,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -75,7 +76,7 @@ def _remove_semaphores(pid: int) -> None:
             match = re.fullmatch(r"sem\.loky-(\d+)-\w+", entry.name)
             with suppress(OSError):
                 state = entry.stat(follow_symlinks=False)
-                old = time.time() - state.st_mtime > _ABANDONED
+                old = datetime.now(UTC).timestamp() - state.st_mtime > _ABANDONED
                 if match and old and state.st_uid == os.getuid() and not ProcessId(int(match[1]), 0).alive:
                     Path(entry.path).unlink()
 
