@@ -58,7 +58,7 @@ the metamodel is coarse; later batches go on searching, and learn those regions 
 _QUIET = 3
 """Batches without a new mode after which it ends."""
 _COMMON = 0.02
-"""P(critical) under the inputs' distribution above which draws from it meet every region that counts."""
+"""P(critical) under the inputs' distribution above which draws from it meet every region that counts beside noise."""
 _EVEN_SHARE = 0.1
 """Of the search picks, those that are spread evenly: they do not depend on the metamodel."""
 _BEYOND = 1e-9
