@@ -92,11 +92,24 @@ def test_a_run_that_signals_its_process_group_costs_itself_only(tmp_path: Path, 
     assert (frame.loc[frame["x.a"] <= 0.9, "status"] == "ok").all()
 
 
-def test_own_code_imports_the_modules_beside_it(tmp_path: Path):
-    (tmp_path / "beside_it.py").write_text("k = 3.0\n")
-    path = write(tmp_path, imports="from beside_it import k", k="k")
-    found = run_study(study(path, "executor.kind=local", "executor.workers=1"), report=False)
-    assert found.ok == 24
+def test_own_code_imports_the_modules_beside_it_and_no_others_of_their_name(tmp_path: Path):
+    """Also in workers, and as they are when a command begins."""
+    folders = [tmp_path / name for name in "ab"]
+    for k, folder in enumerate(folders, 2):
+        folder.mkdir()
+        (folder / "beside_it.py").write_text(f"k = {k}.0\n")
+        write(folder, imports="from beside_it import k", k="k")
+    for k, folder in enumerate(folders, 2):
+        run_study(study(folder / "c.yaml"), report=False)
+        frame = sbt.open(folder / "s", trust=True).frame
+        assert (frame["y.y"] == k * frame["x.a"]).all()
+    (folders[1] / "beside_it.py").write_text("k = 50.0\n")
+    forget_changed()
+    for executor in (("executor.kind=serial",), ("executor.kind=local", "executor.workers=1")):
+        store = tmp_path / executor[0][-6:]
+        run_study(study(folders[1] / "c.yaml", f"store={store}", *executor), report=False)
+        frame = sbt.open(store, trust=True).frame
+        assert (frame["y.y"] == 50.0 * frame["x.a"]).all()
 
 
 def _in_a_pool(folder: str) -> str:

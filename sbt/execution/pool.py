@@ -110,6 +110,8 @@ def _begin(driver: ProcessId) -> None:
         os._exit(1)
     with suppress(OSError, AttributeError):  # what a run sends to its process group reaches neither driver nor other workers
         os.setpgid(0, 0)
+        for number in (signal.SIGTTOU, signal.SIGTTIN):  # a terminal stops who uses it from another group than its own
+            signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_watch, args=(driver,), name="sbt-driver-watch", daemon=True).start()
     for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)

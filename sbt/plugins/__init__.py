@@ -9,8 +9,8 @@ from __future__ import annotations
 import importlib.util
 import sys
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
@@ -36,6 +36,8 @@ Objects = Mapping[tuple[str, str], Any]
 KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
+_USER = "sbt_user_"
+"""How the names of modules begin that a file of the user's was imported as."""
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 _stamps: dict[Path, tuple[int, int]] = {}
@@ -187,24 +189,53 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
 def _module(path: str) -> Any:
     """Import one file under a name of its own, once a process while it stays as it is."""
     noted(Path(path))
-    name = f"sbt_user_{abs(hash(path)):x}_{Path(path).stem}"
+    name = f"{_USER}{abs(hash(path)):x}_{Path(path).stem}"
     spec = importlib.util.spec_from_file_location(name, path, loader=FromSource(name, path))
     if spec is None or spec.loader is None or not Path(path).is_file():
         raise PluginError(f"a plug-in file must exist, but got '{path}'")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     import_from_source(Path(path).parent)
-    if (folder := str(Path(path).resolve().parent)) not in sys.path:  # modules beside it, after all that are installed
-        sys.path.append(folder)
     try:
-        _guarded(
-            partial(spec.loader.exec_module, module),
-            lambda error: f"plug-in file {path}{_line_of(error, path)} raised on import",
-        )
+        with _modules_beside(Path(path).resolve().parent):
+            _guarded(
+                partial(spec.loader.exec_module, module),
+                lambda error: f"plug-in file {path}{_line_of(error, path)} raised on import",
+            )
     except BaseException:
         del sys.modules[name]
         raise
     return module
+
+
+@contextmanager
+def _modules_beside(folder: Path) -> Iterator[None]:
+    """Let a file import the modules in its folder, after all that are installed; each file has its own.
+
+    Other folders may have modules of the same names. Where the folder is on Python's path anyway, they are as ever.
+    """
+    if folder in {Path(place or ".").resolve() for place in sys.path}:
+        yield
+        return
+    before = set(sys.modules)
+    sys.path.append(str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+        own: list[str] = []
+        for name in set(sys.modules) - before:
+            top = sys.modules.get(name.partition(".")[0])
+            if _file_of(top).parent in (folder, folder / name.partition(".")[0]) and not name.startswith(_USER):
+                noted(_file_of(sys.modules[name]))
+                own.append(name)
+        for name in own:
+            del sys.modules[name]
+
+
+def _file_of(module: Any) -> Path:
+    """Return the file of a module; the root where it has none."""
+    return Path(getattr(module, "__file__", None) or "/").resolve()
 
 
 def _guarded(action: Callable[[], T], what: Callable[[BaseException], str], *passing: type[BaseException]) -> T:
