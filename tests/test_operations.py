@@ -51,7 +51,7 @@ def test_no_row_is_of_code_that_was_edited_while_the_campaign_ran(tmp_path: Path
     edit = 'p = pathlib.Path(__file__); seed % 5 == 0 and p.write_text(p.read_text().replace("K = 1.0", "K = 2.0"))'
     path = write(tmp_path, first=edit)
     before = (tmp_path / "own.py").read_text()
-    with pytest.raises(InputError, match=r"new workers must load .* began with, but .*own.py was changed: put it back"):
+    with pytest.raises(InputError, match=r"new workers must load .* began with, but changed: .*own.py; put it back"):
         run_study(study(path, *RECYCLED), report=False)
     kept = sbt.open(tmp_path / "s", trust=True).frame
     assert 0 < len(kept) < 24

@@ -20,6 +20,7 @@ from sbt.campaigns.precision import cautions
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.stopping import not_met
 from sbt.campaigns.summing import SummingStage, summed, sums, took_sum
 from sbt.campaigns.telling import tell_estimation
 from sbt.campaigns.two_level import TwoLevelStage
@@ -179,8 +180,7 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         found, limits = on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
         asked, met = settings.gate, Seen.of(log, settings).surprises
-        sure = found.combinations is not None or found.counted == int((log.history.stage == NOMINAL).sum()) > 0
-        unseen = 0.0 if sure else found.undetected_mass_bound  # the limits of random draws, and of sums, have it
+        unseen = 0.0 if found.combinations is not None else not_met(log, settings, found.counted, found.undetected_mass_bound)
         gate = None if asked is None else gate_verdict(limits, asked, unseen, met, found.cov)
         each = each_estimate(log, settings)
         return replace(

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sbt.campaigns.clustering import spread_of_draws
-from sbt.campaigns.counting import Seen, counted_batches, counted_iterations
+from sbt.campaigns.counting import NOMINAL, Seen, counted_batches, counted_iterations
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
@@ -18,7 +18,7 @@ from sbt.loop.stages import Log
 from sbt.store.records import Iteration
 
 __all__ = [
-    "FEWEST_BATCHES", "count_begins", "draws_that_count", "is_precise", "only_unseen", "pools_of", "relative_error",
+    "FEWEST_BATCHES", "count_begins", "draws_that_count", "is_precise", "not_met", "only_unseen", "pools_of", "relative_error",
     "relative_error_of", "spared", "steadier", "trusts_search",
 ]  # fmt: skip
 
@@ -146,6 +146,21 @@ def trusts_search(log: Log, settings: Settings) -> bool:
         return False
     seen = Seen.of(log, settings)
     return seen.most(seen.surprises, gate.confidence) > left
+
+
+def not_met(log: Log, settings: Settings, counted: int | None, bound: float) -> float:
+    """Return what no run has met may hold beside the limits of an estimate, at the confidence of the gate.
+
+    Args:
+        log: of the campaign.
+        settings: of the campaign.
+        counted: runs of the estimate; where they are all random draws, their limits have what no run has met.
+        bound: `undetected_mass_bound` of the conclusion, where no draws tell.
+    """
+    if settings.gate is None or counted == int((log.history.stage == NOMINAL).sum()) > 0:
+        return 0.0
+    seen = Seen.of(log, settings)
+    return seen.most(seen.surprises, settings.gate.confidence) if seen.draws else bound
 
 
 def only_unseen(log: Log, settings: Settings) -> bool:

@@ -19,7 +19,7 @@ import struct
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from enum import Enum, auto
@@ -27,14 +27,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
-from sbt.errors import PluginError, SbtError, described
+from sbt.errors import InputError, PluginError, SbtError, described
 from sbt.execution.pool import broken, close_pool, open_pool
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.starting import start_apart
 from sbt.execution.streams import open_missing
 from sbt.execution.worker import run_at_levels
-from sbt.plugins import check_read
+from sbt.plugins import contents_read
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.processes import scratch
@@ -87,7 +87,7 @@ class LocalExecutor:
         self._memory, self._recycle = memory, recycle
         self._started = 0  # runs since the workers were
         self._pool: Any = None
-        self._check: Callable[[], None] = lambda: None
+        self._files: Mapping[str, str] = {}  # as the first workers read them
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._seconds = _TARGET
 
@@ -99,7 +99,6 @@ class LocalExecutor:
         (folder / _SCENARIO).write_bytes(pickle.dumps((self._spec, self._timeout)))
         (folder / _LIMIT).write_text(str(self._memory or 0))
         (folder / _MARKS).mkdir()
-        self._check = check_read()
         try:
             self._start()
         except BaseException:
@@ -119,9 +118,17 @@ class LocalExecutor:
         wait(ready)
         for future in ready:
             if not isinstance(future.exception(), broken()):
-                future.result()
+                self._compare(future.result())
 
-    def _prepare_all(self) -> list[Future[None]]:
+    def _compare(self, files: Mapping[str, str]) -> None:
+        """Refuse a worker that has read other files than the first ones have."""
+        self._files = self._files or files
+        changed = ", ".join(sorted(path for path, was in self._files.items() if files.get(path, was) != was))
+        if changed:
+            rule = "new workers must load the code and files of the scenario that the campaign began with"
+            raise InputError(f"{rule}, but changed: {changed}; put it back and run again, or choose another store")
+
+    def _prepare_all(self) -> list[Future[Mapping[str, str]]]:
         return [self._pool.submit(_prepare, self._folder, self._workers) for _ in range(self._workers)]
 
     def _stop(self) -> None:
@@ -257,7 +264,6 @@ class LocalExecutor:
         return {runs[0]: _Cause.LATE for runs, _ in late if len(runs) == 1}  # of several: repeated alone
 
     def _restart(self) -> None:
-        self._check()  # new workers would load what files are now
         self._stop()
         for path in Path(self._folder, _MARKS).iterdir():
             path.unlink()
@@ -295,8 +301,8 @@ def _scenario(folder: str, level: int = 0) -> LogicalScenario:
         raise PluginError(f"scenario {scenario.name} must be prepared without an error, but raised {described(error)}") from None
 
 
-def _prepare(folder: str, workers: int) -> None:
-    """Load the scenario in a worker, and wait until every worker does."""
+def _prepare(folder: str, workers: int) -> Mapping[str, str]:
+    """Load the scenario in a worker, and wait until every worker does; return what is in the files that it read."""
     _scenario(folder)
     settle()
     _limit_memory(folder)
@@ -304,6 +310,7 @@ def _prepare(folder: str, workers: int) -> None:
     marks, deadline = Path(folder, _MARKS), time.monotonic() + 20.0
     while len(os.listdir(marks)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
         time.sleep(0.005)
+    return contents_read()
 
 
 def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:

@@ -62,14 +62,12 @@ class Driver:
         counter: tells the listener.
         seed: of the campaign.
         versions: of the software that runs it.
-        check: called before outcomes are written; raises where they are not of what the campaign began with.
     """
 
     store: Store
     counter: Counter
     seed: int
     versions: str
-    check: Callable[[], None] = lambda: None
     seconds: dict[str, float] = field(default_factory=lambda: {"simulate": 0.0, "fit": 0.0, "propose": 0.0})
     _busy: float = 0.0
     _first: float | None = None
@@ -103,7 +101,6 @@ class Driver:
         """Write outcomes that came together."""
         if not outcomes:
             return
-        self.check()
         self.store.append_all(outcomes, self.versions)
         self._last = time.perf_counter()
         self._busy += sum(outcome.seconds for outcome in outcomes)

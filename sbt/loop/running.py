@@ -76,13 +76,10 @@ class Finished:
 
 def run_stages(
     campaign: Campaign, store: Store, executor: Executor, *, seed: int, budget: int, requirement: Requirement,
-    versions: str, listener: Callable[[Progress], None], workers: int | None = None, check: Callable[[], None] = lambda: None,
+    versions: str, listener: Callable[[Progress], None], workers: int | None = None,
 ) -> Finished:  # fmt: skip
-    """Run all stages to their end, resuming what the store holds; `workers` are what the use of their time is counted of.
-
-    `check` is called before outcomes are written, see `Driver`.
-    """
-    driver, reason = Driver(store, Counter(listener, requirement, budget), seed, versions, check), ""
+    """Run all stages to their end, resuming what the store holds; `workers` are what the use of their time is counted of."""
+    driver, reason = Driver(store, Counter(listener, requirement, budget), seed, versions), ""
     driver.counter.count_all(store.history())
     for stage in campaign.stages:
         reason = _StageLoop(stage, driver, executor).run()
@@ -239,7 +236,7 @@ class _Thought:
 
 def run_shard(
     campaign: Campaign, shard: Shard, store: Store, executor: Executor, *, seed: int, requirement: Requirement,
-    versions: str, listener: Callable[[Progress], None], check: Callable[[], None] = lambda: None,
+    versions: str, listener: Callable[[Progress], None],
 ) -> Finished:  # fmt: skip
     """Run one shard's runs of a campaign whose batches depend on no result, resuming what the store holds.
 
@@ -261,7 +258,7 @@ def run_shard(
             runs, seeds = [batch.runs[index - first] for index in mine], run_seeds(seed, mine)
             store.plan(iteration, stage, runs, seeds, batch.proposal, indices=mine)
         first += len(batch.runs)
-    driver = Driver(store, Counter(listener, requirement, store.planned, iteration=len(batches)), seed, versions, check)
+    driver = Driver(store, Counter(listener, requirement, store.planned, iteration=len(batches)), seed, versions)
     driver.seconds["propose"] = time.perf_counter() - start
     driver.counter.count_all(store.history())
     while jobs := store.unfinished(_AT_ONCE):

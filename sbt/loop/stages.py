@@ -132,8 +132,8 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
         said = [*said, f"{which}: metrics see it leave and come, not move (column unconfirmed; SUMO's time-to-teleport)."]
     dead = int(facts.history.doubtful(Doubt.STOPPED).sum())
     if said and dead:
-        which = f"In {dead:,} of {len(facts.history):,} runs a road user near the ego brakes as no vehicle can"
-        said = [*said, f"{which}: SUMO stops one dead before a red light or where its lane ends (column unconfirmed)."]
+        which = f"In {dead:,} of {len(facts.history):,} runs another road user brakes as no vehicle can"
+        said = [*said, f"{which} (column unconfirmed); SUMO lets one do so before a red light or where its lane ends."]
     bare = [part.metric for part in facts.requirement.parts if not facts.units.get(part.metric)]
     return said and [*said, *(f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings)]
 

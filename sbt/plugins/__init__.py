@@ -6,6 +6,7 @@ user's own file, and only because the user names it: what a store names is asked
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import sys
 import threading
@@ -23,7 +24,7 @@ from sbt.plugins.approval import check_approved, modules_of, named_by
 from sbt.plugins.source import FromSource, import_from_source
 
 __all__ = [
-    "KINDS", "OBJECT", "Objects", "Scope", "check_read", "forget_changed", "forget_files", "kept", "load", "names", "newer",
+    "KINDS", "OBJECT", "Objects", "Scope", "contents_read", "forget_changed", "forget_files", "kept", "load", "names", "newer",
     "noted", "read_files",
 ]  # fmt: skip
 
@@ -36,6 +37,8 @@ Objects = Mapping[tuple[str, str], Any]
 KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "controllers", "campaigns")
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
+_LARGE = 2**22
+"""Size (bytes) up to which the contents of files are compared."""
 _USER = "sbt_user_"
 """How the names of modules begin that a file of the user's was imported as."""
 T = TypeVar("T")
@@ -85,24 +88,14 @@ def read_files() -> list[Path]:
     return sorted({file for path in found for file in (modules_of(path) if path.suffix == ".py" else (path,))})
 
 
-def check_read() -> Callable[[], None]:
-    """Return a function that refuses to go on where the user's code or scenario files are no longer as this process read them.
+def contents_read() -> dict[str, str]:
+    """Return what is in the user's files that this process has read: a hash, of large ones when they were changed."""
 
-    A worker that starts later, or a module that a run imports, would be of what they are then.
-    """
-    read = {path.resolve(): state for path, state in _stamps.items()}
-    states = {path: read.get(path, _stamp(path)) for path in read_files() if path.suffix in (".py", ".yaml", ".yml")}
-    contents = {path: path.read_bytes() for path in states}
+    def content(path: Path) -> str:
+        state = _stamp(path)
+        return str(state) if state[1] > _LARGE else hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
-    def check() -> None:
-        for path in [path for path, state in states.items() if _stamp(path) != state]:
-            now = path.read_bytes() if path.is_file() else None
-            if now != contents[path]:
-                rule = "new workers must load the code and scenario files that the campaign began with"
-                raise InputError(f"{rule}, but {path} was changed: put it back and run again, or choose another store")
-            states[path] = _stamp(path)
-
-    return check
+    return {str(path): content(path) for path in read_files()}
 
 
 def _stamp(path: Path) -> tuple[int, int]:

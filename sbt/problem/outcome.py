@@ -38,7 +38,7 @@ class Doubt(StrEnum):
     """it accelerates or brakes by more than tyres hold"""
     TELEPORTED = "somebody near the ego was teleported"
     """a road user was moved to another place, such as by SUMO out of a jam"""
-    STOPPED = "somebody near the ego was stopped dead"
+    STOPPED = "another road user was stopped dead"
     """a road user brakes by more than tyres hold, such as SUMO lets one before a red light or where its lane ends"""
 
 

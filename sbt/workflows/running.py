@@ -19,7 +19,7 @@ from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.running import Finished, check_shard, run_shard, run_stages
 from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard, sentences_of
-from sbt.plugins import OBJECT, Objects, check_read, forget_files
+from sbt.plugins import OBJECT, Objects, forget_files
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Doubt, Job, Outcome, Status
@@ -135,8 +135,6 @@ def run_study(
         executor = study.executor()  # at the isolation level that the store remembers
         warm_up(study.spec, study.config.executor.workers, partial(_tell, store, study, common["listener"]))
         with executor:
-            if study.config.executor.kind == "dask":  # whose workers may come at any time
-                common["check"] = check_read()
             check_code(store, study, executor, changed=changed)
             if changed:
                 keep_configuration(store, study, snapshot)
