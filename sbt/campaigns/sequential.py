@@ -59,6 +59,8 @@ _QUIET = 3
 """Batches without a new mode after which it ends."""
 _COMMON = 0.02
 """P(critical) under the inputs' distribution above which draws from it meet every region that counts beside noise."""
+_SMALL = 150
+"""Budget below which the search ends there: what it takes is missing where draws count."""
 _EVEN_SHARE = 0.1
 """Of the search picks, those that are spread evenly: they do not depend on the metamodel."""
 _BEYOND = 1e-9
@@ -219,9 +221,10 @@ class SequentialStage:
     def _modes_while_searching(self, log: Log, known: Known, log_probability: LogProbability | None) -> int | None:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
-        It ends with a quarter of the budget, after three batches without a new mode, and where the simulator is noisy and
-        failures are common: draws from the inputs' distribution meet what counts, as precisely as noise lets it be known.
-        Elsewhere they are too few: the metamodel is soon so precise that a second region of a tenth of P decides the error.
+        It ends with a quarter of the budget, after three batches without a new mode, and where failures are common and the
+        simulator is noisy, or the budget small: draws from the inputs' distribution meet what counts, as precisely as that lets it
+        be known. Elsewhere they are too few: the metamodel is soon so precise that a second region of a tenth of P decides the
+        error.
         """
         if self._spares_search and not known.one_sided:
             return None
@@ -232,7 +235,8 @@ class SequentialStage:
         if modes[-1] > 0 and len(modes) > _QUIET and modes[-1] <= modes[-1 - _QUIET]:
             return None
         noisy = simulator_noise(log.history, self.settings.scenario.requirement).noisy is True
-        return None if modes[-1] > 0 and noisy and self._common(log_probability, log.iteration) else modes[-1]
+        spares = modes[-1] > 0 and (noisy or self.settings.budget < _SMALL)
+        return None if spares and self._common(log_probability, log.iteration) else modes[-1]
 
     def _common(self, log_probability: LogProbability | None, iteration: int) -> bool:
         """Return whether the metamodel takes more than 1 in 50 draws from the inputs' distribution to be critical."""
