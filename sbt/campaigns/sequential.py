@@ -222,9 +222,8 @@ class SequentialStage:
         """Return the number of modes known so far while phase 0 goes on, None once it is over.
 
         It ends with a quarter of the budget, after three batches without a new mode, and where failures are common and the
-        simulator is noisy, or the budget small: draws from the inputs' distribution meet what counts, as precisely as that lets it
-        be known. Elsewhere they are too few: the metamodel is soon so precise that a second region of a tenth of P decides the
-        error.
+        simulator is noisy, or the budget small: draws from the inputs' distribution meet what counts, as precisely as that lets
+        it be known. Elsewhere they are too few: soon the metamodel is so precise that a region of a tenth of P decides the error.
         """
         if self._spares_search and not known.one_sided:
             return None
