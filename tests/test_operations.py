@@ -145,6 +145,7 @@ def test_a_report_says_what_it_leaves_out_and_leaves_no_old_figures(tmp_path: Pa
     run_study(study(path, "campaign=boundary", "initial=10"))
     page, figure = tmp_path / "s" / "report.html", tmp_path / "s" / "figures" / "probability.svg"
     assert figure.is_file()
+    (figure.parent / "mine.svg").write_text("<svg/>")
     assert "metamodel are left out" not in page.read_text()
     (tmp_path / "mine.py").unlink()
     forget_changed()
@@ -153,3 +154,4 @@ def test_a_report_says_what_it_leaves_out_and_leaves_no_old_figures(tmp_path: Pa
     assert told[0].startswith("The figures of the metamodel are left out: a plug-in file must exist")
     assert "The figures of the metamodel are left out" in page.read_text()
     assert not figure.exists()
+    assert (figure.parent / "mine.svg").exists(), "not one of its figures"

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 from sbt.campaigns.settings import Gate
 
-__all__ = ["GateVerdict", "Limits", "gate_verdict"]
+__all__ = ["CONDITION", "GateVerdict", "Limits", "gate_verdict"]
 
+CONDITION = "if the search has met whatever is critical"
+"""How the statement of a pass begins that trusts the search."""
 _KNOWN = 1.0
 """Coefficient of variation above which an estimate is no number to rely on: a few draws of very unequal weight decide it."""
 
@@ -93,7 +95,7 @@ def gate_verdict(
         if high + undetected > gate.probability:
             unmet = "a critical region that no run has met, or failures that few seeds show, could hold up to"
             more = "" if undetected > gate.probability else " more"
-            statement = f"if the search has met whatever is critical, {statement}; {unmet} {undetected:.2g}{more}"
+            statement = f"{CONDITION}, {statement}; {unmet} {undetected:.2g}{more}"
     elif low > gate.probability:
         verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
     else:

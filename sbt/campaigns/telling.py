@@ -11,6 +11,7 @@ import numpy as np
 
 from sbt.campaigns.combinations import none_left
 from sbt.campaigns.counting import NOMINAL
+from sbt.campaigns.gate import CONDITION
 from sbt.campaigns.lost import (
     decides_bound,
     decides_share,
@@ -350,8 +351,17 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         known, narrow = bool(found.probability), bool(found.probability) and width(found) <= 1.0
         more = runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=known, narrow=narrow)
         return more + as_many_draws(found, n)
-    unseen = 3.0 / max(found.probability, 1e-300)
-    if found.undetected_mass_bound > found.probability and unseen < _TOO_FAR:
+    return _where_narrow(found)
+
+
+def _where_narrow(found: EstimationConclusion) -> str:
+    """Return what would tell more than an interval that is narrow enough: what no run has met."""
+    if found.gate is not None and found.gate.statement.startswith(CONDITION):
+        draws = 3.0 / max(found.gate.probability - found.gate.upper, 1e-300)
+        if draws < _TOO_FAR:
+            return f"a larger budget: about {rounded(draws):,} random draws in all make the pass of the gate unconditional"
+    unseen = 3.0 / max(found.probability or 0.0, 1e-300)
+    if found.undetected_mass_bound > (found.probability or 0.0) and unseen < _TOO_FAR:
         return (
             f"it is narrow enough; to bound the unseen by the estimate itself, draw {rounded(unseen):,} runs from the"
             " inputs' distribution (acquisition: {kind: monte_carlo})"

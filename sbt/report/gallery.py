@@ -19,9 +19,12 @@ from sbt.report.words import Findings, requirement_words
 from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord
 
-__all__ = ["Drawing", "draw"]
+__all__ = ["DRAWN", "Drawing", "draw"]
 
-
+DRAWN = frozenset(
+    ("convergence", "modes", "runs", "probability", "precision_recall", "reliability", "validation", "metric", "progress")
+)
+"""Names of the figures, of which some may be there several times, numbered."""
 _MOST_RUNS_ON_MAP = 800
 _MOST_PANELS = 9
 _FEW_HELD_OUT = 20

@@ -19,7 +19,7 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.choosing import runs_to_film
 from sbt.report.explorer import explorer_data, library, packed, render, scripts, styles
-from sbt.report.gallery import Drawing, draw
+from sbt.report.gallery import DRAWN, Drawing, draw
 from sbt.report.influence import influence_of
 from sbt.report.modes import mode_table
 from sbt.report.projection import Predict, influence_from_runs
@@ -70,8 +70,9 @@ def write_report(
     coarse = store.history(level=None) if store.coarse else None
     coarse = None if coarse is None else coarse.where(coarse.columns["level"] > 0)
     drawings = draw(found, scenario.space, fits, predict, order)
-    for old in set() if folder is not None else set((target / "figures").glob("*.svg")):
-        if old.stem not in {drawing.name for drawing in drawings}:
+    drawn = {drawing.name for drawing in drawings}
+    for old in (target / "figures").glob("*.svg") if folder is None else ():
+        if old.stem.rstrip("_0123456789") in DRAWN and old.stem not in drawn:
             old.unlink()  # of a report before, which no longer holds
     for drawing in drawings:
         write_atomically(target / "figures" / f"{drawing.name}.svg", drawing.svg)

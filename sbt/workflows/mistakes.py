@@ -15,7 +15,9 @@ __all__ = ["further_mistakes"]
 
 _AT_KEY = re.compile(r"(?:--set |.*?:\d+:\d+: )(?P<key>\w+)")
 """The key at the top that an error of a configuration is about."""
-_ANY, _OF_ANY = "falsification", ("scenario", "metamodel", "inputs", "metrics", "requirement", "ego")
+_ANY, _OF_ANY = "falsification", (
+    "scenario", "metamodel", "inputs", "correlation", "constraints", "features", "metrics", "requirement", "ego",
+)  # fmt: skip
 """A campaign in place of one that is not there, and what means the same in any."""
 
 
