@@ -107,7 +107,7 @@ class PairStage:
             return self._by_inputs.stop(log)
         if log.iterations and len(log.planned) >= self.settings.budget:
             return "budget"
-        return "cov" if is_precise(log, self.settings) else None
+        return "cov" if is_precise(log, self.settings, self.settings.stop.get("cov")) else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""

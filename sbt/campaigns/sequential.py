@@ -61,6 +61,8 @@ _COMMON = 0.02
 """P(critical) under the inputs' distribution above which draws from it meet every region that counts beside noise."""
 _SMALL = 150
 """Budget below which the search ends there: what it takes is missing where draws count."""
+_BLUR = 0.05
+"""Standard deviation of noise over the median deviation of the metric, from which on a simulator is taken for noisy there."""
 _EVEN_SHARE = 0.1
 """Of the search picks, those that are spread evenly: they do not depend on the metamodel."""
 _BEYOND = 1e-9
@@ -141,7 +143,8 @@ class SequentialStage:
             return MonteCarloStage(self.settings).stop(log)
         if log.iterations and len(log.planned) >= self.settings.budget:
             return "budget"
-        return "cov" if is_precise(log, self.settings) and not trusts_search(log, self.settings) else None
+        precise = is_precise(log, self.settings, self.settings.stop.get("cov"))
+        return "cov" if precise and not trusts_search(log, self.settings) else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""
@@ -233,9 +236,15 @@ class SequentialStage:
         modes = [p.modes or 0 for p in proposals if p.phase == EXPLORE] + [known.modes(log_probability)]
         if modes[-1] > 0 and len(modes) > _QUIET and modes[-1] <= modes[-1 - _QUIET]:
             return None
-        noisy = simulator_noise(log.history, self.settings.scenario.requirement).noisy is True
-        spares = modes[-1] > 0 and (noisy or self.settings.budget < _SMALL)
+        spares = modes[-1] > 0 and (self.settings.budget < _SMALL or self._blurred(log))
         return None if spares and self._common(log_probability, log.iteration) else modes[-1]
+
+    def _blurred(self, log: Log) -> bool:
+        """Return whether noise, beside how the metric differs over the space, hides what is precise."""
+        requirement = self.settings.scenario.requirement
+        noise, y = simulator_noise(log.history, requirement).std or 0.0, requirement.told(log.history)
+        y = y[np.isfinite(y)]
+        return noise > _BLUR * float(np.median(np.abs(y - np.median(y))))
 
     def _common(self, log_probability: LogProbability | None, iteration: int) -> bool:
         """Return whether the metamodel takes more than 1 in 50 draws from the inputs' distribution to be critical."""

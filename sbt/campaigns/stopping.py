@@ -118,12 +118,11 @@ def spared(pilot: Plan, shares: tuple[float, ...], draws: float, target: float |
     return (shares[0] - best, shares[1] + best, *shares[2:])
 
 
-def is_precise(log: Log, settings: Settings) -> bool:
-    """Return whether the estimate has the coefficient of variation at which `stop.cov` ends the campaign.
+def is_precise(log: Log, settings: Settings, target: float | None) -> bool:
+    """Return whether the estimate has this coefficient of variation, such as that at which `stop.cov` ends the campaign.
 
     The interval must be narrow as well: where one large error decides the variance, its coefficient says little.
     """
-    target = settings.stop.get("cov")
     counted = counted_batches(log, settings)
     if target is None or len(counted) < FEWEST_BATCHES:
         return False
@@ -165,7 +164,9 @@ def not_met(log: Log, settings: Settings, counted: int | None, bound: float) -> 
 
 def only_unseen(log: Log, settings: Settings) -> bool:
     """Return whether a gate lacks nothing but draws that bound what no run has met: none since the last count was a surprise."""
-    if settings.gate is None or not is_precise(log, settings) or not trusts_search(log, settings):
+    target = settings.stop.get("cov")
+    enough = is_precise(log, settings, _TARGET if target is None else target)
+    if settings.gate is None or not enough or not trusts_search(log, settings):
         return False
     return Seen.of(log, settings).surprised <= counted_iterations(log)[-1]
 

@@ -69,7 +69,7 @@ class TwoLevelStage:
             return self._without.stop(log)
         if self.settings.budget - spent(log, self.settings) < 1.0:
             return "budget"
-        return "cov" if is_precise(log, self.settings) else None
+        return "cov" if is_precise(log, self.settings, self.settings.stop.get("cov")) else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
