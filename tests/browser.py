@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import os
 import shutil
 import subprocess
 import tempfile
@@ -29,7 +30,8 @@ class Browser:
         self._folder = tempfile.TemporaryDirectory(prefix="browser-", ignore_cleanup_errors=True)
         place = Path(self._folder.name)
         command = [PROGRAM, *(f"--{flag}" for flag in _FLAGS), f"--user-data-dir={place}", "about:blank"]
-        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        inside = {**os.environ, "TMPDIR": self._folder.name}  # where it makes its own folders
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=inside)
         deadline = time.monotonic() + 60
         port = place / "DevToolsActivePort"
         while not (port.is_file() and len(port.read_text().splitlines()) == 2):
