@@ -100,6 +100,22 @@ def test_reading_needs_no_code_and_a_replay_without_a_trace_runs_none(loud: Any,
     assert (code, json.loads(said)["identical"], (theirs / "ran").exists()) == (0, True, True)
 
 
+def test_a_merge_runs_no_code_that_is_not_approved(loud: Any, stranger: Any, tmp_path: Path):
+    """Not to try the runs of shards either, whose files are newer here."""
+    own = loud("PLAIN")
+    for k in (1, 2):
+        assert tried("run", own / "c.yaml", "--shard", f"{k}/2", "--store", own / f"part-{k}")[0] == 0
+    theirs = Path(shutil.copytree(own, tmp_path / "theirs"))
+    shutil.rmtree(own)
+    os.utime(theirs / "loud.py", (4e9, 4e9))
+    (theirs / "ran").unlink(missing_ok=True)
+    stranger()
+    approval._trusted.clear()
+    code, said = tried("merge", theirs / "part-1", theirs / "part-2", "--into", theirs / "whole")
+    assert code == 0, said
+    assert not (theirs / "ran").exists()
+
+
 def test_code_that_is_needed_is_refused_until_it_is_approved_with_this_content(loud: Any, stranger: Any, tmp_path: Path):
     own = loud("ODD")
     assert tried("export", own / "s")[0] == 0, "one's own store asks for nothing"

@@ -112,15 +112,19 @@ def _check_same(parts: Sequence[_Part]) -> None:
 
 
 def _check_files(parts: Sequence[_Part], study: Study) -> None:
-    """Refuse a shard whose runs would not come again from code and files that were changed after it began, if they are there."""
-    try:
-        study.spec.resolve()
-    except SbtError:
-        return
-    for part in parts:
-        if changed_since(part.folder):
-            with Store.read(part.folder) as store, study.executor() as executor:
-                check_code(store, study, executor, changed=True)
+    """Refuse a shard whose runs would not come again from code and files that were changed after it began.
+
+    Not where they are absent, or code is not approved: merging needs none of it.
+    """
+    with study.loaded.scope.naming():
+        try:
+            study.spec.resolve()
+        except SbtError:
+            return
+        for part in parts:
+            if changed_since(part.folder):
+                with Store.read(part.folder) as store, study.executor() as executor:
+                    check_code(store, study, executor, changed=True)
 
 
 def _check_whole(parts: Sequence[_Part]) -> None:
