@@ -68,7 +68,7 @@ def log_scores(acquisition: Acquisition, prediction: Prediction, critical: Criti
     """
     n, name = len(prediction), _name(acquisition)
     try:
-        found = np.asarray(acquisition(prediction, critical, log_density), dtype=np.float64)
+        found = np.asarray(acquisition(prediction, critical, log_density.copy()), dtype=np.float64)
     except Exception as error:
         raise InputError(f"acquisition {name} must score {n} points, but raised {described(error)}") from error
     if found.shape != (n,):

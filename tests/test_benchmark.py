@@ -155,6 +155,59 @@ def test_a_store_of_other_settings_is_refused(analytic):
         run_cell(next(written(analytic.parent, max_candidates=2048).cells()))
 
 
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"metamodels": [{"kind": "gp", "name": "et"}, {"kind": "gp"}]}, "metamodel: {'kind': 'et', "),
+        ({"iterations": 2}, "budget: 36 there, 24 now"),
+        ({"scenarios": [{"scenario": "analytic.py:LINE", "name": "disc", "batch": 12}]}, "scenario: analytic.py:SCENARIO there"),
+        ({"max_candidates": 2048}, "max_candidates: 1024 there, 2048 now"),
+        ({"reference": 50}, "reference: 60 there, 50 now"),
+    ],
+)
+def test_finished_cells_of_other_settings_are_no_results(analytic, changed, said):
+    """The table and the figures of the old settings were told as those of the new ones, with exit code 0."""
+    folder = analytic.parent
+    loaded = written(folder, metamodels=[{"kind": "et", "trees": 10}])
+    make_reference(next(loaded.references())[1], 1)
+    for cell in loaded.cells():
+        run_cell(cell)
+    write_table(folder / "b" / "results.csv", loaded.cells())
+    before = (folder / "b" / "results.csv").read_text()
+    other = written(folder, **{"metamodels": [{"kind": "et", "trees": 10}], **changed})
+    assert not any(is_done(cell) for cell in other.cells())
+    assert table(other) == []
+    asked = [part for key, value in changed.items() for part in ("--set", f"{key}={json.dumps(value)}")]
+    kept = ["--store", str(folder / "b"), "--set", 'metamodels=[{"kind": "et", "trees": 10}]']
+    done = CliRunner().invoke(app, ["benchmark", str(folder / "benchmark.yaml"), *kept, *asked])
+    assert (done.exit_code, said in done.stderr) == (2, True), done.output
+    assert (folder / "b" / "results.csv").read_text() == before
+
+
+def test_an_edited_file_is_another_configuration_and_recalls_nothing(analytic):
+    folder = analytic.parent
+    loaded = written(folder)
+    make_reference(next(loaded.references())[1], 1)
+    cell = next(loaded.cells())
+    run_cell(cell)
+    assert is_done(cell)
+    analytic.write_text(analytic.read_text() + "\n# edited\n")
+    assert not is_done(cell)
+    assert cell_module._known_runs(list(loaded.cells())[2]) == {}
+
+
+def test_a_benchmark_of_more_iterations_goes_on(analytic):
+    folder = analytic.parent
+    grown, whole = (written(folder, store=str(folder / name), metamodels=[{"kind": "et", "trees": 10}]) for name in "gw")
+    for loaded in (grown, whole):
+        make_reference(next(loaded.references())[1], 1)
+    few = written(folder, store=str(folder / "g"), metamodels=[{"kind": "et", "trees": 10}], iterations=2)
+    for loaded in (few, grown, whole):
+        for cell in loaded.cells():
+            run_cell(cell)
+    assert table(grown) == table(whole)
+
+
 def test_missing_reference_runs_are_said(analytic):
     with pytest.raises(StoreError, match="there is none in"):
         run_cell(next(written(analytic.parent).cells()))

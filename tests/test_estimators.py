@@ -391,6 +391,24 @@ def test_subset_simulation_meets_a_plane_in_many_dimensions():
     assert abs(spread.value - truth) < 3 * spread.std_error < 1.5 * truth
 
 
+@pytest.mark.parametrize(
+    "margin",
+    [lambda s: 6.0 - np.floor(2.0 * s), lambda s: np.minimum(3.0 - s, 1.3), lambda s: 3.0 - np.floor(s)],
+    ids=["halves", "capped", "whole"],
+)
+def test_subset_simulation_is_unbiased_where_values_are_equal(margin):
+    """The deepest of all that reach a level began its chains: 2.2, 2.7 and 1.3 times the truth."""
+    found = []
+    for k in range(150):
+        repeat, rng = SubsetRun(200, 2), stream(9, "ties", k)
+        while not repeat.finished:
+            z = repeat.ask(rng)
+            repeat = repeat.tell(z, margin(z.sum(axis=1) / math.sqrt(2)))
+        found.append(repeat.share)
+    spread, truth = combine_repeats(found), float(ndtr(-3.0))
+    assert abs(spread.value - truth) < 3 * spread.std_error + 0.1 * truth < 0.6 * truth
+
+
 def test_subset_simulation_ends_on_a_plateau_and_without_a_run():
     for margin in (np.ones(100), np.full(100, np.nan)):
         repeat = SubsetRun(100, 3)

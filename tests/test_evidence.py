@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,30 @@ def test_on_a_bridge_and_below_is_no_contact_and_a_net_without_heights_is_warned
     one = simulation(tmp_path, net(flat), MEETING, deaf("ego", "other"), 5.0)
     one({}, 1)
     assert any("'sn' and 'we' at (0, 0)" in line and "taken for bridges" in line for line in one.warnings())
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize(
+    "shape", [[(0.0, 0.0, 0.0), (300.0, 0.0, 18.0)], [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (100.0, 0.0, 6.0), (300.0, 0.0, 6.0)]]
+)
+def test_who_drives_ahead_on_a_hill_is_on_the_same_level(simulate, shape):
+    """It was not recorded until it was 50 m ahead on 6 %, as it was 3 m higher."""
+    vehicles = vehicle("ego", "up", departPos=20, departSpeed=20) + vehicle("lead", "up", departPos=110, departSpeed=10)
+    trace = simulate(net({"up": shape}, z=True), vehicles, deaf("ego", "lead"), duration=6.0)
+    assert trace.actors == ("ego", "lead")
+    assert trace.present.all()
+    assert encounter(trace, "ego", "lead").gap[0] == pytest.approx(85.0, abs=0.3)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("heights", [True, False])
+def test_a_named_one_on_a_bridge_is_on_another_level_at_any_distance(tmp_path, heights):
+    """Beyond the radius it was recorded: a time to collision of a second with who crossed 6 m above."""
+    crossing = {"we": WEST_EAST, "sn": [(x, y, 6.0) for x, y in SOUTH_NORTH]}
+    network = net({k: [(*p, 0.0)[:3] for p in shape] for k, shape in crossing.items()}, z=heights)
+    one = simulation(tmp_path, network, MEETING, deaf("ego", "other"), 20.0)
+    near = replace(one, recording=replace(one.recording, within=15.0, named=("other",)))
+    assert near({}, 1).actors == ("ego",)
 
 
 @pytest.mark.sumo

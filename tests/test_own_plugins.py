@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.distance import pdist
 from typer.testing import CliRunner
 
+import sbt
 from sbt.acquisitions import boundary, greedy, is_greedy, log_scores
 from sbt.cli import app
 from sbt.config.load import parse
@@ -203,6 +204,39 @@ def test_a_plain_class_runs_a_campaign(run, campaign):
     again, same = run("again", campaign=campaign, metamodel=metamodel)
     np.testing.assert_array_equal(x, same)
     assert again.conclusion == result.conclusion
+
+
+class InPlace:
+    """Changes what its predictor is given."""
+
+    def __init__(self, factor=1.0):
+        self.factor = factor
+
+    def fit(self, u, y, rng):
+        w = np.linalg.lstsq(np.column_stack([np.ones(len(u)), u]), y, rcond=None)[0]
+
+        def predict(v):
+            v *= self.factor
+            return Prediction.gaussian(w[0] + (v / self.factor) @ w[1:], np.full(len(v), 1e-9 + y.std() / 4))
+
+        return predict
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "falsification", "estimation"])
+def test_a_predictor_that_changes_its_points_changes_no_other_ones(folder, campaign):
+    """A boundary had a critical share of 1 for .52."""
+    plane = sbt.Scenario(
+        "plane", [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)], sbt.Requirement("y", high=0.0),
+        evaluate=lambda values, seed: {"y": 3.0 * (values["a"] - 0.5) + values["b"] ** 2},
+    )  # fmt: skip
+    plain, changing = (
+        sbt.run(campaign=campaign, scenario=plane, metamodel=InPlace(factor), budget=45, seed=3, initial=20, batch=10,
+                executor="serial", store=folder / f"{campaign}{factor}", report=False)
+        for factor in (1.0, 0.5)
+    )  # fmt: skip
+    np.testing.assert_array_equal(changing.history.x, plain.history.x)
+    assert changing.conclusion == plain.conclusion
+    check_metamodel(InPlace(0.5), dimensions=(2,))
 
 
 def test_objects_and_recalibration_work_in_campaigns(run, folder):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sbt.benchmark.reference import reference_rows
-from sbt.benchmark.stores import open_store
+from sbt.benchmark.stores import SIMULATED, changes_in, open_store
 from sbt.campaigns.settings import Acquisition, PlainConclusion
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
@@ -26,7 +26,7 @@ from sbt.loop.stages import Batch, Campaign, Log, Progress
 from sbt.metamodels.ended import ended
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Job, Outcome, Status
-from sbt.problem.plain import Value
+from sbt.problem.plain import Json, Value
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
@@ -34,7 +34,7 @@ from sbt.samplers.sobol import SobolSequence
 from sbt.store.database import PlannedRun, Store
 from sbt.store.history import History
 
-__all__ = ["PREDICTIONS", "CellProposal", "is_done", "run_cell"]
+__all__ = ["PREDICTIONS", "CellProposal", "changes", "is_done", "run_cell"]
 
 PREDICTIONS = "predictions.npz"
 """In the folder of a finished cell: y, mu, sigma and log odds of P(critical) at the reference runs."""
@@ -42,11 +42,29 @@ _CHUNK = 4096
 
 
 def is_done(cell: Cell) -> bool:
-    """Return whether a cell was run to its end."""
-    if not (cell.folder / PREDICTIONS).is_file():
+    """Return whether a cell was run to its end, as it is configured now."""
+    if not (cell.folder / PREDICTIONS).is_file() or changes(cell):
         return False
     with Store.read(cell.folder) as store:
-        return store.conclusion is not None and store.configuration["reference"] == cell.reference_runs
+        return store.conclusion is not None and store.configuration["budget"] == cell.loaded.config.budget
+
+
+def changes(cell: Cell) -> str:
+    """Return in words how what the folder of a cell holds was made otherwise than configured; "" where it was not, or is empty."""
+    if not Store.begun(cell.folder):
+        return ""
+    with Store.read(cell.folder) as store:
+        return changes_in(store, cell.loaded, _fixed(cell))
+
+
+def _fixed(cell: Cell) -> Json:
+    """Return the settings of a cell, beside its configuration, that must not change: it may get more batches, not fewer."""
+    fixed: Json = {"reference": cell.reference_runs, "max_candidates": cell.max_candidates}
+    if Store.begun(cell.folder):
+        with Store.read(cell.folder) as store:
+            if store.configuration["budget"] > (asked := cell.loaded.config.budget):
+                fixed["budget"] = asked
+    return fixed
 
 
 def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> None:
@@ -76,7 +94,7 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
         _write_predictions(cell.folder, learner, fitted, log.history)
         return PlainConclusion({}), fitted
 
-    with open_store(cell.folder, cell.loaded, scenario, reference=n, max_candidates=cell.max_candidates) as store:
+    with open_store(cell.folder, cell.loaded, scenario, **_fixed(cell)) as store:
         limit = None if config.executor.timeout == float("inf") else config.executor.timeout
         with _Recalling(SerialExecutor(parts.spec, limit), _known_runs(cell)) as executor:
             finished = run_stages(
@@ -229,6 +247,8 @@ def _known_runs(cell: Cell) -> dict[tuple[int, tuple[Value, ...]], Outcome]:
     for folder in sorted(cell.folder.parents[2].glob(f"*/even/{cell.seed}")):
         if folder != cell.folder and Store.begun(folder):
             with Store.read(folder) as store:
+                if changes_in(store, cell.loaded, {}, SIMULATED):
+                    continue
                 for r in store.history().training.records:
                     outcome = Outcome(r.index, Status(r.status), r.metrics, r.reason, r.seconds, r.collisions, r.unconfirmed)
                     known[r.seed, tuple(r.inputs.values())] = outcome

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from sbt.benchmark.cell import is_done, run_cell
+from sbt.benchmark.cell import changes, is_done, run_cell
 from sbt.benchmark.reference import make_reference
 from sbt.benchmark.table import write_table
 from sbt.config.benchmark import LoadedBenchmark
+from sbt.errors import InputError
 from sbt.execution.tasks import each
 from sbt.loop.stages import Progress
 from sbt.problem.plain import Json
@@ -47,9 +48,19 @@ def run_benchmark(
 
     Returns:
         What `benchmark --json` prints: store, references, cells, done, failed (name: reason), rows, table, figures.
+
+    Raises:
+        InputError: cells that are there were made with other settings.
     """
     config, all_cells = loaded.config, list(loaded.cells())
     store, failed = Path(config.store), {}
+    others = [(cell, why) for cell in all_cells if (why := changes(cell))]
+    if others:
+        (cell, why), many = others[0], f"{len(others)} of its {len(all_cells)} cells"
+        raise InputError(
+            f"a cell belongs to one configuration, but {many} in {store} were made with another ({cell.name}: {why}); give the"
+            " benchmark another store, a changed metamodel or scenario another name, or remove these folders"
+        )
     references, made = dict(loaded.references()), []
     todo = [cell for cell in all_cells if not is_done(cell)] if cells else []
     listener.message(f"{len(all_cells)} cells, {len(todo)} to do")

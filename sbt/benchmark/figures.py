@@ -70,11 +70,11 @@ class Results:
         """Return the finished cell whose last likelihood is closest to the median over the seeds, as the paper does."""
         wanted = (scenario, metamodel, acquisition)
         cells = [c for c in self.cells if (c.scenario, c.metamodel, c.acquisition) == wanted]
-        done = [c for c in cells if (c.folder / PREDICTIONS).is_file()]
-        if not done:
-            return None
         last = {row["seed"]: row["log_likelihood"] for row in self.rows
                 if (row["scenario"], row["metamodel"], row["acquisition"]) == wanted}  # rows are in the order of the runs
+        done = [c for c in cells if c.seed in last and (c.folder / PREDICTIONS).is_file()]
+        if not done:
+            return None
         middle = np.median([last[c.seed] for c in done])
         return min(done, key=lambda c: abs(last[c.seed] - middle))
 
@@ -250,6 +250,6 @@ def _times(results: Results) -> Figure | None:
                 seconds = sum(r["sampling_seconds"] for r in rows) / sum(r["sampled"] for r in rows)
                 right.bar(j + (k + 0.5) * width - 0.4, 1e3 * seconds, width, color=COLOURS[k % 8])
     left.set(xlabel="runs learned from", ylabel="training (s, median of cells)", yscale="log")
-    right.set(ylabel="sampling from a_BI (ms a sample)", yscale="log")
+    right.set(ylabel="a sample from a_BI (ms)", yscale="log")
     right.set_xticks(range(len(results.scenarios)), results.scenarios, rotation=30, ha="right")
     return _finished(figure, [left, right], "training and sampling times (wall clock)")

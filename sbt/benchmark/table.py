@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sbt.benchmark.cell import CellProposal
+from sbt.benchmark.cell import CellProposal, changes
 from sbt.config.benchmark import Cell
 from sbt.files import write_atomically
 from sbt.store.database import Store
@@ -27,8 +27,8 @@ from the metamodel of this row; they are empty in the last iteration."""
 
 
 def rows_of(cell: Cell) -> Iterator[dict[str, Any]]:
-    """Yield one row for each finished iteration of a cell; none where the cell has not begun."""
-    if not Store.begun(cell.folder):
+    """Yield one row for each finished iteration of a cell; none where it has not begun, or with other settings."""
+    if not Store.begun(cell.folder) or changes(cell):
         return
     with Store.read(cell.folder) as store:
         history, drawn = store.history(), {batch.number: batch.read(CellProposal) for batch in store.iterations()}

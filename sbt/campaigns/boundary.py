@@ -206,14 +206,14 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
     """
     if settings.learner is None or len(history.finished) < 2:
         raise InputError("boundary points need a metamodel and two finished runs, but there are none")
-    predictor = settings.learner.train(history.finished)
-    space, critical, inputs = settings.scenario.space, settings.scenario.requirement.critical, settings.learner.inputs
+    predict = settings.learner.on_inputs(settings.learner.train(history.finished), len(history.finished))
+    space, critical = settings.scenario.space, settings.scenario.requirement.critical
     sequence = SobolSequence(space.dimension, settings.seed)
     u = sequence.admissible(lambda v: space.feasible(space.from_unit(v)), 8192, 2048)
     group = np.unique(space.cube.cells(u), axis=0, return_inverse=True)[1].reshape(-1)  # there is nothing between choices
     alike = space.cube.snapped(u)
     found = np.concatenate([
-        crossings(lambda v: predictor(inputs(v)).probability(critical), alike[group == g], most)
+        crossings(lambda v: predict(v).probability(critical), alike[group == g], most)
         for g in range(group.max() + 1)
     ])  # fmt: skip
     found = found[succeeding(settings.learner.success(history), found)]

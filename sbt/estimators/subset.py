@@ -86,11 +86,14 @@ class SubsetRun:
         stuck = level >= self.level and self.levels > 0  # a plateau: no progress is possible
         if hits >= seeds or not math.isfinite(level) or stuck:
             return replace(self, hits=hits, share=self.share * hits / len(self.margin), levels=self.levels + 1, finished=True)
-        inside = int((self.margin <= level).sum())
-        front = order[:seeds]
+        below = self.margin[self.margin < level]
+        if 2 * len(below) >= seeds and (self.margin <= level).sum() > 2 * seeds:  # many equal values: on to the next one
+            level = float(below.max())
+        inside = np.flatnonzero(self.margin <= level)
+        front = inside[np.linspace(0, len(inside) - 1, seeds).round().astype(np.intp)]  # of equal ones any, not the deepest
         return replace(
             self, z=self.z[front], margin=self.margin[front], front=self.z[front], front_margin=self.margin[front],
-            level=level, share=self.share * inside / len(self.margin), levels=self.levels + 1, hits=hits,
+            level=level, share=self.share * len(inside) / len(self.margin), levels=self.levels + 1, hits=hits,
         )  # fmt: skip
 
 

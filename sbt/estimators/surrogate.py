@@ -18,7 +18,7 @@ from scipy.special import ndtr
 
 from sbt.estimators.ridge import ridge_trend
 from sbt.estimators.transfer import Trend, trended
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, sketched, with_target, without_repetitions
+from sbt.metamodels.base import Metamodel, Predictor, named_errors, predicted, sketched, with_target, without_repetitions
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.gaps import better_without_gap
 from sbt.metamodels.joint import joined_log_probability
@@ -175,7 +175,7 @@ class _Learned:
     def __call__(self, inputs: Points) -> Prediction:
         """Return the prediction of the values at the metamodel's inputs (n, d)."""
         with named_errors(self.metamodel, self.n):
-            p = self._noisy(check_prediction(self.predictor(inputs), len(inputs)))
+            p = self._noisy(predicted(self.predictor, inputs))
         p = p if self.tails is None else p.with_tails(*self.tails)
         trend = self.form.trend
         return p if trend is None else Prediction(p.mean + trend(inputs), p.std, p.weight, p.noise)
@@ -192,7 +192,7 @@ class _Learned:
         largest = math.sqrt(most * self.form.noise)
 
         def predict(inputs: Points) -> Prediction:
-            p = self._noisy(check_prediction(self.predictor(inputs), len(inputs)))
+            p = self._noisy(predicted(self.predictor, inputs))
             noise = np.maximum(np.minimum(p.noise, largest), 1e-12 * p.sigma)
             return Prediction.gaussian(p.mu, noise, noise)
 

@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, named_errors, without_repetitions
+from sbt.metamodels.base import Metamodel, Predictor, named_errors, predicted, without_repetitions
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
@@ -97,7 +97,7 @@ def trended(
 
     def belief(inputs: Points, scores: Points) -> Prediction:
         with named_errors(metamodel, len(t)):
-            rest = check_prediction(predict(inputs), len(inputs))
+            rest = predicted(predict, inputs)
         return Prediction.gaussian(rest.mu + rho * trend.mean(scores), rest.sigma)
 
     return belief

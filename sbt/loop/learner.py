@@ -12,7 +12,7 @@ import numpy as np
 
 from sbt.loop.earlier import EarlierRuns
 from sbt.loop.several import each_requirement, independence
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_prediction, log_ambiguity_bound, named_errors, sketched
+from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound, named_errors, predicted, sketched
 from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import scored
@@ -119,7 +119,7 @@ class Learner:
         def predict(points: Points) -> Prediction:
             inputs = self.inputs(points)
             with named_errors(self.metamodel, learned):
-                return check_prediction(predictor(inputs), len(inputs))
+                return predicted(predictor, inputs)
 
         return predict
 

@@ -37,9 +37,9 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_prediction", "check_rows", "gives_different",
-    "is_rate", "log_ambiguity_bound", "named_errors", "sample_paths", "simplest", "sketched", "split_validation", "standardise",
-    "with_target", "without_repetitions",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "gives_different", "is_rate",
+    "log_ambiguity_bound", "named_errors", "predicted", "sample_paths", "simplest", "sketched", "split_validation",
+    "standardise", "with_target", "without_repetitions",
 ]  # fmt: skip
 
 Predictor = Callable[[Points], Prediction]
@@ -123,7 +123,7 @@ def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generat
     own: Any = getattr(predictor, "sample_paths", None)
     if own is not None:
         return own(u, n, rng)
-    p = predictor(u)
+    p = predicted(predictor, u)
     component = rng.choice(len(p.weight), n, p=p.weight)
     if len(p.weight) >= _MIXED:
         return p.mean[component]
@@ -240,13 +240,14 @@ def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
             raise InputError(f"metamodel {name}, fitted to {n} rows: {error}") from error
 
 
-def check_prediction(prediction: Prediction, n: int) -> Prediction:
-    """Return what a predictor returned for n points.
+def predicted(predict: Predictor, u: Points) -> Prediction:
+    """Return what a predictor says of points u (n, d); it may change the copy that it gets.
 
     Raises:
         TypeError: it is no `Prediction`.
         ValueError: it is one of another number of points.
     """
+    prediction, n = predict(u.copy()), len(u)
     if not isinstance(prediction, Prediction):
         kind = type(prediction).__name__
         raise TypeError(f"a predictor must return a Prediction, such as Prediction.gaussian(mu, sigma), but returned a {kind}")

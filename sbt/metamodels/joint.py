@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, check_rows, sample_paths
+from sbt.metamodels.base import Metamodel, Predictor, check_rows, predicted, sample_paths
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import Opened
 from sbt.problem.arrays import Points, Vector
@@ -94,7 +94,7 @@ class JointPredictor:
 
     def __call__(self, u: Points) -> JointPrediction:
         """Return the prediction of the margin at u (n, d)."""
-        return JointPrediction.of([check_prediction(part(u), len(u)) for part in self.parts], self.critical)
+        return JointPrediction.of([predicted(part, u) for part in self.parts], self.critical)
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of the margin as a function, at u (m, d)."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, check_rows, split_validation, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_rows, predicted, split_validation, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -48,7 +48,7 @@ class Recalibrated:
         factor = 1.0
         if len(y) >= _FEWEST:
             held_out, training = split_validation(len(y))
-            prediction = check_prediction(self.metamodel.fit(u[training], y[training], rng)(u[held_out]), held_out.stop)
+            prediction = predicted(self.metamodel.fit(u[training], y[training], rng), u[held_out])
             z = (y[held_out] - prediction.mu) / prediction.sigma
             size = max(float(np.sqrt(np.mean(z**2))), _LEAST)
             factor = size ** (len(z) / (len(z) + _PRIOR))
@@ -64,4 +64,4 @@ class RecalibratedPredictor:
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction at u (n, d)."""
-        return check_prediction(self.predictor(u), len(u)).rescaled(self.factor)
+        return predicted(self.predictor, u).rescaled(self.factor)

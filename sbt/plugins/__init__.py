@@ -10,7 +10,7 @@ import hashlib
 import importlib.util
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -124,6 +124,16 @@ class Scope:
     def naming(self) -> AbstractContextManager[None]:
         """Return the context in which code is loaded that these names stand for."""
         return named_by(self.store)
+
+    def prints(self, names: Iterable[str]) -> dict[str, str]:
+        """Return prints of the user's own files that names stand for, and of the modules beside them, by the files' names."""
+        found = {}
+        for name in names:
+            file = (self.folder / Path(name.rpartition(":")[0] if ".py:" in name else name).expanduser()).resolve()
+            if file.is_file():
+                for each in modules_of(file) if file.suffix == ".py" else (file,):
+                    found[each.name] = hashlib.blake2b(each.read_bytes(), digest_size=4).hexdigest()
+        return found
 
     def load(self, kind: str, name: str) -> Any:
         """Return the object with this name; as `load`, and the objects of the scope.

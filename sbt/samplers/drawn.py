@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from sbt.metamodels.base import check_prediction, named_errors, sample_paths
+from sbt.metamodels.base import named_errors, predicted, sample_paths
 from sbt.metamodels.bootstrap import drawn_regression
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.noise import scores
@@ -89,7 +89,7 @@ def propose_in_noise(
     chosen = np.vstack([largest, candidates[np.array(picks, dtype=np.intp)]])
     chosen = np.vstack([chosen, spread_out(seen.admissible, np.vstack([known, chosen]), filled, rng, search.cube)])
     why = ("rate",) * len(largest) + ("drawn",) * len(picks) + ("fill",) * filled
-    order = np.argsort(check_prediction(process(search.columns(chosen)), n).mu, kind="stable")
+    order = np.argsort(predicted(process, search.columns(chosen)).mu, kind="stable")
     return Picks(chosen[order], tuple(why[k] for k in order))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Predictor, check_prediction, named_errors
+from sbt.metamodels.base import Predictor, named_errors, predicted
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.search import Search, SearchData, fill_uniformly
 
@@ -135,7 +135,7 @@ def _latent(
     floor = float(value[flat].max())
     with named_errors(search.metamodel, int(ok.sum())):
         around = search.metamodel.fit(inputs[ok & ~flat], value[ok & ~flat], rng)
-        guess = check_prediction(around(inputs[flat]), int(flat.sum()))
+        guess = predicted(around, inputs[flat])
         mean, std = guess.mu, guess.sigma
         beneath = value.copy()
         beneath[flat] = _truncated(mean, std, floor)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from sbt.metamodels.base import Metamodel, Predictor, check_prediction, gives_different, named_errors, sample_paths
+from sbt.metamodels.base import Metamodel, Predictor, gives_different, named_errors, predicted, sample_paths
 from sbt.metamodels.joint import metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import on_side
@@ -137,7 +137,7 @@ class WarpedModel:
         """Return the prediction of the warped metric at u (n, d)."""
         inputs = self.columns(u)
         with named_errors(self.metamodel, self.n):
-            return check_prediction(self.predictor(inputs), len(u))
+            return predicted(self.predictor, inputs)
 
     def log_probability(self, u: Points, inflation: float = 1.0) -> Vector:
         """Return (n,) log P(a run gives a metric and is critical) at u, sigma multiplied by `inflation`."""

@@ -11,7 +11,7 @@ import heapq
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise, product
@@ -20,10 +20,12 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["LEVEL_HEIGHT", "Levels", "levels_of"]
+__all__ = ["Levels", "is_above", "levels_of"]
 
-LEVEL_HEIGHT = 3.0
+_LEVEL_HEIGHT = 3.0
 """Difference in height from which on two road users are on different levels, such as on and under a bridge (m)."""
+_STEEPEST = 0.15
+"""Slope of no road: who is so much higher is above, also on a road that the ego's way leads to."""
 _RAMP = 60.0
 """A way between two roads that is not longer does not lead to another level (m): 3 m in 60 m are a slope of 5 %."""
 _APPROACH = 150.0
@@ -69,6 +71,34 @@ def levels_of(sumo: Any) -> Levels:
     except OSError:  # traci with a SUMO that has another working directory
         return _find(sumo)
     return _cached(file.resolve(), state.st_mtime_ns, state.st_size, _Client(sumo))
+
+
+def is_above(
+    sumo: Any, domain: Any, ego: str, own: Sequence[float], name: str, other: Sequence[float], *, person: bool
+) -> bool:  # fmt: skip
+    """Return whether a road user is so much higher or lower than the ego that it is on another level.
+
+    Roads rise: as far as the slopes of both lead there, and along the ego's way, who is far is higher and on the same level.
+
+    Args:
+        sumo: its client.
+        domain: its vehicles or persons, whichever the ego is.
+        ego: its name.
+        own: its position (x, y, z).
+        name: of the road user.
+        other: its position.
+        person: whether it walks.
+    """
+    height, far = abs(other[2] - own[2]), math.dist(own[:2], other[:2])
+    if height < _LEVEL_HEIGHT:
+        return False
+    slope = max(abs(domain.getSlope(ego)), abs((sumo.person if person else sumo.vehicle).getSlope(name)))
+    if height < _LEVEL_HEIGHT + far * math.tan(math.radians(slope)):
+        return False
+    if height > _STEEPEST * far or person or domain is not sumo.vehicle:
+        return True
+    passed = sumo.vehicle.getRouteIndex(name)
+    return passed < 0 or sumo.vehicle.getRoute(name)[passed] not in domain.getRoute(ego)
 
 
 class _Client:
@@ -123,7 +153,7 @@ def _find(sumo: Any) -> Levels:
         a, b = roads[i], roads[j]
         height = _height(sumo, a, at_i) - _height(sumo, b, at_j)
         flat = abs(height) < _FLAT
-        if (not flat and abs(height) < LEVEL_HEIGHT) or network.connected(a, at_i, b, at_j):
+        if (not flat and abs(height) < _LEVEL_HEIGHT) or network.connected(a, at_i, b, at_j):
             continue
         if flat:
             inferred.append((a.edge, b.edge, x, y))

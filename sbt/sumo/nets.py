@@ -133,7 +133,7 @@ def _lane(element: ET.Element, function: str) -> list[Lane]:
     points = [tuple(map(float, point.split(","))) for point in element.get("shape", "").split()]
     if len(points) < (3 if element.tag == "junction" else 2):  # a dead end has no area
         return []
-    height = sum(p[2] for p in points) / len(points) if len(points[0]) > 2 else 0.0
+    height = sum(p[2] for p in points if len(p) > 2) / len(points)  # netconvert leaves out a height of 0
     allowed = set(element.get("allow", "").split())
     if element.tag == "junction":
         kind = "area"

@@ -21,7 +21,7 @@ from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
-from sbt.sumo.levels import LEVEL_HEIGHT, levels_of
+from sbt.sumo.levels import is_above, levels_of
 from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
@@ -141,19 +141,18 @@ class Surroundings:
         self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
-        height = near[ego][_POSITION][2]
+        at = near[ego][_POSITION]
         road = self._own_domain.getRoadID(ego) if self.levels.apart else ""
         apart = self.levels.apart.get(road)
-        for name in sorted([*near, *self._far(near)] if self._very_long else near):
+        around = sorted([*near, *self._far(near)] if self._very_long else near)
+        for name in (*around, *sorted(self._named_present - set(around))):
             variables = near[name] if name in near else self._read(name)
-            if name == ego or variables.get(_VEHICLE) or abs(variables[_POSITION][2] - height) >= LEVEL_HEIGHT:
+            if name == ego or variables.get(_VEHICLE) or self._is_above(name, variables, at):
                 continue
             if apart is None or name in self.placed or (other := self._road(name, variables)) not in apart:
                 self._record(row, parts, before, name, variables)
             elif (road, other) not in self._other_level:
-                self._note_level(road, other, name, near[ego][_POSITION], variables)
-        for name in sorted(self._named_present - set(near) - set(row)):
-            self._record(row, parts, before, name, self._read(name))
+                self._note_level(road, other, name, at, variables)
         for name in self.present:
             if name in self.jumped:
                 self._ways.pop(name, None)
@@ -162,6 +161,11 @@ class Surroundings:
         self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
+
+    def _is_above(self, name: str, variables: Mapping[int, Any], ego: tuple[float, ...]) -> bool:
+        """Return whether the height of somebody tells that it is on another level than the ego at (x, y, z)."""
+        person = _VEHICLE in variables
+        return is_above(self._sumo, self._own_domain, self._ego, ego, name, variables[_POSITION], person=person)
 
     def _placed_near(self, ego: tuple[float, ...]) -> dict[str, dict[int, Any]]:
         """Return the variables of the placed road users that are within the radius, or named, on the ego's level."""

@@ -76,7 +76,7 @@ def check_metamodel(metamodel: Metamodel, *, dimensions: tuple[int, ...] = (1, 2
 
         try:
             predictor, same = fit(u, y), fit(u, y)
-            prediction = predictor(at)
+            prediction = predictor(at.copy())
         except Exception as error:
             raise ContractError(f"a metamodel must learn from {len(y)} rows and predict, but raised {error!r}") from error
         _check_prediction(prediction, len(at), f"d = {d}")
@@ -307,8 +307,8 @@ def _check_prediction(prediction: Prediction, n: int, case: str) -> None:
 
 def _check_predictor(predictor: Predictor, same: Predictor, at: Points, prediction: Prediction) -> None:
     """Check that a predictor is a pure function that the rng decides."""
-    _same_bits(same(at), prediction, "the same rng must give the same predictor, bit by bit")
-    _same_bits(predictor(at), prediction, "a predictor must return the same prediction when called again")
+    _same_bits(_predicted(same, at), prediction, "the same rng must give the same predictor, bit by bit")
+    _same_bits(_predicted(predictor, at), prediction, "a predictor must return the same prediction when called again")
     try:
         pickled = pickle.dumps(predictor)
     except Exception:  # it holds a local function, say; campaigns do not need it
@@ -325,7 +325,7 @@ def _check_predictor(predictor: Predictor, same: Predictor, at: Points, predicti
 
 def _predicted(predictor: Predictor, at: Points) -> Prediction:
     try:
-        return predictor(at)
+        return predictor(at.copy())
     except Exception as error:
         raise ContractError(f"a predictor must take n = {len(at)} points, but raised {error!r}") from error
 
@@ -333,7 +333,7 @@ def _predicted(predictor: Predictor, at: Points) -> Prediction:
 def _check_learning(predictor: Predictor, u: Points, y: Vector, at: Points) -> None:
     """Check that a smooth function is learned better than by the mean of y."""
     near = np.clip(u + 0.01 * (at.mean() - 0.5), 0.0, 1.0)
-    error = float(np.sqrt(np.mean((predictor(near).mu - _smooth(near)) ** 2)))
+    error = float(np.sqrt(np.mean((_predicted(predictor, near).mu - _smooth(near)) ** 2)))
     limit = 0.8 * float(y.std())
     rule = "near its rows a metamodel must predict a smooth function better than the mean does"
     _require(error < limit, rule, f"RMSE {error:.3g} for a standard deviation of {y.std():.3g}")
@@ -341,13 +341,13 @@ def _check_learning(predictor: Predictor, u: Points, y: Vector, at: Points) -> N
 
 def _check_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y: Vector, at: Points, prediction: Prediction) -> None:
     """Check that scale, shift and order of the rows hardly matter."""
-    scaled = fit(u, 1e6 * y + 3e6)(at)
+    scaled = _predicted(fit(u, 1e6 * y + 3e6), at)
     size = float(prediction.sigma.max())
     rule = "scaling and shifting y must scale and shift the prediction"
     _close((scaled.mu - 3e6) / 1e6, prediction.mu, 0.05, rule, size)
     _close(scaled.sigma / 1e6, prediction.sigma, 0.05, rule, size)
     order = np.random.Generator(np.random.PCG64(0)).permutation(len(y))
-    other = fit(u[order], y[order])(at)
+    other = _predicted(fit(u[order], y[order]), at)
     rule = "the order of the rows must not change the prediction beyond its own sigma"
     _require(float(np.median(np.abs(other.mu - prediction.mu) / prediction.sigma)) < 2.0, rule, "a shift > 2 sigma")
 
@@ -369,11 +369,11 @@ def _check_awkward_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y
     }
     for case, (rows, values) in cases.items():
         try:
-            prediction = fit(rows, values)(at)
+            prediction = fit(rows, values)(at.copy())
         except Exception as error:
             raise ContractError(f"a metamodel must learn from {case}, but got {error!r}") from error
         _check_prediction(prediction, len(at), case)
-    constant = fit(u, np.full(len(y), 10.0))(at)
+    constant = _predicted(fit(u, np.full(len(y), 10.0)), at)
     off = float(np.abs(constant.mu - 10.0).max())
     _require(off < 1.0, "where all y are 10 the prediction must be about 10", f"off by {off}")
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
-from sbt.metamodels.base import Predictor
+from sbt.metamodels.base import Predictor, predicted
 from sbt.metamodels.ended import ended
 from sbt.metamodels.joint import JointPrediction
 from sbt.metamodels.persistence import load, read_info, save
@@ -127,7 +127,7 @@ def predict_inputs(
     u = learner.inputs(space.to_unit(x))
     parts = []
     for k in range(0, len(u), _CHUNK):
-        p = predictor(u[k : k + _CHUNK])
+        p = predicted(predictor, u[k : k + _CHUNK])
         each = p.parts if isinstance(p, JointPrediction) else ()
         single = [one.probability(need.critical) for one, need in zip(each, requirement.parts, strict=False)]
         told = ended(p)
