@@ -6,13 +6,14 @@ folder of a campaign; `RunError` ends one run and becomes a row of the store, ne
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 
 __all__ = [
     "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean", "must_be",
-    "naming", "place_of",
+    "must_take", "naming", "place_of",
 ]  # fmt: skip
 
 
@@ -63,6 +64,20 @@ def must_be(rule: str, value: object, *kinds: type) -> None:
     """
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
         raise InputError(f"{rule}, but got {value!r}")
+
+
+def must_take(rule: str, function: object, n: int) -> None:
+    """Refuse a function that does not take n arguments by position; one that is built in tells no signature.
+
+    Raises:
+        InputError: the rule, then why not.
+    """
+    try:
+        inspect.signature(function).bind(*[None] * n)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise InputError(f"{rule}, but: {error}") from None
+    except ValueError:
+        pass
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

@@ -50,7 +50,7 @@ def is_done(cell: Cell) -> bool:
 
 
 def changes(cell: Cell) -> str:
-    """Return in words how what the folder of a cell holds was made otherwise than configured; "" where it was not, or is empty."""
+    """Return in words how a cell that is there was made otherwise than it is configured; "" where it was not, or is not there."""
     if not Store.begun(cell.folder):
         return ""
     with Store.read(cell.folder) as store:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit
 
-from sbt.campaigns.wording import measured, number
+from sbt.campaigns.wording import measured, number, plural
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
@@ -99,7 +99,7 @@ class BoundaryPlace:
         if self.fixed:
             names = sorted(self.fixed, key=lambda name: -self.weights.get(name, 0.0))
             told = [measured(name, self.fixed[name], units.get(name, "")) for name in names[:_MOST_FIXED]]
-            told += [f"{len(names) - _MOST_FIXED} more inputs fixed too"] if len(names) > _MOST_FIXED else []
+            told += [f"{plural(len(names) - _MOST_FIXED, 'more input')} fixed too"] if len(names) > _MOST_FIXED else []
             said += f", in the section with {', '.join(told)}"
         return said
 

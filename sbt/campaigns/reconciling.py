@@ -36,8 +36,14 @@ def denial(found: BoundaryConclusion, runs: CriticalShare) -> str:
     return "" if whose is None else f" The {whose} deny its figures (below): do not rely on it yet."
 
 
-def reconciled(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
-    """Return the critical share by the metamodel and by the held-out runs alone, whether they agree, and what runs deny."""
+def reconciled(found: BoundaryConclusion, runs: CriticalShare, *, recorded: bool = False) -> list[str]:
+    """Return the critical share by the metamodel and by the held-out runs alone, whether they agree, and what runs deny.
+
+    Recorded rows that are left over were not drawn at random: they check no share.
+    """
+    if recorded:
+        said = f"The metamodel takes {percent(found.critical_fraction or 0.0)} of the parameter space to be critical."
+        return [said, *_too_sure(found)]
     return [*_by_held_out(found, runs), *_unlike_even(found), *_too_sure(found)]
 
 

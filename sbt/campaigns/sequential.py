@@ -65,6 +65,9 @@ _BLUR = 0.05
 """Standard deviation of noise over the median deviation of the metric, from which on a simulator is taken for noisy there."""
 _EVEN_SHARE = 0.1
 """Of the search picks, those that are spread evenly: they do not depend on the metamodel."""
+_BATCHES, _BATCH = 8, 15
+"""Least number of batches that a budget is for, and runs that a batch may have anyway. With a single batch that counts a fifth of
+the intervals missed where the metric jumps: it was drawn with what a search alone had learned, and no other one denies it."""
 _BEYOND = 1e-9
 """Mass of the inputs' distribution beyond the ball in normal scores that is searched: failures out there do not count."""
 _SEARCH_SHARE = (0.2, 0.1)
@@ -153,7 +156,8 @@ class SequentialStage:
                 return MonteCarloStage(self.settings).propose(log)
             s, left = self.settings, self.settings.budget - len(log.planned)
             again = repeats_wanted(log.planned, s.scenario, left - 1)
-            batch = self._proposed(log, max(min(s.batch, left) - len(again), 1))
+            size = min(s.batch, max(s.budget // _BATCHES, _BATCH), left)
+            batch = self._proposed(log, max(size - len(again), 1))
             return replace(batch, runs=(*batch.runs, *again))
 
     def _tells_now(self, log: Log) -> bool:

@@ -138,12 +138,14 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     ]
     if found.place is not None and where != section and not none_critical(facts):
         said.append(f"On lines across the boundary, a run is critical where {section}.")
-    return [*said, *reconciled(found, measured_share)]
+    return [*said, *reconciled(found, measured_share, recorded=facts.recorded)]
 
 
 def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:
     if all_critical(facts):
         return _WIDEN
+    if not tested and facts.recorded:
+        return "test it: a smaller budget leaves rows that score the metamodel"
     if not tested:
         return "test it: validation.reference: 300 scores the metamodel on 300 more runs drawn at random"
     scores, unsure = found.validation, found.ambiguous_volume or 0.0
@@ -151,7 +153,8 @@ def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) ->
         few = f"held-out runs with so few critical ones among them ({scores.n_critical} of {scores.n})"
         if 2 * scores.n_critical > scores.n:
             few = f"so few held-out runs ({scores.n}, {scores.n_critical} of them critical)"
-        return f"a larger budget, or validation.reference: 300, since {few} cannot tell whether a critical region is missing"
+        more = "" if facts.recorded else ", or validation.reference: 300,"
+        return f"a larger budget{more} since {few} cannot tell whether a critical region is missing"
     if found.place is None:
         return "campaign: falsification searches for the rare critical run"
     return (

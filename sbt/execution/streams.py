@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from typing import Any, TextIO
@@ -27,6 +28,8 @@ class SteadyStream:
 
     def __init__(self, stream: TextIO, *, any_error: bool = False):
         self._stream, self._any = stream, any_error
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")  # of ASCII or Latin-1: \u2264 for ≤
         self.gone = False
 
     def write(self, text: str) -> int:

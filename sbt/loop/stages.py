@@ -100,6 +100,7 @@ class Facts:
         units: of inputs and metrics, by name.
         combinations: of the inputs, where all are whole numbers or choices and there are at most 4,096; None: otherwise.
         meanings: of metrics, by name.
+        recorded: its runs are recorded rows; there are no others.
     """
 
     history: History
@@ -109,13 +110,14 @@ class Facts:
     units: Mapping[str, str] = field(default_factory=dict)
     combinations: int | None = None
     meanings: Mapping[str, str] = field(default_factory=dict)
+    recorded: bool = False
 
     @classmethod
     def of(cls, history: History, scenario: LogicalScenario) -> Facts:
         """Return the facts of a campaign with this scenario."""
         return cls(
             history, scenario.requirement, scenario.unit, scenario.name, scenario.units, few_combinations(scenario),
-            {m.name: m.description for m in scenario.metrics if m.description},
+            {m.name: m.description for m in scenario.metrics if m.description}, scenario.pool is not None,
         )
 
 

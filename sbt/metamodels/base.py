@@ -232,7 +232,8 @@ def _rule(declared: str, value: Any, stated: Iterable[Any]) -> str:
 @contextmanager
 def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
     """Return a context in which an error of a metamodel's own code names the metamodel, its n rows and the line (`naming`)."""
-    name = type(metamodel).__name__
+    inner: Any = getattr(metamodel, "metamodel", metamodel) if type(metamodel).__module__.startswith("sbt.") else metamodel
+    name = type(inner).__name__  # of the user's own, whose errors these are, where another one wraps it
     with naming(f"metamodel {name} must learn from {n} rows and predict"):
         try:
             yield

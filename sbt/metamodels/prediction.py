@@ -93,6 +93,9 @@ class Prediction:
     def gaussian(cls, mu: ArrayLike, sigma: ArrayLike, noise: ArrayLike | None = None) -> Prediction:
         """Return one Gaussian a point; without `noise` all of `sigma` (n,) counts as epistemic."""
         mean, std = np.atleast_2d(np.asarray(mu, float)), np.atleast_2d(np.asarray(sigma, float))
+        for name, given in (("mu", mean), ("sigma", std)):
+            if given.ndim > 2 or len(given) > 1:
+                raise PredictionError(f"{name} must have shape (n,), one value a point, but got {given.shape}")
         aleatoric = np.zeros(mean.shape[1]) if noise is None else np.asarray(noise, float)
         return cls(mean, std, np.ones(1), aleatoric)
 

@@ -9,7 +9,7 @@ from numbers import Real
 from typing import Any
 
 from sbt import plugins
-from sbt.errors import InputError, RunError, must_be
+from sbt.errors import InputError, RunError, must_be, must_take
 from sbt.problem.arrays import FARTHEST, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
@@ -50,10 +50,16 @@ class Metric:
         must_be("a metric's name must be text", self.name, str)
         must_be(f"metric {self.name}: a unit must be text", self.unit, str)
         must_be(f"metric {self.name}: what stands for no interaction (without) must be a number", self.without, Real)
+        if math.isnan(self.without):
+            raise InputError(f"metric {self.name}: what stands for no interaction (without) must be a number, but got nan")
+        if self.direction not in ("low", "high"):
+            raise InputError(f"metric {self.name}: direction must be 'low' or 'high', but got {self.direction!r}")
         if not self.name.strip() or not self.name.isprintable():
             raise InputError(f"a metric's name must be text on one line, but got {self.name!r}")
         if self.function is not None and not callable(self.function):
             raise InputError(f"metric {self.name} must have a function of a trace, but got {self.function!r}")
+        if self.function is not None:
+            must_take(f"metric {self.name} must have a function of one argument, the trace", self.function, 1)
 
     def __call__(self, trace: Trace) -> float:
         """Return the metric of a trace.

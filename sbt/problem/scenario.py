@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError, RunError, did_you_mean, must_be
+from sbt.errors import InputError, RunError, did_you_mean, must_be, must_take
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.metric import Metric, meaningful, metric_from
 from sbt.problem.outcome import Status
@@ -188,6 +188,7 @@ class LogicalScenario:
             raise InputError(f"scenario {name}: give either simulate or evaluate")
         if not callable(simulate if evaluate is None else evaluate):
             raise InputError(f"scenario {name}: what simulates or evaluates must be a function of values and seed")
+        must_take(f"scenario {name}: what simulates or evaluates must take values and seed", simulate or evaluate, 2)
         must_be(f"scenario {name}: metrics must be a list", metrics, list, tuple, Mapping)
         if evaluate is not None:
             metrics = _returned(name, metrics, tuple(metric_names) or tuple(part.metric for part in requirement.parts))

@@ -67,6 +67,7 @@ class Findings:
         scenario: its name.
         combinations: of the inputs, where they are few.
         meanings: of metrics, by name.
+        recorded: its runs are recorded rows.
     """
 
     history: History
@@ -82,6 +83,7 @@ class Findings:
     scenario: str = ""
     combinations: int | None = None
     meanings: Mapping[str, str] = field(default_factory=dict)
+    recorded: bool = False
 
     @classmethod
     def of(
@@ -95,7 +97,7 @@ class Findings:
             conclusion, store.conclusion or {},
             validation, store.counts.get(PLANNED, 0), scenario.direction,
             scenario.units, scenario.name, few_combinations(scenario),
-            {m.name: m.description for m in scenario.metrics if m.description},
+            {m.name: m.description for m in scenario.metrics if m.description}, scenario.pool is not None,
         )  # fmt: skip
 
     @property
@@ -111,7 +113,9 @@ class Findings:
     @property
     def facts(self) -> Facts:
         """What the conclusion's own sentences may refer to."""
-        return Facts(self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations, self.meanings)
+        return Facts(
+            self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations, self.meanings, self.recorded
+        )  # fmt: skip
 
 
 def distribution_words(parameter: Parameter) -> str:

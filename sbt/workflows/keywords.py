@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
 
-from sbt.errors import InputError, must_be
+from sbt.errors import InputError, must_be, must_take
 from sbt.loop.stages import Progress
 from sbt.plugins import OBJECT
 from sbt.problem.combination import CombinedRequirement
@@ -64,12 +63,7 @@ def check_listener(progress: object) -> None:
         return
     if not callable(progress):
         raise InputError(f"progress must be a function, but got {progress!r}")
-    try:
-        inspect.signature(progress).bind(None)
-    except TypeError as error:
-        raise InputError(f"progress must take one argument, where the campaign stands, but: {error}") from None
-    except ValueError:
-        pass  # one that is built in tells no signature
+    must_take("progress must take one argument, where the campaign stands", progress, 1)
 
 
 def as_data(keys: JsonMapping) -> tuple[Json, dict[tuple[str, str], Any]]:

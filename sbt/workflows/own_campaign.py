@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sbt.campaigns.settings import Settings
 from sbt.errors import InputError, must_be, naming
 from sbt.loop.running import ahead_of
 from sbt.loop.stages import Batch, Campaign, Log, Stage
@@ -20,14 +21,19 @@ _ROOM = 1e-9
 """Relative to the larger end of a range, by which rounding may take a value beyond it."""
 
 
-def checked(campaign: object, space: ParameterSpace) -> Campaign:
-    """Return a campaign whose stages and conclusion are checked.
+def checked(recipe: Callable[[Settings], object], settings: Settings) -> Campaign:
+    """Return the campaign of a user's recipe, whose stages and conclusion are checked.
 
     Raises:
-        InputError: a recipe returned something else.
+        InputError: the recipe returned something else.
+        SbtError: it raised.
     """
+    rule = "a campaign's recipe must return a Campaign"
+    with naming(rule):
+        campaign = recipe(settings)
     if not isinstance(campaign, Campaign):
-        raise InputError(f"a campaign's recipe must return a Campaign, but returned {campaign!r}")
+        raise InputError(f"{rule}, but returned {campaign!r}")
+    space = settings.scenario.space
     return Campaign(tuple(_Checked(stage, space) for stage in campaign.stages), _concluding(campaign.conclude))
 
 

@@ -323,9 +323,8 @@ class Study:
         Raises:
             InputError: its batches are to be chosen ahead, but each needs all results before it.
         """
-        found = self.kind.recipe(self.settings)
-        if not getattr(self.kind.recipe, "__module__", "").startswith("sbt."):
-            found = checked(found, self.scenario.space)
+        own = not getattr(self.kind.recipe, "__module__", "").startswith("sbt.")
+        found = checked(self.kind.recipe, self.settings) if own else self.kind.recipe(self.settings)
         if self.config.ahead and not any(ahead_of(stage) for stage in found.stages):
             kind, how = self.config.campaign, self.config.acquisition.kind
             raise InputError(f"batch.ahead must be 0 where each batch needs all results before it, as in {kind} by {how}")
