@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -479,6 +480,15 @@ def test_a_full_disk_is_an_error_for_results_and_none_for_progress():
         progress.write("y")
         progress.flush()
         assert progress.gone
+
+
+def test_a_stream_of_fewer_characters_gets_escapes():
+    """A terminal in ASCII ended a finished campaign with an internal error."""
+    inner = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    stream = SteadyStream(inner)
+    stream.write("TTC \u2264 1 s")
+    stream.flush()
+    assert inner.buffer.getvalue() == b"TTC \\u2264 1 s"
 
 
 @pytest.mark.parametrize("ending", [[], ["--json"]])

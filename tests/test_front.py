@@ -357,6 +357,24 @@ def test_a_campaign_of_ones_own_in_three_ways(tmp_path, monkeypatch):
         assert result.report().is_file()
 
 
+def test_a_result_stays_where_it_is_and_home_is_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    made = sbt.run(campaign="coverage", scenario=scenario_of(), store="runs/a", **TINY)
+    opened = sbt.open("runs/a")
+    (tmp_path / "sub").mkdir()
+    monkeypatch.chdir(tmp_path / "sub")
+    assert len(made.frame) == len(opened.frame) == 24
+    there = sbt.run(campaign="coverage", scenario=scenario_of(), store="~/b", **TINY)
+    assert there.store == tmp_path / "home" / "b"
+
+
+def test_a_campaign_that_is_run_again_keeps_what_it_took(tmp_path):
+    first, again = (sbt.run(campaign="coverage", scenario=scenario_of(), store=tmp_path / "s", **TINY).summary for _ in range(2))
+    assert first["seconds"]["simulate"] > 0
+    assert again["seconds"] == first["seconds"]
+
+
 def test_a_store_opens_without_its_metamodel(tmp_path):
     (tmp_path / "flat.py").write_text(OWN)
     flat = plugins.load("metamodels", str(tmp_path / "flat.py:Flat"))

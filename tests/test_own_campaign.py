@@ -82,6 +82,14 @@ def test_what_is_no_conclusion_is_refused(conclude, said, tmp_path):
         run(tmp_path, Mine([GOOD]), conclude)
 
 
+def test_a_recipe_that_raises_is_named(tmp_path):
+    def mine(settings):
+        return 1 / 0
+
+    with pytest.raises(sbt.SbtError, match=r"a campaign's recipe must return a Campaign, but raised ZeroDivisionError.*test_own"):
+        sbt.run(campaign=mine, scenario=SCENARIO, budget=6, store=tmp_path / "s", executor="serial", report=False)
+
+
 def test_a_reason_to_stop_is_text(tmp_path):
     with pytest.raises(sbt.InputError, match="stop must return why it is over, as text, or None, but got 5"):
         run(tmp_path, Mine([GOOD], reason=5))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ from scipy.spatial.distance import pdist
 from typer.testing import CliRunner
 
 import sbt
+from sbt import plugins
 from sbt.acquisitions import boundary, greedy, is_greedy, log_scores
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.errors import InputError
+from sbt.errors import InputError, PluginError
 from sbt.metamodels.base import build
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.recalibrated import Recalibrated
 from sbt.plugins import load
 from sbt.problem.requirement import CriticalInterval
 from sbt.store.database import Store
@@ -237,6 +240,40 @@ def test_a_predictor_that_changes_its_points_changes_no_other_ones(folder, campa
     np.testing.assert_array_equal(changing.history.x, plain.history.x)
     assert changing.conclusion == plain.conclusion
     check_metamodel(InPlace(0.5), dimensions=(2,))
+
+
+class Columns:
+    def fit(self, u, y, rng):
+        return lambda v: Prediction.gaussian(np.zeros((len(v), 1)), np.ones((len(v), 1)))
+
+
+class Raises:
+    def fit(self, u, y, rng):
+        raise ArithmeticError("no")
+
+
+@pytest.mark.parametrize(
+    ("metamodel", "said"),
+    [
+        (Columns(), r"metamodel Columns, fitted to 9 rows: mu must have shape \(n,\), one value a point, but got \(\d+, 1\)"),
+        (Recalibrated(Raises()), "metamodel Raises must learn from 9 rows and predict, but raised ArithmeticError: no"),
+    ],
+)
+def test_an_error_names_the_users_class_and_what_it_gave(tmp_path, metamodel, said):
+    line = sbt.Scenario("line", [sbt.Parameter("a", 0, 1)], sbt.Requirement("y", high=0.2), evaluate=lambda v, s: {"y": v["a"]})
+    with pytest.raises(sbt.SbtError, match=said):
+        sbt.run(campaign="boundary", scenario=line, metamodel=metamodel, budget=20, initial=10, batch=10, executor="serial",
+                store=tmp_path / "s", report=False)  # fmt: skip
+
+
+def test_two_packages_with_one_name_are_told(monkeypatch):
+    """The one of a stranger was taken, or not, in silence."""
+    known = plugins._entries("metamodels")
+    stranger = EntryPoint("gp", "theirs:Quadratic", "sbt.metamodels")
+    monkeypatch.setattr(plugins, "_entries", lambda kind: {**known, "gp": [*known["gp"], stranger]})
+    with pytest.raises(PluginError, match="metamodels must have names of their own, but packages offer 'gp' as .* and as theirs"):
+        load("metamodels", "gp")
+    load("metamodels", "et")
 
 
 def test_objects_and_recalibration_work_in_campaigns(run, folder):

@@ -11,11 +11,14 @@ from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.config.load import parse
+from sbt.config.source import ConfigError
 from sbt.errors import InputError
 from sbt.plugins import load
 from sbt.samplers.pool import PoolSequence
 from sbt.seeds import stream
 from sbt.store.database import Store
+from sbt.workflows.running import run_study
+from sbt.workflows.study import Study
 
 CONFIG = """
 title: "Disc"
@@ -47,6 +50,17 @@ def configuration(folder: Path, campaign: str, store: str, budget: int = 60) -> 
         f"budget: {budget}\ninitial: 20\nbatch: 20\nmetamodel: {{kind: et}}\nexecutor: {{kind: serial}}\n"
         f"store: {folder.parent / store}\n"
     )
+
+
+def test_rows_that_are_left_over_check_no_share_and_no_others_are_promised(folder: Path) -> None:
+    for budget, left in ((60, True), (200, False)):
+        done = run_study(Study(parse(configuration(folder, "boundary", f"s{budget}", budget), folder=folder)), report=False)
+        said = " ".join(done.sentences)
+        assert "held-out run checks that" not in said
+        assert "validation.reference" not in said
+        assert ("that it had not seen" in said) is left
+    with pytest.raises(ConfigError, match=r"validation\.reference: recorded rows have no runs beside them"):
+        run_study(Study(parse(configuration(folder, "boundary", "r") + "validation: {reference: 30}\n", folder=folder)))
 
 
 def test_table_is_a_scenario(folder: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue, model_validator
 
+from sbt.config.executor_model import Folder
 from sbt.config.load import Loaded, checked, read_text
 from sbt.config.model import (
     Choice,
@@ -99,7 +100,7 @@ class Benchmark(_Strict):
     iterations: int = Field(default=10, ge=1, le=MOST_RUNS, description="Batches of a cell, the even first one included.")
     reference: int = Field(default=100_000, ge=2, le=MOST_RUNS, description="Random runs a scenario that score all its cells.")
     reference_seed: int = Field(default=1_000_000, ge=0, le=2**64 - 1, description="Seed of the reference runs; none of `seeds`.")
-    references: Name | None = Field(
+    references: Folder | None = Field(
         default=None, description="Folder of the reference runs, shared by benchmarks; default: <store>/reference."
     )
     max_candidates: int = Field(
@@ -107,7 +108,7 @@ class Benchmark(_Strict):
     )
     workers: int = Field(default=1, ge=1, le=4096, description="Cells that run at the same time.")
     timeout: float = Field(default=60.0, gt=0, description="Wall-clock time (s) after which a run is stopped.")
-    store: Name = Field(default="runs/benchmark", description="Folder of the results.")
+    store: Folder = Field(default="runs/benchmark", description="Folder of the results.")
 
     @model_validator(mode="after")
     def _distinct(self) -> Benchmark:

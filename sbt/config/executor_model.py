@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from sbt.config.requirement_model import MOST_RUNS, Name
 from sbt.errors import did_you_mean
 
-__all__ = ["EXECUTORS", "ExecutorChoice"]
+__all__ = ["EXECUTORS", "ExecutorChoice", "Folder"]
 
 EXECUTORS = ("serial", "local", "dask")
 """Where runs can be executed."""
@@ -48,6 +48,8 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+Folder = Annotated[Name, AfterValidator(os.path.expanduser)]
+"""A folder of the user's; ~ is the home."""
 ExecutorName = Annotated[str, AfterValidator(_one_of(EXECUTORS)), Field(json_schema_extra={"enum": [*EXECUTORS]})]
 
 

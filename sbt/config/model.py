@@ -27,7 +27,7 @@ from pydantic import (
     model_validator,
 )
 
-from sbt.config.executor_model import ExecutorChoice
+from sbt.config.executor_model import ExecutorChoice, Folder
 from sbt.config.fidelity_model import FidelityChoice
 from sbt.config.kinds import kind_of
 from sbt.config.requirement_model import MOST, MOST_RUNS, Interval, Name, RequirementChange, check_numbers, each_once, two_values
@@ -239,7 +239,7 @@ def _acquisition(data: Json) -> AcquisitionChoice:
 class WarmStart(_Strict):
     """An earlier campaign to learn from: its runs teach the metamodel, they are never counted."""
 
-    store: Name = Field(description="Store of a finished campaign of the same scenario, ego, step and inputs.")
+    store: Folder = Field(description="Store of a finished campaign of the same scenario, ego, step and inputs.")
     transfer: bool = Field(
         default=False, description="It had another ego, step, net, version or other inputs: it is told apart from this one."
     )
@@ -327,7 +327,7 @@ class Configuration(_Strict):
         default=None, description="Egos to run failures again with; default: falsification, the four reference drivers.",
     )  # fmt: skip
     executor: ExecutorChoice = Field(default_factory=ExecutorChoice, description="Where runs are executed.")
-    store: Name = Field(default_factory=_store, description="Folder of the results; default: runs/<campaign>_<scenario>.")
+    store: Folder = Field(default_factory=_store, description="Folder of the results; default: runs/<campaign>_<scenario>.")
 
     @field_validator("initial")
     @classmethod

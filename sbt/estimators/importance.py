@@ -169,7 +169,7 @@ def plan_batch(
     for name, log_spread in log_uncertainty.items():
         if form not in (None, name):
             continue
-        r = shares[1] * nominal + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
+        r = shares[1] * nominal + shares[2] * _normalised(log_pi + log_w, alive) + shares[3] * _normalised(log_wide, alive)
         mean = float((w * pi).sum())
         guided = _guided(log_spread, mean, others, w, log_w)
         r += shares[0] * guided

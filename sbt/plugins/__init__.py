@@ -151,15 +151,13 @@ class Scope:
 
 
 @cache
-def _entries(kind: str) -> dict[str, EntryPoint]:
+def _entries(kind: str) -> dict[str, list[EntryPoint]]:
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, but got '{kind}'")
-    return {entry.name: entry for entry in _offered(kind)}
-
-
-@cache
-def _offered(kind: str) -> tuple[EntryPoint, ...]:
-    return tuple(entry_points(group=f"sbt.{kind}"))
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in entry_points(group=f"sbt.{kind}"):
+        found.setdefault(entry.name, []).append(entry)
+    return found
 
 
 def names(kind: str) -> list[str]:
@@ -190,11 +188,9 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
     if name not in entries:
         known = ", ".join(sorted(entries)) or "nothing is installed"
         raise PluginError(f"{kind} must be one of {known}, or file.py:NAME, but got '{name}'{did_you_mean(name, entries)}")
-    values = {entry.value for entry in _offered(kind) if entry.name == name}
-    if len(values) > 1:
-        offered = " and as ".join(sorted(values))
-        raise PluginError(f"{kind} must have names of their own, but installed packages offer '{name}' as {offered}")
-    return _guarded(entries[name].load, lambda _: f"{kind[:-1]} '{name}' cannot be imported", InputError)
+    if len(values := sorted({entry.value for entry in entries[name]})) > 1:
+        raise PluginError(f"{kind} must have names of their own, but packages offer '{name}' as {' and as '.join(values)}")
+    return _guarded(entries[name][0].load, lambda _: f"{kind[:-1]} '{name}' cannot be imported", InputError)
 
 
 @kept

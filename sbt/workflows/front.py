@@ -96,7 +96,7 @@ def run_campaign(config: str | Path | None = None, **keys: Any) -> Result[Any]:
         study = Study.from_mapping(data, name="sbt.run", scope=Scope(Path.cwd(), objects))
     summary = run_study(study, progress=progress, report=report)
     trust_store(Path(summary.store))  # the caller has named its code, which has run
-    return Result(Path(summary.store), objects)
+    return Result(Path(summary.store).absolute(), objects)
 
 
 def open_result(
@@ -134,7 +134,7 @@ def open_result(
             changed = scenario_differences(study.kept["described"], describe_scenario(study.runnable))
             if changed:
                 raise InputError(f"scenario {scenario.name} must be the one that {folder} was made with, but {changed}")
-    return Result(folder, objects)
+    return Result(folder.absolute(), objects)
 
 
 def _check_objects(study: Study, objects: Objects, folder: Path) -> None:

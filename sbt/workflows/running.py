@@ -226,11 +226,14 @@ def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> Non
 def summarise(store: Store, study: Study, finished: Finished) -> Summary:
     """Return how a campaign ended."""
     history, config, scenario = store.history(), study.config, study.scenario
+    seconds, before = {k: round(v, 4) for k, v in finished.seconds.items()}, store.conclusion
+    if before is not None and before["runs"] == len(history):  # nothing was run: what it took is known from then
+        seconds = before["seconds"]
     ok, critical = int(history.ok.sum()), scenario.requirement.critical_runs(history)
     return Summary(
         config.campaign, config.scenario, str(Path(config.store)), len(history), ok, len(history) - ok,
         int(np.count_nonzero(critical)), len(store.iterations()), finished.stopped,
-        {k: round(v, 4) for k, v in finished.seconds.items()}, finished.conclusion,
+        seconds, finished.conclusion,
         int(np.count_nonzero(critical & history.unconfirmed)), int(np.count_nonzero(critical & history.doubtful(Doubt.STRUCK))),
         int(np.count_nonzero(history.doubtful(Doubt.OTHER_LEVEL))),
         tuple(sentences_of(finished.conclusion, Facts.of(history, scenario))),
