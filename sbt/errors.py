@@ -67,13 +67,15 @@ def must_be(rule: str, value: object, *kinds: type) -> None:
 
 
 def must_take(rule: str, function: object, n: int) -> None:
-    """Refuse a function that does not take n arguments by position; one that is built in tells no signature.
+    """Refuse a function that does not take n arguments by position; what wraps another one is asked itself.
+
+    One that is built in tells no signature.
 
     Raises:
         InputError: the rule, then why not.
     """
     try:
-        inspect.signature(function).bind(*[None] * n)  # type: ignore[arg-type]
+        inspect.signature(function, follow_wrapped=False).bind(*[None] * n)  # type: ignore[arg-type]
     except TypeError as error:
         raise InputError(f"{rule}, but: {error}") from None
     except ValueError:

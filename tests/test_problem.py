@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import pickle
@@ -460,6 +461,17 @@ def test_streams_depend_on_seed_and_path_only():
 def test_what_is_no_such_thing_is_told_as_that(make, said):
     with pytest.raises(InputError, match=said):
         make()
+
+
+def test_a_decorated_function_is_asked_for_its_own_arguments():
+    def with_limit(function):
+        @functools.wraps(function)
+        def inner(trace):
+            return function(trace, 3.0)
+
+        return inner
+
+    assert Metric("m", with_limit(lambda trace, limit: limit))(None) == 3.0
 
 
 def test_the_ends_of_a_range_are_plain_numbers():

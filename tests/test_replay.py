@@ -163,6 +163,14 @@ def test_another_sumo_program_shows_the_same_run(name: str, stored: dict[str, Ru
     assert scenario.simulate(record.inputs, record.seed).identical(trace)  # and libsumo goes on as before
 
 
+@pytest.mark.parametrize(("shape", "height"), [("0,0,6 100,0", 3.0), ("0,0 100,0,6", 3.0), ("0,0 100,0", 0.0)])
+def test_netconvert_leaves_out_heights_of_0(tmp_path, shape, height):
+    """A ramp down to 0 ended every report with an internal error."""
+    net = tmp_path / "a.net.xml"
+    net.write_text(f'<net version="1.20"><edge id="a"><lane id="a_0" index="0" shape="{shape}"/></edge></net>')
+    assert [lane.height for lane in lanes(str(net))] == [height]
+
+
 def test_lanes_are_where_the_network_has_them():
     shapes = lanes("straight")
     assert [lane.shape[0][1] for lane in shapes] == [-8.75, -5.25, -1.75]

@@ -39,11 +39,16 @@ def list_(
 
 
 def schema(
-    kind: Annotated[str, typer.Argument(metavar="[campaign|scenario]", help="Of which file.")] = "campaign",
+    kind: Annotated[str, typer.Argument(metavar="[campaign|scenario|benchmark]", help="Of which file.")] = "campaign",
 ) -> None:
-    """Print the JSON schema of configurations or of scenario.yaml, for editors."""
-    if kind not in ("campaign", "scenario"):
-        raise InputError(f"a schema must be campaign or scenario, but got '{kind}'")
+    """Print the JSON schema of configurations, of scenario.yaml or of a benchmark's file, for editors."""
+    if kind not in ("campaign", "scenario", "benchmark"):
+        raise InputError(f"a schema must be campaign, scenario or benchmark, but got '{kind}'")
+    if kind == "benchmark":
+        from sbt.config.benchmark import Benchmark
+
+        print(json.dumps(Benchmark.model_json_schema(), indent=2))
+        return
     if kind == "scenario":
         from sbt.config.scenario_model import schema as scenario_schema
 

@@ -54,6 +54,8 @@ class ScenarioEntry(_Strict):
     @property
     def label(self) -> str:
         """Name in tables and folders."""
+        if self.scenario.startswith("testbed:"):
+            return self.name or self.scenario.removeprefix("testbed:").replace(":", " ")
         path = Path(self.scenario.removesuffix(":SCENARIO"))
         return self.name or (path.stem if path.suffix else path.name).rpartition(":")[2]
 

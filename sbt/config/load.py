@@ -323,6 +323,8 @@ def _problem(error: Any, model: type[BaseModel], source: SourceMap) -> tuple[Key
         return path, str(error["ctx"]["error"]), False
     if kind == "too_long":
         return path, f"must have at most {error['ctx']['max_length']} entries, but got {len(error['input'])}", False
+    if kind == "too_short":
+        return path, f"must have at least {error['ctx']['min_length']} right entries", False
     rule = _RULES.get(kind, error["msg"].replace("Input should be", "must be"))
     return path, f"{rule}, but got {_shown(error['input'])}", kind == "invalid_key"
 

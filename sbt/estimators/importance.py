@@ -37,6 +37,8 @@ _LEAST_DRAWN = 1e-300
 """Probability of a pool point that is never drawn, as a divisor: its weight is 0."""
 _LEAST_PROBABILITY = 1e-12
 """Of an event, in the coefficient of variation that draws are planned by: one that is denied must not take them all."""
+_DOUBT = 0.3
+"""Share of the guided draws that go where the metamodel would be unsure with errors as rare and large as left-out runs show."""
 _OWN = 0.5
 """Share of the guided draws that no further event has a say in."""
 
@@ -141,7 +143,7 @@ class Draws:
 
 def plan_batch(
     log_pi: Vector, log_not: Vector, log_w: Vector, log_wide: Vector, stratum: Vector, shares: tuple[float, ...] = SHARES,
-    form: str | None = None, *, others: Sequence[LogPair] = (),
+    form: str | None = None, *, others: Sequence[LogPair] = (), doubt: LogPair | None = None,
 ) -> Plan:  # fmt: skip
     """Return the plan of a form, the difference form or Meta-IS.
 
@@ -159,6 +161,7 @@ def plan_batch(
         form: "difference" or "meta"; None: that of smaller anticipated variance. A pool that is counted must not choose its
             own form: it would choose the one that its points happen to flatter.
         others: further events that the draws estimate.
+        doubt: as the first two, of a metamodel that is less sure of itself; None: there is none.
     """
     n = len(log_w)
     w, pi = np.exp(log_w) / n, np.exp(log_pi)
@@ -172,6 +175,8 @@ def plan_batch(
         r = shares[1] * nominal + shares[2] * _normalised(log_pi + log_w, alive) + shares[3] * _normalised(log_wide, alive)
         mean = float((w * pi).sum())
         guided = _guided(log_spread, mean, others, w, log_w)
+        if doubt is not None:
+            guided = (1.0 - _DOUBT) * guided + _DOUBT * _normalised(0.5 * (doubt[0] + doubt[1]) + log_w, alive)
         r += shares[0] * guided
         r /= r.sum()
         variance = stratified_variance(n * w * pi, stratum)

@@ -22,7 +22,7 @@ __all__ = ["AppearanceMonitor", "refuse_overlap_at_start"]
 _MAX_BRAKING = 9.0
 """Deceleration that tyres allow on a dry road (m/s^2); SUMO's default `emergencyDecel` too."""
 _REMEDY = (
-    "let SUMO check its insertion (neither it nor an option sets the insertion checks to none), or let it depart elsewhere"
+    "let it depart elsewhere or more slowly, and leave SUMO's insertion checks on (neither it nor an option sets them to none)"
 )
 
 
