@@ -19,6 +19,7 @@ from sbt.cli import app
 from sbt.config.benchmark import LoadedBenchmark, load_benchmark
 from sbt.config.source import ConfigError
 from sbt.errors import StoreError
+from sbt.plugins import Scope
 from sbt.store.database import Store
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -194,6 +195,36 @@ def test_an_edited_file_is_another_configuration_and_recalls_nothing(analytic):
     analytic.write_text(analytic.read_text() + "\n# edited\n")
     assert not is_done(cell)
     assert cell_module._known_runs(list(loaded.cells())[2]) == {}
+
+
+def test_growth_that_was_killed_goes_on(analytic, monkeypatch):
+    """The cell was taken for finished, with the conclusion and the predictions of fewer iterations."""
+    folder = analytic.parent
+    few, many = (next(written(folder, metamodels=[{"kind": "et", "trees": 10}], iterations=n).cells()) for n in (2, 3))
+    make_reference(next(written(folder).references())[1], 1)
+    run_cell(few)
+
+    def killed(self, history):
+        raise KeyboardInterrupt
+
+    for kind, method in ((cell_module._BenchmarkStage, "propose"), (cell_module._ReferenceLearner, "fit")):
+        with monkeypatch.context() as patched:
+            patched.setattr(kind, method, killed)
+            with pytest.raises(KeyboardInterrupt):
+                run_cell(many)
+        assert not is_done(many)
+    run_cell(many)
+    assert is_done(many)
+    assert len(list(rows_of(many))) == 3
+
+
+def test_own_files_of_one_name_are_told_apart(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model.py").write_text(f"X = {name!r}\n")
+    found = Scope(tmp_path).prints(["a/model.py:X", "b/model.py:X", "cut_in"])
+    assert sorted(found) == ["a/model.py", "b/model.py"]
+    assert len(set(found.values())) == 2
 
 
 def test_a_benchmark_of_more_iterations_goes_on(analytic):

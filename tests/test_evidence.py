@@ -125,13 +125,24 @@ def test_on_a_bridge_and_below_is_no_contact_and_a_net_without_heights_is_warned
 @pytest.mark.parametrize(
     "shape", [[(0.0, 0.0, 0.0), (300.0, 0.0, 18.0)], [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (100.0, 0.0, 6.0), (300.0, 0.0, 6.0)]]
 )
-def test_who_drives_ahead_on_a_hill_is_on_the_same_level(simulate, shape):
+@pytest.mark.parametrize(
+    "bridge", [{}, {"we": [(-400.0, 9.0, 0.0), (-300.0, 9.0, 0.0)], "sn": [(-350.0, -50.0, 6.0), (-350.0, 50.0, 6.0)]}]
+)
+def test_who_drives_ahead_on_a_hill_is_on_the_same_level(simulate, shape, bridge):
     """It was not recorded until it was 50 m ahead on 6 %, as it was 3 m higher."""
     vehicles = vehicle("ego", "up", departPos=20, departSpeed=20) + vehicle("lead", "up", departPos=110, departSpeed=10)
-    trace = simulate(net({"up": shape}, z=True), vehicles, deaf("ego", "lead"), duration=6.0)
+    trace = simulate(net({"up": shape, **bridge}, z=True), vehicles, deaf("ego", "lead"), duration=6.0)
     assert trace.actors == ("ego", "lead")
     assert trace.present.all()
     assert encounter(trace, "ego", "lead").gap[0] == pytest.approx(85.0, abs=0.3)
+
+
+@pytest.mark.sumo
+def test_the_other_deck_of_a_road_that_falls_is_another_level(simulate):
+    """What the slope allows has a sign: the oncoming car 6 m above was near the height of the ego 60 m before it."""
+    decks = {"low": [(0.0, 0.0, 20.0), (400.0, 0.0, 0.0)], "high": [(400.0, 0.0, 6.0), (0.0, 0.0, 26.0)]}
+    vehicles = vehicle("ego", "low", departPos=20, departSpeed=20) + vehicle("other", "high", departPos=20, departSpeed=20)
+    assert simulate(net(decks, z=True), vehicles, deaf("ego", "other"), duration=15.0).actors == ("ego",)
 
 
 @pytest.mark.sumo

@@ -13,7 +13,7 @@ from sbt.cli import app
 from sbt.config.load import parse
 from sbt.config.source import ConfigError
 from sbt.errors import InputError
-from sbt.plugins import load
+from sbt.plugins import Scope, load
 from sbt.samplers.pool import PoolSequence
 from sbt.seeds import stream
 from sbt.store.database import Store
@@ -61,6 +61,18 @@ def test_rows_that_are_left_over_check_no_share_and_no_others_are_promised(folde
         assert ("that it had not seen" in said) is left
     with pytest.raises(ConfigError, match=r"validation\.reference: recorded rows have no runs beside them"):
         run_study(Study(parse(configuration(folder, "boundary", "r") + "validation: {reference: 30}\n", folder=folder)))
+
+
+def test_rows_that_were_changed_do_not_go_on_with_a_store(folder: Path) -> None:
+    """50 runs of the old rows and 50 of the new ones were in one store, exit code 0."""
+    run_study(Study(parse(configuration(folder, "boundary", "s"), folder=folder)), report=False)
+    before = Scope(folder.parent).prints([f"table:{folder.name}"])
+    assert sorted(before) == ["table/config.yml", "table/rows.csv"]
+    lines = (folder / "rows.csv").read_text().splitlines()
+    (folder / "rows.csv").write_text("\n".join([lines[0], *(f"{line}1" for line in lines[1:])]))
+    assert Scope(folder.parent).prints([f"table:{folder.name}"]) != before
+    with pytest.raises(InputError, match=r"code and files must give the runs of .* again to go on"):
+        run_study(Study(parse(configuration(folder, "boundary", "s", 80), folder=folder)), report=False)
 
 
 def test_table_is_a_scenario(folder: Path) -> None:

@@ -46,7 +46,9 @@ def is_done(cell: Cell) -> bool:
     if not (cell.folder / PREDICTIONS).is_file() or changes(cell):
         return False
     with Store.read(cell.folder) as store:
-        return store.conclusion is not None and store.configuration["budget"] == cell.loaded.config.budget
+        ended = store.conclusion
+        whole = ended is not None and ended["runs"] == len(store.history())  # else it was to grow
+        return ended is not None and whole and (ended["iterations"] == cell.iterations or ended["stopped"] == "no rows left")
 
 
 def changes(cell: Cell) -> str:

@@ -13,10 +13,10 @@ from sbt.store.database import Store
 
 __all__ = ["SIMULATED", "changes_in", "open_store"]
 
-_FILES = "files"
+_FILES, _LEARNER = "files", "learner"
 SIMULATED = ("scenario", "requirement", "inputs", "ego", "simulation", _FILES)
 """What the outcome of a run depends on, beside its inputs and seed."""
-_IDENTITY = (*SIMULATED, "campaign", "seed", "batch", "metamodel", "acquisition")
+_IDENTITY = (*SIMULATED, _LEARNER, "campaign", "seed", "batch", "metamodel", "acquisition")
 """What must stay the same of a configuration; other keys may come and go with versions."""
 
 
@@ -30,7 +30,7 @@ def changes_in(store: Store, loaded: Loaded, more: JsonMapping, keys: tuple[str,
         keys: of the configuration.
     """
     before, now = store.configuration, fingerprint(loaded.config) | _own_files(loaded) | dict(more)
-    return differences(before, now, {*keys, *more} - ({_FILES} - set(before)))
+    return differences(before, now, {*keys, *more} - ({_FILES, _LEARNER} - set(before)))
 
 
 def open_store(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: object) -> Store:
@@ -60,8 +60,9 @@ def open_store(folder: Path, loaded: Loaded, scenario: LogicalScenario, **more: 
 
 
 def _own_files(loaded: Loaded) -> Json:
-    """Return prints of the user's own files that a configuration names; nothing where there are none."""
+    """Return prints of the user's own files that a configuration names, of the scenario and of what learns."""
     config = loaded.config
-    kinds = [choice.kind for choice in (config.ego, config.metamodel) if choice is not None]
-    found = loaded.scope.prints([config.scenario, *kinds, *config.metrics])
-    return {_FILES: found} if found else {}
+    runs = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
+    learns = [] if config.metamodel is None else [config.metamodel.kind]
+    found = {_FILES: loaded.scope.prints(runs), _LEARNER: loaded.scope.prints(learns)}
+    return {key: prints for key, prints in found.items() if prints}

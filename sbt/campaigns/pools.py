@@ -227,7 +227,9 @@ def draw_batch(
         return planned(space, pool.z[rows], LEARNED), EstimationProposal(phase, "uncertainty", pool=summary, nominal=nominal)
     draws = draw_systematic(pool.plan, n, log_pi - log_not, rng, once=once)
     plan = draws.plan
-    summary = PoolSummary(len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback)
+    summary = PoolSummary(
+        len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback, plan.doubted or None
+    )  # fmt: skip
     pi = tuple(np.exp(log_pi[draws.rows]).tolist())
     z, nominal = pool.z[draws.rows], NominalDraws(pi[: draws.nominal])
     if not counts:

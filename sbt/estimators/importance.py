@@ -81,6 +81,7 @@ class Plan:
         moment: (N,) mean square of what a run would correct at each pool point, by the metamodel.
         guided: (N,) probability of each pool point in a draw that the metamodel guides, sum 1.
         guided_share: of the draws.
+        doubted_moment: (N,) as `moment`, with errors as rare and large as left-out runs show; None: they show none.
     """
 
     form: str
@@ -96,6 +97,14 @@ class Plan:
     moment: Vector
     guided: Vector
     guided_share: float
+    doubted_moment: Vector | None = None
+
+    @property
+    def doubted(self) -> float:
+        """Variance of one draw if the metamodel errs as much as left-out runs let expect; 0 where they show nothing."""
+        if self.doubted_moment is None:
+            return 0.0
+        return float((self.weight**2 * self.doubted_moment / np.maximum(self.probability, _LEAST_DRAWN)).sum())
 
     def moved(self, share: float) -> Plan:
         """Return the plan with this share of all draws taken from the guided ones and made from the nominal distribution."""
@@ -182,6 +191,9 @@ def plan_batch(
         variance = stratified_variance(n * w * pi, stratum)
         if name == "difference":
             plan = Plan(name, r, pi, w, mean, mean, 0.0, variance, shares[1], nominal, pi * np.exp(log_not), guided, shares[0])
+            if doubt is not None:
+                met = np.exp(doubt[0])
+                plan = replace(plan, doubted_moment=met * np.exp(2.0 * log_not) + (1.0 - met) * pi**2)
         else:
             plan = Plan(name, r, np.zeros(n), w, 0.0, mean, 0.0, variance, shares[1], nominal, pi, guided, shares[0])
         plans.append(plan.drawn_with(r))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -45,6 +46,7 @@ T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 _stamps: dict[Path, tuple[int, int]] = {}
 _forgetters: list[Callable[[], None]] = []
+_scenarios_of: dict[tuple[Path, str], tuple[Path, ...]] = {}
 
 
 def noted(path: Path) -> Path:
@@ -126,14 +128,26 @@ class Scope:
         return named_by(self.store)
 
     def prints(self, names: Iterable[str]) -> dict[str, str]:
-        """Return prints of the user's own files that names stand for, and of the modules beside them, by the files' names."""
-        found = {}
+        """Return prints of the user's own files that names stand for, by their paths.
+
+        Those of code with the modules beside it, of a scenario with its files of SUMO, of a table.
+        """
+        files: set[Path] = set()
         for name in names:
-            file = (self.folder / Path(name.rpartition(":")[0] if ".py:" in name else name).expanduser()).resolve()
-            if file.is_file():
-                for each in modules_of(file) if file.suffix == ".py" else (file,):
-                    found[each.name] = hashlib.blake2b(each.read_bytes(), digest_size=4).hexdigest()
-        return found
+            if ".py:" in name:
+                files |= set(modules_of((self.folder / Path(name.rpartition(":")[0]).expanduser()).resolve()))
+            elif name.endswith((".yaml", ".yml")) or name.startswith("table:"):
+                files |= set(self._read_for(name))
+        prints = ((each, hashlib.blake2b(each.read_bytes(), digest_size=4)) for each in sorted(files))
+        return {os.path.relpath(each, self.folder.resolve()): found.hexdigest() for each, found in prints}
+
+    def _read_for(self, scenario: str) -> tuple[Path, ...]:
+        """Return the files that a scenario is made of; found out once a process."""
+        if (self.folder, scenario) not in _scenarios_of:
+            forget_files()
+            self.load("scenarios", scenario)
+            _scenarios_of[self.folder, scenario] = tuple(read_files())
+        return _scenarios_of[self.folder, scenario]
 
     def load(self, kind: str, name: str) -> Any:
         """Return the object with this name; as `load`, and the objects of the scope.
@@ -183,6 +197,10 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
         return load("sources", "yaml")(name, folder or Path.cwd())
     source, _, rest = name.partition(":")
     if kind == "scenarios" and rest and source in _entries("sources"):
+        place = (folder or Path.cwd()) / rest
+        for file in place.parent.glob("*") if place.is_file() else place.glob("*"):
+            if file.is_file():
+                noted(file.resolve())
         return load("sources", source)(rest, folder or Path.cwd())
     entries = _entries(kind)
     if name not in entries:

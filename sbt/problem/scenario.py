@@ -186,9 +186,10 @@ class LogicalScenario:
             raise InputError(f"scenario {name}: inputs must be a list of parameters, but got {got}")
         if (simulate is None) == (evaluate is None):
             raise InputError(f"scenario {name}: give either simulate or evaluate")
-        if not callable(simulate if evaluate is None else evaluate):
+        runs = simulate if evaluate is None else evaluate
+        if not callable(runs):
             raise InputError(f"scenario {name}: what simulates or evaluates must be a function of values and seed")
-        must_take(f"scenario {name}: what simulates or evaluates must take values and seed", simulate or evaluate, 2)
+        must_take(f"scenario {name}: what simulates or evaluates must take values and seed", runs, 2)
         must_be(f"scenario {name}: metrics must be a list", metrics, list, tuple, Mapping)
         if evaluate is not None:
             metrics = _returned(name, metrics, tuple(metric_names) or tuple(part.metric for part in requirement.parts))

@@ -26,6 +26,10 @@ _LEVEL_HEIGHT = 3.0
 """Difference in height from which on two road users are on different levels, such as on and under a bridge (m)."""
 _STEEPEST = 0.15
 """Slope of no road: who is so much higher is above, also on a road that the ego's way leads to."""
+_DETOUR = 1.5
+"""Largest ratio of the way to the beeline between road users on one level by their way: a ramp leads around, and above itself."""
+_STACKED = 12.0
+"""Distance of places on roads within which they are one above the other, or not (m): places are at most 20 m apart on each."""
 _RAMP = 60.0
 """A way between two roads that is not longer does not lead to another level (m): 3 m in 60 m are a slope of 5 %."""
 _APPROACH = 150.0
@@ -45,10 +49,12 @@ class Levels:
     Attributes:
         apart: edge to the edges that are on another level than it; edges without such are missing.
         inferred: crossings (edge, edge, x, y) that only the missing junction tells to be bridges: the network is flat there.
+        stacked: whether a road passes above another one, or itself, so that heights tell levels.
     """
 
     apart: Mapping[str, frozenset[str]] = field(default_factory=dict)
     inferred: tuple[tuple[str, str, float, float], ...] = ()
+    stacked: bool = False
 
     @property
     def warning(self) -> str:
@@ -78,7 +84,8 @@ def is_above(
 ) -> bool:  # fmt: skip
     """Return whether a road user is so much higher or lower than the ego that it is on another level.
 
-    Roads rise: as far as the slopes of both lead there, and along the ego's way, who is far is higher and on the same level.
+    Roads rise: who is far is on the same level if it is as high as the slope of its road or of the ego's leads, or between, or on
+    the way of one to the other.
 
     Args:
         sumo: its client.
@@ -89,16 +96,26 @@ def is_above(
         other: its position.
         person: whether it walks.
     """
-    height, far = abs(other[2] - own[2]), math.dist(own[:2], other[:2])
-    if height < _LEVEL_HEIGHT:
+    height, far = other[2] - own[2], math.dist(own[:2], other[:2])
+    others = sumo.person if person else sumo.vehicle
+    rises = [_rise(each, who, own, other) for each, who in ((domain, ego), (others, name))]
+    if min(rises) - _LEVEL_HEIGHT < height < max(rises) + _LEVEL_HEIGHT:
         return False
-    slope = max(abs(domain.getSlope(ego)), abs((sumo.person if person else sumo.vehicle).getSlope(name)))
-    if height < _LEVEL_HEIGHT + far * math.tan(math.radians(slope)):
-        return False
-    if height > _STEEPEST * far or person or domain is not sumo.vehicle:
+    if abs(height) > _STEEPEST * far or person or domain is not sumo.vehicle:
         return True
-    passed = sumo.vehicle.getRouteIndex(name)
-    return passed < 0 or sumo.vehicle.getRoute(name)[passed] not in domain.getRoute(ego)
+    return not any(0.0 <= _way(sumo.vehicle, a, b) <= _DETOUR * far for a, b in ((ego, name), (name, ego)))
+
+
+def _rise(domain: Any, name: str, own: Sequence[float], other: Sequence[float]) -> float:
+    """Return by how much one place is higher than the other if all of the way there has the slope under somebody."""
+    angle, slope = math.radians(domain.getAngle(name)), math.tan(math.radians(domain.getSlope(name)))
+    return slope * ((other[0] - own[0]) * math.sin(angle) + (other[1] - own[1]) * math.cos(angle))
+
+
+def _way(vehicle: Any, name: str, to: str) -> float:
+    """Return how far a vehicle's route leads to another one (m); negative where it does not."""
+    road, position, lane = vehicle.getRoadID(to), vehicle.getLanePosition(to), vehicle.getLaneIndex(to)
+    return float(vehicle.getDrivingDistance(name, road, position, lane)) if road else -1.0
 
 
 class _Client:
@@ -143,9 +160,9 @@ def _roads(sumo: Any) -> list[_Road]:
 
 def _find(sumo: Any) -> Levels:
     roads = _roads(sumo)
-    crossings = list(_crossings(roads))
+    crossings, stacked = list(_crossings(roads)), _stacked(sumo, roads)
     if not crossings:
-        return Levels()
+        return Levels(stacked=stacked)
     network = _Network(roads)
     apart: dict[str, set[str]] = defaultdict(set)
     inferred = []
@@ -161,7 +178,21 @@ def _find(sumo: Any) -> Levels:
             if not network.near(one, other):
                 apart[one.edge].add(other.edge)
                 apart[other.edge].add(one.edge)
-    return Levels({edge: frozenset(others) for edge, others in apart.items()}, tuple(inferred))
+    return Levels({edge: frozenset(others) for edge, others in apart.items()}, tuple(inferred), stacked)
+
+
+def _stacked(sumo: Any, roads: list[_Road]) -> bool:
+    """Return whether there are places on roads one above the other."""
+    from scipy.spatial import cKDTree
+
+    if all(abs(_height(sumo, road, at)) < _FLAT for road in roads for at in (0.0, math.inf)):
+        return False
+    start, end, owner, place = _pieces(roads)
+    at = place + np.hypot(*(end - start).T)
+    points = np.concatenate([start, end])
+    heights = np.array([_height(sumo, roads[k], x) for k, x in zip((*owner, *owner), (*place, *at), strict=True)])
+    pairs = cKDTree(points).query_pairs(_STACKED, output_type="ndarray")
+    return bool((np.abs(heights[pairs[:, 0]] - heights[pairs[:, 1]]) >= _LEVEL_HEIGHT).any())
 
 
 def _height(sumo: Any, road: _Road, at: float) -> float:

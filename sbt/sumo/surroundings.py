@@ -164,8 +164,8 @@ class Surroundings:
 
     def _is_above(self, name: str, variables: Mapping[int, Any], ego: tuple[float, ...]) -> bool:
         """Return whether the height of somebody tells that it is on another level than the ego at (x, y, z)."""
-        person = _VEHICLE in variables
-        return is_above(self._sumo, self._own_domain, self._ego, ego, name, variables[_POSITION], person=person)
+        at, person = variables[_POSITION], _VEHICLE in variables
+        return self.levels.stacked and is_above(self._sumo, self._own_domain, self._ego, ego, name, at, person=person)
 
     def _placed_near(self, ego: tuple[float, ...]) -> dict[str, dict[int, Any]]:
         """Return the variables of the placed road users that are within the radius, or named, on the ego's level."""

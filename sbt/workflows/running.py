@@ -207,7 +207,7 @@ def _own_code(study: Study) -> bool:
     """Return whether runs depend on files or objects of the user's."""
     config = study.config
     code = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
-    return any(name.startswith(OBJECT) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code)
+    return any(name.startswith((OBJECT, "table:")) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code)
 
 
 def _again(history: History, rows: Sequence[np.intp], executor: Executor) -> Iterator[tuple[Record, Outcome]]:
