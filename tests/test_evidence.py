@@ -138,6 +138,27 @@ def test_who_drives_ahead_on_a_hill_is_on_the_same_level(simulate, shape, bridge
 
 
 @pytest.mark.sumo
+@pytest.mark.parametrize(("named", "within", "length"), [(("other",), 30.0, 5), ((), 300.0, 5), ((), 50.0, 60)])
+def test_a_vehicle_that_a_loop_removes_leaves_the_trace(tmp_path, named, within, length):
+    """SUMO does not list it as arrived: the run failed as it was not known."""
+    kind = f'<vType id="tr" length="{length}" sigma="0"/>'
+
+    def loop(sumo, values, rng):
+        sumo.simulationStep()
+        while sumo.simulation.getTime() < 4.0:
+            sumo.simulationStep()
+        sumo.vehicle.remove("other")
+        step_until_over(sumo, values, rng)
+
+    other = vehicle("other", "we", "tr", departPos=150, departSpeed=1)
+    vehicles = kind + vehicle("ego", "we", departPos=10, departSpeed=2) + other
+    one = simulation(tmp_path, net({"we": WEST_EAST}), vehicles, loop, 8.0)
+    trace = replace(one, recording=replace(one.recording, within=within, named=named))({}, 1)
+    assert trace.ended == "duration"
+    assert "other" not in trace.actors or not trace.present[-1, trace.actors.index("other")]
+
+
+@pytest.mark.sumo
 def test_the_other_deck_of_a_road_that_falls_is_another_level(simulate):
     """What the slope allows has a sign: the oncoming car 6 m above was near the height of the ego 60 m before it."""
     decks = {"low": [(0.0, 0.0, 20.0), (400.0, 0.0, 0.0)], "high": [(400.0, 0.0, 6.0), (0.0, 0.0, 26.0)]}

@@ -104,7 +104,9 @@ def compare(
 def _settings(loaded: Loaded) -> Json:
     """Return the settings that a cell depends on, beside sampler and seed."""
     settings = loaded.config.model_dump(mode="json", exclude={"seed", "store", "executor", "acquisition"})
-    return json.loads(json.dumps(settings))
+    ego = [] if loaded.config.ego is None else [loaded.config.ego.kind]
+    files = loaded.scope.prints([loaded.config.scenario, *ego, *loaded.config.metrics])
+    return json.loads(json.dumps({**settings, **({"files": files} if files else {})}))
 
 
 def _finished(path: Path, settings: JsonMapping) -> Iterator[tuple[tuple[str, int], Cell]]:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Levels", "is_above", "levels_of"]
+__all__ = ["Levels", "is_above", "is_known", "levels_of"]
 
 _LEVEL_HEIGHT = 3.0
 """Difference in height from which on two road users are on different levels, such as on and under a bridge (m)."""
@@ -104,6 +104,15 @@ def is_above(
     if abs(height) > _STEEPEST * far or person or domain is not sumo.vehicle:
         return True
     return not any(0.0 <= _way(sumo.vehicle, a, b) <= _DETOUR * far for a, b in ((ego, name), (name, ego)))
+
+
+def is_known(sumo: Any, vehicle: str) -> bool:
+    """Return whether a vehicle is in the simulation: SUMO does not list as arrived whom a loop has removed."""
+    try:
+        sumo.vehicle.getPosition(vehicle)
+    except sumo.TraCIException:
+        return False
+    return True
 
 
 def _rise(domain: Any, name: str, own: Sequence[float], other: Sequence[float]) -> float:

@@ -21,7 +21,7 @@ from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
-from sbt.sumo.levels import is_above, levels_of
+from sbt.sumo.levels import is_above, is_known, levels_of
 from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
@@ -48,7 +48,7 @@ class Surroundings:
         sumo: libsumo or traci, started.
         ego: id of the vehicle under test.
         within: radius (m).
-        named: vehicles or persons that are recorded at any distance.
+        named: vehicles that are recorded at any distance.
         dt: step (s).
 
     Attributes:
@@ -144,10 +144,12 @@ class Surroundings:
         at = near[ego][_POSITION]
         road = self._own_domain.getRoadID(ego) if self.levels.apart else ""
         apart = self.levels.apart.get(road)
-        around = sorted([*near, *self._far(near)] if self._very_long else near)
-        for name in (*around, *sorted(self._named_present - set(around))):
+        for name in self._around(near):
             variables = near[name] if name in near else self._read(name)
-            if name == ego or variables.get(_VEHICLE) or self._is_above(name, variables, at):
+            if name == ego or variables.get(_VEHICLE):
+                continue
+            person, place = _VEHICLE in variables, variables[_POSITION]
+            if self.levels.stacked and is_above(self._sumo, self._own_domain, ego, at, name, place, person=person):
                 continue
             if apart is None or name in self.placed or (other := self._road(name, variables)) not in apart:
                 self._record(row, parts, before, name, variables)
@@ -161,11 +163,6 @@ class Surroundings:
         self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
-
-    def _is_above(self, name: str, variables: Mapping[int, Any], ego: tuple[float, ...]) -> bool:
-        """Return whether the height of somebody tells that it is on another level than the ego at (x, y, z)."""
-        at, person = variables[_POSITION], _VEHICLE in variables
-        return self.levels.stacked and is_above(self._sumo, self._own_domain, self._ego, ego, name, at, person=person)
 
     def _placed_near(self, ego: tuple[float, ...]) -> dict[str, dict[int, Any]]:
         """Return the variables of the placed road users that are within the radius, or named, on the ego's level."""
@@ -183,7 +180,7 @@ class Surroundings:
         self._ways.pop(name, None)
         if self.is_person(name) or name in self.rigid:
             return
-        if name in self._arrived:
+        if name in self._arrived or not is_known(self._sumo, name):
             self._ways[name] = (LEFT_THE_ROAD,) * (1 + (self._bodies[name].count if name in self._bodies else 0))
             return
         state, now = self.states[name], self._sumo.vehicle.getPosition(name)
@@ -200,16 +197,18 @@ class Surroundings:
             parts = [k * size for k in range(len(poses))] if name in self._parts[-1] else []
             self._ways[name] = (*ways, *rectangle_ways(behind, ahead, size, parts))
 
+    def _around(self, near: Mapping[str, Any]) -> list[str]:
+        """Return who is near, whose rear may be, and who is named; whom a loop has removed is forgotten."""
+        for name in [n for n in (*self._very_long, *self._named_present) if not is_known(self._sumo, n)]:
+            self._very_long.pop(name, None)
+            self._named_present.discard(name)
+        around = sorted([*near, *self._far(near)] if self._very_long else near)
+        return [*around, *sorted(self._named_present - set(around))]
+
     def _far(self, near: Mapping[str, Any]) -> list[str]:
         """Return the very long vehicles whose rear may be within the radius although their front is not."""
-        x, y = near[self._ego][_POSITION][:2]
-        found = []
-        for name, length in self._very_long.items():
-            if name not in near:
-                u, v = self._sumo.vehicle.getPosition(name)
-                if math.hypot(u - x, v - y) <= self._within + length:
-                    found.append(name)
-        return found
+        own, at, far = near[self._ego][_POSITION][:2], self._sumo.vehicle.getPosition, self._very_long.items()
+        return [n for n, length in far if n not in near and math.dist(at(n), own) <= self._within + length]
 
     def _read(self, name: str) -> dict[int, Any]:
         vehicle = self._sumo.vehicle

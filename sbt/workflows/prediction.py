@@ -273,6 +273,7 @@ def _key(learner: Learner, training: History, settings: str) -> str:
     decisive = (settings, learner.seed, repr(critical), repr(space.parameters), features, version("sumo-sbt"))
     digest = hashlib.blake2b(json.dumps([str(part) for part in decisive]).encode(), digest_size=16)
     digest.update(np.ascontiguousarray(training.x).tobytes())
+    digest.update(np.ascontiguousarray(learner.inputs(space.to_unit(training.x))).tobytes())  # features, too
     digest.update(np.ascontiguousarray(learner.scenario.requirement.values(training)).tobytes())
     return digest.hexdigest()
 

@@ -254,9 +254,12 @@ def rebuild_report(
 
     Raises:
         StoreError: the folder holds no campaign.
+        InputError: it is one shard of a campaign.
     """
     with Store.read(folder) as store:
         study, ended = Study.from_store(store, objects=objects), store.conclusion
+        if "shard" in store.configuration:
+            raise InputError(f"a report is of a whole campaign, but {folder} is one shard of it: merge joins them")
         conclusion = None if ended is None else study.conclusion(ended["conclusion"])
         note = _left_out(study)
         if note and told is not None:
