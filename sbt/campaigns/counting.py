@@ -51,8 +51,8 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
             raise InputError("an estimate needs runs with a known proposal density, but a counted run has none")
         prior = pool.probability if batch.read(EstimationProposal).method == "difference" else 0.0
         of_batch = CountedBatch(
-            prior, max(pool.anticipated, pool.doubted or 0.0), draws.pool_variance, np.array(draws.coefficient),
-            np.array(draws.control_variate), critical[rows].astype(np.float64), draws.weight,
+            prior, pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
+            critical[rows].astype(np.float64), draws.weight,
         )  # fmt: skip
         stated = draws.failed_critical if failed_critical else None
         found.append(of_batch if stated is None else with_event(of_batch, stated))

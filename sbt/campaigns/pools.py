@@ -19,7 +19,7 @@ from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
 from sbt.estimators.events import Event, events
 from sbt.estimators.importance import Draws, Plan, draw_systematic, plan_batch, stated
 from sbt.estimators.mixture import Mixture, Near, effective_size, fit_mixture, particles, reweighted
-from sbt.estimators.surrogate import LogProbability, doubted, sketch_of
+from sbt.estimators.surrogate import LogProbability, sketch_of
 from sbt.metamodels.joint import LogPair
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.space import ParameterSpace
@@ -140,7 +140,6 @@ class _Drawn:
     log_h: Vector
     whole: Event
     parts: tuple[Event, ...]
-    doubt: LogPair | None
 
 
 def _drawn(mixture: Mixture, log_probability: LogProbability | None, n: int, rng: np.random.Generator) -> _Drawn:
@@ -148,8 +147,7 @@ def _drawn(mixture: Mixture, log_probability: LogProbability | None, n: int, rng
     v, stratum = mixture.sample(n, rng)
     unsure = np.full(n, np.log(0.5))
     whole, parts = (Event((unsure, unsure)), ()) if log_probability is None else events(log_probability, v)
-    rough = None if log_probability is None else doubted(log_probability)
-    return _Drawn(v, stratum, mixture.log_density(v), whole, parts, None if rough is None else rough(v))
+    return _Drawn(v, stratum, mixture.log_density(v), whole, parts)
 
 
 def _pooled(
@@ -166,7 +164,6 @@ def _pooled(
     plan = plan_batch(
         *whole.safe, log_w, log_wide(v, frame.wide, frame.choices) - log_h, stratum, shares, form,
         others=tuple(event for event in (whole.critical, *(part.safe for part in parts)) if event is not None),
-        doubt=drawn.doubt,
     )  # fmt: skip
     return Pool(mixture, z, x, plan, whole, parts, stratum)
 
@@ -227,9 +224,7 @@ def draw_batch(
         return planned(space, pool.z[rows], LEARNED), EstimationProposal(phase, "uncertainty", pool=summary, nominal=nominal)
     draws = draw_systematic(pool.plan, n, log_pi - log_not, rng, once=once)
     plan = draws.plan
-    summary = PoolSummary(
-        len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback, plan.doubted or None
-    )  # fmt: skip
+    summary = PoolSummary(len(pool.z), plan.predicted, plan.anticipated, len(pool.mixture.shares), fallback)
     pi = tuple(np.exp(log_pi[draws.rows]).tolist())
     z, nominal = pool.z[draws.rows], NominalDraws(pi[: draws.nominal])
     if not counts:

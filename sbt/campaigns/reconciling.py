@@ -36,7 +36,7 @@ def denial(found: BoundaryConclusion, runs: CriticalShare) -> str:
     return "" if whose is None else f" The {whose} deny its figures (below): do not rely on it yet."
 
 
-def reconciled(found: BoundaryConclusion, runs: CriticalShare, *, recorded: bool = False) -> list[str]:
+def reconciled(found: BoundaryConclusion, runs: CriticalShare, learned: int, *, recorded: bool = False) -> list[str]:
     """Return the critical share by the metamodel and by the held-out runs alone, whether they agree, and what runs deny.
 
     Recorded rows that are left over were not drawn at random: they check no share.
@@ -44,10 +44,10 @@ def reconciled(found: BoundaryConclusion, runs: CriticalShare, *, recorded: bool
     if recorded:
         said = f"The metamodel takes {percent(found.critical_fraction or 0.0)} of the parameter space to be critical."
         return [said, *_too_sure(found)]
-    return [*_by_held_out(found, runs), *_unlike_even(found), *_too_sure(found)]
+    return [*_by_held_out(found, runs, learned), *_unlike_even(found), *_too_sure(found)]
 
 
-def _by_held_out(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
+def _by_held_out(found: BoundaryConclusion, runs: CriticalShare, learned: int) -> list[str]:
     share, held_out, every = found.critical_fraction or 0.0, _as_told(found, runs), _as_told(found, found.even_fraction)
     where, told = ("the parameter space", "") if found.failing_fraction is None else ("what gives a metric", " that gave one")
     said = f"The metamodel takes {percent(share)} of {where} to be critical"
@@ -62,8 +62,8 @@ def _by_held_out(found: BoundaryConclusion, runs: CriticalShare) -> list[str]:
         return [f"{said}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
     if held_out.counted < _HARDLY:
         return [f"{said}. So few runs hardly test it: it lies within their interval."]
-    sharper = share and held_out.counted < _MANY
-    more = "; the metamodel's figure, which rests on all runs, is the sharper one" if sharper else ""
+    sharper = share and held_out.counted < min(_MANY, learned)
+    more = f"; the metamodel's figure, which rests on {plural(learned, 'other run')}, is the sharper one" if sharper else ""
     return [f"{said}. They agree: it lies within that interval{more}."]
 
 

@@ -108,7 +108,6 @@ class PoolSummary:
         anticipated: variance of one draw that the metamodel anticipates.
         components: of the mixture that the pool was sampled from.
         fallback: an earlier metamodel was used, because the newest one had lost its precision.
-        doubted: as `anticipated`, with errors as rare and large as left-out runs show; None: they show none.
     """
 
     size: int
@@ -116,7 +115,6 @@ class PoolSummary:
     anticipated: float
     components: int
     fallback: bool = False
-    doubted: float | None = optional()
 
 
 @dataclass(frozen=True)

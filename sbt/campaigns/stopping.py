@@ -43,8 +43,6 @@ FEWEST_BATCHES = 4
 _SPARED, _LEAST_GUIDED, _SURPLUS, _HITS_LEFT = 0.05, 0.3, 0.4, 1.1
 """Steps in which guided draws give way to draws from the inputs' distribution, and the share that stays guided; what is left is
 expected to have this share of the coefficient of variation that is good enough, and so many times the critical draws that are."""
-_CHECKED = 0.3
-"""Of those, the share that checks what the metamodel takes to be critical: a part of it may be safe that no run has met."""
 _LOST, _MEMORY, _EXACT = 10.0, 4, 0.01
 """An earlier metamodel is preferred to the newest one after a loss of precision by this factor against one of so many batches
 before, of which the anticipated coefficient of variation of one draw is taken for at least the last value."""
@@ -117,7 +115,7 @@ def spared(pilot: Plan, shares: tuple[float, ...], draws: float, target: float |
         if relative_error(plan.anticipated, plan.predicted) > enough * math.sqrt(draws) or draws * plan.hits < hits:
             break
         best = float(share)
-    return (shares[0] - best, shares[1] + (1.0 - _CHECKED) * best, shares[2] + _CHECKED * best, *shares[3:])
+    return (shares[0] - best, shares[1] + best, *shares[2:])
 
 
 def is_precise(log: Log, settings: Settings, target: float | None) -> bool:

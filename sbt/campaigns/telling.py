@@ -138,7 +138,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     ]
     if found.place is not None and where != section and not none_critical(facts):
         said.append(f"On lines across the boundary, a run is critical where {section}.")
-    return [*said, *reconciled(found, measured_share, recorded=facts.recorded)]
+    return [*said, *reconciled(found, measured_share, learned, recorded=facts.recorded)]
 
 
 def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:

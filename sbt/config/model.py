@@ -303,7 +303,7 @@ class Configuration(_Strict):
     batch: Batch = Field(
         default_factory=_batch,
         description="Runs per iteration, or {size: 50, ahead: 1}; default: as many as initial; falsification 10, estimation "
-        "with a metamodel 15.",
+        "with a metamodel 15, at most the larger of 15 and an eighth of the budget.",
     )  # fmt: skip
     validation: ValidationChoice = Field(default=ValidationChoice(), description="Held-out runs that score the metamodel.")
     metamodel: MetamodelChoice | None = Field(

@@ -37,8 +37,6 @@ _LEAST_DRAWN = 1e-300
 """Probability of a pool point that is never drawn, as a divisor: its weight is 0."""
 _LEAST_PROBABILITY = 1e-12
 """Of an event, in the coefficient of variation that draws are planned by: one that is denied must not take them all."""
-_DOUBT = 0.3
-"""Share of the guided draws that go where the metamodel would be unsure with errors as rare and large as left-out runs show."""
 _OWN = 0.5
 """Share of the guided draws that no further event has a say in."""
 
@@ -81,7 +79,6 @@ class Plan:
         moment: (N,) mean square of what a run would correct at each pool point, by the metamodel.
         guided: (N,) probability of each pool point in a draw that the metamodel guides, sum 1.
         guided_share: of the draws.
-        doubted_moment: (N,) as `moment`, with errors as rare and large as left-out runs show; None: they show none.
     """
 
     form: str
@@ -97,14 +94,6 @@ class Plan:
     moment: Vector
     guided: Vector
     guided_share: float
-    doubted_moment: Vector | None = None
-
-    @property
-    def doubted(self) -> float:
-        """Variance of one draw if the metamodel errs as much as left-out runs let expect; 0 where they show nothing."""
-        if self.doubted_moment is None:
-            return 0.0
-        return float((self.weight**2 * self.doubted_moment / np.maximum(self.probability, _LEAST_DRAWN)).sum())
 
     def moved(self, share: float) -> Plan:
         """Return the plan with this share of all draws taken from the guided ones and made from the nominal distribution."""
@@ -152,7 +141,7 @@ class Draws:
 
 def plan_batch(
     log_pi: Vector, log_not: Vector, log_w: Vector, log_wide: Vector, stratum: Vector, shares: tuple[float, ...] = SHARES,
-    form: str | None = None, *, others: Sequence[LogPair] = (), doubt: LogPair | None = None,
+    form: str | None = None, *, others: Sequence[LogPair] = (),
 ) -> Plan:  # fmt: skip
     """Return the plan of a form, the difference form or Meta-IS.
 
@@ -170,7 +159,6 @@ def plan_batch(
         form: "difference" or "meta"; None: that of smaller anticipated variance. A pool that is counted must not choose its
             own form: it would choose the one that its points happen to flatter.
         others: further events that the draws estimate.
-        doubt: as the first two, of a metamodel that is less sure of itself; None: there is none.
     """
     n = len(log_w)
     w, pi = np.exp(log_w) / n, np.exp(log_pi)
@@ -181,19 +169,14 @@ def plan_batch(
     for name, log_spread in log_uncertainty.items():
         if form not in (None, name):
             continue
-        r = shares[1] * nominal + shares[2] * _normalised(log_pi + log_w, alive) + shares[3] * _normalised(log_wide, alive)
+        r = shares[1] * nominal + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
         mean = float((w * pi).sum())
         guided = _guided(log_spread, mean, others, w, log_w)
-        if doubt is not None:
-            guided = (1.0 - _DOUBT) * guided + _DOUBT * _normalised(0.5 * (doubt[0] + doubt[1]) + log_w, alive)
         r += shares[0] * guided
         r /= r.sum()
         variance = stratified_variance(n * w * pi, stratum)
         if name == "difference":
             plan = Plan(name, r, pi, w, mean, mean, 0.0, variance, shares[1], nominal, pi * np.exp(log_not), guided, shares[0])
-            if doubt is not None:
-                met = np.exp(doubt[0])
-                plan = replace(plan, doubted_moment=met * np.exp(2.0 * log_not) + (1.0 - met) * pi**2)
         else:
             plan = Plan(name, r, np.zeros(n), w, 0.0, mean, 0.0, variance, shares[1], nominal, pi, guided, shares[0])
         plans.append(plan.drawn_with(r))

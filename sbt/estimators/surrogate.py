@@ -118,12 +118,6 @@ def settled(log_probability: LogProbability, most: float) -> LogProbability:
     return log_probability if known is None else known(most)
 
 
-def doubted(log_probability: LogProbability) -> LogProbability | None:
-    """Return it with errors as heavy-tailed as left-out runs show; None where they show none, or it cannot tell."""
-    found: Any = getattr(log_probability, "doubted", None)
-    return None if found is None else found()
-
-
 def sketch_of(log_probability: LogProbability, rows: int) -> LogProbability:
     """Return about the same, learned from so many runs and many times quicker; itself where that would gain nothing."""
     sketch: Any = getattr(log_probability, "sketch", None)
@@ -170,7 +164,6 @@ class _Learned:
         predictor: of what the trend leaves.
         metamodel, n: what was fitted, and to how many runs; errors name them.
         tails: factors on the standard deviation, and their probabilities; None: errors are Gaussian.
-        doubt: the same of a deterministic metric, where left-out runs deny that; the estimate is not made with it.
     """
 
     form: _Form
@@ -178,7 +171,6 @@ class _Learned:
     metamodel: Metamodel
     n: int
     tails: tuple[Vector, Vector] | None = None
-    doubt: tuple[Vector, Vector] | None = None
 
     def __call__(self, inputs: Points) -> Prediction:
         """Return the prediction of the values at the metamodel's inputs (n, d)."""
@@ -213,8 +205,7 @@ class _Learned:
             return self
         values = self.form.values if self.form.trend is None else self.form.values - self.form.trend(u)
         p = self._noisy(left_out(u, values))
-        found = student_mixture((values - p.mu) / p.sigma)
-        return replace(self, tails=found) if self.form.noise > 0.0 else replace(self, doubt=found)
+        return replace(self, tails=student_mixture((values - p.mu) / p.sigma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,12 +233,6 @@ class _Largest:
     def sketch(self, rows: int) -> _Largest:
         """Return about the same, learned from fewer runs."""
         return replace(self, learned=tuple(replace(each, predictor=sketched(each.predictor, rows)) for each in self.learned))
-
-    def doubted(self) -> _Largest | None:
-        """Return the same with errors as heavy-tailed as left-out runs show; None where they show none."""
-        if all(each.doubt is None for each in self.learned):
-            return None
-        return replace(self, learned=tuple(replace(each, tails=each.doubt or each.tails) for each in self.learned))
 
     def settled(self, most: float) -> _Largest:
         """Return what would be left to chance if the means were known."""
@@ -322,7 +307,7 @@ def fit_log_probability(
         sure = forms[best].trend is None or gain[best] > _SURE
         chosen = [forms[best]] if sure else [whole, forms[best]]
     learned = (form.fit(metamodel, u, every, rng) for form in chosen)
-    return _Largest(coordinates, tuple(each.with_tails(u) if len(every) == len(y) else each for each in learned))
+    return _Largest(coordinates, tuple(each.with_tails(u) if least > 0.0 and len(every) == len(y) else each for each in learned))
 
 
 def _noise_in(warp: Warp, z: Points, y: Vector, variance: float) -> float:

@@ -119,7 +119,7 @@ def open_result(
         InputError: an object is not the one that the store was made with.
     """
     must_be("a store must be the path of a folder", store, str, Path)
-    folder = Path(store)
+    folder = Path(store).expanduser()
     if trust:
         trust_store(folder)
     given = {"scenario": scenario, "metamodel": metamodel, "acquisition": acquisition, "campaign": campaign}
