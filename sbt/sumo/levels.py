@@ -49,24 +49,37 @@ class Levels:
     Attributes:
         apart: edge to the edges that are on another level than it; edges without such are missing.
         inferred: crossings (edge, edge, x, y) that only the missing junction tells to be bridges: the network is flat there.
+        level: those whose heights differ, but by less than a vehicle: roads that meet there, though SUMO does not know it.
         stacked: whether a road passes above another one, or itself, so that heights tell levels.
     """
 
     apart: Mapping[str, frozenset[str]] = field(default_factory=dict)
     inferred: tuple[tuple[str, str, float, float], ...] = ()
+    level: tuple[tuple[str, str, float, float], ...] = ()
     stacked: bool = False
 
     @property
     def warning(self) -> str:
-        """What the user is told; "" where nothing was inferred."""
-        if not self.inferred:
-            return ""
-        few = ", ".join(f"'{a}' and '{b}' at ({x:.0f}, {y:.0f})" for a, b, x, y in self.inferred[:_NAMED])
-        more = f" and {len(self.inferred) - _NAMED} more" if len(self.inferred) > _NAMED else ""
-        return (
-            f"the network has no heights where edges cross without a junction ({few}{more}): they are taken for bridges, and road"
-            " users on one are not recorded for an ego on the other; give the nodes heights (z) to decide it"
-        )
+        """What the user is told; "" where there is nothing."""
+        said = []
+        if self.inferred:
+            said.append(
+                f"the network has no heights where edges cross without a junction ({_named(self.inferred)}): they are taken"
+                " for bridges, and road users on one are not recorded for an ego on the other; give the nodes heights (z) to"
+                " decide it"
+            )
+        if self.level:
+            said.append(
+                f"edges cross without a junction at heights that differ by less than {_LEVEL_HEIGHT:g} m"
+                f" ({_named(self.level)}): they are taken to meet there, although in SUMO nobody sees the other; give bridges their"
+                " height (z), or make a junction"
+            )
+        return "; ".join(said)
+
+
+def _named(crossings: Sequence[tuple[str, str, float, float]]) -> str:
+    few = ", ".join(f"'{a}' and '{b}' at ({x:.0f}, {y:.0f})" for a, b, x, y in crossings[:_NAMED])
+    return f"{few} and {len(crossings) - _NAMED} more" if len(crossings) > _NAMED else few
 
 
 def levels_of(sumo: Any) -> Levels:
@@ -174,12 +187,15 @@ def _find(sumo: Any) -> Levels:
         return Levels(stacked=stacked)
     network = _Network(roads)
     apart: dict[str, set[str]] = defaultdict(set)
-    inferred = []
+    inferred, level = [], []
     for i, j, at_i, at_j, x, y in crossings:
         a, b = roads[i], roads[j]
         height = _height(sumo, a, at_i) - _height(sumo, b, at_j)
         flat = abs(height) < _FLAT
-        if (not flat and abs(height) < _LEVEL_HEIGHT) or network.connected(a, at_i, b, at_j):
+        if network.connected(a, at_i, b, at_j):
+            continue
+        if not flat and abs(height) < _LEVEL_HEIGHT:
+            level.append((a.edge, b.edge, x, y))
             continue
         if flat:
             inferred.append((a.edge, b.edge, x, y))
@@ -187,7 +203,7 @@ def _find(sumo: Any) -> Levels:
             if not network.near(one, other):
                 apart[one.edge].add(other.edge)
                 apart[other.edge].add(one.edge)
-    return Levels({edge: frozenset(others) for edge, others in apart.items()}, tuple(inferred), stacked)
+    return Levels({edge: frozenset(others) for edge, others in apart.items()}, tuple(inferred), tuple(level), stacked)
 
 
 def _stacked(sumo: Any, roads: list[_Road]) -> bool:
