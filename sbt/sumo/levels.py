@@ -71,8 +71,8 @@ class Levels:
         if self.level:
             said.append(
                 f"edges cross without a junction at heights that differ by less than {_LEVEL_HEIGHT:g} m"
-                f" ({_named(self.level)}): they are taken to meet there, although in SUMO nobody sees the other; give bridges their"
-                " height (z), or make a junction"
+                f" ({_named(self.level)}): they are taken to meet there, although in SUMO nobody sees the other; give bridges"
+                " their height (z), or make a junction"
             )
         return "; ".join(said)
 
