@@ -159,6 +159,19 @@ def test_a_vehicle_that_a_loop_removes_leaves_the_trace(tmp_path, named, within,
 
 
 @pytest.mark.sumo
+@pytest.mark.parametrize(("across", "ended"), [(6.0, "duration"), (0.5, "collision")])
+def test_a_train_is_where_its_body_is_not_on_the_level_of_its_front(simulate, across, ended):
+    """On the bridge with its front down it touched who passed below; on the crossing with its front up it was not there."""
+    far = 6.5 - across
+    rail = [(0.0, -300.0, across), (0.0, 20.0, across), (0.0, 120.0, far), (0.0, 400.0, far)]
+    bridge = {"over": [(200.0, -50.0, 6.0), (200.0, 50.0, 6.0)], "below": [(150.0, 0.0, 0.0), (250.0, 0.0, 0.0)]}
+    roads = {"we": [(-200.0, 0.0, 0.0), (100.0, 0.0, 0.0)], "sn": rail, **bridge}
+    vehicles = vehicle("train", "sn", "rail", departPos=300, departSpeed=12) + vehicle("ego", "we", departPos=10, departSpeed=14)
+    trace = simulate(net(roads, z=True), vehicles, deaf("ego", "train"), duration=18.0)
+    assert trace.ended == ended
+
+
+@pytest.mark.sumo
 def test_the_other_deck_of_a_road_that_falls_is_another_level(simulate):
     """What the slope allows has a sign: the oncoming car 6 m above was near the height of the ego 60 m before it."""
     decks = {"low": [(0.0, 0.0, 20.0), (400.0, 0.0, 0.0)], "high": [(400.0, 0.0, 6.0), (0.0, 0.0, 26.0)]}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import math
 import re
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Levels", "is_above", "is_known", "levels_of"]
+__all__ = ["Levels", "Trails", "is_above", "is_known", "levels_of"]
 
 _LEVEL_HEIGHT = 3.0
 """Difference in height from which on two road users are on different levels, such as on and under a bridge (m)."""
@@ -28,6 +28,8 @@ _STEEPEST = 0.15
 """Slope of no road: who is so much higher is above, also on a road that the ego's way leads to."""
 _DETOUR = 1.5
 """Largest ratio of the way to the beeline between road users on one level by their way: a ramp leads around, and above itself."""
+_MOVED = 1.0
+"""Distance between places that a trail keeps (m)."""
 _STACKED = 12.0
 """Distance of places on roads within which they are one above the other, or not (m): places are at most 20 m apart on each."""
 _RAMP = 60.0
@@ -126,6 +128,32 @@ def is_known(sumo: Any, vehicle: str) -> bool:
     except sumo.TraCIException:
         return False
     return True
+
+
+class Trails:
+    """Where the fronts of very long vehicles have been, as far as their bodies are there now."""
+
+    def __init__(self, sumo: Any):
+        self._sumo = sumo
+        self._passed: dict[str, deque[tuple[float, Sequence[float], str]]] = {}
+
+    def note(self, name: str, length: float) -> bool:
+        """Note where a vehicle of a length (m) is; return whether SUMO knows it."""
+        if not is_known(self._sumo, name):
+            self._passed.pop(name, None)
+            return False
+        vehicle, trail = self._sumo.vehicle, self._passed.setdefault(name, deque())
+        place = vehicle.getPosition3D(name)
+        along, moved = (trail[-1][0], math.dist(trail[-1][1][:2], place[:2])) if trail else (0.0, math.inf)
+        if moved >= _MOVED:
+            trail.append((along + min(moved, length), place, vehicle.getRoadID(name)))
+        while len(trail) > 1 and trail[-1][0] - trail[1][0] > length:
+            trail.popleft()
+        return True
+
+    def nearest(self, name: str, own: Sequence[float]) -> tuple[Sequence[float], str]:
+        """Return the place (x, y, z) that its body covers next to the ego's, and the road there."""
+        return min(self._passed[name], key=lambda passed: math.dist(passed[1][:2], own[:2]))[1:]
 
 
 def _rise(domain: Any, name: str, own: Sequence[float], other: Sequence[float]) -> float:

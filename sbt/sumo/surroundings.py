@@ -21,7 +21,7 @@ from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
-from sbt.sumo.levels import is_above, is_known, levels_of
+from sbt.sumo.levels import Trails, is_above, is_known, levels_of
 from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
@@ -84,7 +84,7 @@ class Surroundings:
         self._ending: Sequence[str] = ()
         self._unreacting: set[str] = set()
         self._other_level: dict[tuple[str, str], str] = {}
-        self.levels = levels_of(sumo)
+        self.levels, self._trails = levels_of(sumo), Trails(sumo)
         self.follow(sumo.vehicle.getIDList())
 
     def __len__(self) -> int:
@@ -141,17 +141,16 @@ class Surroundings:
         self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
-        at = near[ego][_POSITION]
-        road = self._own_domain.getRoadID(ego) if self.levels.apart else ""
+        at, road = near[ego][_POSITION], self._own_domain.getRoadID(ego) if self.levels.apart else ""
         apart = self.levels.apart.get(road)
         for name in self._around(near):
             variables = near[name] if name in near else self._read(name)
             if name == ego or variables.get(_VEHICLE):
                 continue
-            person, place = _VEHICLE in variables, variables[_POSITION]
+            (place, other), person = self._beside(name, variables, at, named=apart is not None), _VEHICLE in variables
             if self.levels.stacked and is_above(self._sumo, self._own_domain, ego, at, name, place, person=person):
                 continue
-            if apart is None or name in self.placed or (other := self._road(name, variables)) not in apart:
+            if apart is None or name in self.placed or other not in apart:
                 self._record(row, parts, before, name, variables)
             elif (road, other) not in self._other_level:
                 self._note_level(road, other, name, at, variables)
@@ -199,7 +198,8 @@ class Surroundings:
 
     def _around(self, near: Mapping[str, Any]) -> list[str]:
         """Return who is near, whose rear may be, and who is named; whom a loop has removed is forgotten."""
-        for name in [n for n in (*self._very_long, *self._named_present) if not is_known(self._sumo, n)]:
+        gone = [name for name, length in self._very_long.items() if not self._trails.note(name, length)]
+        for name in (*gone, *(n for n in tuple(self._named_present) if not is_known(self._sumo, n))):
             self._very_long.pop(name, None)
             self._named_present.discard(name)
         around = sorted([*near, *self._far(near)] if self._very_long else near)
@@ -214,9 +214,12 @@ class Surroundings:
         vehicle = self._sumo.vehicle
         return {_POSITION: vehicle.getPosition3D(name), _ANGLE: vehicle.getAngle(name), _SPEED: vehicle.getSpeed(name)}
 
-    def _road(self, name: str, variables: Mapping[int, Any]) -> str:
-        road: str = (self._sumo.person if _VEHICLE in variables else self._sumo.vehicle).getRoadID(name)
-        return road
+    def _beside(self, name: str, variables: Mapping[int, Any], ego: Sequence[float], *, named: bool) -> tuple[Any, str]:
+        """Return where somebody is next to the ego, and the name of the road there; a very long body may be on another level."""
+        if name in self._very_long:
+            return self._trails.nearest(name, ego)
+        domain = self._sumo.person if _VEHICLE in variables else self._sumo.vehicle
+        return variables[_POSITION], domain.getRoadID(name) if named else ""
 
     def _record(
         self, row: dict[str, _Row], parts: dict[str, int], before: Mapping[str, _Row], name: str,
