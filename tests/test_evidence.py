@@ -162,7 +162,7 @@ def test_a_vehicle_that_a_loop_removes_leaves_the_trace(tmp_path, named, within,
 @pytest.mark.parametrize(("across", "ended"), [(6.0, "duration"), (0.5, "collision")])
 def test_a_train_is_where_its_body_is_not_on_the_level_of_its_front(simulate, across, ended):
     """On the bridge with its front down it touched who passed below; on the crossing with its front up it was not there."""
-    far = 6.5 - across
+    far = 14.0 if across < 1.0 else 0.5
     rail = [(0.0, -300.0, across), (0.0, 20.0, across), (0.0, 120.0, far), (0.0, 400.0, far)]
     bridge = {"over": [(200.0, -50.0, 6.0), (200.0, 50.0, 6.0)], "below": [(150.0, 0.0, 0.0), (250.0, 0.0, 0.0)]}
     roads = {"we": [(-200.0, 0.0, 0.0), (100.0, 0.0, 0.0)], "sn": rail, **bridge}

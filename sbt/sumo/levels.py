@@ -30,7 +30,7 @@ _DETOUR = 1.5
 """Largest ratio of the way to the beeline between road users on one level by their way: a ramp leads around, and above itself."""
 _MOVED = 1.0
 """Distance between places that a trail keeps (m)."""
-_STACKED = 12.0
+_STACKED = 15.0
 """Distance of places on roads within which they are one above the other, or not (m): places are at most 20 m apart on each."""
 _RAMP = 60.0
 """A way between two roads that is not longer does not lead to another level (m): 3 m in 60 m are a slope of 5 %."""

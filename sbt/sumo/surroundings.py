@@ -88,7 +88,7 @@ class Surroundings:
         self.follow(sumo.vehicle.getIDList())
 
     def __len__(self) -> int:
-        """Return the number of recorded instants."""
+        """Number of recorded instants."""
         return len(self._rows)
 
     def is_person(self, name: str) -> bool:
@@ -135,8 +135,7 @@ class Surroundings:
             raise RunError(Status.FAILED, f"{rule}, but it rides in '{near[ego][_VEHICLE]}'")
         if self.placed:
             near = {**near, **self._placed_near(near[ego][_POSITION])}
-        row: dict[str, _Row] = {}
-        parts: dict[str, int] = {}
+        row, parts = dict[str, _Row](), dict[str, int]()
         simulation, self.jumped = self._sumo.simulation, set()
         self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
         before = self._rows[-1] if self._rows else {}
@@ -148,7 +147,8 @@ class Surroundings:
             if name == ego or variables.get(_VEHICLE):
                 continue
             (place, other), person = self._beside(name, variables, at, named=apart is not None), _VEHICLE in variables
-            if self.levels.stacked and is_above(self._sumo, self._own_domain, ego, at, name, place, person=person):
+            heights = self.levels.stacked and name not in self.placed
+            if heights and is_above(self._sumo, self._own_domain, ego, at, name, place, person=person):
                 continue
             if apart is None or name in self.placed or other not in apart:
                 self._record(row, parts, before, name, variables)
