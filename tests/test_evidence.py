@@ -159,6 +159,25 @@ def test_a_vehicle_that_a_loop_removes_leaves_the_trace(tmp_path, named, within,
 
 
 @pytest.mark.sumo
+@pytest.mark.parametrize("length", [5, 60])
+def test_who_stands_beside_a_hill_is_seen_and_asked_nothing_that_ends_the_process(tmp_path, length):
+    """libsumo's getRoadID of a vehicle off the lanes is a segmentation fault."""
+    roads = {"up": [(0.0, 0.0, 0.0), (300.0, 0.0, 30.0)], "over": [(-200.0, -50.0, 6.0), (-200.0, 50.0, 6.0)],
+             "below": [(-250.0, 0.0, 0.0), (-150.0, 0.0, 0.0)]}  # fmt: skip
+
+    def loop(sumo, values, rng):
+        sumo.simulationStep()
+        while sumo.simulation.getTime() < 5.0:
+            sumo.vehicle.moveToXY("other", "", -1, 160.0, -12.0, 90.0, 2)
+            sumo.simulationStep()
+
+    kind = f'<vType id="tr" length="{length}" sigma="0"/>'
+    vehicles = kind + vehicle("ego", "up", departSpeed=2) + vehicle("other", "up", "tr", departPos=150, departSpeed=0)
+    trace = simulation(tmp_path, net(roads, z=True), vehicles, loop, 4.0)({}, 1)
+    assert trace.ended == "duration"
+
+
+@pytest.mark.sumo
 @pytest.mark.parametrize(("across", "ended"), [(6.0, "duration"), (0.5, "collision")])
 def test_a_train_is_where_its_body_is_not_on_the_level_of_its_front(simulate, across, ended):
     """On the bridge with its front down it touched who passed below; on the crossing with its front up it was not there."""

@@ -104,8 +104,8 @@ def compare(
 def _settings(loaded: Loaded) -> Json:
     """Return the settings that a cell depends on, beside sampler and seed."""
     settings = loaded.config.model_dump(mode="json", exclude={"seed", "store", "executor", "acquisition"})
-    ego = [] if loaded.config.ego is None else [loaded.config.ego.kind]
-    files = loaded.scope.prints([loaded.config.scenario, *ego, *loaded.config.metrics])
+    kinds = [choice.kind for choice in (loaded.config.ego, loaded.config.metamodel) if choice is not None]
+    files = loaded.scope.prints([loaded.config.scenario, *kinds, *loaded.config.metrics])
     return json.loads(json.dumps({**settings, **({"files": files} if files else {})}))
 
 

@@ -40,6 +40,8 @@ KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "contr
 _LOCK = threading.Lock()
 _LARGE = 2**22
 """Size (bytes) up to which the contents of files are compared."""
+_SHORT = 8
+"""Digits of a hash that people are shown."""
 _USER = "sbt_user_"
 """How the names of modules begin that a file of the user's was imported as."""
 T = TypeVar("T")
@@ -92,12 +94,14 @@ def read_files() -> list[Path]:
 
 def contents_read() -> dict[str, str]:
     """Return what is in the user's files that this process has read: a hash, of large ones when they were changed."""
+    return {str(path): _content(path) for path in read_files()}
 
-    def content(path: Path) -> str:
-        state = _stamp(path)
-        return str(state) if state[1] > _LARGE else hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
-    return {str(path): content(path) for path in read_files()}
+def _content(path: Path) -> str:
+    """Return a hash of what is in a file, of a large one of when it was changed."""
+    state = _stamp(path)
+    content = repr(state).encode() if state[1] > _LARGE else path.read_bytes()
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -138,8 +142,7 @@ class Scope:
                 files |= set(modules_of((self.folder / Path(name.rpartition(":")[0]).expanduser()).resolve()))
             elif name.endswith((".yaml", ".yml")) or name.startswith("table:"):
                 files |= set(self._read_for(name))
-        prints = ((each, hashlib.blake2b(each.read_bytes(), digest_size=4)) for each in sorted(files))
-        return {os.path.relpath(each, self.folder.resolve()): found.hexdigest() for each, found in prints}
+        return {os.path.relpath(each, self.folder.resolve()): _content(each)[:_SHORT] for each in sorted(files)}
 
     def _read_for(self, scenario: str) -> tuple[Path, ...]:
         """Return the files that a scenario is made of; found out once a process."""
@@ -197,10 +200,7 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
         return load("sources", "yaml")(name, folder or Path.cwd())
     source, _, rest = name.partition(":")
     if kind == "scenarios" and rest and source in _entries("sources"):
-        place = (folder or Path.cwd()) / rest
-        for file in place.parent.glob("*") if place.is_file() else place.glob("*"):
-            if file.is_file():
-                noted(file.resolve())
+        _note_table(((folder or Path.cwd()) / rest).resolve())
         return load("sources", source)(rest, folder or Path.cwd())
     entries = _entries(kind)
     if name not in entries:
@@ -209,6 +209,15 @@ def load(kind: str, name: str, folder: Path | None = None) -> Any:
     if len(values := sorted({entry.value for entry in entries[name]})) > 1:
         raise PluginError(f"{kind} must have names of their own, but packages offer '{name}' as {' and as '.join(values)}")
     return _guarded(entries[name][0].load, lambda _: f"{kind[:-1]} '{name}' cannot be imported", InputError)
+
+
+def _note_table(place: Path) -> None:
+    """Note the files of a recorded table, given by its folder or file; what else is there is nobody's business."""
+    folder = place.parent if place.is_file() else place
+    tables = [place] if place.is_file() else [file for kind in ("*.csv", "*.parquet") for file in folder.glob(kind)]
+    for file in (*tables, folder / "config.yml"):
+        if file.is_file():
+            noted(file)
 
 
 @kept

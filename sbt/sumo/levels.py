@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Levels", "Trails", "is_above", "is_known", "levels_of"]
+__all__ = ["Levels", "Trails", "is_above", "is_known", "levels_of", "road_of"]
 
 _LEVEL_HEIGHT = 3.0
 """Difference in height from which on two road users are on different levels, such as on and under a bridge (m)."""
@@ -118,7 +118,7 @@ def is_above(
         return False
     if abs(height) > _STEEPEST * far or person or domain is not sumo.vehicle:
         return True
-    return not any(0.0 <= _way(sumo.vehicle, a, b) <= _DETOUR * far for a, b in ((ego, name), (name, ego)))
+    return not any(0.0 <= _way(sumo, a, b) <= _DETOUR * far for a, b in ((ego, name), (name, ego)))
 
 
 def is_known(sumo: Any, vehicle: str) -> bool:
@@ -146,7 +146,7 @@ class Trails:
         place = vehicle.getPosition3D(name)
         along, moved = (trail[-1][0], math.dist(trail[-1][1][:2], place[:2])) if trail else (0.0, math.inf)
         if moved >= _MOVED:
-            trail.append((along + min(moved, length), place, vehicle.getRoadID(name)))
+            trail.append((along + min(moved, length), place, road_of(self._sumo, name)))
         while len(trail) > 1 and trail[-1][0] - trail[1][0] > length:
             trail.popleft()
         return True
@@ -162,10 +162,22 @@ def _rise(domain: Any, name: str, own: Sequence[float], other: Sequence[float]) 
     return slope * ((other[0] - own[0]) * math.sin(angle) + (other[1] - own[1]) * math.cos(angle))
 
 
-def _way(vehicle: Any, name: str, to: str) -> float:
+def _way(sumo: Any, name: str, to: str) -> float:
     """Return how far a vehicle's route leads to another one (m); negative where it does not."""
-    road, position, lane = vehicle.getRoadID(to), vehicle.getLanePosition(to), vehicle.getLaneIndex(to)
-    return float(vehicle.getDrivingDistance(name, road, position, lane)) if road else -1.0
+    road = road_of(sumo, to)
+    if not road:
+        return -1.0
+    try:
+        at = road, sumo.vehicle.getLanePosition(to), sumo.vehicle.getLaneIndex(to)
+        return float(sumo.vehicle.getDrivingDistance(name, *at))
+    except sumo.TraCIException:  # a lane that is not on its way
+        return -1.0
+
+
+def road_of(sumo: Any, name: str, *, person: bool = False) -> str:
+    """Return the road that somebody is on; "" for a vehicle off the lanes, where libsumo's getRoadID ends the process."""
+    road: str = sumo.person.getRoadID(name) if person else sumo.vehicle.getLaneID(name).rpartition("_")[0]
+    return road
 
 
 class _Client:

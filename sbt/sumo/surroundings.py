@@ -21,7 +21,7 @@ from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
-from sbt.sumo.levels import Trails, is_above, is_known, levels_of
+from sbt.sumo.levels import Trails, is_above, is_known, levels_of, road_of
 from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
@@ -218,8 +218,7 @@ class Surroundings:
         """Return where somebody is next to the ego, and the name of the road there; a very long body may be on another level."""
         if name in self._very_long:
             return self._trails.nearest(name, ego)
-        domain = self._sumo.person if _VEHICLE in variables else self._sumo.vehicle
-        return variables[_POSITION], domain.getRoadID(name) if named else ""
+        return variables[_POSITION], road_of(self._sumo, name, person=_VEHICLE in variables) if named else ""
 
     def _record(
         self, row: dict[str, _Row], parts: dict[str, int], before: Mapping[str, _Row], name: str,
