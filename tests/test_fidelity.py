@@ -214,6 +214,17 @@ def test_check_says_what_coarse_runs_cost_and_how_alike_they_are(tmp_path: Path)
     assert told.numbers["correlation"] > 0.6
 
 
+@pytest.mark.sumo
+def test_the_cost_of_runs_of_milliseconds_is_measured(tmp_path: Path) -> None:
+    """By a clock of 10 ms it was .05 for .62, whatever the coarse runs."""
+    from sbt.workflows.fidelity import fidelity_findings
+
+    given = {"campaign": "estimation", "scenario": "cut_in", "budget": 50}
+    found = study(tmp_path, given, fidelity={"step_length": [0.05, 0.2]})
+    _, told = fidelity_findings(found.spec, found.scenario, 1)
+    assert told.numbers["cost"] >= 0.3
+
+
 @pytest.mark.slow
 @pytest.mark.sumo
 def test_coarse_runs_begin_with_coarse_warm_ups_and_replay_so(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.config.source import ConfigError
 from sbt.errors import InputError
 from sbt.plugins import Scope, load
 from sbt.samplers.pool import PoolSequence
@@ -59,7 +58,7 @@ def test_rows_that_are_left_over_check_no_share_and_no_others_are_promised(folde
         assert "held-out run checks that" not in said
         assert "validation.reference" not in said
         assert ("that it had not seen" in said) is left
-    with pytest.raises(ConfigError, match=r"validation\.reference: recorded rows have no runs beside them"):
+    with pytest.raises(InputError, match=r"validation\.reference: recorded rows have no runs beside them"):
         run_study(Study(parse(configuration(folder, "boundary", "r") + "validation: {reference: 30}\n", folder=folder)))
 
 

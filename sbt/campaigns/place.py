@@ -19,6 +19,7 @@ from sbt.store.records import optional
 
 __all__ = ["BoundaryPlace", "Cut", "Stretch", "boundary_place", "succeeding"]
 
+_MOST_STRETCHES = 3  # critical stretches of a line across the boundary that a sentence tells
 _MOST_FIXED = 4  # inputs beside the two that a sentence names
 
 LogOdds = Callable[[Points], Vector]
@@ -104,9 +105,9 @@ class BoundaryPlace:
         return said
 
     def _stretches(self, cut: Cut, unit: str) -> list[str]:
-        """Return the critical stretches of the first input, without ends that are those of its range."""
-        said = []
-        for stretch in cut.critical[:3]:
+        """Return the widest critical stretches of the first input, without ends of its range, and how many others there are."""
+        said, widest = [], sorted(cut.critical, key=lambda stretch: stretch.low - stretch.high)[:_MOST_STRETCHES]
+        for stretch in sorted(widest, key=lambda stretch: stretch.low):
             low, high = number(stretch.low, 3), measured("", stretch.high, unit).strip()
             if stretch.low <= self.low:
                 said.append(f"below {high}")
@@ -114,7 +115,8 @@ class BoundaryPlace:
                 said.append(f"above {measured('', stretch.low, unit).strip()}")
             else:
                 said.append(f"{low} to {high}")
-        return said
+        others = len(cut.critical) - len(widest)
+        return [*said, f"in {plural(others, 'narrower part')}"] if others else said
 
 
 def boundary_place(

@@ -162,8 +162,6 @@ def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
     requirement = _requirement(loaded, scenario, problems)
     if (choice := config.fidelity) is not None:
         problems.attempt(("fidelity",), partial(check_levels, choice, spec, replace(scenario, requirement=requirement)))
-    if scenario.pool is not None and config.validation.reference:
-        problems.add(("validation", "reference"), "recorded rows have no runs beside them; those that are left over score")
     return replace(scenario, space=space, requirement=requirement)
 
 

@@ -22,6 +22,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from sbt import plugins
 from sbt.errors import InputError, did_you_mean
 from sbt.problem.arrays import Vector
 from sbt.problem.distribution import Distribution
@@ -204,7 +205,7 @@ def read_curve(path: Path, time: str, value: str, interpolate: Interpolation = "
     """
     check_table(path)
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = plugins.noted(path.resolve()).read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"a recorded profile must be a readable CSV file, but '{path}' is not: {error}") from None
     try:

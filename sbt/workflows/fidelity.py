@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -121,9 +121,13 @@ def _run_pairs(spec: ScenarioSpec, jobs: list[tuple[Values, int]]) -> list[_Pair
 
 
 def _cpu() -> float:
-    """Return the CPU seconds of this process and its children so far."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    """Return the CPU seconds of this process and its ended children so far; `os.times` counts in hundredths of a second."""
+    try:
+        import resource
+    except ImportError:  # not a Unix
+        return time.process_time()
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)
 
 
 def _cost(pairs: list[_Pair]) -> float:

@@ -117,6 +117,8 @@ def run_study(
         if shard is not None:
             check_shard(campaign)
         _check_earlier(study)
+        if study.scenario.pool is not None and study.config.validation.reference:
+            raise InputError("validation.reference: recorded rows have no runs beside them; those that are left over score")
     with Store.open(Path(study.config.store)) as store:
         study = study.stored_in(store)
         campaign, snapshot = study.campaign, study.snapshot(shard) | _code_of(study)
