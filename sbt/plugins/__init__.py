@@ -139,7 +139,8 @@ class Scope:
         files: set[Path] = set()
         for name in names:
             if ".py:" in name:
-                files |= set(modules_of((self.folder / Path(name.rpartition(":")[0]).expanduser()).resolve()))
+                file = (self.folder / Path(name.rpartition(":")[0]).expanduser()).resolve()
+                files |= set(modules_of(file)) if file.is_file() else set()
             elif name.endswith((".yaml", ".yml")) or name.startswith("table:"):
                 files |= set(self._read_for(name))
         return {os.path.relpath(each, self.folder.resolve()): _content(each)[:_SHORT] for each in sorted(files)}
