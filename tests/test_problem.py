@@ -443,7 +443,7 @@ def test_streams_depend_on_seed_and_path_only():
     (lambda: sbt.Metric(5), "a metric's name must be text, but got 5"),
     (lambda: sbt.Metric("m", 5), "metric m must have a function of a trace, but got 5"),
     (lambda: sbt.Metric("m\n"), "a metric's name must be text on one line"),
-    (lambda: sbt.Metric("m", direction="lo"), "metric m: direction must be 'low' or 'high', but got 'lo'"),
+    (lambda: _of(metrics=[sbt.Metric("m", direction="lo")]), "metric m: direction must be 'low' or 'high', but got 'lo'"),
     (lambda: sbt.Metric("m", without=math.nan), r"\(without\) must be a number, but got nan"),
     (lambda: sbt.Metric("m", lambda: 1.0), "metric m must have a function of one argument, the trace, but: too many"),
     (lambda: _of(evaluate=lambda values: {"m": 1.0}), "scenario x: what simulates .* must take values and seed, but: too many"),

@@ -52,8 +52,6 @@ class Metric:
         must_be(f"metric {self.name}: what stands for no interaction (without) must be a number", self.without, Real)
         if math.isnan(self.without):
             raise InputError(f"metric {self.name}: what stands for no interaction (without) must be a number, but got nan")
-        if self.direction not in ("low", "high"):
-            raise InputError(f"metric {self.name}: direction must be 'low' or 'high', but got {self.direction!r}")
         if not self.name.strip() or not self.name.isprintable():
             raise InputError(f"a metric's name must be text on one line, but got {self.name!r}")
         if self.function is not None and not callable(self.function):

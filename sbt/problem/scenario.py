@@ -204,6 +204,9 @@ class LogicalScenario:
         doubled = [m for k, m in enumerate(self.measured) if m in self.measured[:k]]
         if doubled:
             raise InputError(f"scenario {name}: metrics must have different names, but got '{doubled[0]}' twice")
+        for metric in self.metrics:
+            if metric.direction not in ("low", "high"):
+                raise InputError(f"metric {metric.name}: direction must be 'low' or 'high', but got {metric.direction!r}")
         for part in requirement.parts:
             if part.metric not in self.measured:
                 known, hint = ", ".join(self.measured), did_you_mean(part.metric, self.measured)
