@@ -196,7 +196,7 @@ class LogicalScenario:
             metric_names = [m.name for m in metrics]
         values = {
             "name": name, "space": given if isinstance(given, ParameterSpace) else ParameterSpace(tuple(given)),
-            "requirement": requirement, "simulate": simulate, "metrics": tuple(metric_from(m) for m in metrics),
+            "requirement": requirement, "simulate": simulate, "metrics": tuple(map(_directed, metrics)),
             "description": description, "evaluate": evaluate, "metric_names": tuple(metric_names), "pool": pool, "roles": roles,
         }  # fmt: skip
         for key, value in values.items():
@@ -204,9 +204,6 @@ class LogicalScenario:
         doubled = [m for k, m in enumerate(self.measured) if m in self.measured[:k]]
         if doubled:
             raise InputError(f"scenario {name}: metrics must have different names, but got '{doubled[0]}' twice")
-        for metric in self.metrics:
-            if metric.direction not in ("low", "high"):
-                raise InputError(f"metric {metric.name}: direction must be 'low' or 'high', but got {metric.direction!r}")
         for part in requirement.parts:
             if part.metric not in self.measured:
                 known, hint = ", ".join(self.measured), did_you_mean(part.metric, self.measured)
@@ -297,6 +294,14 @@ class LogicalScenario:
         if self.evaluate is None:
             raise InputError(f"scenario {self.name}: give either simulate or evaluate")
         return _checked(self.evaluate(values, seed), self.metric_names)
+
+
+def _directed(given: Metric | str | Callable[[Trace], float]) -> Metric:
+    """Return a metric that says on which side values are critical."""
+    metric = metric_from(given)
+    if metric.direction not in ("low", "high"):
+        raise InputError(f"metric {metric.name}: direction must be 'low' or 'high', but got {metric.direction!r}")
+    return metric
 
 
 def _returned(
