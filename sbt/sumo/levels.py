@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Levels", "Trails", "is_above", "is_known", "levels_of", "road_of"]
+__all__ = ["Ground", "Levels", "Trails", "is_known", "levels_of", "road_of"]
 
 _LEVEL_HEIGHT = 3.0
 """Difference in height from which on two road users are on different levels, such as on and under a bridge (m)."""
@@ -94,31 +94,44 @@ def levels_of(sumo: Any) -> Levels:
     return _cached(file.resolve(), state.st_mtime_ns, state.st_size, _Client(sumo))
 
 
-def is_above(
-    sumo: Any, domain: Any, ego: str, own: Sequence[float], name: str, other: Sequence[float], *, person: bool
-) -> bool:  # fmt: skip
-    """Return whether a road user is so much higher or lower than the ego that it is on another level.
+@dataclass(frozen=True)
+class Ground:
+    """Where the ego is in a step, and how the road rises there.
 
-    Roads rise: who is far is on the same level if it is as high as the slope of its road or of the ego's leads, or between, or on
-    the way of one to the other.
-
-    Args:
-        sumo: its client.
+    Attributes:
+        sumo: SUMO's client.
         domain: its vehicles or persons, whichever the ego is.
         ego: its name.
-        own: its position (x, y, z).
-        name: of the road user.
-        other: its position.
-        person: whether it walks.
+        place: its position (x, y, z).
+        rise: of the road in both directions of the plane (m/m).
     """
-    height, far = other[2] - own[2], math.dist(own[:2], other[:2])
-    others = sumo.person if person else sumo.vehicle
-    rises = [_rise(each, who, own, other) for each, who in ((domain, ego), (others, name))]
-    if min(rises) - _LEVEL_HEIGHT < height < max(rises) + _LEVEL_HEIGHT:
-        return False
-    if abs(height) > _STEEPEST * far or person or domain is not sumo.vehicle:
-        return True
-    return not any(0.0 <= _way(sumo, a, b) <= _DETOUR * far for a, b in ((ego, name), (name, ego)))
+
+    sumo: Any
+    domain: Any
+    ego: str
+    place: Sequence[float]
+    rise: tuple[float, float]
+
+    @classmethod
+    def under(cls, sumo: Any, domain: Any, ego: str, place: Sequence[float]) -> Ground:
+        """Return the ground under the ego."""
+        return cls(sumo, domain, ego, place, _rise(domain, ego))
+
+    def is_below(self, name: str, other: Sequence[float], *, person: bool) -> bool:
+        """Return whether a road user at (x, y, z) is so much higher, or lower, that it is on another level.
+
+        Roads rise: who is far is on the same level if it is as high as the slope of its road or of the ego's leads, or between,
+        or on the way of one to the other.
+        """
+        dx, dy, height = (there - here for there, here in zip(other, self.place, strict=True))
+        rises = [dx * x + dy * y for x, y in (self.rise, _rise(self.sumo.person if person else self.sumo.vehicle, name))]
+        if min(rises) - _LEVEL_HEIGHT < height < max(rises) + _LEVEL_HEIGHT:
+            return False
+        vehicle, far = self.sumo.vehicle, math.hypot(dx, dy)
+        if abs(height) > _STEEPEST * far or person or self.domain is not vehicle:
+            return True
+        ways = ((self.ego, name), (name, self.ego))
+        return not any(0.0 <= _way(self.sumo, a, b) <= _DETOUR * far for a, b in ways)
 
 
 def is_known(sumo: Any, vehicle: str) -> bool:
@@ -142,8 +155,7 @@ class Trails:
         if not is_known(self._sumo, name):
             self._passed.pop(name, None)
             return False
-        vehicle, trail = self._sumo.vehicle, self._passed.setdefault(name, deque())
-        place = vehicle.getPosition3D(name)
+        place, trail = self._sumo.vehicle.getPosition3D(name), self._passed.setdefault(name, deque())
         along, moved = (trail[-1][0], math.dist(trail[-1][1][:2], place[:2])) if trail else (0.0, math.inf)
         if moved >= _MOVED:
             trail.append((along + min(moved, length), place, road_of(self._sumo, name)))
@@ -156,10 +168,10 @@ class Trails:
         return min(self._passed[name], key=lambda passed: math.dist(passed[1][:2], own[:2]))[1:]
 
 
-def _rise(domain: Any, name: str, own: Sequence[float], other: Sequence[float]) -> float:
-    """Return by how much one place is higher than the other if all of the way there has the slope under somebody."""
+def _rise(domain: Any, name: str) -> tuple[float, float]:
+    """Return by how much the road under somebody rises in both directions of the plane (m/m)."""
     angle, slope = math.radians(domain.getAngle(name)), math.tan(math.radians(domain.getSlope(name)))
-    return slope * ((other[0] - own[0]) * math.sin(angle) + (other[1] - own[1]) * math.cos(angle))
+    return slope * math.sin(angle), slope * math.cos(angle)
 
 
 def _way(sumo: Any, name: str, to: str) -> float:

@@ -21,7 +21,7 @@ from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
-from sbt.sumo.levels import Trails, is_above, is_known, levels_of, road_of
+from sbt.sumo.levels import Ground, Trails, is_known, levels_of, road_of
 from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
@@ -142,13 +142,13 @@ class Surroundings:
         self._record(row, parts, before, ego, near[ego])
         at, road = near[ego][_POSITION], self._own_domain.getRoadID(ego) if self.levels.apart else ""
         apart = self.levels.apart.get(road)
+        ground = Ground.under(self._sumo, self._own_domain, ego, at) if self.levels.stacked else None
         for name in self._around(near):
             variables = near[name] if name in near else self._read(name)
             if name == ego or variables.get(_VEHICLE):
                 continue
             (place, other), person = self._beside(name, variables, at, named=apart is not None), _VEHICLE in variables
-            heights = self.levels.stacked and name not in self.placed
-            if heights and is_above(self._sumo, self._own_domain, ego, at, name, place, person=person):
+            if ground is not None and name not in self.placed and ground.is_below(name, place, person=person):
                 continue
             if apart is None or name in self.placed or other not in apart:
                 self._record(row, parts, before, name, variables)
