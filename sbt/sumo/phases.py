@@ -22,7 +22,7 @@ class Stopwatch:
 
     phase: str = PHASES[0]
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
-    _since: float = field(default_factory=time.process_time)
+    _since: float = field(default_factory=lambda: time.process_time())  # looked up when asked, so that tests may set the clock
 
     def enter(self, phase: str) -> None:
         """End the present phase and begin another, or go on with the same."""
