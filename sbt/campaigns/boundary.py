@@ -147,7 +147,7 @@ def recipe(settings: Settings) -> Campaign:
         each = each_share(log.history.where(log.history.stage == VALIDATION), settings.scenario.requirement)
         if fitted is None:
             return BoundaryConclusion(None, None, None, None, held_out_fraction=held_out, held_out_fractions=each), None
-        r = fitted.record
+        r, unchosen = fitted.record, space_filling(log) | (settings.acquisition is even)
         shares = r.critical_fraction, r.expected_misclassified, r.ambiguous_volume
         if r.critical_fraction < _SMALL and not settings.scenario.requirement.combined:
             shares = learner.fine_shares(fitted)
@@ -160,9 +160,9 @@ def recipe(settings: Settings) -> Campaign:
         return BoundaryConclusion(
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
-            place, explained_variance(settings, log.history), traffic_doubt(settings, log.history),
+            place, explained_variance(settings, log.history, unchosen), traffic_doubt(settings, log.history),
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted),
-            critical_share(log.history.where(space_filling(log) | (settings.acquisition is even)), settings.scenario),
+            critical_share(log.history.where(unchosen), settings.scenario),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

@@ -263,7 +263,8 @@ class FailureSearch:
             bound, None if len(hits) else _closest(searched, margin, scenario.requirement),
             _statement(searched, len(hits), modes, bound), None if fit is None else fit.validation,
             stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
-            None if fit is None else fit.independence, explained_variance(self.settings, history),
+            None if fit is None else fit.independence,
+            explained_variance(self.settings, history, (history.iteration == 0) | (history.stage == VALIDATION)),
             raced=len(raced) or None, links=self._links_told(log),
         )  # fmt: skip
 

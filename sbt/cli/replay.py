@@ -40,7 +40,7 @@ def replay(
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
         from sbt.workflows.judging import judge_run, judgement_line, stored_judgements, with_driver
-        from sbt.workflows.running import replay_run
+        from sbt.workflows.running import not_repeated, replay_run
         from sbt.workflows.showing import show_replay
         from sbt.workflows.study import changed_since
 
@@ -78,7 +78,8 @@ def replay(
             next_command(*(film if gif is None else ["sumo-sbt", "pin", str(folder), str(run), "--into", "tests"]))
     if not same:
         now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
-        raise fail(f"a replay must equal the stored run, but got {now}, not {stored}{changed_since(folder)}", Exit.INTERNAL)
+        why = changed_since(folder) or not_repeated(again.scenario)
+        raise fail(f"a replay must equal the stored run, but got {now}, not {stored}{why}", Exit.INTERNAL)
 
 
 def _compared(again: Replay) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 
 __all__ = ["drawn_regression", "out_of_bag"]
 
@@ -39,10 +39,19 @@ def drawn_regression(u: Points, y: Vector, at: Points, rng: np.random.Generator,
     return line + np.asarray(forest.fit(u, y, sample_weight=weight).predict(at))
 
 
-def out_of_bag(u: Points, y: Vector, rng: np.random.Generator) -> float:
-    """Return the share of the variance of y (n,) that a forest on u (n, d) explains of rows its trees did not see, at least 0."""
+def out_of_bag(u: Points, y: Vector, rng: np.random.Generator, judged: Mask | None = None) -> float:
+    """Return the share of the variance of y (n,) at the judged rows that a forest explains of rows its trees did not see.
+
+    Args:
+        u: (n, d) rows, all of which teach.
+        y: (n,) values.
+        rng: of the trees.
+        judged: (n,) rows whose variance is meant: those that lie as the inputs are distributed; None: all.
+    """
     from sklearn.ensemble import ExtraTreesRegressor
 
     state = int(rng.integers(2**31))
     forest = ExtraTreesRegressor(_BAGGED, min_samples_split=4, bootstrap=True, oob_score=True, random_state=state, n_jobs=1)
-    return max(float(forest.fit(u, y).oob_score_), 0.0)
+    rows = slice(None) if judged is None else judged
+    missed = (y - forest.fit(u, y).oob_prediction_)[rows]
+    return max(1.0 - float((missed**2).mean() / y[rows].var()), 0.0)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["inserted_at", "place_in", "said_at", "stands_for"]
+__all__ = ["inserted_at", "made_here", "place_in", "said_at", "stands_for"]
 
 _ELSEWHERE: dict[str, Mapping[int, str]] = {}
 """Of files of this process: line to where the user wrote what is there."""
@@ -23,6 +23,11 @@ def place_in(path: Path | str, line: int, column: int) -> str:
 def stands_for(path: Path, places: Mapping[int, str]) -> None:
     """Let the lines of a file be named by the places at which the user wrote them."""
     _ELSEWHERE[str(path)] = places
+
+
+def made_here(path: Path) -> bool:
+    """Return whether a file is none of the user's: it stands for what the user wrote elsewhere."""
+    return str(path) in _ELSEWHERE
 
 
 def inserted_at(place: str) -> bool:

@@ -22,6 +22,7 @@ from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.guided import Placed
 from sbt.sumo.levels import Ground, Trails, is_known, levels_of, road_of
+from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_near, read
 from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
@@ -29,12 +30,12 @@ from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
 
 __all__ = ["Surroundings"]
 
-_POSITION, _ANGLE, _SPEED, _VEHICLE = 0x39, 0x43, 0x40, 0xC3
-"""TraCI variables: VAR_POSITION3D, VAR_ANGLE, VAR_SPEED, VAR_VEHICLE (the vehicle a person rides in)."""
 _VEHICLES, _PERSONS = 0xA4, 0xAE
 """TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
 _VERY_LONG = 20.0
 """Length from which on a vehicle may be near although its front is not within the radius (m)."""
+_BESIDE = 0.5
+"""How far who parks, or leaves its place, is moved beside what it drives, from which on it has jumped there (m)."""
 _LONGEST = 30.0
 """Length up to which others on another level are compared with the ego (m)."""
 
@@ -54,7 +55,7 @@ class Surroundings:
     Attributes:
         states: the last state of every road user seen so far; the ego first.
         present: names of those that are there now, the ego first.
-        rigid: vehicles that are moved by poses; their bodies are rectangles, however long.
+        rigid: road users that are moved by poses; their bodies are rectangles, and their speeds those of their motion.
         placed: road users that are moved by position, as they are in the next step to be recorded.
         jumped: who was moved to another place in this step: left out at this instant, so that nothing takes it for motion.
     """
@@ -82,7 +83,8 @@ class Surroundings:
         self._recorded_at = 0.0
         self._teleported: dict[str, str] = {}
         self._ending: Sequence[str] = ()
-        self._unreacting: set[str] = set()
+        self._parking: Sequence[str] = ()
+        self._unreacting, self._unmoved = set[str](), set[str]()
         self._other_level: dict[tuple[str, str], str] = {}
         self.levels, self._trails = levels_of(sumo), Trails(sumo)
         self.follow(sumo.vehicle.getIDList())
@@ -117,8 +119,8 @@ class Surroundings:
     def subscribe(self, *, walks: bool = False) -> None:
         """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
         self._own_domain = domain = self._sumo.person if walks else self._sumo.vehicle
-        domain.subscribeContext(self._ego, _VEHICLES, self._within, [_POSITION, _ANGLE, _SPEED])
-        domain.subscribeContext(self._ego, _PERSONS, self._within, [_POSITION, _ANGLE, _SPEED, _VEHICLE])
+        domain.subscribeContext(self._ego, _VEHICLES, self._within, [POSITION, ANGLE, SPEED])
+        domain.subscribeContext(self._ego, _PERSONS, self._within, [POSITION, ANGLE, SPEED, VEHICLE])
 
     def record(self) -> None:
         """Append the states of all road users that are present.
@@ -127,28 +129,33 @@ class Surroundings:
             RunError: the ego is not on the road.
         """
         ego, near = self._ego, self._own_domain.getContextSubscriptionResults(self._ego)
-        if ego not in near:
-            now = self._sumo.simulation.getTime()
-            raise RunError(Status.FAILED, f"the ego '{ego}' must stay on the road, but it was gone at t = {now:g} s")
-        if near[ego].get(_VEHICLE):
+        unseen = {ego, *self.rigid, *self.present} - near.keys() - self.placed.keys()
+        off = off_lanes(self._sumo, ego, near, unseen, self._within) if unseen else {}
+        if off:
+            near = {**near, **off}
+            self.rigid.update(off)
+        if near[ego].get(VEHICLE):
             rule = f"the ego '{ego}' must walk while it is recorded"
-            raise RunError(Status.FAILED, f"{rule}, but it rides in '{near[ego][_VEHICLE]}'")
+            raise RunError(Status.FAILED, f"{rule}, but it rides in '{near[ego][VEHICLE]}'")
         if self.placed:
-            near = {**near, **self._placed_near(near[ego][_POSITION])}
+            near = {**near, **placed_near(self.placed, self._named, near[ego][POSITION], self._within)}
         row, parts = dict[str, _Row](), dict[str, int]()
         simulation, self.jumped = self._sumo.simulation, set()
         self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
+        self._parking = parking(simulation)
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
-        at, road = near[ego][_POSITION], self._own_domain.getRoadID(ego) if self.levels.apart else ""
+        at, walks = near[ego][POSITION], self._own_domain is not self._sumo.vehicle
+        road = road_of(self._sumo, ego, person=walks) if self.levels.apart or self.levels.stacked else ""
         apart = self.levels.apart.get(road)
-        ground = Ground.under(self._sumo, self._own_domain, ego, at) if self.levels.stacked else None
+        ground = Ground.under(self._sumo, self._own_domain, ego, at) if self.levels.stacked and road else None
         for name in self._around(near):
-            variables = near[name] if name in near else self._read(name)
-            if name == ego or variables.get(_VEHICLE):
+            variables = near[name] if name in near else read(self._sumo, name)
+            if name == ego or variables.get(VEHICLE):
                 continue
-            (place, other), person = self._beside(name, variables, at, named=apart is not None), _VEHICLE in variables
-            if ground is not None and name not in self.placed and ground.is_below(name, place, person=person):
+            (place, other), person = self._beside(name, variables, at, named=apart is not None), VEHICLE in variables
+            seen = name not in self.placed and name not in off  # by SUMO, which knows heights of lanes only
+            if seen and ground is not None and ground.is_below(name, place, person=person):
                 continue
             if apart is None or name in self.placed or other not in apart:
                 self._record(row, parts, before, name, variables)
@@ -162,14 +169,6 @@ class Surroundings:
         self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
-
-    def _placed_near(self, ego: tuple[float, ...]) -> dict[str, dict[int, Any]]:
-        """Return the variables of the placed road users that are within the radius, or named, on the ego's level."""
-        return {
-            name: {_POSITION: (s.x, s.y, ego[2]), _ANGLE: s.angle, _SPEED: s.speed, **({_VEHICLE: ""} if s.person else {})}
-            for name, s in self.placed.items()
-            if name in self._named or math.hypot(s.x - ego[0], s.y - ego[1]) <= self._within
-        }
 
     def _keep_way(self, name: str) -> None:
         """Keep where a vehicle goes on that is recorded no more: its rectangle, and the parts of a long one.
@@ -207,42 +206,44 @@ class Surroundings:
 
     def _far(self, near: Mapping[str, Any]) -> list[str]:
         """Return the very long vehicles whose rear may be within the radius although their front is not."""
-        own, at, far = near[self._ego][_POSITION][:2], self._sumo.vehicle.getPosition, self._very_long.items()
+        own, at, far = near[self._ego][POSITION][:2], self._sumo.vehicle.getPosition, self._very_long.items()
         return [n for n, length in far if n not in near and math.dist(at(n), own) <= self._within + length]
-
-    def _read(self, name: str) -> dict[int, Any]:
-        vehicle = self._sumo.vehicle
-        return {_POSITION: vehicle.getPosition3D(name), _ANGLE: vehicle.getAngle(name), _SPEED: vehicle.getSpeed(name)}
 
     def _beside(self, name: str, variables: Mapping[int, Any], ego: Sequence[float], *, named: bool) -> tuple[Any, str]:
         """Return where somebody is next to the ego, and the name of the road there; a very long body may be on another level."""
         if name in self._very_long:
             return self._trails.nearest(name, ego)
-        return variables[_POSITION], road_of(self._sumo, name, person=_VEHICLE in variables) if named else ""
+        return variables[POSITION], road_of(self._sumo, name, person=VEHICLE in variables) if named else ""
 
     def _record(
-        self, row: dict[str, _Row], parts: dict[str, int], before: Mapping[str, _Row], name: str,
+        self, row: dict[str, _Row], parts: dict[str, int], before: dict[str, _Row], name: str,
         variables: Mapping[int, Any],
     ) -> None:  # fmt: skip
         """Record one state; SUMO's position is the front of a vehicle and the centre of a person, ours is the centre."""
-        x, y = variables[_POSITION][:2]
+        x, y = variables[POSITION][:2]
         if x == INVALID_DOUBLE:
             return
         state = self.states.get(name)
         if state is None:
             state = self._first_seen(name, (x, y), variables)
-        if variables[_ANGLE] != state.angle:
-            state.turn(variables[_ANGLE])
-        half, speed = self._centre_offsets[name], float(variables[_SPEED])
-        last = before.get(name)
-        state.acceleration = 0.0 if last is None else (speed - last[3]) / self._dt
-        state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speed
+        if variables[ANGLE] != state.angle:
+            state.turn(variables[ANGLE])
+        half, speed, last = self._centre_offsets[name], float(variables[SPEED]), before.get(name)
+        state.x, state.y = x - half * state.cos, y - half * state.sin
         moved = 0.0 if last is None else math.hypot(state.x - last[0], state.y - last[1])
         if last is not None and half and moved > self._farthest:  # SUMO turns a long vehicle at once: where was its front?
             moved = min(moved, math.hypot(x - last[0] - half * math.cos(last[2]), y - last[1] - half * math.sin(last[2])))
-        if moved > self._farthest or (last is not None and name in self._ending):
+        parks = last is not None and name in self._parking and moved > (last[3] + speed) * self._dt + _BESIDE
+        if moved > self._farthest or (parks and name != self._ego) or (last is not None and name in self._ending):
             self._note_jump(name, moved)
             return
+        if name in self.rigid and name not in self.placed:  # SUMO's speed is what its own driver would do
+            if last is not None:
+                speed = ((state.x - last[0]) * state.cos + (state.y - last[1]) * state.sin) / self._dt
+            if last is not None and name in self._unmoved:
+                before[name] = last = (*last[:3], speed, 0.0)
+            (self._unmoved.add if last is None else self._unmoved.discard)(name)
+        state.speed, state.acceleration = speed, 0.0 if last is None else (speed - last[3]) / self._dt
         row[name] = (state.x, state.y, state.heading, speed, state.acceleration)
         if name in self._bodies and name not in self.rigid:
             lane = self._sumo.vehicle.getLaneID(name)
@@ -260,8 +261,8 @@ class Surroundings:
 
     def _note_level(self, road: str, other: str, name: str, ego: tuple[float, ...], variables: Mapping[int, Any]) -> None:
         """Note a contact in the plane that is none, as the network has no heights and the roads are taken for bridges."""
-        own, person = self.states[self._ego], _VEHICLE in variables
-        if math.dist(ego[:2], variables[_POSITION][:2]) > own.length + _LONGEST:
+        own, person = self.states[self._ego], VEHICLE in variables
+        if math.dist(ego[:2], variables[POSITION][:2]) > own.length + _LONGEST:
             return
         state = state_in_sumo(self._sumo.person if person else self._sumo.vehicle, name, person=person)
         found = deepest_overlap(instant(own), {name: instant(state)})
@@ -271,7 +272,7 @@ class Surroundings:
             self._other_level[road, other] = f"{OTHER_LEVEL}{at}: bodies overlap by {found[1]:.2f} m in the plane, but {why}"
 
     def _first_seen(self, name: str, front: tuple[float, float], variables: Mapping[int, Any]) -> State:
-        person = _VEHICLE in variables
+        person = VEHICLE in variables
         domain = self._sumo.person if person else self._sumo.vehicle
         state = self.states[name] = State(name, float(domain.getLength(name)), float(domain.getWidth(name)), self._dt)
         self._centre_offsets[name] = 0.0 if person else 0.5 * state.length

@@ -29,7 +29,7 @@ from sbt.problem.expression import Expression
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.sumo.outputs import MARKS, in_signals, names_output, output_names, run_file
-from sbt.sumo.places import place_in
+from sbt.sumo.places import made_here, place_in
 
 __all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
 
@@ -247,7 +247,7 @@ def template(path: Path) -> Template:
         InputError: it cannot be read, is not well-formed XML, declares a document type or entities, or has a
             placeholder that is not a formula; the message begins with file, line and column.
     """
-    data = _read(noted(path))
+    data = _read(path if made_here(path) else noted(path))
     if b"\0" in data[:64]:
         raise InputError(f"{path}: a SUMO file must be encoded byte by byte (UTF-8), but it has zero bytes")
     parser = xml.parsers.expat.ParserCreate()

@@ -219,10 +219,12 @@ class _CommandProxy:
         result = function(*args, **kwargs)
         if self._domain == "vehicle" and name == "add":
             self._expect(*args, **kwargs)
-        elif self._domain == "vehicle" and name.startswith(("moveTo", "remove")) and args:
-            self._proxy.recorder.ignore_departure(str(args[0]))
+        elif name.startswith(("moveTo", "remove")):
+            who = str(args[0] if args else kwargs.get("vehID", kwargs.get("personID", "")))
+            if self._domain == "vehicle":
+                self._proxy.recorder.ignore_departure(who)
             if name == "moveToXY":
-                self._proxy.recorder.take_as_rigid(str(args[0]))
+                self._proxy.recorder.take_as_rigid(who)
         return result
 
     def _expect(

@@ -45,6 +45,7 @@ from sbt.sumo.levels import levels_of
 from sbt.sumo.messages import explained, refuse_dropped
 from sbt.sumo.phases import Stopwatch
 from sbt.sumo.recorder import RecordingSettings, RunEnded
+from sbt.sumo.repeating import unrepeatable
 from sbt.sumo.session import scratch_folder, session
 from sbt.sumo.snapshot import CAN_FORK, NoSnapshot, Snapshot, WarmUp, snapshot_of
 from sbt.sumo.traci_proxy import Loop, TraciProxy, step_until_over
@@ -313,10 +314,10 @@ class UserSimulation:
         return start()
 
     def warnings(self) -> tuple[str, ...]:
-        """Return SUMO's warnings about the files in the last run of this process, each once, and that on missing heights."""
+        """Return SUMO's warnings about the files in the last run of this process, each once, and what is known beside them."""
         lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
         found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
-        return (*filter(None, [session().ask(lambda sumo: levels_of(sumo).warning)]), *found)
+        return (*filter(None, [unrepeatable(self.files), session().ask(lambda sumo: levels_of(sumo).warning)]), *found)
 
     def run_with_traci(self, values: Values, seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
         """Run one concrete scenario in a separate SUMO process, such as sumo-gui, through traci.

@@ -65,6 +65,11 @@ traci.close()
 """
 
 
+_ADVICE = re.compile(r'(\blcStateBase="[^" ]*) [^"]*"')
+"""In a vehicle's state, what the lane changes of others ask of its speed. In the sublane model SUMO reads with it what it has
+never set (myDontBrake): the first step of a run would depend on what the process had in its memory before."""
+
+
 @dataclass(frozen=True)
 class State:
     """A warmed state as text, without its random numbers."""
@@ -168,11 +173,12 @@ class WarmedFiles:
             if not os.access(path.parent, os.W_OK):  # a store that is only read
                 path = self.path_of(number, "")
             self._make(number, path)
+        sublane = "--lateral-resolution" in self.launch.arguments
         with contextlib.suppress(OSError, EOFError, zlib.error, UnicodeDecodeError):
-            return _read(path)
+            return _read(path, sublane=sublane)
         path.unlink()  # damaged: a warm-up is the same whenever it is made
         self._make(number, path)
-        return _read(path)
+        return _read(path, sublane=sublane)
 
     def _make(self, number: int, path: Path) -> None:
         """Make a state where no other process has made it meanwhile."""
@@ -267,9 +273,10 @@ def _write(path: Path, elements: Iterable[bytes]) -> None:
 
 
 @lru_cache(maxsize=_KEPT)
-def _read(path: Path) -> State:
+def _read(path: Path, *, sublane: bool) -> State:
     """Read a state; kept in this process, as most runs of a worker need one of few."""
     text = gzip.decompress(path.read_bytes()).decode()
+    text = _ADVICE.sub(r'\1"', text) if sublane else text
     found = re.search(r"<rngState\b.*?</rngState>", text, re.DOTALL)
     if found is None:
         raise RunError(Status.FAILED, f"a warmed state must hold SUMO's generators, but {path} does not")

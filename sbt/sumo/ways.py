@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,14 +35,51 @@ def line_ahead(sumo: Any, name: str) -> States | None:
     at = vehicle.getLanePosition(name) * along[-1] / max(lane.getLength(here), 1e-9)
     ahead = [shape[along > at]]
     length = along[-1] - at
-    inside = lane.getLinks(here)[:1] if here.startswith(":") else ()  # SUMO's next links are those after the junction
-    for link in (*inside, *vehicle.getNextLinks(name)):
+    for following, inside in _links_ahead(sumo, name, here):
         if length > _LENGTH:
             break
-        for part in (*_inside(lane, link[4]), link[0]):
+        for part in (*_inside(lane, inside), following):
             ahead.append(_points(lane.getShape(part)))
             length += float(_along(ahead[-1])[-1])
     return _beside(np.concatenate(ahead), vehicle.getLateralLanePosition(name))
+
+
+def _links_ahead(sumo: Any, name: str, here: str) -> Iterator[tuple[str, str]]:
+    """Yield the lanes that a vehicle's route leads to from the lane here, and the lane inside the junction before each, or "".
+
+    As `vehicle.getNextLinks` gives them. That draws random numbers for who ignores others at a junction (jmIgnoreFoeProb):
+    what is simulated would depend on who looks.
+    """
+    vehicle, lane = sumo.vehicle, sumo.lane
+    route, k, kind = vehicle.getRoute(name), max(vehicle.getRouteIndex(name), 0), vehicle.getVehicleClass(name)
+    if here.startswith(":"):
+        links = lane.getLinks(here)[:1]
+        for link in links:
+            yield link[0], link[4]
+        here, k = links[0][0] if links else "", k + 1
+    wanted = next((list(best[5][1:]) for best in vehicle.getBestLanes(name) if best[0] == here), [])
+    for edge in route[k + 1 :] if here else ():
+        links = next((found for one in _lanes_beside(sumo, here) if (found := _links_to(lane, one, edge, kind))), [])
+        best = wanted.pop(0) if wanted else ""
+        link = next((one for one in links if one[0] == best), links[0] if links else None)
+        if link is None:
+            return
+        yield link[0], link[4]
+        here = link[0]
+
+
+def _lanes_beside(sumo: Any, here: str) -> Iterator[str]:
+    """Yield a lane and the others of its edge, the nearest first."""
+    yield here
+    edge, _, index = here.rpartition("_")
+    others = sorted(range(sumo.edge.getLaneNumber(edge)), key=lambda k: abs(k - int(index)))
+    yield from (f"{edge}_{k}" for k in others[1:])
+
+
+def _links_to(lane: Any, here: str, edge: str, kind: str) -> list[Any]:
+    """Return the links from a lane to those of an edge that a vehicle class may use."""
+    links = [link for link in lane.getLinks(here) if link[0].rpartition("_")[0] == edge]
+    return [link for link in links if not (allowed := lane.getAllowed(link[0])) or kind in allowed]
 
 
 def rectangle_ways(behind: States, ahead: States, length: float, offsets: Sequence[float] = (0.0,)) -> list[States]:

@@ -30,7 +30,7 @@ from sbt.workflows.exporting import export_store
 from sbt.workflows.judging import judge_run, with_driver
 from sbt.workflows.keywords import as_data
 from sbt.workflows.plots import Plots
-from sbt.workflows.running import Replay, rebuild_report, replay_run
+from sbt.workflows.running import Replay, not_repeated, rebuild_report, replay_run
 from sbt.workflows.showing import net_of_run, save_film, shown_trace
 from sbt.workflows.study import Study, changed_since
 
@@ -218,7 +218,7 @@ class Result(Generic[C]):
         if not again.identical:
             now, stored = f"{again.outcome.status} {dict(again.outcome.metrics)}", dict(again.record.metrics)
             rule = f"a replay must equal the stored run {run}, but got {now}, not {again.record.status} {stored}"
-            raise StoreError(rule + changed_since(self.store))
+            raise StoreError(rule + (changed_since(self.store) or not_repeated(again.scenario)))
         return again
 
     def trace(self, run: int) -> pd.DataFrame:

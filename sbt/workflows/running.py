@@ -36,8 +36,8 @@ from sbt.workflows.portable import write_bundle
 from sbt.workflows.study import RESOLVED, Study, changed_since
 
 __all__ = [
-    "Replay", "Summary", "bundle_store", "check_code", "keep_configuration", "rebuild_report", "replay_run", "run_study",
-    "summarise",
+    "Replay", "Summary", "bundle_store", "check_code", "keep_configuration", "not_repeated", "rebuild_report", "replay_run",
+    "run_study", "summarise",
 ]  # fmt: skip
 
 _TRIED = 20
@@ -171,19 +171,33 @@ def check_code(store: Store, study: Study, executor: Executor, *, changed: bool)
     """Refuse to go on with a store whose runs the user's code and files would not give again.
 
     The first and the last with metrics are tried, where files or code were changed since as many as `_TRIED` of all, and the
-    first that could not be run: code may change just what is invalid.
+    first that could not be run: code may change just what is invalid. Where nothing was changed, and SUMO does not repeat every
+    run of such files, most of as many are enough.
     """
     history = store.history()
     if not _own_code(study):
         return
     ok, invalid = np.flatnonzero(history.ok), np.flatnonzero(history.status == str(Status.INVALID))
-    tried = ok[np.linspace(0, len(ok) - 1, min(_TRIED if changed else 2, len(ok))).round().astype(np.intp)]
-    for record, outcome in _again(history, [*tried, *invalid[:1]], executor):
-        if dict(outcome.metrics) != dict(record.metrics):
+    unsure = "" if changed else not_repeated(study.runnable)
+    tried = ok[np.linspace(0, len(ok) - 1, min(_TRIED if changed or unsure else 2, len(ok))).round().astype(np.intp)]
+    again = list(_again(history, [*tried, *invalid[:1]], executor))
+    differing = [(record, outcome) for record, outcome in again if dict(outcome.metrics) != dict(record.metrics)]
+    if not unsure or 2 * len(differing) > len(again):
+        for record, outcome in differing:
             now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics) or record.reason
             rule = f"code and files must give the runs of {store.folder} again to go on, but run {record.index} now gives {now}"
             remedy = "choose another store for what has changed"
-            raise InputError(f"{rule}, not {stored}{changed_since(store.folder)}; {remedy}")
+            raise InputError(f"{rule}, not {stored}{changed_since(store.folder) or unsure}; {remedy}")
+
+
+def not_repeated(scenario: LogicalScenario) -> str:
+    """Return in words why a run may differ although nothing was changed; "" where no reason is known."""
+    from sbt.sumo.files import SumoFiles
+    from sbt.sumo.repeating import unrepeatable
+
+    files = getattr(scenario.simulate, "files", None)
+    why = unrepeatable(files) if isinstance(files, SumoFiles) else ""
+    return why and f"; {why}"
 
 
 def _check_earlier(study: Study) -> None:

@@ -9,6 +9,7 @@ from sbt.errors import RunError, SbtError
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import elsewhere
 from sbt.problem.isolation import Warmable
+from sbt.problem.outcome import Status
 from sbt.problem.plain import Values, written
 from sbt.problem.trace import Trace
 from sbt.seeds import run_seed
@@ -20,6 +21,8 @@ _POINTS = 3
 """Points that are compared."""
 _DEADLINE = 900.0
 """Longest wait for the other process, which warms up anew (s)."""
+_REFUSED = tuple(f"{status}: " for status in Status)
+"""How what is told of a run without a trace begins."""
 
 Digest = Callable[[Trace], str]
 """Of every number and name in a trace."""
@@ -69,9 +72,14 @@ def snapshot_findings(spec: ScenarioSpec, points: Sequence[Values], seed: int, d
     why = "; known of persons beside an ego that is a <trip>, where ways are equally long: a <vehicle> with a <route> mends that"
     said = f"they differ at {'; '.join(differing)}{why}; isolation: fresh simulates all traffic" if differing else "bit-equal"
     yield Finding(rule, ok=not differing, detail=said)
-    differ = _digests(spec, [(jobs[0][0], another)], digest)[0] != forked[0]
+    traced = [k for k, found in enumerate(forked) if not found.startswith(_REFUSED)]
+    k = traced[0] if traced else 0
+    differ = bool(traced) and _digests(spec, [(jobs[k][0], another)], digest)[0] != forked[k]
     said = "they differ" if differ else "they give one run: in this traffic nothing is drawn after the warm-up"
-    yield Finding("for information: two seeds from one warm-up", ok=True, detail=said, numbers={"differ": float(differ)})
+    if not traced:
+        said = f"not known: no run gave a trace at {'; '.join(written(values) for values, _ in jobs)}"
+    numbers = {"differ": float(differ)} if traced else {}
+    yield Finding("for information: two seeds from one warm-up", ok=True, detail=said, numbers=numbers)
 
 
 def _digests(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], digest: Digest) -> list[str]:

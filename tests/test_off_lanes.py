@@ -1,0 +1,109 @@
+"""Who is moved by poses is there off the lanes too, moves as it is moved, and who parks jumps there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_evidence import net, simulation, vehicle
+
+from sbt.errors import RunError
+from sbt.metrics.planar import pet
+from sbt.sumo.user_simulation import Loop
+
+pytestmark = pytest.mark.sumo
+ROAD = net({"road": [(0.0, 0.0), (400.0, 0.0)]})
+EGO, OTHER = vehicle("ego", "road", departPos=50), vehicle("other", "road", departPos=150)
+
+
+def moving(*poses: tuple[str, float, float, float, float, float], domain: str = "vehicle", by_sumo: bool = False) -> Loop:
+    """A loop that moves road users: name, x and y (m) of the front at 0 s, angle (degrees), speeds along x and y (m/s)."""
+
+    def loop(sumo, values, rng):
+        if by_sumo:  # past the proxy
+            import libsumo
+        client = libsumo if by_sumo else sumo
+        sumo.simulationStep()
+        while sumo.simulation.getTime() < 30.0:
+            t = sumo.simulation.getTime()
+            for name, x, y, angle, vx, vy in poses:
+                lane = [-1] if domain == "vehicle" else []
+                getattr(client, domain).moveToXY(name, "", *lane, x + vx * t, y + vy * t, angle, 2)
+            sumo.simulationStep()
+
+    return loop
+
+
+@pytest.mark.parametrize("by_sumo", [False, True])
+def test_who_comes_from_beside_the_road_is_met(tmp_path: Path, by_sumo: bool):
+    """SUMO's subscription does not see it 2.7 m beside the lane: the contact was missed without a word."""
+    poses = ("ego", 50.0, 0.0, 90.0, 10.0, 0.0), ("other", 100.0, -12.0, 0.0, 0.0, 2.0)
+    trace = simulation(tmp_path, ROAD, EGO + OTHER, moving(*poses, by_sumo=by_sumo), 8.0, step_length="0.1")({}, 1)
+    assert trace.ended == "collision"
+    assert trace.time[-1] == pytest.approx(5.5, abs=0.2), "its front is at y = -0.9 m, beside the ego's"
+    k = trace.actors.index("other")
+    if not by_sumo:
+        assert trace.y[5, k] == pytest.approx(-12.0 + 2.0 * trace.time[5] - 2.5, abs=0.4), "seen before it reaches the road"
+
+
+def test_an_ego_may_leave_its_lane(tmp_path: Path):
+    """The run ended as if it were gone."""
+    beside = vehicle("other", "road", departPos=150, departSpeed=0)
+    trace = simulation(tmp_path, ROAD, EGO + beside, moving(("ego", 50.0, 0.0, 100.0, 10.0, -2.0)), 5.0, step_length="0.1")({}, 1)
+    assert trace.ended == "duration"
+    assert np.isfinite(trace.actor("ego").x).all()
+    assert trace.actor("ego").y[-1] < -8.0
+    assert trace.actors[1] == "other", "whom it meets on the lanes is there"
+
+
+def test_an_ego_that_the_loop_leaves_beside_the_road_is_gone_and_why_is_said(tmp_path: Path):
+    def loop(sumo, values, rng):
+        for k in range(40):
+            sumo.simulationStep()
+            if k < 10:
+                sumo.vehicle.moveToXY("ego", "", -1, 52.0 + k, -float(k), 90.0, 2)
+
+    with pytest.raises(RunError, match=r"was gone at t = .*SUMO keeps only whom the loop moves \(moveToXY\) in every step"):
+        simulation(tmp_path, ROAD, EGO, loop, 5.0, step_length="0.1")({}, 1)
+
+
+@pytest.mark.parametrize(("y", "vx"), [(0.0, 3.0), (-12.0, 3.0), (-12.0, -3.0), (0.0, 0.0)])
+def test_speed_is_that_of_the_motion(tmp_path: Path, y: float, vx: float):
+    """SUMO's is what its own driver would do: 53 m/s after a jump, braking from there on, on and off the lanes."""
+    poses = ("ego", 50.0, 0.0, 90.0, 10.0, 0.0), ("other", 120.0, y, 90.0, vx, 0.0)
+    trace = simulation(tmp_path, ROAD, EGO + OTHER, moving(*poses), 4.0, step_length="0.1")({}, 1)
+    other = trace.actor("other")
+    there = np.flatnonzero(np.isfinite(other.speed))[3:]
+    assert len(there) > 30
+    assert other.speed[there] == pytest.approx(vx)
+    assert other.acceleration[there] == pytest.approx(0.0, abs=1e-9)
+    assert trace.actor("ego").speed[3:] == pytest.approx(10.0)
+
+
+def test_a_person_that_is_moved_has_the_speed_of_its_motion(tmp_path: Path):
+    person = '<person id="p" depart="0" departPos="120"><walk edges="road" arrivalPos="300"/></person>'
+    network = ROAD.replace("<lane ", '<lane allow="passenger pedestrian" ')
+    loop = moving(("p", 120.0, 9.0, 180.0, 0.0, -1.5), domain="person")
+    trace = simulation(tmp_path, network, vehicle("ego", "road", departPos=20, departSpeed=1) + person, loop, 6.0)({}, 1)
+    assert trace.actor("p").speed[3:] == pytest.approx(1.5)
+
+
+def test_who_is_moved_into_a_parking_place_does_not_drive_there(tmp_path: Path):
+    """SUMO moves it by 5 m sideways within a step: a post-encroachment time of .1 s with who passed behind it."""
+    (tmp_path / "b.add.xml").write_text(
+        '<additional><parkingArea id="pa" lane="road_0" startPos="100" endPos="112" roadsideCapacity="1" angle="45" length="5"/>'
+        "</additional>"
+    )
+    stop = '<stop parkingArea="pa" duration="100"/>'
+    parks = vehicle("other", "road", departPos=60, departSpeed=8).replace("</vehicle>", f"{stop}</vehicle>")
+    one = simulation(tmp_path, ROAD, vehicle("ego", "road", departPos=20, departSpeed=4) + parks, _keeps_on, 25.0,
+                     additional_files="b.add.xml", step_length="0.1")  # fmt: skip
+    trace = one({}, 1)
+    assert any(text.startswith("teleported: 'other'") for text in trace.unconfirmed)
+    assert pet("ego", "other").function(trace) > 1.0
+
+
+def _keeps_on(sumo, values, rng):
+    while True:
+        sumo.simulationStep()
