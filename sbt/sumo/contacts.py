@@ -21,6 +21,8 @@ __all__ = ["CONFIRMED_WITHIN", "collisions_of", "listed_only", "unconfirmed_cont
 
 CONFIRMED_WITHIN = 1.0
 """Time between a contact and its entry in SUMO's list, before or after (s)."""
+_CREEPING, _ASKEW = 2.0, 5.0
+"""Speed (m/s) up to which, and angle to the lane (degrees) from which on, a vehicle is askew."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,9 @@ def _why(sumo: Any, a: _Place, b: _Place, moved: set[str]) -> str:
     if a.lane == b.lane:
         return _why_lane(sumo, a, b)
     if a.edge == b.edge and not a.junction:
-        return f"side by side on lanes '{a.lane}' and '{b.lane}', and SUMO compares along one lane only{_sublane(sumo)}"
+        askew = [text for one in (a, b) if (text := _askew(sumo, one))]
+        how = f"; {' and '.join(askew)}, as SUMO's sublane model turns who moves sideways" if askew else _sublane(sumo)
+        return f"side by side on lanes '{a.lane}' and '{b.lane}', and SUMO compares along one lane only{how}"
     if not a.nodes & b.nodes:
         return f"'{a.edge}' and '{b.edge}' overlap in the plane but share no junction, and SUMO never compares them"
     if a.junction and a.junction == b.junction:
@@ -192,5 +196,19 @@ def _why_lane(sumo: Any, a: _Place, b: _Place) -> str:
 
 def _sublane(sumo: Any) -> str:
     """Return a hint where SUMO does not look sideways."""
+    return "" if _has_sublanes(sumo) else " (no sublane model: lateral-resolution is not set)"
+
+
+def _has_sublanes(sumo: Any) -> bool:
     resolution = float(sumo.simulation.getOption("lateral-resolution") or 0.0)
-    return "" if resolution > 0 and math.isfinite(resolution) else " (no sublane model: lateral-resolution is not set)"
+    return resolution > 0 and math.isfinite(resolution)
+
+
+def _askew(sumo: Any, one: _Place) -> str:
+    """Return by how much a vehicle that stands or creeps in the sublane model is turned out of its lane; "" where it is not."""
+    vehicle, speed = sumo.vehicle, sumo.vehicle.getSpeed(one.id)
+    if speed > _CREEPING or not _has_sublanes(sumo):
+        return ""
+    along = sumo.lane.getAngle(one.raw_lane, vehicle.getLanePosition(one.id))
+    turned = (vehicle.getAngle(one.id) - along + 180.0) % 360.0 - 180.0
+    return f"'{one.name}' is askew by {abs(turned):.0f} degrees at {speed:.2g} m/s" if abs(turned) > _ASKEW else ""
