@@ -61,7 +61,7 @@ def answer(found: Reused) -> EstimationConclusion:
         warnings.append(f"one draw carries {share:.0%} of the weight")
     if found.failed:
         counts = f"{found.failed} of {len(weight)} draws failed"
-        warnings.insert(0, f"{counts}: the lower end counts them as safe, the upper end as critical")
+        warnings.insert(0, f"{counts}: the estimate and its lower end count them as safe, the upper end as critical")
     return replace(told, effective_sample_size=size, largest_weight_share=share, counted=len(weight), warnings=tuple(warnings))
 
 

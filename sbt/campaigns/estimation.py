@@ -174,7 +174,8 @@ def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settin
         found, limits = concluded(log, settings)
         failed = int((~log.history.ok).sum())
         if failed:
-            warning = f"{failed} of {len(log.history)} runs failed: the lower end counts them as safe, the upper end as critical"
+            counted = "the estimate and its lower end count them as safe, the upper end as critical"
+            warning = f"{failed} of {len(log.history)} runs failed: {counted}"
             found = replace(found, warnings=(warning, *found.warnings))
         traffic = warmed_traffic(log, settings)
         found, limits = on_warm_ups(found, limits, traffic)

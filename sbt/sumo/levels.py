@@ -1,8 +1,7 @@
 """Which roads of a network pass over each other: edges that cross in the plane without a junction.
 
-Two road users on such edges, or on those that lead there, are on different levels, and no conflict. Where the network
-has heights they decide; where it has none, a crossing without a junction and without a short way from one road to
-the other is taken for a bridge, and the user is told once.
+Two road users on such edges, or on those that lead there, are on different levels, and no conflict. Where the network has heights
+they decide; else a crossing without a junction and without a short way between is taken for a bridge, and the user is told once.
 """
 
 from __future__ import annotations
@@ -101,9 +100,9 @@ class Ground:
     Attributes:
         sumo: SUMO's client.
         domain: its vehicles or persons, whichever the ego is.
-        ego: its name.
-        place: its position (x, y, z).
+        ego, place: its name and position (x, y, z).
         rise: of the road in both directions of the plane (m/m).
+        off: it is on no lane.
     """
 
     sumo: Any
@@ -111,24 +110,26 @@ class Ground:
     ego: str
     place: Sequence[float]
     rise: tuple[float, float]
+    off: bool = False
 
     @classmethod
-    def under(cls, sumo: Any, domain: Any, ego: str, place: Sequence[float]) -> Ground:
-        """Return the ground under the ego."""
-        return cls(sumo, domain, ego, place, _rise(domain, ego))
+    def under(cls, sumo: Any, domain: Any, ego: str, place: Sequence[float], *, off: bool = False) -> Ground:
+        """Return the ground under the ego; flat where it is on no lane."""
+        return cls(sumo, domain, ego, place, (0.0, 0.0) if off else _rise(domain, ego), off)
 
-    def is_below(self, name: str, other: Sequence[float], *, person: bool) -> bool:
-        """Return whether a road user at (x, y, z) is so much higher, or lower, that it is on another level.
+    def is_below(self, name: str, other: Sequence[float], *, person: bool, off: bool = False) -> bool:
+        """Return whether a road user at (x, y, z), off: on no lane, is so much higher, or lower, that it is on another level.
 
         Roads rise: who is far is on the same level if it is as high as the slope of its road or of the ego's leads, or between,
         or on the way of one to the other.
         """
         dx, dy, height = (there - here for there, here in zip(other, self.place, strict=True))
-        rises = [dx * x + dy * y for x, y in (self.rise, _rise(self.sumo.person if person else self.sumo.vehicle, name))]
+        theirs = (0.0, 0.0) if off else _rise(self.sumo.person if person else self.sumo.vehicle, name)
+        rises = [dx * x + dy * y for x, y in (self.rise, theirs)]
         if min(rises) - _LEVEL_HEIGHT < height < max(rises) + _LEVEL_HEIGHT:
             return False
         vehicle, far = self.sumo.vehicle, math.hypot(dx, dy)
-        if abs(height) > _STEEPEST * far or person or self.domain is not vehicle:
+        if abs(height) > _STEEPEST * far or person or off or self.off or self.domain is not vehicle:
             return True
         ways = ((self.ego, name), (name, self.ego))
         return not any(0.0 <= _way(self.sumo, a, b) <= _DETOUR * far for a, b in ways)
@@ -147,8 +148,7 @@ class Trails:
     """Where the fronts of very long vehicles have been, as far as their bodies are there now."""
 
     def __init__(self, sumo: Any):
-        self._sumo = sumo
-        self._passed: dict[str, deque[tuple[float, Sequence[float], str]]] = {}
+        self._sumo, self._passed = sumo, dict[str, deque[tuple[float, Sequence[float], str]]]()
 
     def note(self, name: str, length: float) -> bool:
         """Note where a vehicle of a length (m) is; return whether SUMO knows it."""

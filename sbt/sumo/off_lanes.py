@@ -62,8 +62,8 @@ def placed_near(
     }
 
 
-def parking(simulation: Any) -> Sequence[str]:
-    """Return the vehicles that SUMO moves into a parking place, or out of one, in this step."""
+def parking(simulation: Any) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the vehicles that SUMO moves into a parking place in this step, and out of one in the next."""
     begins = simulation.getParkingStartingVehiclesIDList() if simulation.getParkingStartingVehiclesNumber() else ()
     ends = simulation.getParkingEndingVehiclesIDList() if simulation.getParkingEndingVehiclesNumber() else ()
-    return (*begins, *ends)
+    return begins, ends

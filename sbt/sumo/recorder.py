@@ -159,7 +159,7 @@ class Recorder:
 
     def take_as_rigid(self, name: str) -> None:
         """Take the body of a vehicle that the loop moves by poses as a rectangle, however long it is."""
-        self._surroundings.rigid.add(name)
+        self._surroundings.move(name)
 
     def before_step(self) -> None:
         """Let the controller of the ego act.

@@ -191,19 +191,24 @@ class Session:
         """
         if not reference:
             _keep_xml()
+        loaded = False
         with self._captured():
             try:
                 self._load(setup, seed, isolation)
                 if state is not None:
                     self._sumo.simulation.loadState(str(state))
+                loaded = True
                 yield self._sumo
                 if self._setup is not None:
                     self.remove()
             except BaseException as error:
                 self._setup = None
-                if isinstance(error, (self._sumo.TraCIException, self._sumo.FatalTraCIError)):
-                    raise RunError(Status.FAILED, self._reason(error)) from None
-                self._flush()
+                told = isinstance(error, (self._sumo.TraCIException, self._sumo.FatalTraCIError))
+                reason = self._reason(error) if told else ""
+                if loaded and not isinstance(error, self._sumo.FatalTraCIError):
+                    self._flush()
+                if told:
+                    raise RunError(Status.FAILED, reason) from None
                 raise
 
     def hold(self, setup: Loadable) -> None:
@@ -294,7 +299,7 @@ class Session:
         self._stderr.seek(0)
         return tuple(line.strip() for line in self._stderr.read().decode(errors="replace").splitlines() if line.strip())
 
-    def _reason(self, error: Exception) -> str:
+    def _reason(self, error: BaseException) -> str:
         return "SUMO: " + "; ".join(dict.fromkeys([str(error).strip(), *self.messages()[-5:]]))
 
 

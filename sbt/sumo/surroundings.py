@@ -17,13 +17,14 @@ import numpy as np
 
 from sbt.errors import RunError
 from sbt.metrics.geometry import contact_part, farthest, rectangle_distance
-from sbt.problem.outcome import OTHER_LEVEL, TELEPORTED, Status
+from sbt.problem.outcome import TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
+from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
-from sbt.sumo.levels import Ground, Trails, is_known, levels_of, road_of
+from sbt.sumo.levels import is_known
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_near, read
-from sbt.sumo.overlaps import Rectangle, deepest_overlap, instant, separate, state_in_sumo
+from sbt.sumo.overlaps import Rectangle, separate
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
@@ -36,8 +37,6 @@ _VERY_LONG = 20.0
 """Length from which on a vehicle may be near although its front is not within the radius (m)."""
 _BESIDE = 0.5
 """How far who parks, or leaves its place, is moved beside what it drives, from which on it has jumped there (m)."""
-_LONGEST = 30.0
-"""Length up to which others on another level are compared with the ego (m)."""
 
 _Row = tuple[float, ...]
 
@@ -84,9 +83,9 @@ class Surroundings:
         self._teleported: dict[str, str] = {}
         self._ending: Sequence[str] = ()
         self._parking: Sequence[str] = ()
-        self._unreacting, self._unmoved = set[str](), set[str]()
-        self._other_level: dict[tuple[str, str], str] = {}
-        self.levels, self._trails = levels_of(sumo), Trails(sumo)
+        self._leaving: Sequence[str] = ()
+        self._unreacting, self._unmoved, self._moved = set[str](), set[str](), set[str]()
+        self._level = EgoLevel(sumo)
         self.follow(sumo.vehicle.getIDList())
 
     def __len__(self) -> int:
@@ -116,6 +115,12 @@ class Surroundings:
         self.rigid.update(placed)
         self._unreacting.update(placed)
 
+    def move(self, name: str) -> None:
+        """Take a road user as one that the loop moves by poses, in the next step; it is still where it was."""
+        self.rigid.add(name)
+        self._moved.add(name)
+        self._level.keep(name)
+
     def subscribe(self, *, walks: bool = False) -> None:
         """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
         self._own_domain = domain = self._sumo.person if walks else self._sumo.vehicle
@@ -134,6 +139,7 @@ class Surroundings:
         if off:
             near = {**near, **off}
             self.rigid.update(off)
+            self._moved.update(off)
         if near[ego].get(VEHICLE):
             rule = f"the ego '{ego}' must walk while it is recorded"
             raise RunError(Status.FAILED, f"{rule}, but it rides in '{near[ego][VEHICLE]}'")
@@ -142,25 +148,17 @@ class Surroundings:
         row, parts = dict[str, _Row](), dict[str, int]()
         simulation, self.jumped = self._sumo.simulation, set()
         self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
-        self._parking = parking(simulation)
+        begins, ends = parking(simulation)
+        self._parking, self._leaving = (*begins, *self._leaving), ends
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
-        at, walks = near[ego][POSITION], self._own_domain is not self._sumo.vehicle
-        road = road_of(self._sumo, ego, person=walks) if self.levels.apart or self.levels.stacked else ""
-        apart = self.levels.apart.get(road)
-        ground = Ground.under(self._sumo, self._own_domain, ego, at) if self.levels.stacked and road else None
+        self._level.enter(self.states[ego], near[ego][POSITION], off, len(self) * self._dt, person=self.is_person(ego))
         for name in self._around(near):
             variables = near[name] if name in near else read(self._sumo, name)
             if name == ego or variables.get(VEHICLE):
                 continue
-            (place, other), person = self._beside(name, variables, at, named=apart is not None), VEHICLE in variables
-            seen = name not in self.placed and name not in off  # by SUMO, which knows heights of lanes only
-            if seen and ground is not None and ground.is_below(name, place, person=person):
-                continue
-            if apart is None or name in self.placed or other not in apart:
+            if name in self.placed or not self._level.is_other(name, variables, long=name in self._very_long):
                 self._record(row, parts, before, name, variables)
-            elif (road, other) not in self._other_level:
-                self._note_level(road, other, name, at, variables)
         for name in self.present:
             if name in self.jumped:
                 self._ways.pop(name, None)
@@ -169,6 +167,7 @@ class Surroundings:
         self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
+        self._moved = {name for name in self.rigid if self.is_person(name)}  # they keep the speed of the last step
 
     def _keep_way(self, name: str) -> None:
         """Keep where a vehicle goes on that is recorded no more: its rectangle, and the parts of a long one.
@@ -197,7 +196,7 @@ class Surroundings:
 
     def _around(self, near: Mapping[str, Any]) -> list[str]:
         """Return who is near, whose rear may be, and who is named; whom a loop has removed is forgotten."""
-        gone = [name for name, length in self._very_long.items() if not self._trails.note(name, length)]
+        gone = [name for name, length in self._very_long.items() if not self._level.trails.note(name, length)]
         for name in (*gone, *(n for n in tuple(self._named_present) if not is_known(self._sumo, n))):
             self._very_long.pop(name, None)
             self._named_present.discard(name)
@@ -208,12 +207,6 @@ class Surroundings:
         """Return the very long vehicles whose rear may be within the radius although their front is not."""
         own, at, far = near[self._ego][POSITION][:2], self._sumo.vehicle.getPosition, self._very_long.items()
         return [n for n, length in far if n not in near and math.dist(at(n), own) <= self._within + length]
-
-    def _beside(self, name: str, variables: Mapping[int, Any], ego: Sequence[float], *, named: bool) -> tuple[Any, str]:
-        """Return where somebody is next to the ego, and the name of the road there; a very long body may be on another level."""
-        if name in self._very_long:
-            return self._trails.nearest(name, ego)
-        return variables[POSITION], road_of(self._sumo, name, person=VEHICLE in variables) if named else ""
 
     def _record(
         self, row: dict[str, _Row], parts: dict[str, int], before: dict[str, _Row], name: str,
@@ -237,7 +230,7 @@ class Surroundings:
         if moved > self._farthest or (parks and name != self._ego) or (last is not None and name in self._ending):
             self._note_jump(name, moved)
             return
-        if name in self.rigid and name not in self.placed:  # SUMO's speed is what its own driver would do
+        if name in self._moved and name not in self.placed:  # SUMO's speed is what its own driver would do
             if last is not None:
                 speed = ((state.x - last[0]) * state.cos + (state.y - last[1]) * state.sin) / self._dt
             if last is not None and name in self._unmoved:
@@ -258,18 +251,6 @@ class Surroundings:
         self.jumped.add(name)
         text = f"{TELEPORTED}'{name}' at {t:.3f} s: it was moved by {moved:.0f} m, and its track is interrupted"
         self._teleported.setdefault(name, text)
-
-    def _note_level(self, road: str, other: str, name: str, ego: tuple[float, ...], variables: Mapping[int, Any]) -> None:
-        """Note a contact in the plane that is none, as the network has no heights and the roads are taken for bridges."""
-        own, person = self.states[self._ego], VEHICLE in variables
-        if math.dist(ego[:2], variables[POSITION][:2]) > own.length + _LONGEST:
-            return
-        state = state_in_sumo(self._sumo.person if person else self._sumo.vehicle, name, person=person)
-        found = deepest_overlap(instant(own), {name: instant(state)})
-        if found is not None:
-            why = f"'{road}' and '{other}' cross without a junction and are taken for a bridge: heights (z) of nodes decide it"
-            at = f"'{name}' at {len(self._rows) * self._dt:.3f} s"
-            self._other_level[road, other] = f"{OTHER_LEVEL}{at}: bodies overlap by {found[1]:.2f} m in the plane, but {why}"
 
     def _first_seen(self, name: str, front: tuple[float, float], variables: Mapping[int, Any]) -> State:
         person = VEHICLE in variables
@@ -373,7 +354,7 @@ class Surroundings:
             np.array([self.states[n].length for n in names]), np.array([self.states[n].width for n in names]),
             ended, tuple(reported), ways={name: ways[0] for name, ways in self._ways.items()},
             parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
-            unconfirmed=(*unconfirmed, *self._other_level.values(), *self._teleported.values()),
+            unconfirmed=(*unconfirmed, *self._level.notes, *self._teleported.values()),
             unreacting=tuple(n for n in names if n in self._unreacting),
         )  # fmt: skip
 

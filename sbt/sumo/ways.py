@@ -47,8 +47,8 @@ def line_ahead(sumo: Any, name: str) -> States | None:
 def _links_ahead(sumo: Any, name: str, here: str) -> Iterator[tuple[str, str]]:
     """Yield the lanes that a vehicle's route leads to from the lane here, and the lane inside the junction before each, or "".
 
-    As `vehicle.getNextLinks` gives them. That draws random numbers for who ignores others at a junction (jmIgnoreFoeProb):
-    what is simulated would depend on who looks.
+    Much as `vehicle.getNextLinks`; beyond SUMO's best lanes both guess. That draws random numbers for who ignores others at a
+    junction (jmIgnoreFoeProb): what is simulated would depend on who looks.
     """
     vehicle, lane = sumo.vehicle, sumo.lane
     route, k, kind = vehicle.getRoute(name), max(vehicle.getRouteIndex(name), 0), vehicle.getVehicleClass(name)

@@ -1,0 +1,110 @@
+"""Who is on another level than the ego, such as on a bridge above it, in one step after another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from sbt.problem.outcome import OTHER_LEVEL
+from sbt.sumo.actors import State
+from sbt.sumo.levels import Ground, Trails, is_known, levels_of, road_of
+from sbt.sumo.off_lanes import POSITION, VEHICLE
+from sbt.sumo.overlaps import deepest_overlap, instant, state_in_sumo
+
+__all__ = ["EgoLevel"]
+
+_LONGEST = 30.0
+"""Length up to which others on another level are compared with the ego (m)."""
+
+_Place = tuple[float, ...]
+
+
+class EgoLevel:
+    """The level of the ego. Who is on no lane is on that of its last one: SUMO knows neither road nor height there.
+
+    Args:
+        sumo: libsumo or traci, started.
+
+    Attributes:
+        trails: of very long vehicles.
+    """
+
+    def __init__(self, sumo: Any):
+        self._sumo = sumo
+        self._levels, self.trails = levels_of(sumo), Trails(sumo)
+        self._several = bool(self._levels.apart) or self._levels.stacked
+        self._last: dict[str, tuple[str, float]] = {}
+        self._notes: dict[tuple[str, str], str] = {}
+        self._off: Collection[str] = ()
+        self._road = ""
+        self._apart: Collection[str] | None = None
+        self._ground: Ground | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Contacts in the plane that are none, as roads of a network without heights are taken for bridges."""
+        return tuple(self._notes.values())
+
+    def keep(self, name: str) -> None:
+        """Remember the road and the height of a vehicle that is about to be moved, if it is on a lane."""
+        if self._several and is_known(self._sumo, name):
+            self._keep(name, self._sumo.vehicle.getPosition3D(name), person=False)
+
+    def _keep(self, name: str, at: Sequence[float], *, person: bool) -> str:
+        road = road_of(self._sumo, name, person=person)
+        if road:
+            self._last[name] = road, at[2]
+        return road
+
+    def _at_last(self, name: str, at: Sequence[float]) -> tuple[_Place, str]:
+        """Return a place (x, y, z) with the height of the last road, and that road; "" where it is not known."""
+        road, z = self._last.get(name, ("", at[2]))
+        return (at[0], at[1], z), road
+
+    def enter(self, ego: State, at: Sequence[float], off: Collection[str], t: float, *, person: bool) -> None:
+        """Take the ego to be at (x, y, z) in the step at t (s) of the trace; off: who is on no lane."""
+        if not self._several:
+            return
+        self._off, self._ego, self._t = off, ego, t
+        self._at, self._road = self._at_last(ego.name, at) if ego.name in off else (at, self._keep(ego.name, at, person=person))
+        self._apart = self._levels.apart.get(self._road)
+        domain, gone = self._sumo.person if person else self._sumo.vehicle, ego.name in off
+        self._ground = Ground.under(self._sumo, domain, ego.name, self._at, off=gone) if self._levels.stacked else None
+
+    def is_other(self, name: str, variables: Mapping[int, Any], *, long: bool) -> bool:
+        """Return whether a road user is on another level.
+
+        Args:
+            name: its id.
+            variables: of it in this step.
+            long: it is very long: the place that its body covers next to the ego decides.
+        """
+        if self._ground is None and self._apart is None:
+            return False
+        person, off = VEHICLE in variables, name in self._off
+        place: Sequence[float]
+        if off:
+            place, road = self._at_last(name, variables[POSITION])
+        elif long:
+            place, road = self.trails.nearest(name, self._at)
+        else:
+            place, road = variables[POSITION], road_of(self._sumo, name, person=person) if self._apart is not None else ""
+        known = road or not off
+        if known and self._ground is not None and self._ground.is_below(name, place, person=person, off=off):
+            return True
+        if self._apart is None or road not in self._apart:
+            return False
+        if (self._road, road) not in self._notes:
+            self._note(road, name, variables, person=person)
+        return True
+
+    def _note(self, road: str, name: str, variables: Mapping[int, Any], *, person: bool) -> None:
+        if math.dist(self._at[:2], variables[POSITION][:2]) > self._ego.length + _LONGEST:
+            return
+        state = state_in_sumo(self._sumo.person if person else self._sumo.vehicle, name, person=person)
+        found = deepest_overlap(instant(self._ego), {name: instant(state)})
+        if found is not None:
+            roads, at = f"'{self._road}' and '{road}'", f"'{name}' at {self._t:.3f} s"
+            why = f"{roads} cross without a junction and are taken for a bridge: heights (z) of nodes decide it"
+            self._notes[self._road, road] = f"{OTHER_LEVEL}{at}: bodies overlap by {found[1]:.2f} m in the plane, but {why}"
