@@ -129,8 +129,8 @@ class BatchStage:
         if validation is None or validation.error_rate is None or changed_share(fits[0].sides, fits[1].sides) > target:
             return False
         wrong = round(validation.error_rate * validation.n)
-        if interval(wrong, validation.n)[0] > target:
-            return False
+        if interval(wrong, validation.n)[0] > fits[-1].expected_misclassified:
+            return False  # the conclusion would say that they deny its figures
         if not _both_sides_known(log, self.settings.scenario, target):
             return False
         learned = None if self.settings.learner is None else self.settings.learner.fit(log.history)

@@ -29,9 +29,10 @@ _ATTEMPTS = 4
 """Most of them, where some fail."""
 _HITS_AGAIN = 5
 """Repeats of critical inputs, where the metric has few values: two of them agree by chance where every other seed fails."""
-_ALONE, _ALONE_AGAIN = 3, 3
-"""A critical run stands alone where so many nearest inputs are uncritical; these are repeated until so many critical inputs
-were: what fails with one seed in a hundred, wherever, no repeat of other runs shows."""
+_ALONE, _ALONE_AGAIN, _MOST_ALONE = 3, 3, 9
+"""A critical run stands alone where so many nearest inputs are uncritical. Of those so many are repeated that differ most from
+what is near them, and at most so many critical inputs: what fails with one seed in a hundred, wherever, no repeat of other runs
+shows. Of a smooth region the first ones stand alone too, but differ little, and tell nothing of the others."""
 _FEW_VALUES, _SHARE_OF_VALUES = 3, 0.1
 """A metric has few values where there are at most three, or a tenth of the runs."""
 _DOUBT = 0.05
@@ -201,15 +202,17 @@ def _hits_again(runs: History, again: History, margin: Vector, most: int) -> tup
 
 
 def _alone_again(runs: History, again: History, margin: Vector, space: ParameterSpace, most: int) -> tuple[PlannedRun, ...]:
-    """Return repeats of critical runs that no other is near, each once, until there are enough of them."""
+    """Return repeats of critical runs that no other is near, of those that differ most from what is, each once."""
     x, first = np.unique(runs.x, axis=0, return_index=True)
     critical = margin[first] <= 0.0
     if len(x) <= _ALONE or not critical.any():
         return ()
     u = space.to_unit(x)
     near = cKDTree(u).query(u[critical], k=_ALONE + 1)[1][:, 1:]
-    alone = first[critical][~critical[near].any(axis=1)]
+    single = ~critical[near].any(axis=1)
+    alone = first[critical][single]
+    differ = np.nan_to_num(margin[first[near[single]]].mean(axis=1) - margin[alone])
     repeated = {tuple(row) for row in again.x}
-    n = min(_ALONE_AGAIN - sum(tuple(row) in repeated for row in x[critical]), most)
-    rows = [k for k in sorted(alone) if tuple(runs.x[k]) not in repeated]
-    return tuple(PlannedRun(REPEAT, runs.inputs(int(k))) for k in rows[: max(n, 0)])
+    n = min(_MOST_ALONE - sum(tuple(row) in repeated for row in x[critical]), most)
+    rows = [k for k in alone[np.lexsort((alone, -differ))][:_ALONE_AGAIN].tolist() if tuple(runs.x[k]) not in repeated]
+    return tuple(PlannedRun(REPEAT, runs.inputs(k)) for k in rows[: max(n, 0)])

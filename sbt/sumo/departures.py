@@ -247,6 +247,8 @@ class DepartureMonitor:
             rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"
             raise RunError(Status.INVALID, f"{rule}, but SUMO inserted it at t = {departure:g} s")
         lane = vehicle.getLaneID(name)
+        if not lane:  # a loop has moved it off the lanes, by SUMO's own client
+            return
         length = self._sumo.lane.getLength(lane)
         position = requested.position
         if position is not None and position < 0:

@@ -84,7 +84,8 @@ class Surroundings:
         self._ending: Sequence[str] = ()
         self._parking: Sequence[str] = ()
         self._leaving: Sequence[str] = ()
-        self._unreacting, self._unmoved, self._moved = set[str](), set[str](), set[str]()
+        self._unreacting, self._moved = set[str](), set[str]()
+        self._moved_before, self._moving = dict[str, bool](), dict[str, bool]()  # by poses: whether for the first time
         self._level = EgoLevel(sumo)
         self.follow(sumo.vehicle.getIDList())
 
@@ -167,6 +168,7 @@ class Surroundings:
         self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
+        self._moved_before, self._moving = self._moving, {}
         self._moved = {name for name in self.rigid if self.is_person(name)}  # they keep the speed of the last step
 
     def _keep_way(self, name: str) -> None:
@@ -227,15 +229,20 @@ class Surroundings:
         if last is not None and half and moved > self._farthest:  # SUMO turns a long vehicle at once: where was its front?
             moved = min(moved, math.hypot(x - last[0] - half * math.cos(last[2]), y - last[1] - half * math.sin(last[2])))
         parks = last is not None and name in self._parking and moved > (last[3] + speed) * self._dt + _BESIDE
-        if moved > self._farthest or (parks and name != self._ego) or (last is not None and name in self._ending):
+        if moved > self._farthest or (last is not None and name in self._ending):
             self._note_jump(name, moved)
             return
+        if parks and name != self._ego:
+            self.jumped.add(name)
+            return
         if name in self._moved and name not in self.placed:  # SUMO's speed is what its own driver would do
-            if last is not None:
+            if last is not None and name in self._moved_before:
                 speed = ((state.x - last[0]) * state.cos + (state.y - last[1]) * state.sin) / self._dt
-            if last is not None and name in self._unmoved:
-                before[name] = last = (*last[:3], speed, 0.0)
-            (self._unmoved.add if last is None else self._unmoved.discard)(name)
+                if self._moved_before[name]:  # for the first time: where SUMO had it told nothing of its speed
+                    before[name] = last = (*last[:3], speed, 0.0)
+                self._moving[name] = False
+            else:
+                speed, self._moving[name] = speed if last is None else last[3], True
         state.speed, state.acceleration = speed, 0.0 if last is None else (speed - last[3]) / self._dt
         row[name] = (state.x, state.y, state.heading, speed, state.acceleration)
         if name in self._bodies and name not in self.rigid:
