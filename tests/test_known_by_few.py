@@ -25,7 +25,7 @@ def plateau() -> sbt.Scenario:
     return analytic(beside_a_plateau, inputs=INPUTS, critical=(-np.inf, 0.5), name="plateau")
 
 
-@pytest.mark.parametrize("seed", [4, 3])
+@pytest.mark.parametrize("seed", [4, 3, 6])
 def test_an_interval_reaches_what_random_draws_allow_while_few_critical_runs_are_known(seed: int, tmp_path: Path):
     """One of these stated at most a twentieth of the truth, and a gate at half of it passed."""
     result = sbt.run(
@@ -38,7 +38,8 @@ def test_an_interval_reaches_what_random_draws_allow_while_few_critical_runs_are
     assert found.gate.verdict != "pass"
     runs = result.history
     known = len(np.unique(runs.x[runs.y("y") <= 0.5], axis=0))
-    assert any(f"known at {known} input" in text for text in found.warnings) is (known < 10)
+    crude = (result.frame.stage == "monte_carlo").any()  # then the interval is that of random draws, whatever is known
+    assert any(f"known at {known} input" in text for text in found.warnings) is bool(known < 10 and not crude)
 
 
 def test_a_boundary_says_where_runs_that_fill_the_space_deny_its_share(tmp_path: Path):

@@ -138,7 +138,9 @@ def test_who_leaves_a_parking_place_does_not_drive_out_of_it(tmp_path: Path):
     )
     stop = '<stop parkingArea="pa" duration="4"/>'
     parks = vehicle("other", "road", departPos=80, departSpeed=5).replace("</vehicle>", f"{stop}</vehicle>")
-    one = simulation(tmp_path, ROAD, vehicle("ego", "road", departPos=5, departSpeed=1) + parks, _keeps_on, 20.0,
+    waits = '<stop lane="road_0" endPos="30" duration="100"/>'
+    ego = vehicle("ego", "road", departPos=5, departSpeed=1).replace("</vehicle>", f"{waits}</vehicle>")
+    one = simulation(tmp_path, ROAD, ego + parks, _keeps_on, 20.0,
                      additional_files="b.add.xml", step_length="0.1")  # fmt: skip
     other = one({}, 1).actor("other")
     moved = np.hypot(np.diff(other.x), np.diff(other.y))

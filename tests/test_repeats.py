@@ -166,7 +166,7 @@ def test_modes_of_one_input_each_may_be_parts_of_one_region(tmp_path: Path):
 
 
 def test_failures_by_chance_beside_a_smooth_region_pass_no_gate(tmp_path: Path):
-    """All repeats were of the smooth region, "no noise was met", and a gate passed at a fifth of P = .0169 (seed 12)."""
+    """All repeats were of the smooth region, "no noise was met", and a gate passed at a fifteenth of P = .0169 (seed 21)."""
 
     def evaluate(values: dict[str, float], seed: int) -> dict[str, float]:
         by_chance = values["c"] > 1.0 and np.random.default_rng(seed).random() < 0.1
@@ -174,7 +174,7 @@ def test_failures_by_chance_beside_a_smooth_region_pass_no_gate(tmp_path: Path):
 
     inputs = [sbt.Parameter(name, -6.0, 6.0, "", sbt.Normal(0, 1)) for name in "abc"]
     scenario = sbt.Scenario("chance", inputs, sbt.Requirement("m", high=0.0), evaluate=evaluate, metrics=["m"])
-    for seed in (12, 20):
+    for seed in (20, 21):
         found = sbt.run(
             campaign="estimation", scenario=scenario, budget=200, seed=seed, executor="serial", store=tmp_path / str(seed),
             report=False, gate={"probability": 0.012, "confidence": 0.95},

@@ -29,10 +29,11 @@ _ATTEMPTS = 4
 """Most of them, where some fail."""
 _HITS_AGAIN = 5
 """Repeats of critical inputs, where the metric has few values: two of them agree by chance where every other seed fails."""
-_ALONE, _ALONE_AGAIN, _MOST_ALONE = 3, 3, 9
+_ALONE, _ALONE_AGAIN, _MOST_ALONE, _SURPRISING = 3, 3, 9, 1.5
 """A critical run stands alone where so many nearest inputs are uncritical. Of those so many are repeated that differ most from
-what is near them, and at most so many critical inputs: what fails with one seed in a hundred, wherever, no repeat of other runs
-shows. Of a smooth region the first ones stand alone too, but differ little, and tell nothing of the others."""
+what is near them: what fails with one seed in a hundred, wherever, no repeat of other runs shows. Of a smooth region the first
+ones stand alone too, but differ little, and tell nothing of others: up to so many critical inputs are repeated where one differs
+by this factor more than all before."""
 _FEW_VALUES, _SHARE_OF_VALUES = 3, 0.1
 """A metric has few values where there are at most three, or a tenth of the runs."""
 _DOUBT = 0.05
@@ -213,6 +214,9 @@ def _alone_again(runs: History, again: History, margin: Vector, space: Parameter
     alone = first[critical][single]
     differ = np.nan_to_num(margin[first[near[single]]].mean(axis=1) - margin[alone])
     repeated = {tuple(row) for row in again.x}
-    n = min(_MOST_ALONE - sum(tuple(row) in repeated for row in x[critical]), most)
-    rows = [k for k in alone[np.lexsort((alone, -differ))][:_ALONE_AGAIN].tolist() if tuple(runs.x[k]) not in repeated]
-    return tuple(PlannedRun(REPEAT, runs.inputs(k)) for k in rows[: max(n, 0)])
+    done = np.array([tuple(row) in repeated for row in runs.x[alone]], dtype=np.bool_)
+    spent = sum(tuple(row) in repeated for row in x[critical])
+    more = differ > _SURPRISING * differ[done].max(initial=0.0)  # than all that were repeated
+    rows = [k for k in np.lexsort((alone, -differ))[:_ALONE_AGAIN] if not done[k] and (more[k] or spent < _ALONE_AGAIN)]
+    n = min((_MOST_ALONE if spent >= _ALONE_AGAIN else _ALONE_AGAIN) - spent, most)
+    return tuple(PlannedRun(REPEAT, runs.inputs(int(alone[k]))) for k in rows[: max(n, 0)])

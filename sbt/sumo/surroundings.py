@@ -83,6 +83,7 @@ class Surroundings:
         self._teleported: dict[str, str] = {}
         self._ending: Sequence[str] = ()
         self._parking: Sequence[str] = ()
+        self._left: Sequence[str] = ()
         self._leaving: Sequence[str] = ()
         self._unreacting, self._moved = set[str](), set[str]()
         self._moved_before, self._moving = dict[str, bool](), dict[str, bool]()  # by poses: whether for the first time
@@ -150,7 +151,7 @@ class Surroundings:
         simulation, self.jumped = self._sumo.simulation, set()
         self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
         begins, ends = parking(simulation)
-        self._parking, self._leaving = (*begins, *self._leaving), ends
+        self._parking, self._left, self._leaving = (*begins, *self._leaving), self._leaving, ends
         before = self._rows[-1] if self._rows else {}
         self._record(row, parts, before, ego, near[ego])
         self._level.enter(self.states[ego], near[ego][POSITION], off, len(self) * self._dt, person=self.is_person(ego))
@@ -232,7 +233,7 @@ class Surroundings:
         if moved > self._farthest or (last is not None and name in self._ending):
             self._note_jump(name, moved)
             return
-        if parks and name != self._ego:
+        if parks and name != self._ego and (name not in self._left or self._is_far(state, moved)):
             self.jumped.add(name)
             return
         if name in self._moved and name not in self.placed:  # SUMO's speed is what its own driver would do
@@ -248,6 +249,11 @@ class Surroundings:
         if name in self._bodies and name not in self.rigid:
             lane = self._sumo.vehicle.getLaneID(name)
             parts[name] = self._bodies[name].move((x, y), state.cos, state.sin, lane, speed * self._dt)
+
+    def _is_far(self, state: State, moved: float) -> bool:
+        """Return whether nobody who has just been moved so far (m) can have touched the ego meanwhile."""
+        own = self.states[self._ego]
+        return math.hypot(state.x - own.x, state.y - own.y) > own.length + state.length + moved
 
     def _note_jump(self, name: str, moved: float) -> None:
         """Leave out a road user that was moved to another place; the ego must not be."""
