@@ -14,6 +14,10 @@ from sbt.sumo.user_simulation import Loop
 
 pytestmark = pytest.mark.sumo
 ROAD = net({"road": [(0.0, 0.0), (400.0, 0.0)]})
+BAY = (
+    '<additional><parkingArea id="pa" lane="road_0" startPos="100" endPos="112" roadsideCapacity="1" angle="45" length="5"/>'
+    "</additional>"
+)
 EGO, OTHER = vehicle("ego", "road", departPos=50), vehicle("other", "road", departPos=150)
 
 
@@ -94,10 +98,7 @@ def test_a_person_that_is_moved_has_the_speed_of_its_motion(tmp_path: Path):
 
 def test_who_is_moved_into_a_parking_place_does_not_drive_there(tmp_path: Path):
     """SUMO moves it by 5 m sideways within a step: a post-encroachment time of .1 s with who passed behind it."""
-    (tmp_path / "b.add.xml").write_text(
-        '<additional><parkingArea id="pa" lane="road_0" startPos="100" endPos="112" roadsideCapacity="1" angle="45" length="5"/>'
-        "</additional>"
-    )
+    (tmp_path / "b.add.xml").write_text(BAY)
     stop = '<stop parkingArea="pa" duration="100"/>'
     parks = vehicle("other", "road", departPos=60, departSpeed=8).replace("</vehicle>", f"{stop}</vehicle>")
     one = simulation(tmp_path, ROAD, vehicle("ego", "road", departPos=20, departSpeed=4) + parks, _keeps_on, 25.0,
@@ -132,10 +133,7 @@ def test_who_is_moved_once_drives_at_sumos_speed_afterwards(tmp_path: Path):
 
 def test_who_leaves_a_parking_place_does_not_drive_out_of_it(tmp_path: Path):
     """SUMO says so a step before."""
-    (tmp_path / "b.add.xml").write_text(
-        '<additional><parkingArea id="pa" lane="road_0" startPos="100" endPos="112" roadsideCapacity="1" angle="45" length="5"/>'
-        "</additional>"
-    )
+    (tmp_path / "b.add.xml").write_text(BAY)
     stop = '<stop parkingArea="pa" duration="4"/>'
     parks = vehicle("other", "road", departPos=80, departSpeed=5).replace("</vehicle>", f"{stop}</vehicle>")
     waits = '<stop lane="road_0" endPos="30" duration="100"/>'
