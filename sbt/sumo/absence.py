@@ -15,7 +15,7 @@ from sbt.sumo.files import SumoFiles
 from sbt.sumo.session import session
 from sbt.sumo.template import fill
 
-__all__ = ["why_absent"]
+__all__ = ["why_absent", "why_copied"]
 
 _ROAD_USERS = ("vehicle", "trip", "flow", *PEOPLE)
 
@@ -110,6 +110,18 @@ def _scaled(files: SumoFiles, one: Element, scale: float | None, place: str) -> 
         f"the option scale: {scale:g}{place} has dropped it with a part of the traffic: give it a vType of its own with "
         f'scale="{1.0 / scale:.6g}", which keeps it, or set scale to 1'
     )
+
+
+def why_copied(files: SumoFiles, values: Values, name: str) -> str:
+    """Return the cause and the remedy where SUMO drives copies of a vehicle, from its place, as one text; "" without a cause."""
+    scale = _number(files.options.get("scale"), values)
+    if scale is None or scale <= 1.0:
+        return ""
+    one, place = element(files, name, _ROAD_USERS), files.places.get("scale", "")
+    kind = one.attributes.get("type") if one is not None else None
+    keeper = f"its vType '{kind}'" if kind else "it a vType of its own with"
+    where = f" ({place})" if place else ""
+    return f'the option scale: {scale:g}{where} copies vehicles: give {keeper} scale="{1.0 / scale:.6g}", or set scale to 1'
 
 
 def _waited_too_long(limit: float | None, place: str) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
-from sbt.sumo.absence import why_absent
+from sbt.sumo.absence import why_absent, why_copied
 from sbt.sumo.elements import person
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.places import place_in, said_at
@@ -225,6 +225,12 @@ class DepartureMonitor:
         held = f"but SUMO holds it back, as {why}: {said_at(requested.place, remedy)}{tolerance}"
         raise RunError(Status.INVALID, f"{rule}{f', {gap}' if gap else ''}, {held}")
 
+    def _refuse_copy(self, name: str, place: str) -> None:
+        """Refuse a vehicle of which SUMO drives copies, as the option `scale` asks for."""
+        cause, copy = why_copied(self._files, self._values, name), f"{name}.1"
+        if cause and copy not in self._files.names() and self._delay(copy) is not None:
+            raise RunError(Status.INVALID, f"{place}'{name}' must be one vehicle, but there is '{copy}' too, as {cause}")
+
     def _left_out(self, requested: RequestedDeparture) -> bool:
         """Return whether options ask for leaving out a vehicle of the traffic: a part of it, or what departs too early."""
         return "scale" in self._files.options or (requested.depart is not None and requested.depart < self._start)
@@ -242,6 +248,8 @@ class DepartureMonitor:
             self._compare_person(name, requested, dt)
             return
         vehicle = self._sumo.vehicle
+        if name == self._ego.id and not requested.of_flow:
+            self._refuse_copy(name, requested.place)
         departure = vehicle.getDeparture(name)
         if self._deadline(name, requested) < math.inf and self._late(departure, self._deadline(name, requested), dt):
             rule = f"{requested.place}'{name}' must depart{self._when(name, requested)}"

@@ -48,6 +48,7 @@ _LIKE_AN_OPTION = re.compile(r"--?[A-Za-z]")
 _IDS = (".explicit", ".knownveh", "remove-vehicles")
 """How options end whose values are ids, which may begin with a minus; SUMO never takes these for options."""
 _GUI = ("gui-settings-file", "start", "quit-on-end", "delay", "window-size", "window-pos", "tracker-interval", "S", "Q", "d", "g")
+_FALSE = ("0", "no", "false", "off", "-", "f")
 _OF_SERVER = ("remote-port", "num-clients", "configuration-file")
 """With these SUMO waits for a client, or reads further options by itself."""
 _NEWEST_NET_VERSION = (1, 20)
@@ -244,9 +245,15 @@ def _known(name: str, place: str) -> str:
 
 
 def _check_value(name: str, value: str, place: str) -> None:
-    """Refuse a value that SUMO would take for a further option, where the option before it may stand alone."""
+    """Refuse a value that SUMO would take for a further option, where the option before it may stand alone.
+
+    So is a mesoscopic simulation, whose vehicles have no place but that of the segment of road they are in.
+    """
     if _LIKE_AN_OPTION.match(value) and not name.endswith(_IDS):
         raise InputError(f"{place}: the value of {name} must not look like an option, but got '{value}'")
+    if name == "mesosim" and "${" not in value and value.strip().lower() not in _FALSE:
+        what = "vehicles of a mesoscopic simulation have no positions to measure"
+        raise InputError(f"{place}: mesosim must be false, as {what}, but got '{value}'")
 
 
 def _split(value: str) -> list[str]:

@@ -319,3 +319,5 @@ def check_options(options: Sequence[str]) -> None:
     for option in options:
         if option in reserved:
             raise ValueError(f"SUMO takes each option once, but {option} is set by sbt already")
+        if option == "--mesosim":
+            raise ValueError("SUMO's mesoscopic simulation has no positions of vehicles to measure: leave --mesosim out")

@@ -25,10 +25,13 @@ _SPACING = 0.5
 _JUMP = 3.0
 """Distance (m) beyond what the speed explains, from which on a vehicle has been moved and not driven."""
 
+_BESIDE = 4.0
+"""Distance (m) that a vehicle may be beside the middle of its lane, and its lane's end beside the junction."""
+
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
 """x, y (m) and heading (rad) of the middle of a rectangle."""
-_LeadsTo = Callable[[str, str, float], bool]
+_LeadsTo = Callable[[str, str, float, Point], bool]
 _Instant = tuple[int, int, float, float, float, float]
 """Number of the path, of its points, x and y of the front (m), cosine and sine of the heading."""
 
@@ -39,7 +42,7 @@ class TrailingBody:
     Args:
         length: of the vehicle (m).
         behind: points of the path behind its front at first sight, the nearest first; straight on beyond the last one.
-        leads_to: whether a lane leads to another within some metres (`Lanes.leads_to`).
+        leads_to: whether a lane leads to another within some metres of a point (`Lanes.leads_to`).
     """
 
     def __init__(self, length: float, behind: Sequence[Point] = (), leads_to: _LeadsTo | None = None):
@@ -66,17 +69,20 @@ class TrailingBody:
             x, y = self._instants[-1][2:4]
             if (x, y) == front and previous == lane:
                 return len(self._instants) - 1
-            self._drive((x, y), front, cos, sin, changed=self._changes(previous, lane, travelled), travelled=travelled)
+            self._drive((x, y), front, cos, sin, changed=self._changes(previous, lane, travelled, (x, y)), travelled=travelled)
         self._instants.append((len(self._paths) - 1, len(self._paths[-1].x), *front, cos, sin))
         return len(self._instants) - 1
 
-    def _changes(self, lane: str, other: str, travelled: float) -> bool:
-        """Return whether who was on one lane and is on another has changed lanes: on one edge, or while it entered one."""
+    def _changes(self, lane: str, other: str, travelled: float, front: Point) -> bool:
+        """Return whether who was on one lane and is on another has changed lanes: on one edge, or while it entered one.
+
+        So has who overtakes on the lane of opposite traffic and returns: lanes of two edges, which a turnaround may connect.
+        """
         if lane == other or not lane or not other:
             return False
         if lane.rpartition("_")[0] == other.rpartition("_")[0]:
             return True
-        return self._leads_to is not None and not self._leads_to(lane, other, travelled)
+        return self._leads_to is not None and not self._leads_to(lane, other, travelled, front)
 
     def _drive(self, before: Point, front: Point, cos: float, sin: float, *, changed: bool, travelled: float) -> None:
         """Extend the path from the last front to the new one."""
@@ -173,16 +179,29 @@ class Lanes:
     def __init__(self, sumo: Any):
         self._lane = sumo.lane
         self._known: dict[tuple[str, str, float], bool] = {}
+        self._ends: dict[str, Point] = {}
 
-    def leads_to(self, lane: str, other: str, travelled: float) -> bool:
-        """Return whether one leads to the other, over lanes that are no longer together than what is driven (m)."""
+    def leads_to(self, lane: str, other: str, travelled: float, front: Point) -> bool:
+        """Return whether one leads to the other, over lanes that are no longer together than what is driven (m).
+
+        Args:
+            lane: id.
+            other: id.
+            travelled: speed times step (m).
+            front: where the vehicle was on the first lane, whose end must not be farther.
+        """
         room = math.ceil(1.5 * travelled) + 1.0
         if (lane, other, room) not in self._known:
             self._known[lane, other, room] = self._found(lane, other, room)
-        return self._known[lane, other, room]
+        return self._known[lane, other, room] and math.dist(front, self._end(lane)) <= room + _BESIDE
+
+    def _end(self, lane: str) -> Point:
+        if lane not in self._ends:
+            self._ends[lane] = self._lane.getShape(lane)[-1]
+        return self._ends[lane]
 
     def _found(self, lane: str, other: str, room: float) -> bool:
-        following = {name for link in self._lane.getLinks(lane) for name in (link[0], link[4]) if name}
+        following = {link[4] or link[0] for link in self._lane.getLinks(lane)}
         if other in following:
             return True
         rooms = {name: room - self._lane.getLength(name) for name in following}

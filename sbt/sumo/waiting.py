@@ -33,8 +33,9 @@ class _Requested(Protocol):
 def why_held_back(sumo: Any, name: str, requested: _Requested, files: SumoFiles) -> tuple[str, str, str]:
     """Return the requested gap to the leader ("" without one), the cause and the remedy, as texts.
 
-    In the order in which the causes hide each other: one ahead in the queue of the edge (SUMO tries no further vehicle
-    of an edge, unless `eager-insert` is set), the largest number of vehicles, an occupied place, an unsafe gap.
+    In the order in which the causes hide each other: a departure that SUMO has moved, one ahead in the queue of the edge
+    (SUMO tries no further vehicle of an edge, unless `eager-insert` is set), the largest number of vehicles, an occupied
+    place, an unsafe gap.
     """
     found = element(files, name, _DEPARTING)
     checks = found.attributes.get("insertionChecks") if found is not None else None
@@ -43,6 +44,9 @@ def why_held_back(sumo: Any, name: str, requested: _Requested, files: SumoFiles)
     gap = _gap_ahead(sumo, name, requested)
     if found is not None and found.depart in _TRIGGERS:
         return gap, f'its depart="{found.depart}" waits for somebody who rides in it', "give it a depart in seconds"
+    offset = files.options.get("random-depart-offset", "0")
+    if offset not in ("0", "0.0") and name not in sumo.simulation.getPendingVehicles():
+        return gap, f"the option random-depart-offset: {offset} lets it depart later", "set it to 0"
     own_flow = f"{found.attributes['id']}." if found is not None and found.tag == "flow" else None
     queue = _queue_before(sumo, name)
     if queue and not (own_flow and queue.startswith(own_flow)) and files.options.get("eager-insert") not in ("true", "1"):

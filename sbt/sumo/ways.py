@@ -27,13 +27,17 @@ def line_ahead(sumo: Any, name: str) -> States | None:
         name: of a vehicle on the road.
     """
     vehicle, lane = sumo.vehicle, sumo.lane
-    here = vehicle.getLaneID(name)
+    here, front = vehicle.getLaneID(name), np.array(vehicle.getPosition(name)[:2])
     if not here:
         return None
     shape = _points(lane.getShape(here))
+    at = vehicle.getLanePosition(name) * float(_along(shape)[-1]) / max(lane.getLength(here), 1e-9)
+    if (own := _beside_opposite(sumo, name, here, shape, at)) is not None:
+        here, shape = own, _points(lane.getShape(own))
+        at = _nearest(shape, front)
+    foot, direction = _place(shape, at)
     along = _along(shape)
-    at = vehicle.getLanePosition(name) * along[-1] / max(lane.getLength(here), 1e-9)
-    ahead = [shape[along > at]]
+    ahead = [foot[None], shape[along > at]]
     length = along[-1] - at
     for following, inside in _links_ahead(sumo, name, here):
         if length > _LENGTH:
@@ -41,7 +45,22 @@ def line_ahead(sumo: Any, name: str) -> States | None:
         for part in (*_inside(lane, inside), following):
             ahead.append(_points(lane.getShape(part)))
             length += float(_along(ahead[-1])[-1])
-    return _beside(np.concatenate(ahead), vehicle.getLateralLanePosition(name))
+    beside = front - foot
+    return _beside(np.concatenate(ahead), float(direction[0] * beside[1] - direction[1] * beside[0]))[1:]
+
+
+def _beside_opposite(sumo: Any, name: str, here: str, shape: States, at: float) -> str | None:
+    """Return the lane of its route beside which a vehicle overtakes, if it is on one of opposite traffic.
+
+    Such a lane is of another edge than the route has here, and its direction `at` (m) is not that of the vehicle.
+    """
+    vehicle, edge = sumo.vehicle, here.rpartition("_")[0]
+    route, k, angle = vehicle.getRoute(name), vehicle.getRouteIndex(name), np.radians(vehicle.getAngle(name))
+    if here.startswith(":") or not 0 <= k < len(route) or route[k] == edge:
+        return None
+    if float(_place(shape, at)[1] @ np.array([np.sin(angle), np.cos(angle)])) >= 0.0:
+        return None
+    return f"{route[k]}_{sumo.edge.getLaneNumber(route[k]) - 1}"
 
 
 def _links_ahead(sumo: Any, name: str, here: str) -> Iterator[tuple[str, str]]:
@@ -125,8 +144,29 @@ def _along(points: States) -> States:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
+def _place(points: States, at: float) -> tuple[States, States]:
+    """Return the point at a distance along a polyline (m), and the direction of its segment there, (2,) each."""
+    along = _along(points)
+    k = int(np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(points) - 2))
+    step = points[k + 1] - points[k]
+    size = max(float(np.hypot(*step)), 1e-9)
+    return points[k] + step / size * np.clip(at - along[k], 0.0, size), step / size
+
+
+def _nearest(points: States, to: States) -> float:
+    """Return how far along a polyline it is nearest to a point (m)."""
+    step = np.diff(points, axis=0)
+    size = np.maximum(np.hypot(*step.T), 1e-9)
+    part = np.clip(((to - points[:-1]) * step).sum(axis=1) / size, 0.0, size)
+    apart = np.hypot(*(points[:-1] + step * (part / size)[:, None] - to).T)
+    k = int(np.argmin(apart))
+    return float(_along(points)[k] + part[k])
+
+
 def _beside(points: States, left: float) -> States:
-    """Return a polyline moved to the left (m)."""
+    """Return a polyline moved to the left (m), each point once: a lane begins where the one before it ends."""
+    if len(points) > 1:
+        points = points[np.concatenate([[True], np.hypot(*np.diff(points, axis=0).T) > 1e-3])]
     if left == 0.0 or len(points) < 2:
         return points
     step = np.gradient(points, axis=0)
