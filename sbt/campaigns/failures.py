@@ -207,7 +207,8 @@ class FailureSearch:
         chosen, kind = critical_groups(history, self.settings.scenario)
         runs = history.index[chosen].tolist()
         ways = doubtful(ways_between(
-            fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM, pairs_joined(links, runs)
+            fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM, pairs_joined(links, runs),
+            [k for k, _ in space.cube.nominal],
         ))  # fmt: skip
         return [
             replace(way, ends=(min(ends), max(ends)))

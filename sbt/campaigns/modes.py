@@ -1,4 +1,4 @@
-"""Failure modes: critical runs of one conflict type, and of the same choices, that the metamodel's critical region connects."""
+"""Failure modes: critical runs of one conflict type that the metamodel's critical region connects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sbt.campaigns.linking import Link, connected, pairs_joined
 from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type, without_standing
-from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Value
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -173,7 +173,8 @@ def modes_of(
     at = cube.embedded(u)
     depth, worse = scenario.requirement.depths(history), severity(history)
     tested = pairs_joined(links, history.index[chosen].tolist())
-    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested)
+    nominal = [k for k, _ in cube.nominal]
+    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested, nominal=nominal)
     log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]
@@ -195,7 +196,8 @@ def critical_groups(history: History, scenario: LogicalScenario) -> tuple[NDArra
     hits = np.flatnonzero(scenario.requirement.critical_runs(history))
     depth = scenario.requirement.depths(history)
     chosen = hits[np.argsort(depth[hits], kind="stable")][:_MOST]
-    return chosen, _kind(history, scenario.space.cube.choices(scenario.space.to_unit(history.x)))
+    types = without_standing(np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED))
+    return chosen, np.unique(types, return_inverse=True)[1].reshape(-1).astype(np.float64)
 
 
 def representative_of(log_rate: Vector, depth: Vector, worse: Vector) -> int:
@@ -209,13 +211,6 @@ def representative_of(log_rate: Vector, depth: Vector, worse: Vector) -> int:
         worse: (n,) severity.
     """
     return int(np.lexsort((-worse, depth, -np.round(_RATE_STEPS * log_rate)))[0])
-
-
-def _kind(history: History, choices: Points) -> Vector:
-    """Return (n,) numbers, the same for runs of one type of conflict (where it is measured) and of the same choices (n, c)."""
-    types = without_standing(np.nan_to_num(history.y(CONFLICT_TYPE), nan=_UNMEASURED))
-    told = np.column_stack([types, choices])
-    return np.unique(told, axis=0, return_inverse=True)[1].reshape(-1).astype(np.float64)
 
 
 def describe(mode: Mode, history: History, scenario: LogicalScenario, again: History, *, noisy: bool = False) -> FailureMode:

@@ -98,6 +98,20 @@ class Cube:
         counts = dict(self.nominal)
         return np.repeat(scale, [counts.get(k, 1) for k in range(len(scale))])
 
+    def with_other_choices(self, u: Points) -> Points:
+        """Return the points (n, d) with each other choice of one input, input by input.
+
+        >>> Cube(nominal=((0, 3),)).with_other_choices(np.array([[0.5, 0.4]])).round(2).tolist()
+        [[0.83, 0.4], [0.17, 0.4]]
+        """
+        found = [np.empty((0, u.shape[1]))]
+        for k, n in self.nominal:
+            for step in range(1, n):
+                other = np.array(u, dtype=np.float64)
+                other[:, k] = ((_cell(u[:, k], n) + step) % n + 0.5) / n
+                found.append(other)
+        return np.vstack(found)
+
     def flipped(self, u: Points, start: Points, chance: Vector | float, rng: np.random.Generator) -> Points:
         """Return points u (n, d) that were reached by steps from `start` (n, d), with its choices, or another one.
 

@@ -45,7 +45,7 @@ _MOVED = 0.3  # share of the coordinates that a step changes: others stay, which
 _MOST_TRIES, _MOST_AT_ONCE = 2**18, 2**14  # to find admissible points: 260 where a thousandth is feasible
 _PRIOR_RUNS = 2.0  # what the metamodel's P(critical) weighs beside repetitions of a run
 _MOST_SEEDS, _CERTAIN, _DOUBTFUL = 0.5, 0.9, 0.3  # failure rates: deflated from, without repetition from, left alone below
-_MOST_REPEATED = 3  # runs of the same inputs, after which their basin is left as it is
+_MOST_REPEATED, _MOST_CENTRES = 3, 2000  # runs of the same inputs, after which their basin is left as it is; deflated boxes
 _FARTHEST_OF, _FARTHEST_OF_FEW = 30, 3  # uniform points, the farthest of which fills a gap: around the edges, and plainly
 
 
@@ -285,7 +285,7 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
     undecided: tuple[int, ...] = ()
     if noisy and hit.any():
         deflated, undecided = _decided(search, u, y, ok, hit, rng)
-    free = deflate(search, u[deflated], rng, u.shape[1])
+    free = deflate(search, _in_other_choices(search, u, y, ok, deflated, rng), rng, u.shape[1])
     at = search.cube.embedded
     left = ok & ~deflated & free(at(u))
     flank = ~free(at(u[left]), _FLANK)
@@ -301,6 +301,21 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
         u[left], y[left], number[left], flank, admissible, u[~ok], number[~ok], np.flatnonzero(left), noisy, last_hit, undecided,
         success,
     )  # fmt: skip
+
+
+def _in_other_choices(search: Search, u: Points, y: Vector, ok: Mask, deflated: Mask, rng: np.random.Generator) -> Points:
+    """Return the runs whose basin is deflated, and their points with other choices that are critical as surely as can be known.
+
+    A choice that changes nothing would otherwise show the same failure again, once for each of its values.
+    """
+    centres = u[deflated]
+    if not search.cube.nominal or len(centres) == 0:
+        return centres
+    model = fit_warped(search.for_noise(u, y), u[ok], y[ok], rng)
+    for _ in search.cube.nominal:
+        others = search.cube.with_other_choices(centres)
+        centres = np.unique(np.vstack([centres, others[model.probability(others) >= _CERTAIN]]), axis=0)[:_MOST_CENTRES]
+    return centres
 
 
 def _decided(search: Search, u: Points, y: Vector, ok: Mask, hit: Mask, rng: np.random.Generator) -> tuple[Mask, tuple[int, ...]]:

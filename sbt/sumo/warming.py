@@ -32,14 +32,14 @@ from sbt.sumo.session import libsumo, scratch_folder, session
 from sbt.sumo.snapshot import CAN_FORK, Snapshot
 from sbt.sumo.template import Template, template
 
-__all__ = ["State", "WarmedFiles", "warmed_files"]
+__all__ = ["State", "WarmedFiles", "shortened", "warmed_files"]
 
 _SAVING = {"save-state.rng": "true", "save-state.transportables": "true", "save-state.precision": "17"}
 """Options under which a state holds all that SUMO can save; 17 digits are a double."""
 _READ_UNTIL = re.compile(r'(<delay\b[^>]*\btime=")[^"]*(")')
 """Up to when SUMO has read the route files; a run drops what departs before."""
-_LONG = re.compile(r"\d+\.\d{17}")
-"""Numbers as SUMO saves them; the shortest text of the same number is read twice as fast, and edges have 180 past speeds each."""
+_LONG = re.compile(r"\d+\.\d{17,}(?![\deE])")
+"""Numbers as SUMO saves them, with 17 decimals and some with more; the shortest text of the same number is read twice as fast, and edges have 180 past speeds each."""
 _WORDS = 624
 """Words of the state of a Mersenne Twister (std::mt19937)."""
 _FULL = 1_000_000
@@ -216,11 +216,20 @@ class WarmedFiles:
         text = saved.read_text(encoding="utf-8")
         saved.unlink()
         text = text[text.index("<snapshot") :]  # before it stands the time of day
-        text = _LONG.sub(lambda number: repr(float(number.group())), text)
+        text = shortened(text)
         text = _READ_UNTIL.sub(rf"\g<1>{self.snapshot.until:.3f}\g<2>", text, count=1)
         part = path.with_suffix(f".{os.getpid()}")
         part.write_bytes(gzip.compress(text.encode(), 1, mtime=0))
         part.replace(path)
+
+
+def shortened(text: str) -> str:
+    """Return the text of a state in which each number that is saved as 17 or more decimals is the shortest text of the same one.
+
+    >>> shortened('period="exp(0.10000000000000000555)" speed="13.88888888888888929"')
+    'period="exp(0.1)" speed="13.88888888888889"'
+    """
+    return _LONG.sub(lambda number: repr(float(number.group())), text)
 
 
 def warmed_files(files: SumoFiles, snapshot: Snapshot, step: float | None) -> WarmedFiles:
