@@ -307,11 +307,13 @@ requirement: {{metric: distance_min, critical: [-.inf, 1.0]}}
 
 @pytest.mark.sumo
 def test_flows_go_on_at_the_rate_of_their_file(tmp_path):
-    """SUMO saves 17 digits, of small numbers up to 20 decimals: those beyond the 17th were appended to a shorter text (.1555 for .1)."""
+    """SUMO saves some numbers with more than 17 decimals: those beyond were appended to a shorter text (.1555 for .1)."""
     path = town(tmp_path, warm_up="warm_up: {seeds: 1}")
     rates = {"f1": 'period="exp(0.1)"', "f2": 'probability="0.2"', "f3": 'probability="0.3"', "f4": 'period="exp(0.037)"'}
-    flows = "".join(f'<flow id="{k}" begin="0" end="600" {rate} from="A1B1" to="C3D3"/>' for k, rate in rates.items())
-    (tmp_path / "cars.rou.xml").write_text((tmp_path / "cars.rou.xml").read_text().replace("</types>", "").replace("<trip ", f"{flows}<trip ", 1))
+    flow = '<flow id="{}" begin="0" end="600" {} from="A1B1" to="C3D3"/>'
+    flows = "".join(flow.format(*each) for each in rates.items())
+    cars = (tmp_path / "cars.rou.xml").read_text()
+    (tmp_path / "cars.rou.xml").write_text(cars.replace("<trip ", f"{flows}<trip ", 1))
     found = simulation(path)
     found.isolated(replace(found.isolation, states=str(tmp_path / "states"), forking=False))(CENTRE, 4)
     (state,) = (tmp_path / "states").glob("*.gz")

@@ -332,10 +332,14 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         return "campaign: falsification searches for the first critical run; ten times as many runs lower the bound tenfold"
     if found.probability is None:
         return f"a larger budget than {n:,} runs, so that after searching and learning some draws count"
+    traffic = found.warmed_traffic
+    by_traffic = traffic is not None and traffic.decides(found.cov, found.probability)
+    there = int(facts.history.columns["warm_up"].max(initial=-1)) + 1  # those that no counted draw began with among them
     if worst is not None and worst - found.probability > 2.0 * PRECISE * found.probability:
         return (
             f"failed runs decide the width of the interval: its upper end, {number(found.high, 3)}, counts them as critical, and"
-            f" more runs would bring it to about {number(worst, 3)}, as far as these tell; {why_they_fail()}"
+            f" more {'warm-ups (warm_up.seeds), hardly more runs,' if by_traffic else 'runs'} would bring it to about"
+            f" {number(worst, 3)}, as far as these tell; {why_they_fail()}"
         )
     if found.combinations is not None and found.low == found.high:
         return "if equal inputs may end differently, acquisition: {kind: monte_carlo} gives an interval that holds then too"
@@ -346,9 +350,7 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         ends = ends if found.cov is not None and found.cov <= PRECISE else ""
         return f"a larger budget than {n:,} runs{ends}: it narrows the interval until it lies on one side of the gate"
     wide, counted = too_wide(found), found.counted or n
-    traffic = found.warmed_traffic
-    if wide > 1.0 and traffic is not None and traffic.decides(found.cov, found.probability):
-        there = int(facts.history.columns["warm_up"].max(initial=-1)) + 1  # those that no counted draw began with among them
+    if wide > 1.0 and traffic is not None and by_traffic:
         return _more_warm_ups(max(traffic.warm_ups, there))
     if wide > 1.0 and counted:
         known, narrow = bool(found.probability), bool(found.probability) and width(found) <= 1.0

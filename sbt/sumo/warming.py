@@ -39,7 +39,8 @@ _SAVING = {"save-state.rng": "true", "save-state.transportables": "true", "save-
 _READ_UNTIL = re.compile(r'(<delay\b[^>]*\btime=")[^"]*(")')
 """Up to when SUMO has read the route files; a run drops what departs before."""
 _LONG = re.compile(r"\d+\.\d{17,}(?![\deE])")
-"""Numbers as SUMO saves them, with 17 decimals and some with more; the shortest text of the same number is read twice as fast, and edges have 180 past speeds each."""
+"""Numbers as SUMO saves them, with 17 decimals and some with more; the shortest text of the same number is read twice as
+fast, and edges have 180 past speeds each."""
 _WORDS = 624
 """Words of the state of a Mersenne Twister (std::mt19937)."""
 _FULL = 1_000_000
