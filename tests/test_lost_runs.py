@@ -42,7 +42,7 @@ def test_no_number_of_runs_is_advised_where_failed_runs_decide_the_width():
     for cov in (0.05, 0.2):
         assert lost in _next(cov=cov, high=0.5, failed_as_critical=0.3)
         assert lost not in _next(cov=cov, failed_as_critical=0.11)
-    few = _next(cov=0.9, high=0.5, failed_as_critical=0.3, warmed_traffic=Spread(4, 0.09, std_error_apart=0.01))
+    few = _next(cov=0.5, high=0.5, failed_as_critical=0.3, warmed_traffic=Spread(4, 0.09, std_error_apart=0.01))
     assert "more warm-ups (warm_up.seeds), hardly more runs, would bring it to about 0.3" in few
     assert lost in _next(probability=0.0, low=0.0, exact_bound=0.3, failed_as_critical=0.2, hits=0)
     assert "tenfold" in _next(probability=0.0, low=0.0, exact_bound=0.3, failed_as_critical=0.0, hits=0)
