@@ -65,6 +65,11 @@ def test_what_the_drivers_can_judge(found: Trace, reason: str):
     assert (reason in said) if reason else said == ""
 
 
+def test_who_runs_into_the_first_vehicle_under_test_is_not_excused_where_it_is_under_test_too():
+    found = trace((0, 0, 0, 10), (-30, 0, 0, 15))
+    assert "another vehicle under test runs into the first" in why_not(applicability(also_tested=(found.actors[1],))(found))
+
+
 def test_words_and_columns():
     judged = [Judgement(1, "rss", True, False, 2.0), Judgement(1, "fsm", False, True, 0.0),
               Judgement(2, "rss", None, reason="alone")]  # fmt: skip

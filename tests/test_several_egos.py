@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from test_doors import check, files_of
 
+import sbt
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
+from sbt.workflows.judging import judge_run
 
 ROUTES = """<routes>
 <vType id="car" length="5" width="1.8" sigma="0" maxSpeed="60"/>
@@ -98,3 +100,15 @@ def test_all_of_them_must_depart_and_runs_repeat(tmp_path):
 def test_mistakes_are_named(tmp_path, ego, words):
     with pytest.raises(InputError, match=words):
         ScenarioSpec(str(written(tmp_path, ego))).resolve()
+
+
+@pytest.mark.sumo
+def test_a_failure_of_another_vehicle_under_test_is_not_judged_as_that_of_the_first(tmp_path):
+    scenario, store = str(written(tmp_path)), tmp_path / "store"
+    sbt.run(campaign="coverage", scenario=scenario, budget=4, seed=1, store=store, executor="serial", report=False)
+    frame = sbt.open(store).frame
+    row = frame.sort_values("y.ttc_min").iloc[0]
+    assert row["y.ttc_min"] == row["y.ttc_min_av2"] < 1.0 < row["y.ttc_min_av1"]
+    (judged,) = judge_run(store, int(row["index"]), ["cc_human"])
+    assert judged.avoided is None
+    assert "'av1' does not fail, another vehicle under test does" in judged.reason

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -23,6 +24,7 @@ from sbt.store.database import Store
 from sbt.sumo import snapshot
 from sbt.sumo.demand import excerpts, pieces_of, seconds_of
 from sbt.sumo.departures import requested_departures
+from sbt.sumo.session import session
 from sbt.sumo.template import template
 from sbt.sumo.user_simulation import UserSimulation
 from sbt.sumo.warming import _read
@@ -59,6 +61,29 @@ def test_a_forked_run_is_that_of_a_process_of_its_own(tmp_path):
     assert not forked[0].identical(forked[1])  # the warm-up is the same, what is drawn later is not
     assert not found({**CENTRE, "accel": 1.0}, 4).identical(forked[0])
     assert not any(tmp_path.glob("loop.xml"))
+
+
+def forked(path: str, values: dict[str, float], seed: int) -> Trace:
+    """Run in the child of a process that has loaded nothing before."""
+    return simulation(Path(path))(values, seed)
+
+
+@pytest.mark.sumo
+def test_travel_times_change_on_after_the_warm_up_and_routes_are_found_by_those_of_the_state(tmp_path):
+    """SUMO stopped to adapt them where it had read a vehicle with a device before the state; a route was that of empty roads."""
+    path = town(tmp_path, warm_up="warm_up: {until: 42}")
+    assert elsewhere(300, forked, str(path), CENTRE, 4).identical(elsewhere(300, alone, str(path), CENTRE, 4))
+    found = simulation(path)
+    warmed, state = found._warmed, found._state(4)
+    warmed.blank()
+    with session().run(warmed.launch, 0, "fresh", lambda: warmed.begin(CENTRE, (), state)) as sumo:
+        sumo.simulationStep(43.0)
+        equipped = [n for n in sumo.vehicle.getIDList() if sumo.vehicle.getParameter(n, "has.rerouting.device") == "true"]
+        name = max(equipped, key=sumo.vehicle.getSpeedFactor)
+        ways = [f"device.rerouting.edge:{edge}" for edge in sumo.edge.getIDList() if not edge.startswith(":")]
+        times = [sumo.vehicle.getParameter(name, way) for way in ways]
+        sumo.simulationStep(46.0)
+        assert times != [sumo.vehicle.getParameter(name, way) for way in ways]
 
 
 @pytest.mark.slow
@@ -154,6 +179,11 @@ def test_a_route_file_that_is_not_sorted_is_refused_as_sumo_leaves_out_a_part_of
     buses.write_text(text.replace("</routes>", behind))
     with pytest.raises(InputError, match=r"buses.rou.xml:\d+:\d+: .*'behind' \(30 s\) stands behind 'late' \(45 s\)"):
         simulation(path).isolation.warm  # noqa: B018
+    path = town(tmp_path / "whole", warm_up="warm_up: {until: 42}", options="route-steps: 0")  # then SUMO reads files whole
+    (tmp_path / "whole" / "buses.rou.xml").write_text(text.replace("</routes>", behind))
+    assert simulation(path).isolation.level == "snapshot"
+    if shutil.which("netgenerate"):
+        assert simulation(path)(CENTRE, 4).identical(alone(str(path), CENTRE, 4))
 
 
 def test_what_names_something_that_varies_varies(tmp_path):

@@ -166,7 +166,7 @@ class _Builder:
         name = model.name or (path.parent.name if path.stem == "scenario" else path.stem)
         return LogicalScenario(
             name, whole, requirement or Requirement("", high=0.0), simulation, metrics,
-            model.description, roles=Roles(model.ego.id, None),
+            model.description, roles=Roles(model.ego.id, None, also_tested=tuple(one.id for one in model.egos)),
         )  # fmt: skip
 
     def _warm_up(self) -> WarmUp | None:

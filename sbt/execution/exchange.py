@@ -74,7 +74,7 @@ def with_drivers(
     """
     egos = (scenario, *(scenario.configured(ego=dict(driver)) for driver in drivers))
     who = Parameter(DRIVER, 0, max(len(drivers), 1), "", kind="integer")
-    found = applicability(scenario.roles.ego, decisive)
+    found = applicability(scenario.roles.ego, decisive, scenario.roles.also_tested)
     metrics = (*(m for m in scenario.metrics if m.name != found.name), found)
     space = ParameterSpace((*scenario.space.parameters, who))
     return replace(scenario, space=space, simulate=ExchangedEgo(egos), metrics=metrics)

@@ -24,8 +24,9 @@ _REASONS = (
     "the other is oncoming: the models are of traffic in the same direction",
     "the other is a pedestrian: the models are of vehicles",
     "ego turns: the models are of driving along a lane",
+    "another vehicle under test runs into the first one from behind: the drivers only take the place of the first",
 )
-_NOBODY, _BEHIND, _CROSSING, _ONCOMING, _PEDESTRIAN, _TURNING = range(1, 7)
+_NOBODY, _BEHIND, _CROSSING, _ONCOMING, _PEDESTRIAN, _TURNING, _TESTED = range(1, 8)
 _PERSON = 1.0
 """Rectangles of at most this length and width are persons (m)."""
 _TURN = np.radians(30.0)
@@ -33,19 +34,20 @@ _BEFORE = 5.0
 """Time before the smallest distance in which a turn of the ego by more than 30 degrees counts (s)."""
 
 
-def applicability(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric:
+def applicability(ego: str = "ego", decisive: Sequence[Decisive] = (), also_tested: Sequence[str] = ()) -> Metric:
     """Return the metric `applicability`: 0 where the reference drivers can judge the conflict of a run, or a code.
 
     Args:
         ego: the road user under test.
         decisive: metrics that decide whose the conflict is, as of `conflict_type`.
+        also_tested: further vehicles under test.
     """
 
     def function(trace: Trace) -> float:
         met = conflict(trace, ego, decisive)
         if met is None:
             return float(_NOBODY)
-        _, own, other, at = met
+        name, own, other, at = met
         side, course = side_and_course(own, other, at)
         if max(other.length, other.width) <= _PERSON:
             return float(_PEDESTRIAN)
@@ -54,7 +56,7 @@ def applicability(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric
         before = own.heading[(trace.time >= trace.time[at] - _BEFORE) & (trace.time <= trace.time[at])]
         if np.ptp(np.unwrap(before)) > _TURN:
             return float(_TURNING)
-        return float(_BEHIND) if side == 2 else APPLICABLE
+        return float(_TESTED if name in also_tested else _BEHIND) if side == 2 else APPLICABLE
 
     return Metric(METRIC_NAME, function, "", "low", APPLICABLE, "0: the reference drivers can judge the run; or why not")
 

@@ -119,12 +119,14 @@ class Roles:
         other: the other one; None: all others, the worst at every instant.
         margin: lateral clearance below which the other is in ego's path (m).
         not_judged: why reference drivers, which keep their lane and only brake, cannot stand in for ego; "": they can.
+        also_tested: further vehicles under test, for which they do not stand in.
     """
 
     ego: str = "ego"
     other: str | None = "co"
     margin: float = 0.0
     not_judged: str = ""
+    also_tested: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, init=False)

@@ -13,7 +13,7 @@ import numpy as np
 from sbt.metamodels.base import named_errors, predicted, sample_paths
 from sbt.metamodels.bootstrap import drawn_regression
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.samplers.noise import scores
+from sbt.samplers.noise import by_chance, scores
 from sbt.samplers.search import (
     Picks,
     Search,
@@ -32,6 +32,7 @@ _UNIFORM = 3000  # candidates
 _LOG_AMONG = math.log(50.0), math.log(800.0)  # of the number that a draw decides among
 _LARGEST = 0.3  # share of the picks where the failure rate is believed to be largest; the others are draws
 _KINDS = 4  # of draws
+_CHANCE = 0.1  # p-value of "inputs tell nothing", from which on draws decide among one candidate while nothing was critical
 _HOPELESS, _INFLATION = 1e-6, 2.0  # P(critical), with sigma inflated, below which no run tells of failures
 _FILLING = 0.8  # share of the picks that fills space then
 _CLEAR = 0.05  # picks of one batch repel each other within this part of the cube's diagonal
@@ -48,7 +49,9 @@ def propose_in_noise(
     turn a draw is a line, a line and a few random trees, both fitted to randomly weighted scores (the Bayesian bootstrap), a
     sample path of the metamodel of the scores, and one of that of the metric. Lines learn a trend from few runs, trees
     thresholds, a process hollows. A draw decides among 50 to 800 random candidates: the best of few looks about, that of many
-    looks closer. Runs that failed have the worst score. No failure's neighbourhood is left out: its rate is to be learned, and
+    looks closer. While nothing was critical, and as far as chance alone would explain that inputs seem to order the runs, they
+    decide among fewer, down to one, and half of the picks of `rate` are draws too: a line without a trend leads to a corner.
+    Runs that failed have the worst score. No failure's neighbourhood is left out: its rate is to be learned, and
     is highest there. Where nothing was critical and noise explains no failure anywhere, four fifths of the picks fill space.
 
     Args:
@@ -74,10 +77,13 @@ def propose_in_noise(
     model = fit_warped(noisy, seen.u, seen.y, rng, seen.success)
     nowhere = bool(model.log_probability(candidates, _INFLATION).max() < math.log(_HOPELESS))
     filled = round(_FILLING * n) if nowhere else 0
-    largest = _largest(search, seen, model, best[seen.admissible(best)], round(_LARGEST * (n - filled)), rng)
+    doubt = min(by_chance(inputs, score, rng) / _CHANCE, 1.0) if seen.last_hit == -np.inf else 0.0
+    most = round(_LARGEST * (1.0 - 0.5 * doubt) * (n - filled))
+    largest = _largest(search, seen, model, best[seen.admissible(best)], most, rng)
     picks: list[int] = []
     for k in range(n - filled - len(largest)):
-        among = rng.choice(len(at), min(int(np.exp(rng.uniform(*_LOG_AMONG))), len(at)), replace=False)
+        size = round(float(np.exp((1.0 - doubt) * rng.uniform(*_LOG_AMONG))))
+        among = rng.choice(len(at), min(size, len(at)), replace=False)
         points, kind = at[among], k % _KINDS
         if kind == 3:
             value = model.critical.margin(model.sample_paths(candidates[among], 1, rng))[0]

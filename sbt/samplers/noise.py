@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["hidden_by_noise", "more_repeats", "scores"]
+__all__ = ["by_chance", "hidden_by_noise", "more_repeats", "scores"]
 
 _HIDDEN = 0.1  # share of the noise in the variance of the scores, from which on values of single runs mislead
+_PERMUTATIONS, _MOST_ROWS = 199, 400  # of a test; runs that it looks at, the last ones
 _REPEATS = 4  # of any inputs: two tell whether there is noise, four whether it is large
 
 
@@ -39,6 +40,34 @@ def hidden_by_noise(u: Points, margin: Vector) -> bool:
         return False
     mean = np.bincount(group, score) / count
     return float(((score - mean[group]) ** 2).sum()) / again >= _HIDDEN * float(score.var())
+
+
+def by_chance(inputs: Points, score: Vector, rng: np.random.Generator) -> float:
+    """Return how often scores (n,) that were shuffled depend as much on the inputs (n, k) as these do: a p-value.
+
+    A permutation test of the Hilbert-Schmidt independence criterion, with the sum of a linear and a Gaussian kernel: trends, and
+    hollows of about half of the median distance. Of the last 400 runs.
+
+    Source:
+        Gretton et al. (2008), A kernel statistical test of independence, NIPS 20.
+    """
+    from scipy.spatial.distance import pdist, squareform  # as in `scores`
+
+    inputs, score = inputs[-_MOST_ROWS:], score[-_MOST_ROWS:] - score[-_MOST_ROWS:].mean()
+    square = pdist(inputs, "sqeuclidean")
+    if not square.any() or not score.any():
+        return 1.0
+    width = np.median(square[square > 0.0]) / 4.0
+    kernel = sum(_centred(each) for each in (np.exp(-squareform(square) / width), inputs @ inputs.T))
+    shuffled = np.vstack([score, rng.permuted(np.tile(score, (_PERMUTATIONS, 1)), axis=1)])
+    found = ((shuffled @ kernel) * shuffled).sum(axis=1)
+    return float((found[1:] >= found[0]).mean())
+
+
+def _centred(kernel: Points) -> Points:
+    """Return a kernel (n, n) without what is the same for all, of unit size."""
+    kernel = kernel - kernel.mean(axis=0) - kernel.mean(axis=1)[:, None] + kernel.mean()
+    return kernel / max(float(np.linalg.norm(kernel)), 1e-300)
 
 
 def more_repeats(u: Points, margin: Vector) -> tuple[int, ...]:

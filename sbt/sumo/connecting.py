@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,18 @@ def start_quietly(traci: Any, command: list[str]) -> None:
 
 
 @contextlib.contextmanager
-def traci_connection(traci: Any, command: list[str], state: Path | None = None) -> Iterator[Any]:
-    """Start a SUMO program, load a saved state where one is given, provide traci connected to it, and close it in the end."""
+def traci_connection(traci: Any, command: list[str], state: Callable[[], Path] | None = None) -> Iterator[Any]:
+    """Start a SUMO program, provide traci connected to it, and close it in the end.
+
+    Args:
+        traci: the module.
+        command: program and options.
+        state: writes what a run is loaded from, and returns a saved state, which is loaded; called when the program is up.
+    """
     try:
         start_quietly(traci, command)
         if state is not None:
-            traci.simulation.loadState(str(state))
+            traci.simulation.loadState(str(state()))
         yield traci
     except (traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError) as error:
         raise RunError(Status.FAILED, f"SUMO: {error}") from None

@@ -175,7 +175,7 @@ class Session:
 
     @contextlib.contextmanager
     def run(
-        self, setup: Loadable, seed: int, isolation: str, state: Path | None = None, *, reference: bool = False
+        self, setup: Loadable, seed: int, isolation: str, state: Callable[[], Path] | None = None, *, reference: bool = False
     ) -> Iterator[Any]:
         """Provide libsumo with an empty simulation of this setup, for one run or for one run per replica.
 
@@ -183,7 +183,7 @@ class Session:
             setup: what is loaded.
             seed: of the run.
             isolation: level; all but `fresh` go on with the simulation that is there, if it is of this setup.
-            state: what SUMO has saved, loaded then.
+            state: writes what a run is loaded from, and returns what SUMO has saved; called when the setup is loaded.
             reference: keep nothing at all from one load to the next that is not there already.
 
         Raises:
@@ -196,7 +196,7 @@ class Session:
             try:
                 self._load(setup, seed, isolation)
                 if state is not None:
-                    self._sumo.simulation.loadState(str(state))
+                    self._sumo.simulation.loadState(str(state()))
                 loaded = True
                 yield self._sumo
                 if self._setup is not None:

@@ -270,7 +270,12 @@ def _constant_departure(piece: Piece, begin: float) -> float:
 
 
 def _check_sorted(files: SumoFiles, moving: Sequence[tuple[float, Piece]]) -> None:
-    """Refuse route files of which SUMO would leave out a part, as it is not sorted: a warm-up would have that traffic."""
+    """Refuse route files of which SUMO would leave out a part, as it is not sorted: a warm-up would have that traffic.
+
+    With the option `route-steps: 0` SUMO reads them whole, and leaves out nothing.
+    """
+    if files.options.get("route-steps") in ("0", "0.0"):
+        return
     last: dict[Path, tuple[float, Piece]] = {}
     for time, piece in moving:
         if piece.file.path in files.routes:

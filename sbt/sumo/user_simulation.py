@@ -271,10 +271,11 @@ class UserSimulation:
         """Return the trace of a run, and its CPU seconds by phase."""
         connect: Connect = partial(self._loaded, seed=seed)
         if self.isolation.warm:
-            state, warmed = self._state(seed), self._warmed
-            forking = CAN_FORK and self.isolation.forking
-            isolation = SNAPSHOT if forking else "fresh"
-            connect = partial(self._warm, start=lambda: session().run(warmed.launch, 0, isolation, state))
+            warmed, forking = self._warmed, CAN_FORK and self.isolation.forking
+            start = partial(session().run, warmed.launch, 0, SNAPSHOT if forking else "fresh")
+            state = self._state(seed)
+            connect = lambda files, values: start(lambda: self._begun(files, values, state))  # noqa: E731
+            warmed.blank()
             if forking:
                 session().hold(warmed.launch)
                 session().ask(lambda sumo: levels_of(sumo).warning)  # found once a network, here and not in every child
@@ -305,13 +306,9 @@ class UserSimulation:
         """Load the files of a run."""
         return session().run(files.launch(values, scratch_folder(), self.step), seed, "fresh")
 
-    def _warm(
-        self, files: SumoFiles, values: Values, *, start: Callable[[], AbstractContextManager[Any]]
-    ) -> AbstractContextManager[Any]:
-        """Begin a run with warmed traffic."""
-        own = files.additional[len(self.files.additional) if self.files is not None else 0 :]
-        self._warmed.begin(values, own)
-        return start()
+    def _begun(self, files: SumoFiles, values: Values, state: Path) -> Path:
+        """Write the traffic of a run, and return its state."""
+        return self._warmed.begin(values, files.additional[len(self.files.additional) if self.files is not None else 0 :], state)
 
     def warnings(self) -> tuple[str, ...]:
         """Return SUMO's warnings about the files in the last run of this process, each once, and what is known beside them."""
@@ -337,9 +334,10 @@ class UserSimulation:
                 return traci_connection(traci, [*program, *files.launch(given, scratch_folder(), self.step).command(seed)])
 
             return self._run(values, seed, load, Stopwatch())
-        state, launch = self._state(seed), self._warmed.launch
-        start = partial(traci_connection, traci, [*program, *launch.command(0)], state)
-        return self._run(values, seed, partial(self._warm, start=start), Stopwatch())
+        state, warmed = self._state(seed), self._warmed
+        warmed.blank()
+        start = partial(traci_connection, traci, [*program, *warmed.launch.command(0)])
+        return self._run(values, seed, lambda files, given: start(lambda: self._begun(files, given, state)), Stopwatch())
 
     @property
     def outputs(self) -> Path:
@@ -356,9 +354,8 @@ class UserSimulation:
         if not self.isolation.warm:
             files.launch(values, folder, self.step).write(seed, folder / "run.sumocfg")
             return
-        warmed = self._warmed
-        warmed.begin(values, files.additional[len(self.files.additional) if self.files is not None else 0 :])
-        warmed.write(self._state(seed), folder, warmed.snapshot.last_departure(values) + self.recording.duration)
+        warmed, state = self._warmed, self._begun(files, values, self._state(seed))
+        warmed.write(state, folder, warmed.snapshot.last_departure(values) + self.recording.duration)
 
     def files_of_run(self, values: Values, seed: int) -> SumoFiles:
         """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.

@@ -12,6 +12,7 @@ import gzip
 import hashlib
 import os
 import re
+import shutil
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -47,6 +48,9 @@ _FULL = 1_000_000
 """From this number of draws on SUMO saves, and reads, a generator's whole state."""
 _KEPT = 8
 """States that a process keeps as text, some MB each."""
+LATER = "after.rou.xml", "run.rou.xml"
+"""Route files of a run: traffic that no input changes, and its own; empty while a simulation is loaded."""
+_AFTER = "after.all.xml"
 _LONGEST = 3600.0
 """Wall-clock limit of a warm-up (s)."""
 
@@ -58,7 +62,15 @@ import traci
 
 os.chdir(os.path.dirname(os.path.abspath(__file__)))
 program, *options = sys.argv[1:] or ["sumo-gui"]
-traci.start([program, {arguments}, *options])
+for name in {later!r}:  # SUMO must read traffic after the state: see warmed traffic in the documentation
+    os.replace(name, name + ".later")
+    with open(name, "w") as file:
+        file.write("<routes/>")
+try:
+    traci.start([program, {arguments}, *options])
+finally:
+    for name in {later!r}:
+        os.replace(name + ".later", name)
 traci.simulation.loadState({state!r})
 while traci.simulation.getTime() <= {end!r}:
     traci.simulationStep()
@@ -106,19 +118,35 @@ class WarmedFiles:
     launch: Launch
     warming: Launch
 
-    def begin(self, values: Values, extra: tuple[Path, ...]) -> None:
-        """Write the traffic of a run.
+    def blank(self) -> None:
+        """Empty the route files, for a simulation to be loaded; the state of a run is loaded with those of `begin`.
+
+        Had SUMO read a vehicle that has a device for rerouting before the state, travel times would never change again.
+        """
+        for name in LATER:
+            _write(self.folder / name, [])
+
+    def begin(self, values: Values, extra: tuple[Path, ...], state: Path) -> Path:
+        """Write the traffic of a run, and return the state that it begins with.
 
         Args:
             values: of the inputs.
             extra: additional files of that run alone, with types.
+            state: of the run.
 
         Raises:
             RunError: something departs before the warm-up is over, or a placeholder has no value.
         """
         own = [_inside(path.read_bytes()) for path in extra]
         traffic = excerpts(self.snapshot.departing(values), values, self.folder)
-        _write(self.folder / "run.rou.xml", [*own, *traffic])
+        after, run = (self.folder / name for name in LATER)
+        after.unlink(missing_ok=True)
+        try:
+            after.symlink_to(_AFTER)
+        except OSError:  # no right to, or a file system without links
+            shutil.copyfile(self.folder / _AFTER, after)
+        _write(run, [*own, *traffic])
+        return state
 
     def begin_child(self) -> None:
         """In a child of the process that loaded the files: write nothing into its outputs."""
@@ -150,7 +178,8 @@ class WarmedFiles:
                 (folder / path.name).write_bytes(path.read_bytes().replace(here.encode(), there.encode()))
         written = [word.replace(here, there) for word in words]
         arguments = ", ".join(repr(word.replace(f"{there}{os.sep}", "")) for word in Launch(tuple(written)).command(0))
-        (folder / "run.py").write_text(_SCRIPT.format(arguments=arguments, state=state.name, end=end), encoding="utf-8")
+        script = _SCRIPT.format(arguments=arguments, state=state.name, end=end, later=LATER)
+        (folder / "run.py").write_text(script, encoding="utf-8")
         time = re.search(rb'<snapshot\b[^>]*? time="([^"]+)"', state.read_bytes())  # without it SUMO warns that it begins at 0
         if time is not None:
             at = written.index("--begin") if "--begin" in written else len(written)  # the user's is that of the warm-up
@@ -238,7 +267,8 @@ def warmed_files(files: SumoFiles, snapshot: Snapshot, step: float | None) -> Wa
     digest = _digest(files, snapshot.until, step)
     folder = scratch_folder() / f"warm-{digest}"
     folder.mkdir(exist_ok=True)
-    equipped = replace(files, options={**files.options, **_SAVING}, routes=(), additional=())
+    own = {k: v for k, v in files.options.items() if (k, v) != ("route-steps", "0")}  # the file of a run is read as it goes on
+    equipped = replace(files, options={**own, **_SAVING}, routes=(), additional=())
     base = equipped.launch({}, folder, step).arguments  # begins the folder's outputs, which the files below name
     standing = []
     for k, one in enumerate(_standing(files)):
@@ -247,10 +277,9 @@ def warmed_files(files: SumoFiles, snapshot: Snapshot, step: float | None) -> Wa
     if standing:
         base = (*base, "--additional-files", ",".join(map(str, standing)))
     known = list(excerpts(snapshot.definitions, {}, folder))
-    for name, pieces in (("before", snapshot.before), ("after", snapshot.after)):
-        _write(folder / f"{name}.rou.xml", [*known, *excerpts(pieces, {}, folder)])
-    _write(folder / "run.rou.xml", [])
-    later = f"{folder / 'after.rou.xml'},{folder / 'run.rou.xml'}"
+    for name, pieces in (("before.rou.xml", snapshot.before), (_AFTER, snapshot.after)):
+        _write(folder / name, [*known, *excerpts(pieces, {}, folder)])
+    later = ",".join(str(folder / name) for name in LATER)
     runs, warming = (Launch((*base, "--route-files", names)) for names in (later, str(folder / "before.rou.xml")))
     return WarmedFiles(folder, digest, snapshot, runs, warming)
 
