@@ -1,14 +1,17 @@
-"""Estimations in corners: chains of subset simulation on equal values, batches of half of the budget, failures by chance, waves.
+"""Campaigns in corners: chains of subset simulation on equal values, large batches, failures by chance, waves, idle choices.
 
     python benchmarks/corners.py ties [--seeds 300]
     python benchmarks/corners.py batches [--seeds 16]
     python benchmarks/corners.py chance [--seeds 30]
     python benchmarks/corners.py waves [--seeds 12]
+    python benchmarks/corners.py sometimes [--seeds 60]
+    python benchmarks/corners.py idle [--seeds 12]
 
 `ties` repeats one subset simulation of 200 points a level on a plane in two and ten normal inputs whose margin is rounded or cut
 off. `batches` runs campaigns on P(x >= 2) of a normal x beside a second input that moves the edge, or makes the metric jump.
 `chance` has a smooth region of P = .001, and a sixth of the space where one seed in ten fails, which no metric shows, with a gate
-of .012; `waves` a deterministic metric with seven periods along an input.
+of .012; `waves` a deterministic metric with seven periods along an input. `sometimes` are falsifications of 100 runs where the
+conflict arises with some seeds only; `idle` such of wells beside choices that change nothing.
 """
 
 from __future__ import annotations
@@ -124,7 +127,71 @@ def waves(seeds: int) -> None:
     told([campaign(scenario, s, stop={"cov": None}) for s in range(seeds)], p, "waves")
 
 
-CORNERS = {"ties": ties, "batches": batches, "chance": chance, "waves": waves}
+def _from(v: dict, a: float, b: float) -> float:
+    return float(np.hypot(v["a"] - a, v["b"] - b))
+
+
+def _met(v: dict) -> float:
+    return 0.2 + 2 * _from(v, 0.3, 0.6) + 0.5 * v["c"]
+
+
+SOMETIMES: dict[str, tuple[float, float, Callable[[dict], float], Callable[[dict], float]]] = {
+    "a car comes with .15 of the seeds, else 10 s": (0.15, 0.9, _met, lambda v: 10.0),
+    "with .2, else a slope": (0.2, 0.9, _met, lambda v: 4.0 - 2 * _from(v, 0.3, 0.6)),
+    "two ways to meet, .4 and .6": (
+        0.4, 0.8, lambda v: 0.6 + 1.5 * float(np.hypot(v["a"] - 0.8, v["c"] - 0.7)), lambda v: 1.0 + _from(v, 0.2, 0.2)
+    ),
+}  # fmt: skip
+"""Share of the seeds with the conflict, edge, metric with it and without it."""
+
+
+def _falsified(scenario: sbt.Scenario, seed: int) -> object:
+    with tempfile.TemporaryDirectory() as folder:
+        result = sbt.run(
+            campaign="falsification", scenario=scenario, seed=seed, budget=100, executor="serial", report=False,
+            store=f"{folder}/s",
+        )  # fmt: skip
+        return result.frame, result.conclusion
+
+
+def sometimes(seeds: int) -> None:
+    print("| conflict | critical share | nothing met in 100 runs | random | critical runs (mean) | random |")
+    print("|---|---|---|---|---|---|")
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+    for name, (share, edge, conflict, other) in SOMETIMES.items():
+        def evaluate(v: dict, seed: int, share: float = share, conflict=conflict, other=other) -> dict:
+            return {"m": conflict(v) if np.random.default_rng(seed).random() < share else other(v)}
+
+        points = np.random.default_rng(0).random((100_000, 3))
+        p = share * float(np.mean([conflict(dict(zip("abc", u, strict=True))) <= edge for u in points[:20_000]]))
+        hits = []
+        for seed in range(seeds):
+            frame, _ = _falsified(sbt.Scenario("sometimes", inputs, sbt.Requirement("m", high=edge), evaluate=evaluate), seed)
+            hits.append(int((frame["critical"].fillna(False).astype(bool) & (frame["stage"] != "confirm")).sum()))
+        missed, none = sum(h == 0 for h in hits), (1.0 - p) ** 100
+        told = f"{missed} of {seeds} | {none * seeds:.1f} | {np.mean(hits):.1f} | {100 * p:.1f}"
+        print(f"| {name} | {p:.3f} | {told} |", flush=True)
+
+
+def idle(seeds: int) -> None:
+    print("| choices that change nothing | wells | told as modes, by seed | wells met, by seed |\n|---|---|---|---|")
+    for choices in ((), (6,), (3, 3)):
+        inputs = [sbt.Parameter(f"k{j}", choices=[f"v{i}" for i in range(n)]) for j, n in enumerate(choices)]
+        inputs += [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+
+        def metric(v: dict, seed: int) -> dict:
+            near = 0.8 * _from(v, 0.25, 0.7) + 0.2 * abs(v["c"] - 0.5)
+            return {"m": min(near, 0.08 + 1.2 * _from(v, 0.85, 0.15) + 0.3 * abs(v["c"] - 0.2))}
+
+        told, met = [], []
+        for seed in range(seeds):
+            frame, found = _falsified(sbt.Scenario("idle", inputs, sbt.Requirement("m", high=0.16), evaluate=metric), seed)
+            told.append(len(found.failure_modes))
+            met.append(len(set(frame[frame["critical"].fillna(False).astype(bool)]["x.a"] > 0.55)))
+        print(f"| {choices or 'none'} | 2 | {told} | {met} |", flush=True)
+
+
+CORNERS = {"ties": ties, "batches": batches, "chance": chance, "waves": waves, "sometimes": sometimes, "idle": idle}
 
 
 def main() -> None:

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from scipy import stats
 from studies import run_loaded
+from typer.testing import CliRunner
 
 import sbt
+from sbt.cli import app
 from sbt.config.assemble import assemble
 from sbt.config.load import parse
 from sbt.errors import InputError, RunError, StoreError
@@ -356,6 +358,32 @@ def test_a_campaign_speaks_in_words_and_is_the_same_with_workers_and_after_a_sto
     assert int(table["mean"].argmin()) == KINDS.index(BAD)
     with pytest.raises(InputError, match=r"column kind: input kind must be one of .* but got 'tram'"):
         one.predict({"v": 10.0, "gap": 40.0, "kind": "tram"})
+
+
+def _well(values, v, gap):
+    return ((values["v"] - v) / 4) ** 2 + ((values["gap"] - gap) / 12) ** 2 - 1
+
+
+WELLS = {
+    "idle": (lambda values, seed: {"m": _well(values, 12, 35)}, 1),
+    "elsewhere": (lambda values, seed: {"m": _well(values, *((10, 20) if values["kind"] in ("car", "bus") else (20, 45)))}, 2),
+}
+
+
+@pytest.mark.parametrize("name", WELLS)
+def test_a_choice_that_changes_nothing_makes_no_mode_of_its_own_and_one_that_does_keeps_its_failures(name, tmp_path):
+    """One failure with every kind was told as four, each of them searched for again."""
+    evaluate, wells = WELLS[name]
+    keys = {"campaign": "falsification", "seed": 2, "budget": 80, "report": True, "store": tmp_path / "s", "executor": "serial"}
+    modes = sbt.run(**keys, scenario=scenario(evaluate=evaluate)).conclusion.failure_modes
+    assert len(modes) == wells
+    alike = [set((mode.choices or {"kind": (mode.inputs["kind"],)})["kind"]) for mode in modes]
+    assert sum(len(each) for each in alike) >= 2
+    assert not set.intersection(*alike) if wells == 2 else len(alike[0]) > 1
+    with_several = next(mode for mode in modes if mode.choices)
+    said = " ".join(CliRunner().invoke(app, ["status", str(tmp_path / "s")]).stdout.split())
+    assert f"also with kind {next(k for k in with_several.choices['kind'] if k != with_several.inputs['kind'])}" in said
+    assert f">{with_several.inputs['kind']}, also " in html.unescape((tmp_path / "s" / "report.html").read_text())
 
 
 def test_a_table_of_recorded_runs_with_choices_comes_back(tmp_path):

@@ -113,6 +113,7 @@ class FailureMode:
         nearest_safe: the uncritical run nearest to the representative; None: there is none.
         preventable: what the reference drivers made of the representative; None: they were not asked.
         violates: of a combination, how many of its runs violate each requirement.
+        choices: of inputs with choices, all that its critical runs have, where they have several.
         unconfirmed: its critical runs with a contact that SUMO's own list does not confirm.
     """
 
@@ -131,6 +132,7 @@ class FailureMode:
     violates: Mapping[str, int] | None = optional()
     failure_rate: FailureRate | None = optional()
     confirmations_lost: int | None = optional()
+    choices: Mapping[str, tuple[str, ...]] | None = optional()
 
 
 def severity(history: History) -> Vector:
@@ -237,8 +239,14 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, again: His
         unconfirmed=int(history.unconfirmed[list(mode.rows)].sum()),
         violates=violations(requirement, history.where(np.isin(np.arange(len(history)), mode.rows))),
         failure_rate=FailureRate.of(requirement.critical_runs(again), ~again.ok) if noisy and len(again) else None,
-        confirmations_lost=int((~again.ok).sum()) or None,
+        confirmations_lost=int((~again.ok).sum()) or None, choices=_choices_of(mode, history) or None,
     )  # fmt: skip
+
+
+def _choices_of(mode: Mode, history: History) -> dict[str, tuple[str, ...]]:
+    """Return all choices that a mode's runs have, in their order, of inputs of which they have several."""
+    cells = {name: np.unique(history.x[list(mode.rows), history.names.index(name)]).astype(int) for name in history.choices}
+    return {name: tuple(history.choices[name][k] for k in found) for name, found in cells.items() if len(found) > 1}
 
 
 def single(modes: Sequence[FailureMode], history: History) -> int:

@@ -86,6 +86,8 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
     if len(inputs) > _MOST_INPUTS:
         told.append(f"and {plural(len(inputs) - _MOST_INPUTS, 'more input')}")
     said = [f"run {mode['representative']}, {measured(metric, mode['metric'])}, at {', '.join(told)}"]
+    for name, found in (mode.get("choices") or {}).items():
+        said.append(f"also with {name} {' or '.join(choice for choice in found if choice != mode['inputs'][name])}")
     said += [str(mode["conflict"])] if mode.get("conflict") else []
     violating = ", ".join(name if n == mode["size"] else f"{name} in {n}" for name, n in (mode.get("violates") or {}).items())
     said.append(f"{mode['size']} critical run{'' if mode['size'] == 1 else 's'}{violating and f', violating {violating}'}")

@@ -46,7 +46,7 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
             *((Cell(violated_words(mode)),) if several else ()), Cell.of(mode.size), Cell(confirmed),
             *(() if not doubtful else (Cell.of(mode.unconfirmed),)),
             *(() if not typed else (Cell(mode.conflict or NOTHING),)),
-            *(Cell.of(mode.inputs[name]) for name in space.names), Cell(_change(mode, space)),
+            *(_input(mode, name) for name in space.names), Cell(_change(mode, space)),
             *((Cell(describe_judgements(mode.preventable or ()) or NOTHING),) if judged else ()), Cell.of(mode.most_likely.run),
         ))  # fmt: skip
     metric = found.requirement.told_as
@@ -57,6 +57,12 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
                *(("avoided by",) if judged else ()), "most likely")  # fmt: skip
     note = _JOINED + (_ALIKE if typed else "") + _NOTE + (f" {KNOWN_LIMITS}" if judged else "")
     return Table(columns, tuple(rows), note if rows else "")
+
+
+def _input(mode: FailureMode, name: str) -> Cell:
+    """Return an input of the representative, with the other choices that the mode's runs have."""
+    others = [choice for choice in (mode.choices or {}).get(name, ()) if choice != mode.inputs[name]]
+    return Cell(f"{mode.inputs[name]}, also {', '.join(others)}") if others else Cell.of(mode.inputs[name])
 
 
 def violated_words(mode: FailureMode) -> str:
