@@ -103,12 +103,11 @@ def test_mistakes_are_named(tmp_path, ego, words):
 
 
 @pytest.mark.sumo
-def test_a_failure_of_another_vehicle_under_test_is_not_judged_as_that_of_the_first(tmp_path):
+def test_reference_drivers_take_the_places_of_all_vehicles_under_test(tmp_path):
     scenario, store = str(written(tmp_path)), tmp_path / "store"
     sbt.run(campaign="coverage", scenario=scenario, budget=4, seed=1, store=store, executor="serial", report=False)
     frame = sbt.open(store).frame
     row = frame.sort_values("y.ttc_min").iloc[0]
-    assert row["y.ttc_min"] == row["y.ttc_min_av2"] < 1.0 < row["y.ttc_min_av1"]
+    assert row["y.ttc_min"] == row["y.ttc_min_av2"] < 1.0 < row["y.ttc_min_av1"], "the second one fails"
     (judged,) = judge_run(store, int(row["index"]), ["cc_human"])
-    assert judged.avoided is None
-    assert "'av1' does not fail, another vehicle under test does" in judged.reason
+    assert judged.avoided is not None

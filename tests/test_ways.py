@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from own_networks import run_program
 
 from sbt.errors import InputError
 from sbt.execution.spec import ScenarioSpec
+from sbt.sumo.trailing import TrailingBody
 
 pytestmark = pytest.mark.sumo
 
@@ -127,3 +129,15 @@ def test_an_ego_that_an_option_copies_or_moves_is_told_with_that_option(tmp_path
     scenario = ScenarioSpec(str(_scenario(tmp_path, _ALONE, options=options))).resolve()
     with pytest.raises(Exception, match=says):
         scenario.simulate({"v": 8.0}, 1)
+
+
+def test_a_long_vehicle_that_comes_back_elsewhere_is_behind_its_front():
+    """Teleported, or out of the radius meanwhile: it lay across the road, shifted beside its old path."""
+    body = TrailingBody(16.0, leads_to=lambda *_: False)
+    body.move((0.0, 0.0), 1.0, 0.0, "a_0", 1.0)
+    back = body.move((40.0, 30.0), 0.0, 1.0, "b_0", 1.0)
+    beside = body.move((36.8, 31.0), 0.0, 1.0, "b_1", 1.0)
+    for front, poses in zip(((40.0, 30.0), (36.8, 31.0)), body.poses([back, beside]), strict=True):
+        assert poses[:, 0] == pytest.approx(front[0])
+        assert poses[:, 1] == pytest.approx(front[1] - 2.0 - 4.0 * np.arange(4))
+        assert poses[:, 2] == pytest.approx(np.pi / 2)

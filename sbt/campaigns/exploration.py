@@ -18,9 +18,10 @@ from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.metamodels.base import simplest
 from sbt.problem.arrays import Mask, Points
+from sbt.samplers.free_region import FreeRegion
 from sbt.samplers.plateaus import plateau
 from sbt.samplers.portfolio import propose
-from sbt.samplers.search import DEFLATION, FreeRegion, Search
+from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
 

@@ -20,6 +20,7 @@ from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, select_parts
 
 __all__ = [
+    "LANE_CHANGE",
     "Rectangles",
     "contact_index",
     "contact_part",
@@ -36,7 +37,9 @@ __all__ = [
 ]  # fmt: skip
 
 
-_MAX_SPEED, _LANE_CHANGE = 150.0, 8.0
+LANE_CHANGE = 8.0
+"""How far SUMO may move a road user beside what it drives, where it changes lanes within a step (m)."""
+_MAX_SPEED = 150.0
 _DRIVES, _TURNED, _SWINGS, _ARCS = 0.5, 0.05, 0.3, 16
 """A step of who drives (m/s) in which a corner moves by more than this (m) because its rectangle turns is one along an arc, of so
 many parts; by more than the second, also where nothing touches on the chord."""
@@ -47,7 +50,7 @@ def farthest(elapsed: Any) -> Any:
 
     At 150 m/s, but no less than 8 m: SUMO changes lanes within a step, however short.
     """
-    return np.maximum(_MAX_SPEED * elapsed, _LANE_CHANGE)
+    return np.maximum(_MAX_SPEED * elapsed, LANE_CHANGE)
 
 
 @dataclass(frozen=True, eq=False)

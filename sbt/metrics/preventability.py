@@ -24,9 +24,8 @@ _REASONS = (
     "the other is oncoming: the models are of traffic in the same direction",
     "the other is a pedestrian: the models are of vehicles",
     "ego turns: the models are of driving along a lane",
-    "another vehicle under test runs into the first one from behind: the drivers only take the place of the first",
 )
-_NOBODY, _BEHIND, _CROSSING, _ONCOMING, _PEDESTRIAN, _TURNING, _TESTED = range(1, 8)
+_NOBODY, _BEHIND, _CROSSING, _ONCOMING, _PEDESTRIAN, _TURNING = range(1, 7)
 _PERSON = 1.0
 """Rectangles of at most this length and width are persons (m)."""
 _TURN = np.radians(30.0)
@@ -40,25 +39,30 @@ def applicability(ego: str = "ego", decisive: Sequence[Decisive] = (), also_test
     Args:
         ego: the road user under test.
         decisive: metrics that decide whose the conflict is, as of `conflict_type`.
-        also_tested: further vehicles under test.
+        also_tested: further vehicles under test, whose places the drivers take too: one that can be judged is enough.
     """
 
     def function(trace: Trace) -> float:
-        met = conflict(trace, ego, decisive)
-        if met is None:
-            return float(_NOBODY)
-        name, own, other, at = met
-        side, course = side_and_course(own, other, at)
-        if max(other.length, other.width) <= _PERSON:
-            return float(_PEDESTRIAN)
-        if course:
-            return float(_ONCOMING if course == 2 else _CROSSING)
-        before = own.heading[(trace.time >= trace.time[at] - _BEFORE) & (trace.time <= trace.time[at])]
-        if np.ptp(np.unwrap(before)) > _TURN:
-            return float(_TURNING)
-        return float(_TESTED if name in also_tested else _BEHIND) if side == 2 else APPLICABLE
+        codes = [_code(trace, one, decisive) for one in (ego, *(name for name in also_tested if name in trace.actors))]
+        return APPLICABLE if APPLICABLE in codes else codes[0]
 
     return Metric(METRIC_NAME, function, "", "low", APPLICABLE, "0: the reference drivers can judge the run; or why not")
+
+
+def _code(trace: Trace, ego: str, decisive: Sequence[Decisive]) -> float:
+    met = conflict(trace, ego, decisive)
+    if met is None:
+        return float(_NOBODY)
+    _, own, other, at = met
+    side, course = side_and_course(own, other, at)
+    if max(other.length, other.width) <= _PERSON:
+        return float(_PEDESTRIAN)
+    if course:
+        return float(_ONCOMING if course == 2 else _CROSSING)
+    before = own.heading[(trace.time >= trace.time[at] - _BEFORE) & (trace.time <= trace.time[at])]
+    if np.ptp(np.unwrap(before)) > _TURN:
+        return float(_TURNING)
+    return float(_BEHIND) if side == 2 else APPLICABLE
 
 
 def why_not(code: float) -> str:

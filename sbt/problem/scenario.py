@@ -119,7 +119,7 @@ class Roles:
         other: the other one; None: all others, the worst at every instant.
         margin: lateral clearance below which the other is in ego's path (m).
         not_judged: why reference drivers, which keep their lane and only brake, cannot stand in for ego; "": they can.
-        also_tested: further vehicles under test, for which they do not stand in.
+        also_tested: further vehicles under test, for which they stand in too.
     """
 
     ego: str = "ego"

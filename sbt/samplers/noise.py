@@ -43,7 +43,7 @@ def hidden_by_noise(u: Points, margin: Vector) -> bool:
 
 
 def by_chance(inputs: Points, score: Vector, rng: np.random.Generator) -> float:
-    """Return how often scores (n,) that were shuffled depend as much on the inputs (n, k) as these do: a p-value.
+    """Return how often scores (n,) that were shuffled depend as much on the inputs (n, k) as these do.
 
     A permutation test of the Hilbert-Schmidt independence criterion, with the sum of a linear and a Gaussian kernel: trends, and
     hollows of about half of the median distance. Of the last 400 runs.

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from sbt.metamodels.base import Metamodel, Predictor, gives_different, named_errors, predicted, sample_paths
@@ -26,10 +25,11 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN, CombinedInterval
 from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.problem.requirement import CriticalInterval, as_reached
+from sbt.samplers.free_region import FreeRegion
 from sbt.samplers.noise import hidden_by_noise
 
 __all__ = [
-    "DEFLATION", "FreeRegion", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fill_uniformly", "fit_warped",
+    "DEFLATION", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fill_uniformly", "fit_warped",
     "log_repulsion", "refine_best", "search_data", "spread_out",
 ]  # fmt: skip
 
@@ -175,40 +175,6 @@ def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator, s
     return WarpedModel(predictor, search.columns, warp, critical, search.metamodel, len(y), success)
 
 
-@dataclass(frozen=True, eq=False)
-class FreeRegion:
-    """The part of the cube that is not deflated: all but k boxes, in the embedded coordinates of `Cube`.
-
-    A box holds runs of the same choices only: other ones are farther away than it reaches.
-
-    Args:
-        low, high: (k, e) ends of the boxes.
-        radius: by which each box reaches beyond its critical runs.
-    """
-
-    low: Points
-    high: Points
-    radius: float
-
-    @classmethod
-    def without(cls, hits: Points, radius: float) -> FreeRegion:
-        """Return what boxes around critical runs (n, e) leave; runs whose boxes touch share one box, their hull."""
-        if len(hits) == 0:
-            return cls(hits, hits, radius)
-        count, group = connected_components(cdist(hits, hits, "chebyshev") <= 2.0 * radius, directed=False)
-        members = [hits[group == k] for k in range(count)]
-        return cls(
-            np.array([m.min(axis=0) for m in members]) - radius, np.array([m.max(axis=0) for m in members]) + radius, radius
-        )
-
-    def __call__(self, u: Points, beyond: float = 0.0) -> Mask:
-        """Return (n,) booleans: u is in no box, each grown by `beyond`."""
-        inside = np.zeros(len(u), dtype=bool)
-        for low, high in zip(self.low - beyond, self.high + beyond, strict=True):
-            inside |= ((u >= low) & (u <= high)).all(axis=1)
-        return ~inside
-
-
 def deflate(search: Search, hits: Points, rng: np.random.Generator, dimension: int) -> FreeRegion:
     """Return what deflation leaves; the radius is halved until that is at least 5 % of the space."""
     probe = rng.random((_PROBES, dimension))
@@ -304,17 +270,19 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
 
 
 def _in_other_choices(search: Search, u: Points, y: Vector, ok: Mask, deflated: Mask, rng: np.random.Generator) -> Points:
-    """Return the runs whose basin is deflated, and their points with other choices that are critical as surely as can be known.
+    """Return the runs whose basin is deflated, and their points with other choices, where a basin was met with these too.
 
-    A choice that changes nothing would otherwise show the same failure again, once for each of its values.
+    A choice that changes nothing would otherwise show the whole of the same failure again with each of its values. Only where it
+    is critical as surely as can be known, and beside a critical run: the first one with each choice tells whether it is the same.
     """
-    centres = u[deflated]
+    centres, at = u[deflated], search.cube.embedded
     if not search.cube.nominal or len(centres) == 0:
         return centres
-    model = fit_warped(search.for_noise(u, y), u[ok], y[ok], rng)
+    model, met = fit_warped(search.for_noise(u, y), u[ok], y[ok], rng), FreeRegion.without(at(centres), search.deflation)
     for _ in search.cube.nominal:
         others = search.cube.with_other_choices(centres)
-        centres = np.unique(np.vstack([centres, others[model.probability(others) >= _CERTAIN]]), axis=0)[:_MOST_CENTRES]
+        alike = ~met(at(others)) & (model.probability(others) >= _CERTAIN)
+        centres = np.unique(np.vstack([centres, others[alike]]), axis=0)[:_MOST_CENTRES]
     return centres
 
 

@@ -14,6 +14,7 @@ from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import State
+from sbt.sumo.off_lanes import parking
 from sbt.sumo.overlaps import deepest_overlap, instant, required_braking
 from sbt.sumo.places import inserted_at, said_at
 
@@ -82,6 +83,7 @@ class AppearanceMonitor:
         self._sumo, self._ego, self._departures = sumo, ego, departures
         self._unparked: frozenset[str] = frozenset()
         self._unparked_before: frozenset[str] = frozenset()
+        self._parked: frozenset[str] = frozenset()
         self._jumped: frozenset[str] = frozenset()
 
     def after_step(self, near: _Surroundings, departed: frozenset[str]) -> None:
@@ -95,10 +97,9 @@ class AppearanceMonitor:
             RunError: the ego appears inside another road user, or another one inside or right before it.
         """
         simulation = self._sumo.simulation
-        self._unparked_before, self._unparked = self._unparked, frozenset()
+        self._unparked_before = self._unparked
         moved, self._jumped = self._jumped, frozenset(near.jumped)
-        if simulation.getParkingEndingVehiclesNumber():
-            self._unparked = frozenset(simulation.getParkingEndingVehiclesIDList())
+        self._parked, self._unparked = map(frozenset, parking(simulation))
         new = near.newcomers()
         if len(near) == 1:
             found = deepest_overlap(near.body(self._ego), {name: near.body(name) for name in new})
@@ -113,11 +114,17 @@ class AppearanceMonitor:
             self._check(near, [name for name in new if name in appeared])
 
     def refuse_contact(self, name: str) -> None:
-        """Check a contact of the ego: a vehicle that leaves its parking place jumps onto its lane, through all others.
+        """Check a contact of the ego: who parks, or leaves its place, jumps there within a step, through all others.
 
         Raises:
-            RunError: it is with such a vehicle, in that step.
+            RunError: it is with a vehicle that leaves its place, or the ego itself jumps, in that step.
         """
+        if self._ego in self._parked | self._unparked | self._unparked_before:
+            raise RunError(
+                Status.INVALID,
+                f"the ego '{self._ego}' must park, and leave its parking place, where nobody is, but SUMO has moved it through"
+                f" '{name}' at {self._now()}: let it stop elsewhere, or keep '{name}' away from there",
+            )
         if name in self._unparked | self._unparked_before:
             raise RunError(
                 Status.INVALID,

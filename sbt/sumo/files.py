@@ -19,6 +19,7 @@ from sbt.errors import InputError
 from sbt.problem.plain import Values
 from sbt.sumo.formatting import format_number
 from sbt.sumo.outputs import begin_outputs
+from sbt.sumo.places import place_in
 from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template
 
 __all__ = ["FIXED_OPTIONS", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
@@ -33,7 +34,7 @@ _DEFAULTS = {"step-length": "0.1", "time-to-teleport": "-1", "xml-validation.net
 _ALIASES = {
     "n": "net-file", "net": "net-file", "r": "route-files", "a": "additional-files", "additional": "additional-files",
     "w": "weight-files", "b": "begin", "e": "end", "c": "configuration-file", "routes": "route-files", "weights": "weight-files",
-    "configuration": "configuration-file",
+    "configuration": "configuration-file", "s": "route-steps",
 }  # fmt: skip
 """Short names of options, as SUMO has them."""
 _FILES = ("net-file", "route-files", "additional-files")
@@ -132,6 +133,7 @@ class SumoFiles:
                 if path.name.endswith((".xml", ".xml.gz")) and path.is_file():
                     template(path)
         _check_net(template(self.net))
+        _check_ids(found)
         return found
 
     def placeholders(self) -> Iterator[Placeholder]:
@@ -280,6 +282,22 @@ def _absolute(option: str, value: str, folder: Path) -> str:
     return ",".join(
         str((folder / name).resolve()) if (folder / name).exists() or option in _FILES else name for name in _split(value)
     )
+
+
+def _check_ids(files: Sequence[Template]) -> None:
+    """Check that no person has the id of a vehicle: SUMO takes them apart, but tells of both who is near by their ids alone.
+
+    Raises:
+        InputError: one has.
+    """
+    vehicles = {name: place_in(one.path, *vehicle.place) for one in files for name, vehicle in one.vehicles.items()}
+    for one in files:
+        for name, place in one.persons.items():
+            if name in vehicles:
+                raise InputError(
+                    f"{place_in(one.path, *place)}: no person may have the id of a vehicle, but there is a vehicle '{name}' too"
+                    f" ({vehicles[name]}): give persons a prefix of their own (randomTrips.py --prefix p)"
+                )
 
 
 def _check_net(net: Template) -> None:

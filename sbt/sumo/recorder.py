@@ -161,6 +161,10 @@ class Recorder:
         """Take the body of a vehicle that the loop moves by poses as a rectangle, however long it is."""
         self._surroundings.move(name)
 
+    def take_as_put(self, name: str) -> None:
+        """Take a road user as one that the loop puts to another place of a lane: what is between is no way that it drives."""
+        self._surroundings.put(name)
+
     def before_step(self) -> None:
         """Let the controller of the ego act.
 

@@ -90,6 +90,11 @@ class Recorders:
         for recorder in self._all:
             recorder.take_as_rigid(name)
 
+    def take_as_put(self, name: str) -> None:
+        """Take a road user as one that the loop puts to another place of a lane: what is between is no way that it drives."""
+        for recorder in self._all:
+            recorder.take_as_put(name)
+
     def before_step(self) -> None:
         """Let the controllers act.
 

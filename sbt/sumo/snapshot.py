@@ -11,7 +11,7 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,7 +26,7 @@ from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import placeholders
 
-__all__ = ["CAN_FORK", "NoSnapshot", "Snapshot", "WarmUp", "snapshot_of"]
+__all__ = ["CAN_FORK", "NoSnapshot", "Snapshot", "WarmUp", "reads_whole", "snapshot_of"]
 
 CAN_FORK = hasattr(os, "fork") and sys.platform.startswith("linux")
 """Whether a run can be a child of a process that has loaded the network; elsewhere each run loads it."""
@@ -269,12 +269,17 @@ def _constant_departure(piece: Piece, begin: float) -> float:
     return begin if piece.departs is None and piece.tag.lower().endswith("flow") else _departure(piece, {})
 
 
+def reads_whole(options: Mapping[str, str]) -> bool:
+    """Return whether SUMO reads route files at once, and not as the simulation goes on (`route-steps: 0`)."""
+    return seconds_of(options.get("route-steps", "200")) == 0.0
+
+
 def _check_sorted(files: SumoFiles, moving: Sequence[tuple[float, Piece]]) -> None:
     """Refuse route files of which SUMO would leave out a part, as it is not sorted: a warm-up would have that traffic.
 
     With the option `route-steps: 0` SUMO reads them whole, and leaves out nothing.
     """
-    if files.options.get("route-steps") in ("0", "0.0"):
+    if reads_whole(files.options):
         return
     last: dict[Path, tuple[float, Piece]] = {}
     for time, piece in moving:

@@ -16,17 +16,18 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import RunError
-from sbt.metrics.geometry import contact_part, farthest, rectangle_distance
+from sbt.metrics.geometry import LANE_CHANGE, contact_part, farthest, rectangle_distance
 from sbt.problem.outcome import TELEPORTED, Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
+from sbt.sumo.identity import check_sizes, refuse_twice
 from sbt.sumo.levels import is_known
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_near, read
 from sbt.sumo.overlaps import Rectangle, separate
 from sbt.sumo.session import INVALID_DOUBLE
-from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, path_behind
+from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, part_traces, path_behind
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
 
 __all__ = ["Surroundings"]
@@ -37,6 +38,9 @@ _VERY_LONG = 20.0
 """Length from which on a vehicle may be near although its front is not within the radius (m)."""
 _BESIDE = 0.5
 """How far who parks, or leaves its place, is moved beside what it drives, from which on it has jumped there (m)."""
+
+_SIZED = 1.0
+"""After how much simulated time sizes are looked at (s)."""
 
 _Row = tuple[float, ...]
 
@@ -68,24 +72,21 @@ class Surroundings:
         self._centre_offsets: dict[str, float] = {}
         self._bodies: dict[str, TrailingBody] = {}
         self._lanes = Lanes(sumo)
-        self._rows: list[dict[str, _Row]] = []
-        self._parts: list[dict[str, int]] = []
+        self._rows, self._parts = list[dict[str, _Row]](), list[dict[str, int]]()
         self._last_poses: dict[tuple[str, int], np.ndarray] = {}
         self._arrived: frozenset[str] = frozenset()
         self._ways: dict[str, tuple[States, ...]] = {}
-        self.states: dict[str, State] = {}
-        self.present: list[str] = []
+        self.states, self.present = dict[str, State](), list[str]()
         self.rigid: set[str] = set()
         self.placed: Mapping[str, Placed] = {}
         self.jumped: set[str] = set()
-        self._farthest = float(farthest(dt))
-        self._recorded_at = 0.0
+        self._farthest, self._recorded_at = float(farthest(dt)), 0.0
         self._teleported: dict[str, str] = {}
         self._ending: Sequence[str] = ()
         self._parking: Sequence[str] = ()
         self._left: Sequence[str] = ()
         self._leaving: Sequence[str] = ()
-        self._unreacting, self._moved = set[str](), set[str]()
+        self._unreacting, self._moved, self._put = set[str](), set[str](), set[str]()
         self._moved_before, self._moving = dict[str, bool](), dict[str, bool]()  # by poses: whether for the first time
         self._level = EgoLevel(sumo)
         self.follow(sumo.vehicle.getIDList())
@@ -106,6 +107,8 @@ class Surroundings:
             self._named_present.discard(name)
         length = self._sumo.vehicle.getLength
         for name in departed:
+            if self.is_person(name):
+                refuse_twice(name)
             if (extent := length(name)) > _VERY_LONG:
                 self._very_long[name] = extent
             if name in self._named:
@@ -122,6 +125,10 @@ class Surroundings:
         self.rigid.add(name)
         self._moved.add(name)
         self._level.keep(name)
+
+    def put(self, name: str) -> None:
+        """Take a road user as one that the loop puts to another place of a lane, in the next step."""
+        self._put.add(name)
 
     def subscribe(self, *, walks: bool = False) -> None:
         """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
@@ -169,7 +176,10 @@ class Surroundings:
         self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
+        if len(self._rows) % max(round(_SIZED / self._dt), 1) == 0:
+            check_sizes(self._sumo, self.states, row)
         self._moved_before, self._moving = self._moving, {}
+        self._put.clear()
         self._moved = {name for name in self.rigid if self.is_person(name)}  # they keep the speed of the last step
 
     def _keep_way(self, name: str) -> None:
@@ -222,6 +232,8 @@ class Surroundings:
         state = self.states.get(name)
         if state is None:
             state = self._first_seen(name, (x, y), variables)
+        elif VEHICLE in variables and not self.is_person(name):
+            refuse_twice(name)
         if variables[ANGLE] != state.angle:
             state.turn(variables[ANGLE])
         half, speed, last = self._centre_offsets[name], float(variables[SPEED]), before.get(name)
@@ -230,7 +242,8 @@ class Surroundings:
         if last is not None and half and moved > self._farthest:  # SUMO turns a long vehicle at once: where was its front?
             moved = min(moved, math.hypot(x - last[0] - half * math.cos(last[2]), y - last[1] - half * math.sin(last[2])))
         parks = last is not None and name in self._parking and moved > (last[3] + speed) * self._dt + _BESIDE
-        if moved > self._farthest or (last is not None and name in self._ending):
+        put = last is not None and name in self._put and moved > (last[3] + speed) * self._dt + LANE_CHANGE
+        if moved > self._farthest or put or (last is not None and name in self._ending):
             self._note_jump(name, moved)
             return
         if parks and name != self._ego and (name not in self._left or self._is_far(state, moved)):
@@ -267,6 +280,8 @@ class Surroundings:
 
     def _first_seen(self, name: str, front: tuple[float, float], variables: Mapping[int, Any]) -> State:
         person = VEHICLE in variables
+        if person and is_known(self._sumo, name):
+            refuse_twice(name)
         domain = self._sumo.person if person else self._sumo.vehicle
         state = self.states[name] = State(name, float(domain.getLength(name)), float(domain.getWidth(name)), self._dt)
         self._centre_offsets[name] = 0.0 if person else 0.5 * state.length
@@ -286,9 +301,7 @@ class Surroundings:
             reach = reach_0 + 1.5 * other.length + (ego.speed + other.speed) * self._dt
             if abs(other.x - x) > reach or abs(other.y - y) > reach:
                 continue
-            if not self._near(name):
-                continue
-            touched = contact_part(self._step_of(self._ego, name), self._step_of(name, name))
+            touched = contact_part(self._step_of(self._ego, name), self._step_of(name, name)) if self._near(name) else None
             if touched is not None:
                 found.append((name, *touched[1:]))
         return found
@@ -346,11 +359,12 @@ class Surroundings:
         parts: tuple[ActorTrace, ...] = ()
         if name in self._bodies and name not in self.rigid:
             poses = self._bodies[name].poses([self._parts[k][name] for k in at])
-            parts = _parts(poses, speed, acceleration, self._bodies[name].part_length, state.width)
+            parts = part_traces(poses, speed, acceleration, self._bodies[name].part_length, state.width)
         return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width, parts)
 
     def trace(self, ended: str, reported: Sequence[str], unconfirmed: Sequence[str]) -> Trace:
         """Return the recorded trace; states of absent road users are NaN."""
+        check_sizes(self._sumo, self.states, self.present)
         there = {*self._sumo.vehicle.getIDList(), *self._arrived}
         for name in self.present:
             if name in there:
@@ -381,14 +395,6 @@ class Surroundings:
         poses = np.full((len(self._rows), body.count, 3), np.nan)
         rows = [k for k, parts in enumerate(self._parts) if name in parts]
         poses[rows] = body.poses([self._parts[k][name] for k in rows])
-        made = _parts(poses, table[:, 3], table[:, 4], body.part_length, state.width)
+        made = part_traces(poses, table[:, 3], table[:, 4], body.part_length, state.width)
         ways = self._ways.get(name, ())[1:]
         return tuple(replace(part, way=way) for part, way in zip(made, ways, strict=True)) if ways else made
-
-
-def _parts(poses: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, length: float, width: float) -> tuple[ActorTrace, ...]:
-    """Return the parts of a long vehicle from their (t, parts, 3) poses."""
-    return tuple(
-        ActorTrace(poses[:, j, 0], poses[:, j, 1], poses[:, j, 2], speed, acceleration, length, width)
-        for j in range(poses.shape[1])
-    )

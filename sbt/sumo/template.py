@@ -43,6 +43,7 @@ _REFERRING = ("include", "variableSpeedSign", "rerouter")
 _SMALL, _TIMES_SMALLER = 2**25, 100
 """Bytes to which any packed file may unpack, and how much larger than packed; SUMO's XML is packed to a tenth or thirtieth."""
 _VEHICLES = ("vehicle", "trip", "flow")
+_PERSONS = ("person", "personFlow")
 _QUOTES = {'"': "&quot;", "'": "&apos;"}
 
 
@@ -98,6 +99,7 @@ class Template:
         root: name and attributes of the root element.
         parts: what is replaced in a copy, in order.
         vehicles: vehicles, trips and flows by id.
+        persons: line and column of persons and flows of them, by id.
         data: the bytes of the file; empty if there is nothing to replace.
     """
 
@@ -105,6 +107,7 @@ class Template:
     root: tuple[str, Mapping[str, str]]
     parts: tuple[_Part, ...]
     vehicles: Mapping[str, Vehicle]
+    persons: Mapping[str, tuple[int, int]]
     data: bytes = b""
 
     @cached_property
@@ -254,6 +257,7 @@ def template(path: Path) -> Template:
     roots: list[tuple[str, Mapping[str, str]]] = []
     parts: list[_Part] = []
     vehicles: dict[str, Vehicle] = {}
+    persons: dict[str, tuple[int, int]] = {}
     marks = (b"${", *(b"<" + tag.encode() for tag in _REFERRING), *MARKS)
     has_parts = any(mark in data for mark in marks)
 
@@ -276,6 +280,8 @@ def template(path: Path) -> Template:
             varies = has_parts and any("${" in value for value in attributes.values())
             departure = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane", "begin"))
             vehicles[attributes["id"]] = Vehicle(tag, at, varies, *departure)
+        elif tag in _PERSONS and "id" in attributes:
+            persons[attributes["id"]] = (parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
         if not has_parts:
             return
         signals = in_signals(tag, before=signals)
@@ -290,7 +296,7 @@ def template(path: Path) -> Template:
         parser.Parse(data, True)
     except xml.parsers.expat.ExpatError as error:
         raise InputError(f"{path}:{error.lineno}:{error.offset + 1}: a SUMO file must be well-formed XML, but: {error}") from None
-    return Template(path, roots[0], tuple(parts), vehicles, data if parts else b"")
+    return Template(path, roots[0], tuple(parts), vehicles, persons, data if parts else b"")
 
 
 def _parts(path: Path, data: bytes, at: int, tag: str, place: str, *, writes: bool) -> Iterator[_Part]:

@@ -225,6 +225,8 @@ class _CommandProxy:
                 self._proxy.recorder.ignore_departure(who)
             if name == "moveToXY":
                 self._proxy.recorder.take_as_rigid(who)
+            elif name == "moveTo":
+                self._proxy.recorder.take_as_put(who)
         return result
 
     def _expect(

@@ -14,7 +14,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["LONGEST_RIGID", "Lanes", "TrailingBody", "path_behind"]
+from sbt.metrics.geometry import LANE_CHANGE
+from sbt.problem.trace import ActorTrace
+
+__all__ = ["LONGEST_RIGID", "Lanes", "TrailingBody", "part_traces", "path_behind"]
 
 LONGEST_RIGID = 6.0
 """Length up to which a vehicle is one rectangle (m); above, no part is longer than 5 m, unless that takes too many."""
@@ -89,6 +92,9 @@ class TrailingBody:
         dx, dy = front[0] - before[0], front[1] - before[1]
         path = self._paths[-1]
         u, v = path.direction(before) or (cos, sin)
+        if math.hypot(dx, dy) > 1.5 * travelled + (LANE_CHANGE if changed else _JUMP):
+            self._paths.append(_Path())  # moved, or away meanwhile: straight
+            return
         if changed:  # sideways at once, and the body with it
             along = dx * u + dy * v
             shift_x, shift_y = dx - along * u, dy - along * v
@@ -96,8 +102,8 @@ class TrailingBody:
             path = _Path([(x + shift_x, y + shift_y) for x, y in kept])
             self._paths.append(path)
             before = before[0] + shift_x, before[1] + shift_y
-        elif max(dx * cos + dy * sin, dx * u + dy * v) < -0.1 or math.hypot(dx, dy) > 1.5 * travelled + _JUMP:
-            self._paths.append(_Path())  # backwards (in a tight turn the front drives against the chord), or moved: straight
+        elif max(dx * cos + dy * sin, dx * u + dy * v) < -0.1:
+            self._paths.append(_Path())  # backwards (in a tight turn the front drives against the chord): straight
             return
         path.extend(before, _SPACING)
 
@@ -243,3 +249,13 @@ def _at(shape: Sequence[Point], position: float) -> tuple[Point, int | None]:
             return (a[0] + position / step * (b[0] - a[0]), a[1] + position / step * (b[1] - a[1])), k
         position -= step
     return shape[-1], None
+
+
+def part_traces(
+    poses: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, length: float, width: float
+) -> tuple[ActorTrace, ...]:
+    """Return the parts of a long vehicle from their (t, parts, 3) poses."""
+    return tuple(
+        ActorTrace(poses[:, j, 0], poses[:, j, 1], poses[:, j, 2], speed, acceleration, length, width)
+        for j in range(poses.shape[1])
+    )

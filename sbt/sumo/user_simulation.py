@@ -41,6 +41,7 @@ from sbt.sumo.forking import in_fork
 from sbt.sumo.formatting import plain_values
 from sbt.sumo.friction import Friction
 from sbt.sumo.guided import GuidedVehicle, Participant
+from sbt.sumo.lane_lengths import told_of_lengths
 from sbt.sumo.levels import levels_of
 from sbt.sumo.messages import explained, refuse_dropped
 from sbt.sumo.phases import Stopwatch
@@ -314,7 +315,8 @@ class UserSimulation:
         """Return SUMO's warnings about the files in the last run of this process, each once, and what is known beside them."""
         lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
         found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
-        return (*filter(None, [unrepeatable(self.files), session().ask(lambda sumo: levels_of(sumo).warning)]), *found)
+        of_net = (session().ask(each) for each in (lambda sumo: levels_of(sumo).warning, told_of_lengths))
+        return (*filter(None, [unrepeatable(self.files), *of_net]), *found)
 
     def run_with_traci(self, values: Values, seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
         """Run one concrete scenario in a separate SUMO process, such as sumo-gui, through traci.

@@ -30,7 +30,7 @@ from sbt.sumo.demand import excerpts, pieces_of, without_pieces
 from sbt.sumo.files import Launch, SumoFiles
 from sbt.sumo.forking import in_fork
 from sbt.sumo.session import libsumo, scratch_folder, session
-from sbt.sumo.snapshot import CAN_FORK, Snapshot
+from sbt.sumo.snapshot import CAN_FORK, Snapshot, reads_whole
 from sbt.sumo.template import Template, template
 
 __all__ = ["State", "WarmedFiles", "shortened", "warmed_files"]
@@ -56,25 +56,28 @@ _LONGEST = 3600.0
 
 _SCRIPT = """# Drives the run in sumo-gui, or another program: python run.py [PROGRAM [OPTION ...]]
 import os
+import shutil
 import sys
+import tempfile
 
 import traci
 
 os.chdir(os.path.dirname(os.path.abspath(__file__)))
 program, *options = sys.argv[1:] or ["sumo-gui"]
-for name in {later!r}:  # SUMO must read traffic after the state: see warmed traffic in the documentation
-    os.replace(name, name + ".later")
-    with open(name, "w") as file:
-        file.write("<routes/>")
-try:
-    traci.start([program, {arguments}, *options])
-finally:
-    for name in {later!r}:
-        os.replace(name + ".later", name)
-traci.simulation.loadState({state!r})
-while traci.simulation.getTime() <= {end!r}:
-    traci.simulationStep()
-traci.close()
+arguments = [{arguments}]
+with tempfile.TemporaryDirectory() as folder:
+    routes = [os.path.join(folder, name) for name in {later!r}]
+    for route in routes:  # traffic that SUMO reads before the state makes it keep the travel times of then
+        with open(route, "w") as file:
+            file.write("<routes/>")
+    arguments[arguments.index("--route-files") + 1] = ",".join(routes)
+    traci.start([program, *arguments, *options])
+    for route in routes:
+        shutil.copy(os.path.basename(route), route)
+    traci.simulation.loadState({state!r})
+    while traci.simulation.getTime() <= {end!r}:
+        traci.simulationStep()
+    traci.close()
 """
 
 
@@ -267,8 +270,10 @@ def warmed_files(files: SumoFiles, snapshot: Snapshot, step: float | None) -> Wa
     digest = _digest(files, snapshot.until, step)
     folder = scratch_folder() / f"warm-{digest}"
     folder.mkdir(exist_ok=True)
-    own = {k: v for k, v in files.options.items() if (k, v) != ("route-steps", "0")}  # the file of a run is read as it goes on
-    equipped = replace(files, options={**own, **_SAVING}, routes=(), additional=())
+    options = {**files.options, **_SAVING}
+    if reads_whole(options):  # a run's files are read after its state
+        del options["route-steps"]
+    equipped = replace(files, options=options, routes=(), additional=())
     base = equipped.launch({}, folder, step).arguments  # begins the folder's outputs, which the files below name
     standing = []
     for k, one in enumerate(_standing(files)):

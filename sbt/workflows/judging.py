@@ -199,7 +199,7 @@ def _judged(study: Study, records: Sequence[Record], drivers: Sequence[str], wor
             for k, r in enumerate(records) for d in range(len(panel.names) + 1)}  # fmt: skip
     with study.executor(spec, workers=workers) as executor:
         first = {o.index: o for o in executor.run([jobs[k, 0] for k in range(len(records))])}
-        reasons = [_why_not(study, first[jobs[k, 0].index], record) for k, record in enumerate(records)]
+        reasons = [_why_not(first[jobs[k, 0].index], record) for k, record in enumerate(records)]
         rest = [job for (k, d), job in jobs.items() if d > 0 and not reasons[k]]
         outcomes = {o.index: o for o in executor.run(rest)} if rest else {}
     judged = []
@@ -239,17 +239,13 @@ def _exchanging(study: Study, panel: _Panel) -> ScenarioSpec:
     return replace(study.spec, drivers=panel.egos, metrics=(*study.spec.metrics, *further))
 
 
-def _why_not(study: Study, again: Outcome, record: Record) -> str:
+def _why_not(again: Outcome, record: Record) -> str:
     """Return why a run cannot be judged; "" where it can."""
     if again.status != Status.OK:
         return f"the run itself gives no metric: {again.reason}"
     changed = [name for name, value in record.metrics.items() if again.metrics.get(name) != value and not np.isnan(value)]
     if changed:
         return f"the run is not the same when it is executed again ({changed[0]})"
-    need, roles = study.scenario.requirement, study.runnable.roles
-    own = again.metrics.get(f"{need.metric}_{roles.ego}") if roles.also_tested and not need.combined else None
-    if own is not None and not need.critical.contains(np.array([own]))[0]:
-        return f"'{roles.ego}' does not fail, another vehicle under test does: the drivers only take the place of the first"
     return why_not(again.metrics[METRIC_NAME])
 
 
