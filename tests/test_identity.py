@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from own_networks import run_program
 
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
+from sbt.sumo.ego import Ego
+from sbt.sumo.ego_vehicle import EgoVehicle
 
 pytestmark = pytest.mark.sumo
 
@@ -95,3 +98,19 @@ def test_lengths_that_are_not_those_of_shapes_are_told(tmp_path: Path):
     simulation = ScenarioSpec(str(_scenario(tmp_path, length='length="800"'))).resolve().simulate
     simulation({"v": 10.0}, 1)
     assert any("edges have another length than their shape ('ab' 800 m for 400 m)" in said for said in simulation.warnings())
+
+
+def test_an_ego_with_another_model_keeps_the_other_properties_of_its_type(tmp_path: Path):
+    """What it does at junctions, when it acts and how it changes lanes was that of SUMO's default type."""
+    own = 'actionStepLength="1" jmIgnoreFoeProb="1" jmDriveAfterRedTime="9" lcStrategic="3" impatience="0.7" sigma="0.2"'
+    path = _scenario(tmp_path)
+    routes = tmp_path / "r.rou.xml"
+    traffic = routes.read_text().replace('<vehicle id="ego" type="car"', '<vehicle id="ego" type="mine"')
+    routes.write_text(traffic.replace('<vType id="car"', f'<vType id="mine" {own} accel="${{v / 10}}"/>\n<vType id="car"'))
+    files = ScenarioSpec(str(path)).resolve().simulate.files
+    ego = EgoVehicle("ego", Ego.of(kind="sumo", model="IDM", tau=0.8))
+    made = ET.fromstring(ego.vehicle_type(files, {"v": 20.0})).attrib
+    assert made == {
+        "id": "sbt_ego", "actionStepLength": "1", "jmIgnoreFoeProb": "1", "jmDriveAfterRedTime": "9", "lcStrategic": "3",
+        "impatience": "0.7", "accel": "2", "carFollowModel": "IDM", "laneChangeModel": "LC2013", "tau": "0.8",
+    }  # fmt: skip

@@ -98,19 +98,17 @@ class Cube:
         counts = dict(self.nominal)
         return np.repeat(scale, [counts.get(k, 1) for k in range(len(scale))])
 
-    def with_other_choices(self, u: Points) -> Points:
-        """Return the points (n, d) with each other choice of one input, input by input.
+    def exchanged(self, u: Points) -> Points:
+        """Return each of the points (n, d) with the choices of each other one, where they differ: (m, d).
 
-        >>> Cube(nominal=((0, 3),)).with_other_choices(np.array([[0.5, 0.4]])).round(2).tolist()
-        [[0.83, 0.4], [0.17, 0.4]]
+        >>> Cube(nominal=((0, 2),)).exchanged(np.array([[0.25, 0.1], [0.75, 0.4], [0.25, 0.5]])).round(2).tolist()
+        [[0.75, 0.1], [0.25, 0.4], [0.25, 0.4], [0.75, 0.5]]
         """
-        found = [np.empty((0, u.shape[1]))]
-        for k, n in self.nominal:
-            for step in range(1, n):
-                other = np.array(u, dtype=np.float64)
-                other[:, k] = ((_cell(u[:, k], n) + step) % n + 0.5) / n
-                found.append(other)
-        return np.vstack(found)
+        columns, choices = [k for k, _ in self.nominal], self.choices(u)
+        one, other = np.nonzero((choices[:, None, :] != choices[None, :, :]).any(axis=2))
+        found = np.array(u[one], dtype=np.float64)
+        found[:, columns] = u[other][:, columns]
+        return found
 
     def flipped(self, u: Points, start: Points, chance: Vector | float, rng: np.random.Generator) -> Points:
         """Return points u (n, d) that were reached by steps from `start` (n, d), with its choices, or another one.

@@ -45,7 +45,7 @@ _MOVED = 0.3  # share of the coordinates that a step changes: others stay, which
 _MOST_TRIES, _MOST_AT_ONCE = 2**18, 2**14  # to find admissible points: 260 where a thousandth is feasible
 _PRIOR_RUNS = 2.0  # what the metamodel's P(critical) weighs beside repetitions of a run
 _MOST_SEEDS, _CERTAIN, _DOUBTFUL = 0.5, 0.9, 0.3  # failure rates: deflated from, without repetition from, left alone below
-_MOST_REPEATED, _MOST_CENTRES = 3, 2000  # runs of the same inputs, after which their basin is left as it is; deflated boxes
+_MOST_REPEATED, _MOST_EXCHANGED = 3, 60  # runs of the same inputs, after which their basin is left as it is; critical runs
 _FARTHEST_OF, _FARTHEST_OF_FEW = 30, 3  # uniform points, the farthest of which fills a gap: around the edges, and plainly
 
 
@@ -279,11 +279,9 @@ def _in_other_choices(search: Search, u: Points, y: Vector, ok: Mask, deflated: 
     if not search.cube.nominal or len(centres) == 0:
         return centres
     model, met = fit_warped(search.for_noise(u, y), u[ok], y[ok], rng), FreeRegion.without(at(centres), search.deflation)
-    for _ in search.cube.nominal:
-        others = search.cube.with_other_choices(centres)
-        alike = ~met(at(others)) & (model.probability(others) >= _CERTAIN)
-        centres = np.unique(np.vstack([centres, others[alike]]), axis=0)[:_MOST_CENTRES]
-    return centres
+    others = search.cube.exchanged(centres[-_MOST_EXCHANGED:])
+    others = others[~met(at(others))]
+    return np.vstack([centres, others[model.probability(others) >= _CERTAIN] if len(others) else others])
 
 
 def _decided(search: Search, u: Points, y: Vector, ok: Mask, hit: Mask, rng: np.random.Generator) -> tuple[Mask, tuple[int, ...]]:

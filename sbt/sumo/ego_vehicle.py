@@ -16,10 +16,13 @@ from sbt.problem.plain import Values
 from sbt.sumo.actors import Controller, State
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.ego import SUMO, Ego
+from sbt.sumo.elements import type_of
+from sbt.sumo.files import SumoFiles
 from sbt.sumo.formatting import plain
 from sbt.sumo.guided import STRATEGIC_LANE_CHANGES
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, SPEED_MODE
-from sbt.sumo.models import vtype_attributes
+from sbt.sumo.models import LANE_CHANGE, known_attributes, vtype_attributes
+from sbt.sumo.template import fill
 
 __all__ = ["EGO_TYPE", "EgoControl", "EgoVehicle"]
 
@@ -28,6 +31,8 @@ EGO_TYPE = "sbt_ego"
 _COPIED = ("Length", "Width", "Height", "VehicleClass", "MaxSpeed", "MinGap", "Accel", "Decel", "EmergencyDecel", "Tau",
            "Imperfection", "SpeedFactor", "SpeedDeviation", "Color", "MaxSpeedLat", "MinGapLat", "LateralAlignment")  # fmt: skip
 """Properties that the ego keeps when its type changes, by the names of SUMO's getters and setters."""
+_OF_FILES = ("actionStepLength", "apparentDecel", "impatience", "boardingDuration", "loadingDuration", "timeToTeleport")
+"""Attributes of the type in the files that no getter tells, beside those of junctions (jm...)."""
 _ATTRIBUTE = {"Imperfection": "sigma", "VehicleClass": "vClass", "SpeedDeviation": "speedDev", "LateralAlignment": "latAlignment"}
 """vType attributes of the properties whose names differ."""
 _COMFORTABLE_DECELERATION = 3.0
@@ -91,12 +96,25 @@ class EgoVehicle:
         """Return the vehicle of one run, with the values of its driver's settings that are inputs."""
         return self if self.driver is None else self.with_driver(self.driver.bind(values))
 
-    def vehicle_type(self) -> str | None:
-        """Return the XML of the vehicle type for another model of SUMO; None where none is needed."""
+    def vehicle_type(self, files: SumoFiles | None = None, values: Values = {}) -> str | None:  # noqa: B006
+        """Return the XML of the vehicle type for another model of SUMO; None where none is needed.
+
+        Args:
+            files: whose type the vehicle has; what the settings do not mention is as there, as far as the models have it.
+            values: of the inputs, for placeholders in it.
+        """
         if self.driver is None or self.driver.kind != SUMO:
             return None
-        settings = vtype_attributes(dict(self.driver.settings))
-        return '<vType id="{}" {}/>'.format(self.type_id, " ".join(f"{k}={quoteattr(v)}" for k, v in settings.items()))
+        found = None if files is None else type_of(files.templates, self.id)
+        there = {} if found is None else {k: fill(v, values, found.place) for k, v in found.attributes.items()}
+        settings = dict(self.driver.settings)
+        if not {"lane_change", "laneChangeModel"} & settings.keys() and there.get("laneChangeModel") in LANE_CHANGE:
+            settings["lane_change"] = there["laneChangeModel"]
+        given = vtype_attributes(settings)
+        known = {*known_attributes(given["carFollowModel"], given["laneChangeModel"]), *_OF_FILES}
+        kept = {k: v for k, v in there.items() if k not in given and (k in known or k.startswith("jm"))}
+        written = " ".join(f"{k}={quoteattr(v)}" for k, v in (kept | given).items())
+        return f'<vType id="{self.type_id}" {written}/>'
 
     def take_over(self, sumo: Any, rng: np.random.Generator, *, walks: bool = False) -> EgoControl | None:
         """Give the ego its driver; to be called in the step in which it departs.

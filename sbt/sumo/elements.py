@@ -11,7 +11,7 @@ from sbt.sumo.files import SumoFiles
 from sbt.sumo.places import place_in
 from sbt.sumo.template import Template
 
-__all__ = ["PEOPLE", "Element", "element", "elements", "person"]
+__all__ = ["PEOPLE", "Element", "element", "elements", "person", "type_of"]
 
 PEOPLE = ("person", "personFlow")
 """Elements that put persons on the road."""
@@ -77,6 +77,16 @@ def person(templates: tuple[Template, ...], name: str) -> Element | None:
     flow, _, rank = name.rpartition(".")
     of_flow = (one for one in people if one.tag == "personFlow" and one.attributes["id"] == flow and rank.isdigit())
     return found if found is not None else next(of_flow, None)
+
+
+@kept
+def type_of(templates: tuple[Template, ...], name: str) -> Element | None:
+    """Return the vehicle type of a vehicle, trip or flow; None where it is of a distribution, or is not in the files."""
+    known = [one for each in templates if each.root[0] != "net" for one in _elements_of(each)]
+    wanted = (name, name.rpartition(".")[0])
+    found = next((one for one in known if one.tag in ("vehicle", "trip", "flow") and one.attributes["id"] in wanted), None)
+    kind = None if found is None else found.attributes.get("type")
+    return next((one for one in known if one.tag == "vType" and one.attributes["id"] == kind), None)
 
 
 def element(files: SumoFiles, name: str, tags: Collection[str]) -> Element | None:

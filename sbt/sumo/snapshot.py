@@ -51,6 +51,9 @@ _FORBIDDEN = {
 """Options with the one value that a snapshot takes; "": none."""
 
 
+_TAKE_OVER = "SUMO cannot load a state of vehicles that have a device for taking over (toc)"
+
+
 class NoSnapshot(Exception):  # noqa: N818  (an answer, not a failure)
     """Why a simulation cannot begin with warmed traffic."""
 
@@ -195,19 +198,28 @@ def _because(piece: Piece, varying: tuple[Piece, ...]) -> str:
     return f"it depends on an input by '{found[0]}' ({defined[found[0]]}); " if found else ""
 
 
-def _check_surroundings(files: SumoFiles) -> None:
-    """Refuse what a saved state does not hold, and inputs anywhere but in traffic."""
+def _check_options(files: SumoFiles) -> None:
     for name, value in files.options.items():
         place = files.places.get(name, "options")
         if placeholders(value, place):
             raise NoSnapshot(f"{place}: the option {name} depends on an input")
         if name in _FORBIDDEN and value != _FORBIDDEN[name]:
             raise NoSnapshot(f"{place}: runs with the option {name} {value} load their traffic")
+        if name.startswith("device.toc"):
+            raise NoSnapshot(f"{place}: {_TAKE_OVER}")
+
+
+def _check_surroundings(files: SumoFiles) -> None:
+    """Refuse what a saved state does not hold, and inputs anywhere but in traffic."""
+    _check_options(files)
     for one in files.templates:
         if one.root[0] == "net":
             if one.placeholders:
                 raise NoSnapshot(f"{one.placeholders[0].place}: the network depends on an input")
             continue
+        with one.opened() as file:
+            if b"has.toc.device" in file.read():
+                raise NoSnapshot(f"{one.path}: {_TAKE_OVER}")
         for other in pieces_of(one)[1]:
             if other.varies:
                 raise NoSnapshot(f"{other.place}: <{other.tag}> depends on an input")

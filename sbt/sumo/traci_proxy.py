@@ -117,7 +117,7 @@ class TraciProxy:
         simulation = self._user_simulation
         recording = simulation.recording.bound(self._values)
         ego = recording.ego
-        vehicle_types = "".join(one.vehicle_type() or "" for one in (ego, *recording.further))
+        vehicle_types = "".join(one.vehicle_type(files, self._values) or "" for one in (ego, *recording.further))
         if vehicle_types:
             path = scratch_folder() / "ego.add.xml"
             path.write_text(f"<additional>{vehicle_types}</additional>")
