@@ -114,3 +114,27 @@ def test_an_ego_with_another_model_keeps_the_other_properties_of_its_type(tmp_pa
         "id": "sbt_ego", "actionStepLength": "1", "jmIgnoreFoeProb": "1", "jmDriveAfterRedTime": "9", "lcStrategic": "3",
         "impatience": "0.7", "accel": "2", "carFollowModel": "IDM", "laneChangeModel": "LC2013", "tau": "0.8",
     }  # fmt: skip
+
+
+def test_a_network_without_lanes_inside_junctions_is_named_where_the_ego_jumps_over_one(tmp_path: Path):
+    path = _scenario(tmp_path)
+    nodes = (f'<node id="{name}" x="{x}" y="{y}"/>' for name, x, y in (("a", 0, 0), ("b", 90, 0), ("c", 90, 300)))
+    (tmp_path / "n.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
+    edges = (f'<edge id="{a}{b}" from="{a}" to="{b}" numLanes="2" speed="20"/>' for a, b in ("ab", "bc", "cb"))
+    (tmp_path / "n.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
+    run_program(tmp_path, "netconvert", "-n", "n.nod.xml", "-e", "n.edg.xml", "-o", "net.net.xml", "--no-internal-links",
+                "--default.junctions.radius", "20")  # fmt: skip
+    routes = tmp_path / "r.rou.xml"
+    alone = [line for line in routes.read_text().splitlines() if 'id="lead"' not in line]
+    routes.write_text("\n".join(alone).replace('edges="ab"', 'edges="ab bc"'))
+    said = "as the network has no lanes inside junctions: make it, and run SUMO, without no-internal-links"
+    with pytest.raises(RunError, match=said):
+        ScenarioSpec(str(path)).resolve().simulate({"v": 10.0}, 1)
+
+
+def test_an_error_has_the_place_of_what_it_is_about_and_not_of_a_warning(tmp_path: Path):
+    again = '<vehicle id="ego" type="car" depart="1"><route edges="ab"/></vehicle>'
+    path = _scenario(tmp_path, more=f'<vType id="wild" tau="0.01"/>{again}')
+    with pytest.raises(RunError, match=r"r.rou.xml:3:1: SUMO: .*'ego' already exists") as raised:
+        ScenarioSpec(str(path)).resolve().simulate({"v": 10.0}, 1)
+    assert "Warning" in str(raised.value)

@@ -127,7 +127,8 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     if duplicates.size:
         k = int(duplicates[0])
         where = f"'{users[user[k]]}' at {time[step[k]]:g} s"
-        raise InputError(f"a road user of a recording must occur once per time step, but in '{path}' {where} does not")
+        rule = "a road user of a recording must occur once per time step, a person and a vehicle under ids of their own"
+        raise InputError(f"{rule}, but in '{path}' {where} does not")
     start = np.searchsorted(user, np.arange(len(users) + 1))
     _check_metres(path, data, user)
     person = np.asarray(kinds)[order][start[:-1]] == 1

@@ -27,7 +27,7 @@ _KINDS = {
 """Elements by the words with which SUMO speaks of them."""
 _OF_TYPE = re.compile(r"Car-Following-Model Attribute (\w+)\.|^SUMO: (\w+) must be greater than 0")
 """Mistakes in a vType of which SUMO names the attribute, but not the type."""
-_NAMED = re.compile(rf"\b({'|'.join(sorted(_KINDS, key=len, reverse=True))})(?: with the id)?\s+'([^']+)'", re.IGNORECASE)
+_NAMED = re.compile(rf"\b({'|'.join(sorted(_KINDS, key=len, reverse=True))})(?: with (?:the )?id)?\s+'([^']+)'", re.IGNORECASE)
 
 
 def explained(reason: str, files: SumoFiles) -> str:
@@ -40,7 +40,8 @@ def explained(reason: str, files: SumoFiles) -> str:
     if not reason.startswith(_PREFIX):
         return reason
     known = list(elements(files))
-    named = (_element(known, kind.lower(), name) for kind, name in _NAMED.findall(reason))
+    errors = "; ".join(part for part in reason.split("; ") if not part.startswith("Warning:"))
+    named = (_element(known, kind.lower(), name) for text in (errors, reason) for kind, name in _NAMED.findall(text))
     first = next((one for one in named if one is not None), None) or _faulty_type(reason, known)
     reason = reason.replace(f"{_PREFIX}; Error: ", _PREFIX)
     remedy = ""

@@ -172,7 +172,7 @@ class Recorder:
             RunEnded: the run is over, but the loop went on.
         """
         if self._ended is not None:
-            raise self._ended
+            raise self._ended.with_traceback(None)  # a loop that catches it again and again would lengthen it
         if self._control is not None and self._departed:
             near = self._surroundings
             others = tuple(near.states[name] for name in near.present if name != self._ego)

@@ -22,7 +22,7 @@ from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
-from sbt.sumo.identity import check_sizes, refuse_twice
+from sbt.sumo.identity import check_sizes, refuse_twice, why_jumped
 from sbt.sumo.levels import is_known
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_near, read
 from sbt.sumo.overlaps import Rectangle, separate
@@ -272,8 +272,8 @@ class Surroundings:
         """Leave out a road user that was moved to another place; the ego must not be."""
         t = len(self._rows) * self._dt  # of the row that is being made
         if name == self._ego:
-            rule = f"the ego '{name}' must stay on its way"
-            raise RunError(Status.INVALID, f"{rule}, but was moved by {moved:.0f} m within a step at {t:.3f} s")
+            how = f"was moved by {moved:.0f} m within a step at {t:.3f} s{why_jumped(self._sumo)}"
+            raise RunError(Status.INVALID, f"the ego '{name}' must stay on its way, but {how}")
         self.jumped.add(name)
         text = f"{TELEPORTED}'{name}' at {t:.3f} s: it was moved by {moved:.0f} m, and its track is interrupted"
         self._teleported.setdefault(name, text)
