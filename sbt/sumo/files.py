@@ -290,14 +290,14 @@ def _check_ids(files: Sequence[Template]) -> None:
     Raises:
         InputError: one has.
     """
-    vehicles = {name: place_in(one.path, *vehicle.place) for one in files for name, vehicle in one.vehicles.items()}
     for one in files:
         for name, place in one.persons.items():
-            if name in vehicles:
-                raise InputError(
-                    f"{place_in(one.path, *place)}: no person may have the id of a vehicle, but there is a vehicle '{name}' too"
-                    f" ({vehicles[name]}): give persons a prefix of their own (randomTrips.py --prefix p)"
-                )
+            for other in files:
+                if name in other.vehicles:
+                    there = place_in(other.path, *other.vehicles[name].place)
+                    rule = f"no person may have the id of a vehicle, but there is a vehicle '{name}' too ({there})"
+                    remedy = "give persons a prefix of their own (randomTrips.py --prefix p)"
+                    raise InputError(f"{place_in(one.path, *place)}: {rule}: {remedy}")
 
 
 def _check_net(net: Template) -> None:
