@@ -336,6 +336,33 @@ requirement: {{metric: distance_min, critical: [-.inf, 1.0]}}
 
 
 @pytest.mark.sumo
+def test_who_acts_rarely_drives_on(tmp_path):
+    """SUMO saves no plans: until its next action a vehicle stopped dead at the end of its lane (139 m/s^2)."""
+    found = simulation(town(tmp_path, warm_up="warm_up: {until: 42, seeds: 8}", options="default.action-step-length: 1"))
+    warmed, hardest = found._warmed, 0.0
+    for number in range(8):
+        state = found._state(number)
+        warmed.blank()
+        with session().run(warmed.launch, 0, "fresh", lambda state=state: warmed.begin(CENTRE, (), state)) as sumo:
+            vehicle, speeds = sumo.vehicle, {}
+            for _ in range(12):
+                before, speeds = speeds, {name: sumo.vehicle.getSpeed(name) for name in vehicle.getIDList()}
+                hardest = max([hardest, *(10.0 * (before[name] - speed) for name, speed in speeds.items() if name in before)])
+                sumo.simulationStep()
+    assert hardest < 10.0
+
+
+@pytest.mark.parametrize("kind", ["NEMA", "delay_based"])
+@pytest.mark.sumo
+def test_lights_of_which_states_do_not_hold_the_past_are_not_warmed_up(tmp_path, kind):
+    path = town(tmp_path, warm_up="")
+    net = tmp_path / "town.net.xml"
+    net.write_text(net.read_text().replace('type="actuated"', f'type="{kind}"'))
+    assert "a saved state does not hold wh" in simulation(path, "auto").isolation.why
+    assert kind in simulation(path, "auto").isolation.why
+
+
+@pytest.mark.sumo
 def test_flows_go_on_at_the_rate_of_their_file(tmp_path):
     """SUMO saves some numbers with more than 17 decimals: those beyond were appended to a shorter text (.1555 for .1)."""
     path = town(tmp_path, warm_up="warm_up: {seeds: 1}")

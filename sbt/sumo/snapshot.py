@@ -52,6 +52,12 @@ _FORBIDDEN = {
 
 
 _TAKE_OVER = "SUMO cannot load a state of vehicles that have a device for taking over (toc)"
+_NOT_SAVED = {
+    b"has.toc.device": _TAKE_OVER,
+    b'type="NEMA"': "a saved state does not hold where traffic lights of type NEMA are",
+    b'type="delay_based"': "a saved state does not hold what traffic lights of type delay_based have measured",
+}
+"""What SUMO's states lack, by words of files."""
 
 
 class NoSnapshot(Exception):  # noqa: N818  (an answer, not a failure)
@@ -213,13 +219,15 @@ def _check_surroundings(files: SumoFiles) -> None:
     """Refuse what a saved state does not hold, and inputs anywhere but in traffic."""
     _check_options(files)
     for one in files.templates:
+        with one.opened() as file:
+            text = file.read()
+        for word, why in _NOT_SAVED.items():
+            if word in text:
+                raise NoSnapshot(f"{one.path}: {why}")
         if one.root[0] == "net":
             if one.placeholders:
                 raise NoSnapshot(f"{one.placeholders[0].place}: the network depends on an input")
             continue
-        with one.opened() as file:
-            if b"has.toc.device" in file.read():
-                raise NoSnapshot(f"{one.path}: {_TAKE_OVER}")
         for other in pieces_of(one)[1]:
             if other.varies:
                 raise NoSnapshot(f"{other.place}: <{other.tag}> depends on an input")

@@ -42,6 +42,9 @@ _READ_UNTIL = re.compile(r'(<delay\b[^>]*\btime=")[^"]*(")')
 _LONG = re.compile(r"\d+\.\d{17,}(?![\deE])")
 """Numbers as SUMO saves them, with 17 decimals and some with more; the shortest text of the same number is read twice as
 fast, and edges have 180 past speeds each."""
+_LAST_ACTION = re.compile(r'(<vehicle\b[^>]*? state="(?:\S+ ){6})\d+')
+_STOPPED = re.compile(r'(<stop\b[^>]*\bstarted="[^"/>]*"[^/>]*)/>')
+_LASTS = re.compile(r"\b(duration|until|triggered|containerTriggered)=")
 _WORDS = 624
 """Words of the state of a Mersenne Twister (std::mt19937)."""
 _FULL = 1_000_000
@@ -249,15 +252,35 @@ class WarmedFiles:
         text = saved.read_text(encoding="utf-8")
         saved.unlink()
         text = text[text.index("<snapshot") :]  # before it stands the time of day
-        text = shortened(text)
+        text = mended(shortened(text), self.snapshot.until, rarely="--default.action-step-length" in self.warming.arguments)
         text = _READ_UNTIL.sub(rf"\g<1>{self.snapshot.until:.3f}\g<2>", text, count=1)
         part = path.with_suffix(f".{os.getpid()}")
         part.write_bytes(gzip.compress(text.encode(), 1, mtime=0))
         part.replace(path)
 
 
+def mended(text: str, until: float, *, rarely: bool = False) -> str:
+    """Return the text of a state with which traffic goes on as it did.
+
+    Where vehicles act more rarely than every step (`actionStepLength`, or `rarely`: all by an option), each acts when the state
+    is loaded: SUMO saves no plan, and without one a vehicle stops at the end of its lane until it acts again. A stop that is over,
+    of who waits for a gap to leave its parking place, has a duration of 0: without one it waits for a person.
+
+    Args:
+        text: of a state.
+        until: its time (s).
+        rarely: see above.
+
+    >>> mended('<stop parkingArea="p" started="14.0"/>', 42.0)
+    '<stop parkingArea="p" started="14.0" duration="0"/>'
+    """
+    if rarely or "actionStepLength=" in text:
+        text = _LAST_ACTION.sub(rf"\g<1>{round(1000.0 * until)}", text)
+    return _STOPPED.sub(lambda stop: stop[0] if _LASTS.search(stop[0]) else f'{stop[1]} duration="0"/>', text)
+
+
 def shortened(text: str) -> str:
-    """Return the text of a state in which each number that is saved as 17 or more decimals is the shortest text of the same one.
+    """Return the text of a state in which numbers of 17 or more decimals are the shortest texts of the same ones.
 
     >>> shortened('period="exp(0.10000000000000000555)" speed="13.88888888888888929"')
     'period="exp(0.1)" speed="13.88888888888889"'
