@@ -263,8 +263,8 @@ def mended(text: str, until: float, *, rarely: bool = False) -> str:
     """Return the text of a state with which traffic goes on as it did.
 
     Where vehicles act more rarely than every step (`actionStepLength`, or `rarely`: all by an option), each acts when the state
-    is loaded: SUMO saves no plan, and without one a vehicle stops at the end of its lane until it acts again. A stop that is over,
-    of who waits for a gap to leave its parking place, has a duration of 0: without one it waits for a person.
+    is loaded: SUMO saves no plan, and without one a vehicle stops at the end of its lane until it acts again. A stop that is
+    over, of who waits for a gap to leave its parking place, has a duration of 0: without one it waits for a person.
 
     Args:
         text: of a state.
