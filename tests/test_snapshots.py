@@ -395,6 +395,32 @@ def test_a_damaged_state_is_made_again(tmp_path):
 
 
 @pytest.mark.sumo
+def test_a_state_that_ends_before_its_end_is_made_again(tmp_path):
+    """Where the disk was full while SUMO saved, every run of that warm-up failed from then on."""
+    found = simulation(town(tmp_path, warm_up="warm_up: {seeds: 1}"))
+    kept = found.isolated(replace(found.isolation, states=str(tmp_path / "states"), forking=False))
+    whole = kept(CENTRE, 4)
+    (state,) = (tmp_path / "states").glob("*.gz")
+    text = gzip.decompress(state.read_bytes())
+    state.write_bytes(gzip.compress(text[: len(text) - 200]))
+    _read.cache_clear()
+    assert kept(CENTRE, 4).identical(whole)
+
+
+@pytest.mark.sumo
+def test_manoeuvres_that_states_do_not_hold_are_not_warmed_up(tmp_path):
+    """Half-done changes of lanes jumped sideways at t0; SUMO crashed where somebody overtook on the opposite lane."""
+    slow = simulation(town(tmp_path / "slow", warm_up="", options="lanechange.duration: 3")).isolation
+    assert "does not hold lane changes that take time (lanechange.duration 3)" in slow.why
+    at_once = simulation(town(tmp_path / "at_once", warm_up="warm_up: {seeds: 1}", options="lanechange.duration: 0.0")).isolation
+    assert at_once.level == "snapshot"
+    path = town(tmp_path / "opposite", warm_up="")
+    net = tmp_path / "opposite" / "town.net.xml"
+    net.write_text(net.read_text().replace("</net>", "<!-- <neigh lane='B1A1_1'/> --></net>"))
+    assert "overtakes on an opposite lane" in simulation(path).isolation.why
+
+
+@pytest.mark.sumo
 def test_a_loop_begins_where_warm_up_says(tmp_path):
     found = simulation(looping(tmp_path))
     assert (found.isolation.level, found.isolation.until) == ("snapshot", T0)

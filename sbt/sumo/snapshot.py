@@ -55,6 +55,7 @@ _TAKE_OVER = "SUMO cannot load a state of vehicles that have a device for taking
 _NOT_SAVED = {
     b"has.toc.device": _TAKE_OVER,
     b'type="NEMA"': "a saved state does not hold where traffic lights of type NEMA are",
+    b"<neigh ": "SUMO cannot load a state in which somebody overtakes on an opposite lane, as the network allows (neigh)",
     b'type="delay_based"': "a saved state does not hold what traffic lights of type delay_based have measured",
 }
 """What SUMO's states lack, by words of files."""
@@ -213,6 +214,8 @@ def _check_options(files: SumoFiles) -> None:
             raise NoSnapshot(f"{place}: runs with the option {name} {value} load their traffic")
         if name.startswith("device.toc"):
             raise NoSnapshot(f"{place}: {_TAKE_OVER}")
+        if name == "lanechange.duration" and seconds_of(value) != 0.0:
+            raise NoSnapshot(f"{place}: a saved state does not hold lane changes that take time (lanechange.duration {value})")
 
 
 def _check_surroundings(files: SumoFiles) -> None:

@@ -251,6 +251,8 @@ class WarmedFiles:
             sumo.simulation.saveState(str(saved))
         text = saved.read_text(encoding="utf-8")
         saved.unlink()
+        if not text.rstrip().endswith("</snapshot>"):
+            raise RunError(Status.FAILED, "a warm-up must be saved whole, but its state ends before its end: is the disk full?")
         text = text[text.index("<snapshot") :]  # before it stands the time of day
         text = mended(shortened(text), self.snapshot.until, rarely="--default.action-step-length" in self.warming.arguments)
         text = _READ_UNTIL.sub(rf"\g<1>{self.snapshot.until:.3f}\g<2>", text, count=1)
@@ -344,6 +346,8 @@ def _read(path: Path, *, sublane: bool) -> State:
     """Read a state; kept in this process, as most runs of a worker need one of few."""
     text = gzip.decompress(path.read_bytes()).decode()
     text = _ADVICE.sub(r'\1"', text) if sublane else text
+    if not text.rstrip().endswith("</snapshot>"):
+        raise EOFError(f"{path} ends before its end")
     found = re.search(r"<rngState\b.*?</rngState>", text, re.DOTALL)
     if found is None:
         raise RunError(Status.FAILED, f"a warmed state must hold SUMO's generators, but {path} does not")
