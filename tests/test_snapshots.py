@@ -407,6 +407,41 @@ def test_a_state_that_ends_before_its_end_is_made_again(tmp_path):
     assert kept(CENTRE, 4).identical(whole)
 
 
+FLOW = '<flow id="f" begin="0" end="99" period="6" from="A1B1" to="C1D1"'
+LOST = {
+    "via": f'{FLOW} via="B2C2"/>',
+    "via of": '<trip id="f" depart="0" from="A1B1" to="C1D1" via="B2C2"/>',
+    "parameters": f'{FLOW}><param key="has.rerouting.device" value="true"/></flow>',
+    "speed or duration of walks": f'{FLOW.replace("flow", "personFlow")}><walk from="A1B1" to="B1C1" speed="2.2"/></personFlow>',
+}
+
+
+def with_more(folder: Path, traffic: str) -> Path:
+    """Return the scenario of the town with a further element before its trips."""
+    path = town(folder, warm_up="warm_up: {seeds: 1}")
+    cars = folder / "cars.rou.xml"
+    cars.write_text(cars.read_text().replace("<trip ", f"{traffic}<trip ", 1))
+    return path
+
+
+@pytest.mark.parametrize("lost", LOST)
+@pytest.mark.sumo
+def test_traffic_of_which_states_lose_a_part_is_not_warmed_up(tmp_path, lost):
+    """None of the vehicles of a flow that departed after t0 drove over its via, and none had its devices."""
+    said = rf"cars.rou.xml:\d+:\d+: a saved state does not hold the {lost}.*'f', which begins before t0"
+    with pytest.raises(InputError, match=said):
+        simulation(with_more(tmp_path, LOST[lost])).isolation.warm  # noqa: B018
+
+
+@pytest.mark.sumo
+def test_what_departs_later_has_its_via(tmp_path):
+    later = LOST["via"].replace('begin="0"', 'begin="43"')
+    path = town(tmp_path, warm_up="warm_up: {seeds: 1}")
+    buses = tmp_path / "buses.rou.xml"
+    buses.write_text(buses.read_text().replace('<flow id="late"', f'{later}<flow id="late"'))
+    assert simulation(path).isolation.level == "snapshot"
+
+
 @pytest.mark.sumo
 def test_manoeuvres_that_states_do_not_hold_are_not_warmed_up(tmp_path):
     """Half-done changes of lanes jumped sideways at t0; SUMO crashed where somebody overtook on the opposite lane."""

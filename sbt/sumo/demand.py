@@ -18,7 +18,7 @@ from sbt.problem.plain import Values
 from sbt.sumo.places import place_in
 from sbt.sumo.template import Template, fill, template
 
-__all__ = ["Equipment", "Piece", "excerpts", "expected_departures", "pieces_of", "seconds_of", "without_pieces"]
+__all__ = ["Equipment", "Piece", "excerpts", "expected_departures", "pieces_of", "seconds_of", "texts_of", "without_pieces"]
 
 DEPARTING: Mapping[str, str] = {
     "vehicle": "depart", "trip": "depart", "person": "depart", "container": "depart",
@@ -184,6 +184,15 @@ def excerpts(pieces: Iterable[Piece], values: Values, folder: Path) -> Iterator[
         if path not in read:
             read[path] = _data(piece.file)
         yield piece.file.excerpt(read[path], piece.start, piece.end, values, folder)
+
+
+def texts_of(pieces: Iterable[Piece]) -> Iterator[tuple[Piece, bytes]]:
+    """Yield pieces with their elements as they stand in their files."""
+    read: dict[Path, bytes] = {}
+    for piece in pieces:
+        if piece.file.path not in read:
+            read[piece.file.path] = _data(piece.file)
+        yield piece, read[piece.file.path][piece.start : piece.end]
 
 
 def without_pieces(file: Template, folder: Path) -> bytes:

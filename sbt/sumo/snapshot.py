@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from sbt.errors import InputError, RunError
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.problem.space import ParameterSpace
-from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of
+from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of, texts_of
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import placeholders
 
@@ -52,7 +53,9 @@ _FORBIDDEN = {
 
 
 _TAKE_OVER = "SUMO cannot load a state of vehicles that have a device for taking over (toc)"
+_HOW_IT_WALKS = re.compile(rb"<(walk|personTrip)\b[^>]*\b(speed|duration)=")
 _NOT_SAVED = {
+    b"parkingBadges": "a saved state does not hold the parking badges of vehicle types",
     b"has.toc.device": _TAKE_OVER,
     b'type="NEMA"': "a saved state does not hold where traffic lights of type NEMA are",
     b"<neigh ": "SUMO cannot load a state in which somebody overtakes on an opposite lane, as the network allows (neigh)",
@@ -167,12 +170,26 @@ def snapshot_of(
     _check_sorted(files, moving)
     moving.sort(key=lambda each: each[0])
     before = tuple(piece for time, piece in moving if time < end)
+    _check_kept(before)
     if asked is None and until is None:
         _check_worth(end - begin, before)
     return Snapshot(
         begin, end, tuple(piece for piece in constant if not piece.is_traffic), before,
         tuple(piece for time, piece in moving if time >= end), varying,
     )  # fmt: skip
+
+
+def _check_kept(before: Sequence[Piece]) -> None:
+    """Refuse traffic of the warm-up of which a state loses what it needs later: over which edges, with what, how fast."""
+    for piece, text in texts_of(before):
+        flow, head = piece.tag.lower().endswith("flow"), text.partition(b">")[0]
+        lost = (
+            "via" if b" via=" in head else
+            "parameters" if flow and b"<param" in text else
+            "speed or duration of walks" if piece.tag == "personFlow" and _HOW_IT_WALKS.search(text) else ""
+        )  # fmt: skip
+        if lost:
+            raise NoSnapshot(f"{piece.place}: a saved state does not hold the {lost} of '{piece.id}', which begins before t0")
 
 
 def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: float, step: float, asked: WarmUp | None) -> float:
