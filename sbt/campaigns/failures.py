@@ -208,7 +208,7 @@ class FailureSearch:
         runs = history.index[chosen].tolist()
         ways = doubtful(ways_between(
             fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM, pairs_joined(links, runs),
-            [k for k, _ in space.cube.nominal],
+            space.cube,
         ))  # fmt: skip
         return [
             replace(way, ends=(min(ends), max(ends)))

@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 
 from sbt.campaigns.wording import plural
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.samplers.search import WarpedModel
 from sbt.seeds import stream
 
@@ -94,7 +95,7 @@ def pairs_joined(links: Sequence[Link], runs: Sequence[int]) -> list[tuple[int, 
 
 
 def connected(
-    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False, tested: Pairs = (), nominal: Sequence[int] = ()
+    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False, tested: Pairs = (), cube: Cube = CONTINUOUS
 ) -> NDArray[np.int64]:
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes; equal inputs are one.
 
@@ -107,13 +108,13 @@ def connected(
         kind: (n,) only runs of the same kind are joined.
         noisy: see above.
         tested: of `pairs_joined`.
-        nominal: columns of inputs with choices. There is nothing between choices: a way begins with those of its end.
+        cube: in which u is. There is nothing between choices: a way begins with those of its end.
     """
-    return _linked(fitted, u, kind, nominal, noisy=noisy, tested=tested)[0]
+    return _linked(fitted, u, kind, cube, noisy=noisy, tested=tested)[0]
 
 
 def ways_between(
-    fitted: WarpedModel, u: Points, kind: Vector, link: Mask, tested: Pairs = (), nominal: Sequence[int] = ()
+    fitted: WarpedModel, u: Points, kind: Vector, link: Mask, tested: Pairs = (), cube: Cube = CONTINUOUS
 ) -> list[Way]:  # fmt: skip
     """Return the ways that decide which of n critical runs are of one mode, of a simulator without noise.
 
@@ -125,18 +126,18 @@ def ways_between(
         kind: (n,) only runs of the same kind can be of one mode.
         link: (n,) the run was between others.
         tested: of `pairs_joined`.
-        nominal: as in `connected`.
+        cube: as in `connected`.
     """
-    group, joined = _linked(fitted, u, kind, nominal, tested=tested)
+    group, joined = _linked(fitted, u, kind, cube, tested=tested)
     distance = cdist(u, u)
     apart = sorted(_between_groups(group, kind, distance), key=lambda pair: float(distance[pair]))[:_APART]
     first, second = np.array([pair for pair in joined if distance[pair] > 0.0], dtype=np.intp).reshape(-1, 2).T
-    probes, p = _probed(fitted, u[first], u[second], nominal)
+    probes, p = _probed(fitted, u[first], u[second], cube)
     at = np.where(p.min(axis=1) < _SURE, p.argmin(axis=1), _PROBES // 2)
     untested = (distance[first, second] > _LONG) & ~link[first] & ~link[second]
     ends = list(zip(first.tolist(), second.tolist(), strict=True))
     straight = [Way(ends[k], float(p[k].min()), probes[k, i], bool(untested[k])) for k, i in enumerate(at)]
-    return [*straight, *(Way((i, j), *_bent(fitted, u[i], u[j], nominal)) for i, j in apart)]
+    return [*straight, *(Way((i, j), *_bent(fitted, u[i], u[j], cube)) for i, j in apart)]
 
 
 def _between_groups(group: NDArray[np.int64], kind: Vector, distance: Points) -> Iterator[tuple[int, int]]:
@@ -148,12 +149,12 @@ def _between_groups(group: NDArray[np.int64], kind: Vector, distance: Points) ->
             yield int(a[i]), int(b[j])
 
 
-def _bent(fitted: WarpedModel, a: Vector, b: Vector, nominal: Sequence[int]) -> tuple[float, Vector, bool]:
+def _bent(fitted: WarpedModel, a: Vector, b: Vector, cube: Cube) -> tuple[float, Vector, bool]:
     """Return the way from a to b (d,) over one more point, of many, on which the least P(critical) is largest.
 
     Coordinates that are the same at both ends stay.
     """
-    a = _with_choices_of(b, a, nominal)
+    a = cube.with_choices_of(b, a)
     rng, middle = stream(0, "ways"), 0.5 * (a + b)
     steps = rng.standard_normal((_BENDS, len(a)))
     steps *= rng.random((_BENDS, 1)) ** (1.0 / len(a)) / np.linalg.norm(steps, axis=1, keepdims=True)  # uniform in a ball
@@ -171,7 +172,7 @@ def doubtful(ways: list[Way]) -> list[Way]:
 
 
 def _linked(
-    fitted: WarpedModel, u: Points, kind: Vector, nominal: Sequence[int], *, noisy: bool = False, tested: Pairs = ()
+    fitted: WarpedModel, u: Points, kind: Vector, cube: Cube, *, noisy: bool = False, tested: Pairs = ()
 ) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
     """Return (n,) group numbers, and the pairs that join them."""
     n, pairs = len(u), list[tuple[int, int]]()
@@ -185,7 +186,7 @@ def _linked(
             group[group == group[j]] = group[i]
 
     for i, j in tested:
-        if kind[i] == kind[j] and _probed(fitted, u[[i]], u[[j]], nominal)[1].min() > _DOUBT[0]:
+        if kind[i] == kind[j] and _probed(fitted, u[[i]], u[[j]], cube)[1].min() > _DOUBT[0]:
             join(i, j)
     first, second = np.triu_indices(n, 1)
     alike = kind[first] == kind[second]
@@ -200,25 +201,18 @@ def _linked(
         if len(a) == 0:
             break
         least = np.minimum(level[a], level[b])[:, None]
-        inside: Mask = (_probed(fitted, u[a], u[b], nominal)[1] > least).all(axis=1) | (distance[a, b] == 0.0)
+        inside: Mask = (_probed(fitted, u[a], u[b], cube)[1] > least).all(axis=1) | (distance[a, b] == 0.0)
         for i, j in zip(a[inside].tolist(), b[inside].tolist(), strict=True):
             join(i, j)
     return group, pairs
 
 
-def _probed(fitted: WarpedModel, a: Points, b: Points, nominal: Sequence[int] = ()) -> tuple[NDArray[np.float64], Points]:
+def _probed(fitted: WarpedModel, a: Points, b: Points, cube: Cube = CONTINUOUS) -> tuple[NDArray[np.float64], Points]:
     """Return (m, k, d) points on the segments from a to b (m, d), and (m, k) P(critical) there.
 
     There are nine between the ends; where inputs have choices the first end with those of the other one is a point too.
     """
-    steps = np.linspace(0.0, 1.0, _PROBES + 2)[0 if nominal else 1 : -1, None]
-    a = _with_choices_of(b, a, nominal)
+    steps = np.linspace(0.0, 1.0, _PROBES + 2)[0 if cube.nominal else 1 : -1, None]
+    a = cube.with_choices_of(b, a)
     probes = a[:, None, :] * (1.0 - steps) + b[:, None, :] * steps
     return probes, fitted.probability(probes.reshape(-1, a.shape[1])).reshape(len(a), len(steps))
-
-
-def _with_choices_of(other: Points, points: Points, nominal: Sequence[int]) -> Points:
-    """Return the points (..., d) with the choices of the other ones."""
-    found = np.array(points, dtype=np.float64)
-    found[..., list(nominal)] = other[..., list(nominal)]
-    return found

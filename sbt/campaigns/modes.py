@@ -175,8 +175,7 @@ def modes_of(
     at = cube.embedded(u)
     depth, worse = scenario.requirement.depths(history), severity(history)
     tested = pairs_joined(links, history.index[chosen].tolist())
-    nominal = [k for k, _ in cube.nominal]
-    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested, nominal=nominal)
+    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested, cube=cube)
     log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]

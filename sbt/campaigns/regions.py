@@ -66,12 +66,11 @@ def critical_regions(
     share = len(critical) / len(u)
     critical = critical[:_MOST]  # a part of a Sobol sequence is as evenly spread
 
-    nominal = [k for k, _ in space.cube.nominal]
     steps = np.linspace(0.0, 1.0, _PROBES + 2)[:-1, None]
 
     def joined(a: Points, b: Points) -> Mask:
+        a = space.cube.with_choices_of(b, a)  # the way begins with the other ones
         probes = a[:, None] * (1.0 - steps) + b[:, None] * steps
-        probes[:, :, nominal] = b[:, None, nominal]  # there is nothing between choices: the way begins with the other one
         probes = space.cube.snapped(probes.reshape(-1, u.shape[1]))
         inside = (log_odds(probes) > 0.0) & space.feasible(space.from_unit(probes))
         return np.asarray(inside.reshape(len(a), len(steps)).all(axis=1))

@@ -104,10 +104,15 @@ class Cube:
         >>> Cube(nominal=((0, 2),)).exchanged(np.array([[0.25, 0.1], [0.75, 0.4], [0.25, 0.5]])).round(2).tolist()
         [[0.75, 0.1], [0.25, 0.4], [0.25, 0.4], [0.75, 0.5]]
         """
-        columns, choices = [k for k, _ in self.nominal], self.choices(u)
+        choices = self.choices(u)
         one, other = np.nonzero((choices[:, None, :] != choices[None, :, :]).any(axis=2))
-        found = np.array(u[one], dtype=np.float64)
-        found[:, columns] = u[other][:, columns]
+        return self.with_choices_of(u[other], u[one])
+
+    def with_choices_of(self, other: Points, u: Points) -> Points:
+        """Return points u (..., d) with the choices of the other ones (..., d): there is nothing between choices."""
+        columns = [k for k, _ in self.nominal]
+        found = np.array(u, dtype=np.float64)
+        found[..., columns] = other[..., columns]
         return found
 
     def flipped(self, u: Points, start: Points, chance: Vector | float, rng: np.random.Generator) -> Points:

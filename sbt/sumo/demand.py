@@ -178,21 +178,23 @@ def _rate(attributes: Mapping[str, str]) -> float:
 
 def excerpts(pieces: Iterable[Piece], values: Values, folder: Path) -> Iterator[bytes]:
     """Yield the text of each piece, as a run in a folder needs it."""
-    read: dict[Path, bytes] = {}
-    for piece in pieces:
-        path = piece.file.path
-        if path not in read:
-            read[path] = _data(piece.file)
-        yield piece.file.excerpt(read[path], piece.start, piece.end, values, folder)
+    for piece, data in _with_data(pieces):
+        yield piece.file.excerpt(data, piece.start, piece.end, values, folder)
 
 
 def texts_of(pieces: Iterable[Piece]) -> Iterator[tuple[Piece, bytes]]:
     """Yield pieces with their elements as they stand in their files."""
+    for piece, data in _with_data(pieces):
+        yield piece, data[piece.start : piece.end]
+
+
+def _with_data(pieces: Iterable[Piece]) -> Iterator[tuple[Piece, bytes]]:
+    """Yield pieces with the bytes of their files, each file read once."""
     read: dict[Path, bytes] = {}
     for piece in pieces:
         if piece.file.path not in read:
             read[piece.file.path] = _data(piece.file)
-        yield piece, read[piece.file.path][piece.start : piece.end]
+        yield piece, read[piece.file.path]
 
 
 def without_pieces(file: Template, folder: Path) -> bytes:

@@ -227,8 +227,10 @@ class DepartureMonitor:
 
     def _refuse_copy(self, name: str, place: str) -> None:
         """Refuse a vehicle of which SUMO drives copies, as the option `scale` asks for."""
-        cause, copy = why_copied(self._files, self._values, name), f"{name}.1"
-        if cause and copy not in self._files.names() and self._delay(copy) is not None:
+        copy = f"{name}.1"
+        if "scale" not in self._files.options or self._delay(copy) is None or copy in self._files.names():
+            return
+        if cause := why_copied(self._files, self._values, name):  # reads the files again
             raise RunError(Status.INVALID, f"{place}'{name}' must be one vehicle, but there is '{copy}' too, as {cause}")
 
     def _left_out(self, requested: RequestedDeparture) -> bool:

@@ -32,7 +32,7 @@ _COPIED = ("Length", "Width", "Height", "VehicleClass", "MaxSpeed", "MinGap", "A
            "Imperfection", "SpeedFactor", "SpeedDeviation", "Color", "MaxSpeedLat", "MinGapLat", "LateralAlignment")  # fmt: skip
 """Properties that the ego keeps when its type changes, by the names of SUMO's getters and setters."""
 _OF_FILES = ("actionStepLength", "apparentDecel", "impatience", "boardingDuration", "loadingDuration", "timeToTeleport")
-"""Attributes of the type in the files that no getter tells, beside those of junctions (jm...)."""
+"""Attributes that are taken from the type in the files, beside those of the models and of junctions (jm...)."""
 _ATTRIBUTE = {"Imperfection": "sigma", "VehicleClass": "vClass", "SpeedDeviation": "speedDev", "LateralAlignment": "latAlignment"}
 """vType attributes of the properties whose names differ."""
 _COMFORTABLE_DECELERATION = 3.0
@@ -96,7 +96,7 @@ class EgoVehicle:
         """Return the vehicle of one run, with the values of its driver's settings that are inputs."""
         return self if self.driver is None else self.with_driver(self.driver.bind(values))
 
-    def vehicle_type(self, files: SumoFiles | None = None, values: Values = {}) -> str | None:  # noqa: B006
+    def vehicle_type(self, files: SumoFiles, values: Values) -> str | None:
         """Return the XML of the vehicle type for another model of SUMO; None where none is needed.
 
         Args:
@@ -105,7 +105,7 @@ class EgoVehicle:
         """
         if self.driver is None or self.driver.kind != SUMO:
             return None
-        found = None if files is None else type_of(files.templates, self.id)
+        found = type_of(files.templates, self.id)
         there = {} if found is None else {k: fill(v, values, found.place) for k, v in found.attributes.items()}
         settings = dict(self.driver.settings)
         if not {"lane_change", "laneChangeModel"} & settings.keys() and there.get("laneChangeModel") in LANE_CHANGE:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.parsers.expat
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from sbt.plugins import kept
@@ -83,15 +83,18 @@ def person(templates: tuple[Template, ...], name: str) -> Element | None:
 def type_of(templates: tuple[Template, ...], name: str) -> Element | None:
     """Return the vehicle type of a vehicle, trip or flow; None where it is of a distribution, or is not in the files."""
     known = [one for each in templates if each.root[0] != "net" for one in _elements_of(each)]
-    wanted = (name, name.rpartition(".")[0])
-    found = next((one for one in known if one.tag in ("vehicle", "trip", "flow") and one.attributes["id"] in wanted), None)
+    found = _named(known, name, ("vehicle", "trip", "flow"))
     kind = None if found is None else found.attributes.get("type")
     return next((one for one in known if one.tag == "vType" and one.attributes["id"] == kind), None)
 
 
 def element(files: SumoFiles, name: str, tags: Collection[str]) -> Element | None:
     """Return the element of this id, or for `f.3` the flow `f`; None if there is none."""
-    known = [one for one in elements(files) if one.tag in tags]
+    return _named(elements(files), name, tags)
+
+
+def _named(known: Iterable[Element], name: str, tags: Collection[str]) -> Element | None:
+    known = [one for one in known if one.tag in tags]
     for wanted in (name, name.rpartition(".")[0]):
         for one in known:
             if one.attributes["id"] == wanted:

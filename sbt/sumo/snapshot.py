@@ -20,12 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from sbt.errors import InputError, RunError
+from sbt.plugins import kept
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.problem.space import ParameterSpace
 from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of, texts_of
 from sbt.sumo.files import SumoFiles
-from sbt.sumo.template import placeholders
+from sbt.sumo.template import Template, placeholders
 
 __all__ = ["CAN_FORK", "NoSnapshot", "Snapshot", "WarmUp", "reads_whole", "snapshot_of"]
 
@@ -235,15 +236,20 @@ def _check_options(files: SumoFiles) -> None:
             raise NoSnapshot(f"{place}: a saved state does not hold lane changes that take time (lanechange.duration {value})")
 
 
+@kept
+def _not_saved(file: Template) -> str:
+    """Return what SUMO's states do not hold of what is in a file; "" where nothing of the kind is known."""
+    with file.opened() as opened:
+        text = opened.read()
+    return next((why for word, why in _NOT_SAVED.items() if word in text), "")
+
+
 def _check_surroundings(files: SumoFiles) -> None:
     """Refuse what a saved state does not hold, and inputs anywhere but in traffic."""
     _check_options(files)
     for one in files.templates:
-        with one.opened() as file:
-            text = file.read()
-        for word, why in _NOT_SAVED.items():
-            if word in text:
-                raise NoSnapshot(f"{one.path}: {why}")
+        if why := _not_saved(one):
+            raise NoSnapshot(f"{one.path}: {why}")
         if one.root[0] == "net":
             if one.placeholders:
                 raise NoSnapshot(f"{one.placeholders[0].place}: the network depends on an input")
