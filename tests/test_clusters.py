@@ -14,8 +14,10 @@ from sbt.campaigns.asking import answer
 from sbt.campaigns.clustering import clustered_interval, spread_of_batches
 from sbt.campaigns.gate import Limits
 from sbt.estimators.binomial import interval
-from sbt.estimators.clusters import clustered_error, effective_runs, reach
-from sbt.estimators.intervals import CountedBatch
+from sbt.estimators.clusters import clustered_error, deviations, effective_runs, reach
+from sbt.estimators.importance import draw_systematic, plan_batch
+from sbt.estimators.intervals import CountedBatch, combine_estimates
+from sbt.estimators.two_level import TwoPhases, drawn, inclusion
 from sbt.loop.stages import Log
 from sbt.store.database import Store
 from sbt.workflows.asking import _settings
@@ -154,3 +156,41 @@ def test_the_upper_end_has_the_spread_of_failed_runs_too():
     assert spread_of_batches(warm_up, [even[0]], [even[0]]).std_error_failed is None
     nothing = CountedBatch(0.0, 0.0, 0.0, np.ones(n), np.zeros(n), np.zeros(n))
     assert "is not in the interval" in spread_of_batches(warm_up, [nothing]).sentence()
+
+
+@pytest.mark.parametrize("known", ["coarse runs", "traffic of the pairs"])
+def test_what_is_known_of_pairs_before_their_runs_takes_no_spread_between_warm_ups_away(known):
+    """Six warm-ups of which each decides its runs: the error of the estimate is that of six draws, however sharp the belief."""
+    rng, k, values, errors = np.random.default_rng(3), 6, [], []
+    for _ in range(300):
+        share = rng.choice([0.02, 0.95], k)
+        batches, warm_up = [], []
+        for _ in range(3):
+            seeds = rng.integers(0, 10**6, 300)
+            hits, g = (rng.random(300) < share[seeds % k]).astype(float), share[seeds % k]
+            if known == "coarse runs":
+                first, second = np.ones(300), inclusion(np.sqrt(g * (1 - g)), np.ones(300), 60, fine=True)
+                rows = drawn(second, g, rng)
+                phases = TwoPhases(300, 0.0, 0.0, np.zeros(300), first, g, second)
+                batch = CountedBatch(
+                    phases.prior, phases.anticipated(len(rows)), phases.pool_variance, phases.coefficient(rows), g[rows],
+                    hits[rows], weight=len(rows) + 30.0, by_warm_up=phases.by_warm_up(seeds, k),
+                )  # fmt: skip
+            else:
+                flat = np.zeros(300)
+                plan = plan_batch(np.log(g), np.log1p(-g), flat, flat, flat, (0.8, 0.2, 0.0, 0.0), "difference")
+                draws = draw_systematic(plan, 60, np.log(g) - np.log1p(-g), rng)
+                plan, rows = draws.plan, draws.rows
+                batch = CountedBatch(
+                    plan.prior, plan.anticipated, plan.pool_variance, draws.coefficient, draws.control_variate, hits[rows],
+                    by_warm_up=deviations(plan.weight * g, plan.weight, seeds, k),
+                )  # fmt: skip
+            batches.append(batch)
+            warm_up.append(seeds[rows] % k)
+        values.append(combine_estimates(batches).value)
+        found = spread_of_batches(np.concatenate(warm_up), batches)
+        errors.append(found.std_error)
+        assert found.warm_ups == k
+    between = math.sqrt(0.93**2 / 4 / k)  # standard error of the mean of six warm-ups
+    assert np.std(values) == pytest.approx(between, rel=0.15)
+    assert np.mean(np.square(errors)) == pytest.approx(np.var(values), rel=0.2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from sbt.campaigns.gate import Limits
 from sbt.campaigns.wording import plural
 from sbt.estimators import binomial
 from sbt.estimators.clusters import clustered_error, effective_runs, reach
-from sbt.estimators.intervals import CountedBatch
+from sbt.estimators.intervals import CountedBatch, batch_weights
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Vector
 from sbt.store.history import History
@@ -92,16 +93,22 @@ def spread_of_draws(log: Log, batches: Batches, worst: Batches | None = None) ->
 def spread_of_batches(warm_up: Vector, batches: Batches, worst: Batches | None = None) -> Spread | None:
     """Return the spread of an estimate from weighted batches, of which each draw began with a warm-up (n,), -1 without one.
 
-    `worst` are the same batches with failed runs as critical.
+    `worst` are the same batches with failed runs as critical. What is stated of a pool before its draws depends on warm-ups as
+    much as they do, where the traffic of its pairs is known, or they were run coarse.
     """
+    weights = batch_weights(batches)
+    pools = [b.by_warm_up for b in batches if b.by_warm_up is not None]
+    cluster = np.concatenate([warm_up, *(np.arange(len(pool)) for pool in pools)])
 
     def terms(those: Batches) -> Vector:
-        weights = np.array([np.sqrt(t + 1.0) * len(b.critical) for t, b in enumerate(those)])
-        weights /= weights.sum()  # as `combine_estimates` has them
-        return np.concatenate([w * b.errors for w, b in zip(weights, those, strict=True)])
+        stated = [w * b.by_warm_up for w, b in zip(weights, those, strict=True) if b.by_warm_up is not None]
+        return np.concatenate([*(w * b.errors for w, b in zip(weights, those, strict=True)), *stated])
 
     differ = worst is not None and any((a.critical != b.critical).any() for a, b in zip(batches, worst, strict=True))
-    return _spread(warm_up, terms(batches), terms(worst) if worst is not None and differ else None)
+    known = float(weights**2 @ [0.0 if b.by_warm_up is None else b.pool_variance for b in batches])
+    own = terms(batches)
+    apart = math.sqrt(float((own[: len(warm_up)] ** 2).sum()) + known)
+    return _spread(cluster, own, terms(worst) if worst is not None and differ else None, apart)
 
 
 def spread_of_share(history: History, among: Mask, critical: Mask) -> Spread | None:
@@ -111,7 +118,8 @@ def spread_of_share(history: History, among: Mask, critical: Mask) -> Spread | N
         return None
     readings = (each[rows].astype(np.float64) for each in (critical, critical | ~history.ok))
     safe, worst = ((hits - hits.mean()) / len(rows) for hits in readings)
-    return _spread(history.columns["warm_up"][rows], safe, None if history.ok[rows].all() else worst)
+    apart = float(np.sqrt((safe**2).sum()))
+    return _spread(history.columns["warm_up"][rows], safe, None if history.ok[rows].all() else worst, apart)
 
 
 def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: float = 0.95) -> tuple[float, float]:
@@ -132,8 +140,8 @@ def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: fl
     return float(low), float(high)
 
 
-def _spread(cluster: Vector, terms: Vector, failed: Vector | None) -> Spread | None:
+def _spread(cluster: Vector, terms: Vector, failed: Vector | None, apart: float) -> Spread | None:
     if not (cluster >= 0).any():
         return None
     worst = None if failed is None else clustered_error(failed, cluster)
-    return Spread(len(np.unique(cluster)), clustered_error(terms, cluster), worst, float(np.sqrt((terms**2).sum())))
+    return Spread(len(np.unique(cluster)), clustered_error(terms, cluster), worst, apart)

@@ -14,6 +14,7 @@ from sbt.errors import InputError
 from sbt.estimators import binomial
 from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
+from sbt.problem.arrays import Vector
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.requirement import Requirement
 from sbt.store.history import History
@@ -52,7 +53,7 @@ def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = Fal
         prior = pool.probability if batch.read(EstimationProposal).method == "difference" else 0.0
         of_batch = CountedBatch(
             prior, pool.anticipated, draws.pool_variance, np.array(draws.coefficient), np.array(draws.control_variate),
-            critical[rows].astype(np.float64), draws.weight,
+            critical[rows].astype(np.float64), draws.weight, _array(draws.by_warm_up),
         )  # fmt: skip
         stated = draws.failed_critical if failed_critical else None
         found.append(of_batch if stated is None else with_event(of_batch, stated))
@@ -63,8 +64,12 @@ def with_event(batch: CountedBatch, stated: EventDraws) -> CountedBatch:
     """Return a batch with what the metamodel states of another event of its draws."""
     return replace(
         batch, prior=stated.probability, anticipated=stated.anticipated, pool_variance=stated.pool_variance,
-        control_variate=np.array(stated.pi),
+        control_variate=np.array(stated.pi), by_warm_up=_array(stated.by_warm_up),
     )  # fmt: skip
+
+
+def _array(values: tuple[float, ...] | None) -> Vector | None:
+    return None if values is None else np.array(values)
 
 
 def _counted(log: Log) -> Iterator[tuple[Iteration, PoolSummary, CountedDraws]]:

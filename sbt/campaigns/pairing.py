@@ -22,12 +22,13 @@ from sbt.campaigns.sequential import SEARCHED, SequentialStage
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.stopping import is_precise
 from sbt.errors import InputError
+from sbt.estimators.clusters import deviations
 from sbt.estimators.importance import draw_systematic, plan_batch, stated
 from sbt.loop.stages import Batch, Log
 from sbt.metamodels.bootstrap import out_of_bag
 from sbt.metamodels.joint import LogPair
 from sbt.metamodels.risk import Risk, fit_risk
-from sbt.problem.arrays import Points
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.covariates import Covariates
 from sbt.problem.requirement import Requirement
 from sbt.samplers.noise import scores
@@ -247,14 +248,18 @@ class PairStage:
             for k, (row, q) in enumerate(zip(rows, log_q, strict=True))
         )
 
+        def by_warm_up(pi: Vector) -> tuple[float, ...] | None:
+            k = self.settings.warm_ups
+            return tuple(deviations(plan.weight * pi, plan.weight, pool.seeds, k).tolist()) if k else None
+
         def said(part: LogPair) -> EventDraws:
-            found = stated(part, plan, stratum)
-            return EventDraws(found.prior, found.anticipated, found.pool_variance, tuple(found.pi[rows].tolist()))
+            f = stated(part, plan, stratum)
+            return EventDraws(f.prior, f.anticipated, f.pool_variance, tuple(f.pi[rows].tolist()), by_warm_up(f.pi))
 
         pi = tuple(np.exp(event[0][rows]).tolist())
         counted = CountedDraws(
             plan.pool_variance, tuple(draws.coefficient.tolist()), tuple(draws.control_variate.tolist()), pi,
-            tuple(map(said, of_parts)) or None,
+            tuple(map(said, of_parts)) or None, by_warm_up=by_warm_up(np.exp(event[0])),
         )  # fmt: skip
         summary = PoolSummary(size, plan.predicted, plan.anticipated, 1)
         return Batch(runs, EstimationProposal(

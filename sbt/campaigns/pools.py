@@ -243,7 +243,8 @@ def _event_draws(event: LogPair, pool: Pool, draws: Draws, failed_critical: LogP
     """Return what the log keeps of an event at the draws from a pool."""
     said = stated(event, draws.plan, pool.stratum)
     worst = None if failed_critical is None else _event_draws(failed_critical, pool, draws)
-    return EventDraws(said.prior, said.anticipated, said.pool_variance, tuple(said.pi[draws.rows].tolist()), worst)
+    pi = tuple(said.pi[draws.rows].tolist())
+    return EventDraws(said.prior, said.anticipated, said.pool_variance, pi, failed_critical=worst)
 
 
 def planned(space: ParameterSpace, z: Points, stage: str, log_q: Vector | None = None) -> tuple[PlannedRun, ...]:

@@ -126,6 +126,7 @@ class EventDraws:
         anticipated: variance of one draw that it anticipates.
         pool_variance: variance of the pool's mean.
         pi: of each draw, P(event).
+        by_warm_up: see `CountedDraws`.
         failed_critical: the same with every failed run as the event; left out where no run had failed.
     """
 
@@ -133,6 +134,7 @@ class EventDraws:
     anticipated: float
     pool_variance: float
     pi: tuple[float, ...]
+    by_warm_up: tuple[float, ...] | None = optional()
     failed_critical: EventDraws | None = optional()
 
 
@@ -148,6 +150,7 @@ class CountedDraws:
         parts: of a combination, what is stated of each requirement.
         failed_critical: what is stated of critical or failed runs; left out where no run had failed.
         weight: of the batch among others, in draws; None: their number.
+        by_warm_up: what the pool's pairs of each warm-up add to its mean, less their part of it; None: the mean knows no seeds.
     """
 
     pool_variance: float
@@ -157,6 +160,7 @@ class CountedDraws:
     parts: tuple[EventDraws, ...] | None = optional()
     failed_critical: EventDraws | None = optional()
     weight: float | None = optional()
+    by_warm_up: tuple[float, ...] | None = optional()
 
 
 @dataclass(frozen=True)

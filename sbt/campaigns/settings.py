@@ -52,6 +52,7 @@ class Settings:
         prior_runs: runs of another campaign to learn from, never to count.
         transfer: what a campaign of another setup tells, as a trend.
         covariates: what the seed draws, known before the run; None: seeds are not looked at.
+        warm_ups: number of those that runs begin with, by their seed; 0: they simulate their traffic.
         coarse_cost: of a run at the coarse level of fidelity, in runs; None: there is no such level.
     """
 
@@ -71,6 +72,7 @@ class Settings:
     transfer: Transfer | None = None
     ahead: int = 0
     covariates: Covariates | None = None
+    warm_ups: int = 0
     coarse_cost: float | None = None
 
 

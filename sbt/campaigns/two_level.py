@@ -226,7 +226,9 @@ class TwoLevelStage:
         phases = TwoPhases(kept.pool, kept.total, kept.squares, np.array(kept.before), first, after, second)
         blind = np.arange(len(rows)) < kept.both
         found = found or LevelsRecord(coarse=True)
-        return self._counted(phases, rows, mine.x[rows], mine.seed[rows], kept.both, blind, found)
+        k = s.warm_ups
+        by_warm_up = tuple(phases.by_warm_up(mine.seed, k).tolist()) if k else None  # coarse runs begin with the same traffic
+        return self._counted(phases, rows, mine.x[rows], mine.seed[rows], kept.both, blind, found, by_warm_up)
 
     def _alone(self, log: Log, before: Belief | None, size: float, found: LevelsRecord, *, again: bool = False) -> Batch:
         """Return a round without coarse runs: drawn by what inputs tell, some of them by nothing; without a belief, all of them.
@@ -248,13 +250,15 @@ class TwoLevelStage:
 
     def _counted(
         self, phases: TwoPhases, rows: NDArray[np.intp], x: Points, seeds: NDArray[np.int64], nominal: int,
-        blind: Mask | bool, found: LevelsRecord,
+        blind: Mask | bool, found: LevelsRecord, by_warm_up: tuple[float, ...] | None = None,
     ) -> Batch:  # fmt: skip
         """Return the runs of the scenario that count, and how."""
         coefficient, after = phases.coefficient(rows), tuple(phases.after[rows].tolist())
         pool = PoolSummary(phases.pool, phases.prior, phases.anticipated(len(rows)), 1)
         weight = len(rows) if found.coarse is False else len(rows) + (self.settings.coarse_cost or 0.0) * len(phases.first)
-        counted = CountedDraws(phases.pool_variance, tuple(coefficient.tolist()), after, after, weight=weight)
+        counted = CountedDraws(
+            phases.pool_variance, tuple(coefficient.tolist()), after, after, weight=weight, by_warm_up=by_warm_up
+        )
         kept = EstimationProposal(
             COUNT, "difference", pool=pool, counted=counted, nominal=NominalDraws((1.0,) * nominal), levels=found
         )  # with noise no belief denies a region: what no run has met is bounded by these draws alone

@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from sbt.problem.arrays import Vector
 
-__all__ = ["clustered_error", "effective_runs", "reach"]
+__all__ = ["clustered_error", "deviations", "effective_runs", "reach"]
 
 
 def clustered_error(terms: Vector, cluster: Vector) -> float | None:
@@ -34,6 +35,19 @@ def clustered_error(terms: Vector, cluster: Vector) -> float | None:
         return None
     sums = np.bincount(places, weights=terms)
     return math.sqrt(k / (k - 1.0) * float((sums**2).sum()))
+
+
+def deviations(values: Vector, share: Vector, seeds: NDArray[np.int64], clusters: int) -> Vector:
+    """Return (k,) what each cluster of a pool adds to a sum over it, less its part of that sum.
+
+    Args:
+        values: (n,) terms of the sum.
+        share: (n,) of the pool that a term stands for, any scale.
+        seeds: (n,) of the pairs; modulo their number they choose the cluster.
+        clusters: their number k, >= 1.
+    """
+    sums, part = (np.bincount(seeds % clusters, each, clusters) for each in (values, share))
+    return np.asarray(sums - part / part.sum() * values.sum())
 
 
 def reach(error: float, clusters: int, confidence: float) -> float:

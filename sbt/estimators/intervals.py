@@ -16,7 +16,7 @@ from scipy.special import gammaincinv, stdtrit
 from sbt.errors import InputError
 from sbt.problem.arrays import Vector
 
-__all__ = ["FEWEST_HITS", "FEW_HITS", "WIDEST", "CombinedEstimate", "CountedBatch", "combine_estimates"]
+__all__ = ["FEWEST_HITS", "FEW_HITS", "WIDEST", "CombinedEstimate", "CountedBatch", "batch_weights", "combine_estimates"]
 
 FEWEST_HITS = 10
 """Critical draws before an estimate is taken for precise."""
@@ -45,6 +45,7 @@ class CountedBatch:
         control_variate: (n,) pi of the draws, as the correction subtracts it.
         critical: (n,) 1 where the run was critical, else 0.
         weight: of the batch among others, in draws, fixed before its outcomes; None: their number.
+        by_warm_up: (k,) what each warm-up adds to the prior, less its part of it; None: the prior does not depend on them.
     """
 
     prior: float
@@ -54,6 +55,7 @@ class CountedBatch:
     control_variate: Vector
     critical: Vector
     weight: float | None = None
+    by_warm_up: Vector | None = None
 
     @property
     def value(self) -> float:
@@ -125,6 +127,12 @@ class CombinedEstimate:
         return min(max(limit, 0.0), 1.0)
 
 
+def batch_weights(batches: Sequence[CountedBatch]) -> Vector:
+    """Return (m,) the weights sqrt(t) n_t of batches, t = 1 for the first one, with sum 1."""
+    weights = np.array([math.sqrt(t + 1.0) * (b.weight or len(b.critical)) for t, b in enumerate(batches)])
+    return np.asarray(weights / weights.sum())
+
+
 def combine_estimates(batches: Sequence[CountedBatch]) -> CombinedEstimate:
     """Return the estimate with weights sqrt(t) n_t, t = 1 for the first batch that counts.
 
@@ -141,8 +149,7 @@ def combine_estimates(batches: Sequence[CountedBatch]) -> CombinedEstimate:
     """
     if not batches:
         raise InputError("an estimate needs at least one counted batch, but got none")
-    c = np.array([math.sqrt(t + 1.0) * (b.weight or len(b.critical)) for t, b in enumerate(batches)])
-    c /= c.sum()
+    c = batch_weights(batches)
     values = np.array([b.value for b in batches])
     value = float(c @ values)
     squares = np.concatenate([(ct * b.errors) ** 2 for ct, b in zip(c, batches, strict=True)])

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from sbt.estimators.clusters import deviations
 from sbt.estimators.importance import at_most_one, rows_at
 from sbt.problem.arrays import Vector
 
@@ -100,6 +101,10 @@ class TwoPhases:
         corrected = self.before + self._corrections
         squares = self.squares + float((corrected**2 - self.before**2).sum())
         return max(squares / self.pool - self.prior**2, 0.0) / self.pool
+
+    def by_warm_up(self, seeds: NDArray[np.int64], warm_ups: int) -> Vector:
+        """Return (k,) what coarse runs with these seeds (m,) add to the sums for each of the k warm-ups that they choose."""
+        return deviations(self._corrections / self.pool, 1.0 / self.first, seeds, warm_ups)
 
     def coefficient(self, chosen: NDArray[np.intp]) -> Vector:
         """Return (n,) n / (N r1 r2) of the fine runs: those of the pairs `chosen` (n,)."""

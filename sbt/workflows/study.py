@@ -314,6 +314,7 @@ class Study:
             stop=config.stop.model_dump(), gate=None if config.gate is None else Gate(**config.gate.model_dump()),
             ahead=config.ahead, **self._taught(),
             covariates=self.covariates, coarse_cost=self.coarse_cost,
+            warm_ups=0 if self.isolation is None else self.isolation.seeds,
         )  # fmt: skip
 
     @cached_property
