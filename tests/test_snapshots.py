@@ -21,7 +21,7 @@ from sbt.execution.tasks import elsewhere
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
-from sbt.sumo import snapshot
+from sbt.sumo import snapshot, warming
 from sbt.sumo.demand import excerpts, pieces_of, seconds_of
 from sbt.sumo.departures import requested_departures
 from sbt.sumo.session import session
@@ -391,16 +391,58 @@ def cut(data: bytes) -> bytes:
     return gzip.compress(gzip.decompress(data)[:-200])
 
 
-@pytest.mark.parametrize("damaged", [flipped, cut])
+def test_the_warm_up_ends_before_the_earliest_departure_wherever_in_the_space_that_is(tmp_path):
+    """Six inputs of which the first counts most; a formula that is least between all levels of a grid; a choice."""
+    many = "".join(f", {name}: {{min: 0, max: 1}}" for name in "fabcde")
+    where = {
+        "60+a+b+c+d+e-12*f": many, "46+20*abs(a-0.37)+9*(b-0.81)**2": ", a: {min: 0, max: 1}, b: {min: 0, max: 1}",
+        "46+9*(kind=='car')": ", kind: {choices: [car, truck]}", "46+max(0, a-b)": ", a: {min: 0, max: 9}, b: {min: 3, max: 4}",
+    }  # fmt: skip
+    least = {"60+a+b+c+d+e-12*f": 48.0}
+    for k, (formula, inputs) in enumerate(where.items()):
+        found = simulation(town(tmp_path / str(k), depart=f"${{{formula}}}", inputs=inputs)).isolation
+        assert found.until == pytest.approx(least.get(formula, 46.0) - 2.0, abs=0.06), formula
+
+
+def test_nothing_that_departs_before_is_no_warm_up(tmp_path):
+    """As many empty warm-ups were a sample of traffic, and widened intervals."""
+    path = town(tmp_path, warm_up="warm_up: {seeds: 2}")
+    (tmp_path / "cars.rou.xml").write_text('<routes><trip id="t" depart="43" from="A1B1" to="C1D1"/></routes>')
+    path.write_text(path.read_text().replace(", buses.rou.xml", ""))
+    with pytest.raises(InputError, match="nothing departs before t = 42 s: there is no traffic to warm up"):
+        simulation(path).isolation.warm  # noqa: B018
+
+
 @pytest.mark.sumo
-def test_a_damaged_state_is_made_again(tmp_path, damaged):
+def test_scenarios_of_the_same_files_and_other_egos_keep_their_traffic(tmp_path):
+    """Runs of the first one lacked what departs later once the second one had run in the same process."""
+    path = town(tmp_path, warm_up="warm_up: {seeds: 1}")
+    other = path.with_name("other.yaml")
+    other.write_text(path.read_text().replace("ego: {id: ego", "ego: {id: second"))
+    ego = tmp_path / "ego.rou.xml"
+    second = '<trip id="second" type="car" depart="44" from="A3B3" to="C2D2"/></routes>'
+    ego.write_text(ego.read_text().replace("</routes>", second))
+    first, its = simulation(path), simulation(other)
+    before = first(CENTRE, 4)
+    its(CENTRE, 4)
+    assert "second" in before.actors
+    assert first(CENTRE, 4).identical(before)
+
+
+@pytest.mark.parametrize(("damaged", "writable"), [(flipped, True), (cut, True), (cut, False)])
+@pytest.mark.sumo
+def test_a_damaged_state_is_made_again(tmp_path, damaged, writable, monkeypatch):
     found = simulation(town(tmp_path, warm_up="warm_up: {seeds: 1}"))
     kept = found.isolated(replace(found.isolation, states=str(tmp_path / "states"), forking=False))
     whole = kept(CENTRE, 4)
     (state,) = (tmp_path / "states").glob("*.gz")
-    state.write_bytes(damaged(state.read_bytes()))
+    intact = state.read_bytes()
+    state.write_bytes(damaged(intact))
     _read.cache_clear()
+    monkeypatch.setattr(warming.os, "access", lambda *_: writable)
     assert kept(CENTRE, 4).identical(whole)
+    monkeypatch.undo()
+    assert (state.read_bytes() != damaged(intact)) == writable  # a store that is only read stays as it is
 
 
 FLOW = '<flow id="f" begin="0" end="99" period="6" from="A1B1" to="C1D1"'

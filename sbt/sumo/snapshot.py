@@ -21,9 +21,11 @@ import numpy as np
 
 from sbt.errors import InputError, RunError
 from sbt.plugins import kept
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.problem.space import ParameterSpace
+from sbt.seeds import stream
 from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of, texts_of
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.template import Template, placeholders
@@ -38,9 +40,9 @@ _SETTLING = 2.0
 """Simulated time that a run has from its state to the first departure that depends on an input (s)."""
 _WORTH = (60.0, 100)
 """A warm-up that nobody asks for must be at least so long (s) and have so many departures, or loading is as good."""
-_LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Where in the range of an input departures are computed."""
-_MOST_POINTS = 3125
+_ENDS, _WITHIN, _ROUNDS = 9, 1024, 5
+"""Inputs of which all combinations of ends are looked at for the earliest departure; further points, and how often they are
+looked at, each time in a box a quarter as wide around the earliest so far: a formula may be least anywhere."""
 _STANDING = frozenset((
     "busStop", "trainStop", "containerStop", "chargingStation", "parkingArea", "overheadWireSegment", "tractionSubstation",
     "inductionLoop", "e1Detector", "instantInductionLoop", "laneAreaDetector", "e2Detector", "entryExitDetector", "e3Detector",
@@ -171,6 +173,8 @@ def snapshot_of(
     _check_sorted(files, moving)
     moving.sort(key=lambda each: each[0])
     before = tuple(piece for time, piece in moving if time < end)
+    if not before:
+        raise NoSnapshot(f"nothing departs before t = {end:g} s: there is no traffic to warm up")
     _check_kept(before)
     if asked is None and until is None:
         _check_worth(end - begin, before)
@@ -195,8 +199,7 @@ def _check_kept(before: Sequence[Piece]) -> None:
 
 def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: float, step: float, asked: WarmUp | None) -> float:
     """Return when the warm-up ends (s): as asked for, or shortly before the first departure that depends on an input."""
-    points = _points(space, varying)
-    first, earliest = _earliest(varying, points, begin)
+    first, earliest, latest = _first_departure(varying, space, begin)
     wanted = None if asked is None else asked.until
     end = _in_steps(earliest - _SETTLING if wanted is None else wanted, begin, step)
     if wanted is not None and abs(end - wanted) > 1e-6:
@@ -210,7 +213,6 @@ def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: fl
         raise NoSnapshot(f"{first.place}: '{first.id}' departs at {earliest:g} s; before {least:g} s there is nothing to warm up")
     if end > earliest:
         remedy = f"{_because(first, varying)}let it depart later, or warm_up.until be smaller or auto"
-        latest = max(_departure(first, values) for values in points)
         when = f"at {earliest:g} s" if latest == earliest else f"at {earliest:g} to {latest:g} s, as the inputs have it"
         raise NoSnapshot(f"{first.place}: '{first.id}' departs {when}, before the warm-up ends ({end:g} s): {remedy}")
     return end
@@ -280,25 +282,50 @@ def _varying(pieces: list[Piece], moved: tuple[str, ...]) -> list[bool]:
         varies = [changes or not names.isdisjoint(piece.names) for piece, changes in zip(pieces, varies, strict=True)]
 
 
-def _points(space: ParameterSpace, varying: tuple[Piece, ...]) -> list[Values]:
-    """Return values at which departures are computed: a grid over the inputs that they depend on."""
-    used = {name for piece in varying if piece.departs is not None for hole in placeholders(piece.departs, piece.place)
-            for name in hole.formula.names()}  # fmt: skip
-    axes = [_LEVELS if p.name in used else (0.5,) for p in space.parameters]
-    grid = np.array(list(itertools.islice(itertools.product(*axes), _MOST_POINTS)))
-    if not len(space.parameters):
-        return [{}]
-    return [space.named(x) for x in space.from_unit(grid)]
-
-
-def _earliest(varying: tuple[Piece, ...], points: list[Values], begin: float) -> tuple[Piece | None, float]:
-    """Return what departs first of all that varies, and when (s); None, and never, where nothing does."""
+def _first_departure(varying: tuple[Piece, ...], space: ParameterSpace, begin: float) -> tuple[Piece | None, float, float]:
+    """Return what departs first of all that varies, when (s), and when at the latest; None, and never, where nothing does."""
     traffic = [piece for piece in varying if piece.is_traffic]
     if not traffic:
-        return None, math.inf
-    times = {piece: min(_departure(piece, values) for values in points) for piece in traffic}
-    first = min(traffic, key=lambda piece: times[piece])
-    return first, max(times[first], begin)
+        return None, math.inf, math.inf
+    found = {piece: _departures(piece, space) for piece in traffic}
+    first = min(traffic, key=lambda piece: found[piece][0])
+    return first, max(found[first][0], begin), found[first][1]
+
+
+def _departures(piece: Piece, space: ParameterSpace) -> tuple[float, float]:
+    """Return when a piece departs at the earliest, and at the latest of the points that are looked at (s)."""
+    names = {name for hole in placeholders(piece.departs or "", piece.place) for name in hole.formula.names()}
+    used = [k for k, p in enumerate(space.parameters) if p.name in names]
+    if not used:
+        time = _departure(piece, {})
+        return time, time
+    ends = np.array(list(itertools.product((0.0, 0.5, 1.0), *[(0.0, 1.0)] * (min(len(used), _ENDS) - 1))))
+    ends = np.pad(ends, ((0, 0), (0, len(used) - ends.shape[1])), constant_values=0.5)
+    box = stream(0, "departures").random((_WITHIN, len(used)))
+    u, width, earliest, latest, best = np.vstack([ends, ends[:, ::-1], box]), 1.0, math.inf, -math.inf, box[0]
+    for _ in range(_ROUNDS):
+        times = _departures_at(piece, space, used, u)
+        if times.min() < earliest:
+            earliest, best = float(times.min()), u[times.argmin()]
+        latest, width = max(latest, float(times.max())), 0.25 * width
+        u = np.clip(best + width * (box - 0.5), 0.0, 1.0)
+    return earliest, latest
+
+
+def _departures_at(piece: Piece, space: ParameterSpace, used: Sequence[int], u: Points) -> Vector:
+    """Return when a piece departs (s) at points u (n, k) of the inputs that are used, the others in the middle of their range."""
+    points = np.full((len(u), space.dimension), 0.5)
+    points[:, used] = u
+    x, text = space.from_unit(points), (piece.departs or "").strip()
+    formula = placeholders(text, piece.place)[0].formula
+    if text == f"${{{formula.text}}}" and not set(formula.numbers()) & set(space.choices):
+        columns = {p.name: x[:, k] for k, p in enumerate(space.parameters)}
+        columns |= {name: np.array(choices)[columns[name].astype(int)] for name, choices in space.choices.items()}
+        with np.errstate(all="ignore"):
+            times = np.broadcast_to(np.asarray(formula(columns), dtype=np.float64), len(x))
+        if np.isfinite(times).all():
+            return times
+    return np.array([_departure(piece, space.named(row)) for row in x])
 
 
 def _departure(piece: Piece, values: Values) -> float:

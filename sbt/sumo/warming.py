@@ -212,7 +212,9 @@ class WarmedFiles:
         sublane = "--lateral-resolution" in self.launch.arguments
         with contextlib.suppress(OSError, EOFError, zlib.error, UnicodeDecodeError):
             return _read(path, sublane=sublane)
-        path.unlink()  # damaged: a warm-up is the same whenever it is made
+        if not os.access(path.parent, os.W_OK):
+            path = self.path_of(number, "")
+        path.unlink(missing_ok=True)  # damaged: a warm-up is the same whenever it is made
         self._make(number, path)
         return _read(path, sublane=sublane)
 
@@ -257,8 +259,12 @@ class WarmedFiles:
         text = mended(shortened(text), self.snapshot.until, rarely="--default.action-step-length" in self.warming.arguments)
         text = _READ_UNTIL.sub(rf"\g<1>{self.snapshot.until:.3f}\g<2>", text, count=1)
         part = path.with_suffix(f".{os.getpid()}")
-        part.write_bytes(gzip.compress(text.encode(), 1, mtime=0))
-        part.replace(path)
+        try:
+            part.write_bytes(gzip.compress(text.encode(), 1, mtime=0))
+            part.replace(path)
+        except OSError:
+            part.unlink(missing_ok=True)  # half of it, as the disk is full
+            raise
 
 
 def mended(text: str, until: float, *, rarely: bool = False) -> str:
@@ -292,7 +298,7 @@ def shortened(text: str) -> str:
 
 def warmed_files(files: SumoFiles, snapshot: Snapshot, step: float | None) -> WarmedFiles:
     """Write the files of warm-ups and runs to a temporary folder of this process, and return them."""
-    digest = _digest(files, snapshot.until, step)
+    digest = _digest(files, snapshot, step)
     folder = scratch_folder() / f"warm-{digest}"
     folder.mkdir(exist_ok=True)
     options = {**files.options, **_SAVING}
@@ -314,11 +320,20 @@ def warmed_files(files: SumoFiles, snapshot: Snapshot, step: float | None) -> Wa
     return WarmedFiles(folder, digest, snapshot, runs, warming)
 
 
-def _digest(files: SumoFiles, until: float, step: float | None) -> str:
-    """Return a digest of all that decides the states: files, options, step, end of the warm-up and version of SUMO."""
-    told = repr((sorted(files.options.items()), step, until, version("libsumo")))
+def _digest(files: SumoFiles, snapshot: Snapshot, step: float | None) -> str:
+    """Return a digest of all that decides the states: files, options, step, how traffic is divided, and version of SUMO.
+
+    The same files are divided otherwise for another vehicle under test: what it departs with is no traffic of every run.
+    """
+    standing = [t for path in (*files.routes, *files.additional) for t in template(path).tree()]
+    order = {one.path: k for k, one in enumerate(standing)}
+    divided = [
+        [(order[piece.file.path], piece.start) for piece in pieces]
+        for pieces in (snapshot.definitions, snapshot.before, snapshot.after)
+    ]
+    told = repr((sorted(files.options.items()), step, snapshot.until, divided, version("libsumo")))
     digest = hashlib.blake2b(told.encode(), digest_size=10)
-    for one in (template(files.net), *(t for path in (*files.routes, *files.additional) for t in template(path).tree())):
+    for one in (template(files.net), *standing):
         with one.opened() as stream_of_file:
             digest.update(hashlib.blake2b(stream_of_file.read()).digest())
     return digest.hexdigest()
