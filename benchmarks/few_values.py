@@ -1,6 +1,7 @@
 """Metrics that tell little: flags, speeds of impact, noise that is a share of the value. Is what is concluded so?
 
     python benchmarks/few_values.py combinations [--seeds 20]      # ten combinations of whole numbers and choices, noisy flags
+    python benchmarks/few_values.py values [--seeds 20]            # 18 combinations of a value each; few seeds decide
     python benchmarks/few_values.py estimation [--seeds 8]         # normal and uniform inputs, 150 runs, no stop rule
     python benchmarks/few_values.py logarithms [--seeds 12]        # the same problem as y and as log y, 200 runs
 
@@ -74,6 +75,46 @@ def combinations(seeds: range) -> Iterator[str]:
         yield f"| {name} | {p:.3g} | {met} of {n} | {random} | {covered} | {passed} | {int(np.median(runs))} |"
 
 
+ROAD_USERS = {"car": 0.8, "truck": 0.15, "moto": 0.05}
+EIGHTEEN = [sbt.Parameter("n", 0, 5, kind="integer"), sbt.Parameter("k", choices=ROAD_USERS)]
+
+
+def own(rate: float, event: float, kinds: str = "", low: float = -1.0) -> tuple[Evaluate, float, float]:
+    """Return a metric that a share of the seeds replaces by `event`; P with failed runs as safe, and as critical."""
+
+    def value(n: float, k: str) -> float:
+        return -(2.0 + 0.37 * n + {"car": 0.0, "truck": 0.11, "moto": 0.23}[k])
+
+    def evaluate(values: dict, seed: int) -> dict[str, float]:
+        rare = stream(seed, "event").random() < rate and values["k"] in (kinds or values["k"])
+        return {"y": event if rare else value(values["n"], values["k"])}
+
+    cells = [(value(n, k) >= low, p / 6.0, k in (kinds or k)) for n in range(6) for k, p in ROAD_USERS.items()]
+    sure = sum(p for critical, p, _ in cells if critical)
+    gone, met = (sum(p for critical, p, may in cells if may and critical is which) * rate for which in (True, False))
+    return evaluate, sure - gone + (0.0 if math.isnan(event) else gone + met), sure + met
+
+
+VALUES: dict[str, tuple[tuple[Evaluate, float, float], float]] = {
+    "3 % of the seeds": (own(0.03, 0.3), -1.0), "10 % of the seeds": (own(0.1, 0.3), -1.0),
+    "40 % of the seeds of trucks": (own(0.4, 0.3, "truck"), -1.0), "8 % of the seeds fail": (own(0.08, math.nan, low=-2.3), -2.3),
+    "deterministic": (own(0.0, 0.3, low=-2.3), -2.3),
+}  # fmt: skip
+
+
+def values(seeds: range) -> Iterator[str]:
+    yield "| metric | P | covered | error / P | crude | false passes | runs |"
+    for name, ((evaluate, p, worst), low) in VALUES.items():
+        runs = [campaign("estimation", EIGHTEEN, low, evaluate, seed, budget=200).conclusion for seed in seeds]
+        gate = {"probability": 0.5 * p}
+        gated = [campaign("estimation", EIGHTEEN, low, evaluate, seed, budget=200, gate=gate).conclusion for seed in seeds]
+        covered = sum(found.low - 1e-9 <= p and worst <= found.high + 1e-9 for found in runs)
+        error = math.sqrt(np.mean([(found.probability / p - 1.0) ** 2 for found in runs]))
+        passed, counted = sum(found.gate.verdict == "pass" for found in gated), int(np.median([found.counted for found in runs]))
+        crude = math.sqrt((1.0 - p) / p / 200.0)
+        yield f"| {name} | {p:.3g} | {covered} of {len(runs)} | {error:.2f} | {crude:.2f} | {passed} | {counted} |"
+
+
 SHAPES: dict[str, Callable[[Points], Vector]] = {
     "ball": lambda u: np.sqrt(((u - 0.7) ** 2).sum(axis=1)),
     "two": lambda u: np.minimum(np.sqrt(((u - 0.7) ** 2).sum(axis=1)), np.sqrt(((u - 0.2) ** 2).sum(axis=1))),
@@ -130,10 +171,11 @@ def logarithms(seeds: range) -> Iterator[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("combinations", "estimation", "logarithms"))
+    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms"))
     parser.add_argument("--seeds", type=int, default=8)
     given = parser.parse_args()
-    rows = {"combinations": combinations, "estimation": estimation, "logarithms": logarithms}[given.what](range(given.seeds))
+    tables = {"combinations": combinations, "values": values, "estimation": estimation, "logarithms": logarithms}
+    rows = tables[given.what](range(given.seeds))
     for k, row in enumerate(rows):
         print(row, flush=True)
         if k == 0:

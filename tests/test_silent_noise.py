@@ -53,8 +53,10 @@ def test_where_nothing_differs_the_conclusion_does_not_rule_noise_out(tmp_path: 
 
 
 def test_a_flag_that_many_repeats_confirm_is_exact(tmp_path: Path):
+    """The interval has what so many repeats may have missed, no more."""
     found = campaign("estimation", coin(1.0, lambda v: v["n"] >= 4), tmp_path / "s").conclusion
-    assert found.low == found.high == pytest.approx(0.4)
+    assert found.probability == pytest.approx(0.4)
+    assert 0.32 < found.low < 0.4 < found.high < 0.48
     assert found.counted < 100
 
 

@@ -341,7 +341,7 @@ def conclude_sum(log: Log, settings: Settings) -> Concluded:
         return _from_draws(log, settings)
     found = summed(log, settings)
     value, limits = _clipped(found.share.value), Limits(found.lower, found.upper)
-    bound = limits.upper(_CONFIDENCE) if found.hits == 0 and limits.upper(_CONFIDENCE) > 0.0 else None
+    bound = limits.upper(_CONFIDENCE) if found.hits == 0 and found.noisy else None
     return _conclusion(
         value, limits, cov=found.std_error / value if value > 0 else None, hits=found.hits, failed_as_safe=value,
         failed_as_critical=_clipped(found.worst.value), effective_sample_size=float(len(found.share.weight)),

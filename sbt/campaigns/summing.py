@@ -1,7 +1,8 @@
 """Few combinations of whole numbers and choices: each is run, and the probabilities of the critical ones are summed.
 
-A deterministic simulator leaves nothing to estimate then. With a noisy one every combination is a stratum: it is run again as
-often as it is likely, whatever came back, and the sum has the limits of weighted Poisson counts.
+Every combination is a stratum: it is run again as often as it is likely, whatever came back. With a noisy simulator the sum has
+the limits of weighted Poisson counts. Where all runs of a combination agree, the sum is exact if the simulator is deterministic;
+that it is, no repeat proves, so that the limits allow for what so many runs may have missed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from sbt.campaigns.combinations import ALL_RUN
 from sbt.campaigns.records import COUNT, EstimationProposal
-from sbt.campaigns.repeats import WANTED, repeats_wanted, simulator_noise
+from sbt.campaigns.repeats import WANTED, repeats_wanted, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import Settings
 from sbt.estimators.intervals import FEWEST_HITS
@@ -33,6 +34,8 @@ _REPLICATE = "replicate"
 """Stage of further runs of a combination, of a noisy simulator."""
 _MOST = 4096
 """Combinations that are looked at."""
+_NORMAL = 1.96
+"""Half width of a 95 % interval over its standard error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +47,7 @@ class Summed:
         worst: the same with failed ones as critical.
         missing: probability of the combinations that were not run.
         combinations: number of all.
-        noisy: equal inputs gave different metrics, or it would hardly show if they did.
-        repeats: runs beyond the first one of a combination. A gate asks for as many as there are combinations: a verdict for a
-            release must not rest on two.
+        noisy: equal inputs gave different metrics, or at times none, or it would hardly show if they did.
     """
 
     share: WeightedShare
@@ -54,7 +55,6 @@ class Summed:
     missing: float
     combinations: int
     noisy: bool
-    repeats: int = 0
 
     @property
     def hits(self) -> int:
@@ -63,27 +63,42 @@ class Summed:
 
     @property
     def std_error(self) -> float:
-        """Of the estimate: 0 for a deterministic simulator, else that of Poisson counts, of critical or of other runs."""
-        if not self.noisy or not len(self.share.weight):
+        """Of the estimate: of Poisson counts, of critical or of other runs; where all agree, by what runs may have missed."""
+        if not self.noisy:
+            return 0.5 * (_missed(self.share, 0.975) + _missed(_rest(self.share), 0.975)) / _NORMAL
+        if not len(self.share.weight):
             return 0.0
         squares, critical = (self.share.weight / len(self.share.weight)) ** 2, self.share.critical
         return float(np.sqrt(min(squares @ critical, squares @ (1.0 - critical))))
 
     def lower(self, confidence: float) -> float:
         """Return the one-sided lower limit, failed runs as safe."""
-        if not self.noisy or not len(self.share.weight):
-            return self.share.value if len(self.share.weight) else 0.0
+        if not len(self.share.weight):
+            return 0.0
+        if not self.noisy:
+            return max(self.share.value - _missed(self.share, confidence), 0.0)
         return max(self.share.lower(confidence), 1.0 - _rest(self.share).upper(confidence) - self.missing, 0.0)
 
     def upper(self, confidence: float) -> float:
         """Return the one-sided upper limit, failed runs as critical, and combinations that were not run."""
-        if not self.noisy or not len(self.worst.weight):
-            return min(self.worst.value + self.missing, 1.0) if len(self.worst.weight) else 1.0
+        if not len(self.worst.weight):
+            return 1.0
+        if not self.noisy:
+            return min(self.worst.value + self.missing + _missed(_rest(self.worst), confidence), 1.0)
         return min(self.worst.upper(confidence), 1.0 - self.missing - _rest(self.worst).lower(confidence)) + self.missing
 
 
 def _rest(share: WeightedShare) -> WeightedShare:
     return WeightedShare(share.weight, 1.0 - share.critical)
+
+
+def _missed(share: WeightedShare, confidence: float) -> float:
+    """Return the upper limit of the probability with which combinations that always gave this outcome give another one.
+
+    The number of other outcomes is Poisson, and was 0: a sum of p_k q_k is at most that of n_k q_k times the largest p_k / n_k.
+    """
+    terms = share.weight * share.critical / max(len(share.weight), 1)
+    return float(min(-np.log1p(-confidence) * terms.max(initial=0.0), terms.sum()))
 
 
 @dataclass(frozen=True)
@@ -108,10 +123,9 @@ class SummingStage:
         if not log.iterations or self._left(log) or repeats_wanted(log.history, s.scenario, s.budget - len(log.history)):
             return None
         found, target = summed(log, s), s.stop.get("cov")
-        if not found.noisy:
-            return None if s.gate is not None and found.repeats < found.combinations else ALL_RUN
-        precise = target is not None and found.hits >= FEWEST_HITS and found.std_error <= target * found.share.value
-        return "cov" if precise else None
+        if target is None or found.std_error > target * found.share.value:
+            return None
+        return ALL_RUN if not found.noisy else "cov" if found.hits >= FEWEST_HITS else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next combinations, the repeats that tell whether there is noise, then replicates."""
@@ -157,10 +171,11 @@ def summed(log: Log, settings: Settings, requirement: Requirement | None = None)
     runs, times = history.where(np.isin(np.arange(len(history)), rows)), np.bincount(at, minlength=len(x))
     weight = len(at) * p[at] / np.maximum(times[at], 1)
     critical = (requirement or settings.scenario.requirement).critical_runs(runs)
-    noise = simulator_noise(history, settings.scenario.requirement)
+    noise = stated_noise(history, settings.scenario)
+    noisy = noise is not None and (noise.noisy is True or noise.silent is True or noise.lost is not None)
     return Summed(
         WeightedShare(weight, critical.astype(np.float64)), WeightedShare(weight, (critical | ~runs.ok).astype(np.float64)),
-        float(p[times == 0].sum()), len(x), noise.noisy is True or noise.silent is True, noise.repeats,
+        float(p[times == 0].sum()), len(x), noisy,
     )  # fmt: skip
 
 

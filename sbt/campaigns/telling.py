@@ -279,14 +279,20 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         silent = f"The critical runs so far {how}, so their share is no estimate"
     else:
         ends = f"{confidence} interval {number(found.low, 3)} to {number(found.high, 3)}"
-        if every and found.low == found.high:
-            ends = "exact if the simulator is deterministic"
+        if every and _agree(found):
+            ends += ", exact if the simulator is deterministic"
         said = f"The probability of {subject} is {number(found.probability, 3)} ({ends})"
         if found.counted and not found.hits and found.combinations is None:
             guess = f"no draw that counts was critical, and {number(found.probability, 3)} is the metamodel's own guess"
             said = f"The probability of {subject} is at most {number(found.high, 3)} ({confidence} interval from 0): {guess}"
         silent = _not_told(found, facts, every)
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
+
+
+def _agree(found: EstimationConclusion) -> bool:
+    """Return whether runs of equal inputs always ended alike, with values that show noise."""
+    noise = found.simulator_noise
+    return noise is not None and noise.noisy is False and noise.silent is None and noise.lost is None
 
 
 def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
@@ -304,8 +310,8 @@ def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
         silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"
     if every:
         silent = "This is a sum over all combinations: none is unseen"
-        seeds = ", and what seeds decide is in its interval"
-        silent += ". It does not tell of noise that repeats do not show" if found.low == found.high else seeds
+        silent += ", and what seeds may decide is in its interval"
+        silent += ", though no repeat came out otherwise" if _agree(found) else ""
     elif found.low == 0.0 and found.hits:
         traffic, why = found.warmed_traffic, "of unequal weight"
         why = "of so few warm-ups" if traffic is not None and traffic.decides(found.cov, p) else why
@@ -341,8 +347,8 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
             f" more {'warm-ups (warm_up.seeds), hardly more runs,' if by_traffic else 'runs'} would bring it to about"
             f" {number(worst, 3)}, as far as these tell; {why_they_fail()}"
         )
-    if found.combinations is not None and found.low == found.high:
-        return "if equal inputs may end differently, acquisition: {kind: monte_carlo} gives an interval that holds then too"
+    if found.combinations is not None and found.probability == 0.0:
+        return "ten times as many runs bring the upper end of the interval to a tenth"
     if all_critical(facts):
         return _WIDEN
     if found.gate is not None and found.gate.verdict == "undecided":
