@@ -9,7 +9,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 
 import numpy as np
@@ -173,5 +173,9 @@ def _check_trace(trace: Trace) -> None:
 
 
 def versions() -> str:
-    """Return the versions of what runs a concrete scenario, for the store."""
-    return f"sbt {version('sumo-sbt')}, libsumo {version('libsumo')}"
+    """Return the versions of what runs a concrete scenario, for the store; scenarios of Python alone run without libsumo."""
+    try:
+        sumo = version("libsumo")
+    except PackageNotFoundError:
+        sumo = "none"
+    return f"sbt {version('sumo-sbt')}, libsumo {sumo}"
