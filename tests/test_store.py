@@ -533,3 +533,33 @@ def test_of_a_truncated_store_doctor_says_what_can_be_done(finished: Path, tmp_p
     assert again.stderr == f"a store is saved with its runs, but of {tmp_path} none can be read: begin a new campaign\n"
     told = CliRunner().invoke(app, ["status", str(tmp_path)])
     assert "malformed" not in told.output
+
+
+@pytest.mark.skipif(os.name != "posix", reason="other systems have another longest path")
+def test_a_path_that_sqlite_takes_no_longer_is_told_before_anything_is_made(tmp_path: Path):
+    """It was told as a folder that is not writable, which was there then."""
+
+    def of_length(name: str, n: int) -> Path:
+        """Return a folder whose path has n bytes."""
+        folder = tmp_path.resolve() / name
+        while (missing := n - len(os.fsencode(folder))) > 120:
+            folder /= "ü" * 50
+        return folder / ("x" * (missing - 1))
+
+    longest = 504 - len(f"/{DATABASE}")
+    fits, beyond = of_length("a", longest), of_length("b", longest + 1)
+    assert len(os.fsencode(fits.resolve())) == longest
+    with planned(fits) as store:
+        store.append(outcome(0))
+    with Store.read(fits) as store:
+        assert len(store.history()) == 1
+    said = f"the path of a store must be of at most {longest} bytes, .* has {longest + 1}"
+    with pytest.raises(StoreError, match=said):
+        Store.open(beyond, CONFIGURATION)
+    assert not (tmp_path / "b").exists()
+    shutil.copytree(fits, beyond)
+    with pytest.raises(StoreError, match=said):
+        Store.read(beyond)
+    (tmp_path / "link").symlink_to(beyond)
+    with pytest.raises(StoreError, match=said):
+        Store.open(tmp_path / "link")

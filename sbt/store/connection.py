@@ -2,21 +2,42 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from sbt.errors import StoreError
 from sbt.processes import scratch
+from sbt.store.layout import DATABASE
 
-__all__ = ["connected", "copy_database", "is_never_waited_for", "one_moment", "set_journal"]
+__all__ = ["connected", "copy_database", "is_never_waited_for", "one_moment", "set_journal", "with_room"]
 
 _UNWRITABLE = (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
+_LONGEST = 504
+"""Bytes of the longest path that SQLite opens on a Unix: 512, less the ending of its journal."""
+
+
+def with_room(folder: Path) -> Path:
+    """Return a folder whose path, without links, is short enough for SQLite to open a file in it.
+
+    Raises:
+        StoreError: it is too long.
+    """
+    there = Path(os.path.realpath(folder))
+    excess = len(os.fsencode(there / DATABASE)) - _LONGEST
+    if os.name == "posix" and excess > 0:
+        most = _LONGEST - len(os.fsencode(DATABASE)) - 1
+        rule = f"the path of a store must be of at most {most} bytes, as SQLite opens no longer ones"
+        raise StoreError(f"{rule}, but {there} has {most + excess}")
+    return folder
 
 
 def connected(path: Path) -> sqlite3.Connection:
     """Open a file for reading only."""
+    with_room(path.parent)
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True, isolation_level=None)
     try:
@@ -47,7 +68,7 @@ def _copied(path: Path, log: Path) -> sqlite3.Connection:
 
 def copy_database(source: Path, target: Path) -> None:
     """Write a copy of a file, as it was at one moment; a process may be writing it."""
-    with closing(connected(source)) as db, closing(sqlite3.connect(target)) as copy:
+    with closing(connected(source)) as db, closing(sqlite3.connect(with_room(target.parent) / target.name)) as copy:
         db.backup(copy)
         copy.execute("PRAGMA journal_mode = DELETE")  # one file, which may lie where nobody may write
 

@@ -25,7 +25,7 @@ from sbt.problem.description import described_choices
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import Json, JsonMapping
 from sbt.store.checks import check_row, check_rows
-from sbt.store.connection import connected, is_never_waited_for, one_moment, set_journal
+from sbt.store.connection import connected, is_never_waited_for, one_moment, set_journal, with_room
 from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, checksums_of, damaged, refuse_damage, reported
 from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_metrics, plan_rows, storable, storable_reason
@@ -75,7 +75,7 @@ class Store:
                 until `begin` is called.
             durable: commits reach the disk; False where the whole file can be written again.
         """
-        folder = Path(folder)
+        folder = with_room(Path(folder))
         with reported(folder):
             folder.mkdir(parents=True, exist_ok=True)
             lock = locked(folder)

@@ -17,7 +17,7 @@ from typing import Any
 from sbt.errors import StoreError
 from sbt.problem.plain import JsonMapping
 from sbt.processes import own_name, remove_abandoned
-from sbt.store.connection import connected
+from sbt.store.connection import connected, with_room
 from sbt.store.history import PLANNED
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, reported
 from sbt.store.planning import dump
@@ -97,7 +97,7 @@ def save(folder: Path, target: Path, configuration: JsonMapping | None = None) -
         StoreError: the configuration is damaged and none is given, or no run can be read, so that nothing can go on, or there
             is a store in the target.
     """
-    folder, target = Path(folder), Path(target)
+    folder, target = Path(folder), with_room(Path(target))
     found, content = _read(folder)
     if "configuration" not in content.meta and configuration is not None:
         text = dump(dict(configuration))
