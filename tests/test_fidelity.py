@@ -28,6 +28,8 @@ from tests.warm_networks import town
 NOISY = {"campaign": "estimation", "scenario": "testbed:two_hollows_noisy", "budget": 60, "stop": {"cov": None}, "initial": 10}
 COARSE = {"scenario": "testbed:two_hollows_noisy:coarse", "cost": 0.2}
 
+METRICS = "metrics: [distance_min]\nrequirement: {metric: distance_min, critical: [-.inf, 1.0]}\nstep_length: 0.2\n"
+"""Last keys of a scenario file."""
 STEP = 0.1
 LEFT_TURN = {"campaign": "estimation", "scenario": "unprotected_left_turn"}
 
@@ -241,6 +243,32 @@ def test_coarse_runs_begin_with_coarse_warm_ups_and_replay_so(tmp_path: Path) ->
     assert summary.failed == 0
     assert len(list((tmp_path / "store" / "snapshots").glob("*.state.xml.gz"))) == 4, "two warm-ups, each at both steps"
     assert replay_run(tmp_path / "store", int(coarse.index[0])).identical
+
+
+@pytest.mark.sumo
+def test_warm_ups_of_a_coarser_scenario_that_are_not_the_scenarios_are_refused(tmp_path: Path) -> None:
+    """They were silently replaced by the scenario's."""
+    own = town(tmp_path / "town")
+    head, _, _ = own.read_text().partition("duration")
+    names = itertools.count()
+
+    def check(fine: str, other: str) -> None:
+        number = next(names)
+        paths = [own.with_name(f"{name}_{number}.yaml") for name in ("fine", "coarse")]
+        for path, warm_up in zip(paths, (fine, other), strict=True):
+            path.write_text(f"{head}duration: 3\n{warm_up}\n{METRICS}")
+        data = {"campaign": "estimation", "scenario": str(paths[0]), "fidelity": {"scenario": str(paths[1]), "cost": 0.5}}
+        study(tmp_path, data, budget=8).campaign  # noqa: B018
+
+    stated = "warm_up: {seeds: 2}"
+    with pytest.raises(ConfigError, match=r"which has until: auto, seeds: 2, but coarse_. asks for until: auto, seeds: 3"):
+        check(stated, "warm_up: {seeds: 3}")
+    with pytest.raises(ConfigError, match=r"which has until: auto, seeds: 2, but coarse_. asks for until: 40"):
+        check(stated, "warm_up: {until: 40}")
+    with pytest.raises(ConfigError, match=r"which has none, but coarse_. asks for until: auto"):
+        check("", "warm_up: {until: auto}")
+    for other in ("", stated, "warm_up: {until: auto}"):
+        check(stated, other)
 
 
 @pytest.mark.sumo

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 from sbt.config.fidelity_model import FidelityChoice
 from sbt.config.model import Configuration
@@ -33,7 +34,7 @@ def check_levels(choice: FidelityChoice, spec: ScenarioSpec, scenario: LogicalSc
 
     Raises:
         InputError: the scenario has no step, has another one, a coarse step is beyond what its model takes, or a coarser
-            scenario has other inputs or metrics.
+            scenario has other inputs, metrics or warm-ups.
     """
     if choice.fine is not None and choice.coarse is not None:
         _check_steps(choice.fine, choice.coarse, scenario)
@@ -47,6 +48,24 @@ def check_levels(choice: FidelityChoice, spec: ScenarioSpec, scenario: LogicalSc
     if absent:
         rule = f"a coarser scenario must measure {', '.join(absent)}"
         raise InputError(f"{rule}, but {coarse.name} gives {', '.join(coarse.measured)}")
+    _check_warm_up(coarse, scenario)
+
+
+def _check_warm_up(coarse: LogicalScenario, scenario: LogicalScenario) -> None:
+    """Refuse a coarser scenario that asks for warm-ups of its own: both runs of a pair begin with the warm-up of one number."""
+    own, other = (getattr(each.simulate, "warm", None) for each in (scenario, coarse))
+    if other is None or (own is not None and own.until == other.until and other.seeds in (None, own.seeds)):
+        return
+    rule = "a coarser scenario begins with the warm-ups of the scenario: its warm_up must be left out, or be that of the scenario"
+    raise InputError(f"{rule}, which has {_warm_up(own)}, but {coarse.name} asks for {_warm_up(other)}")
+
+
+def _warm_up(asked: Any) -> str:
+    """Return in words what is asked for."""
+    if asked is None:
+        return "none"
+    until = "until: auto" if asked.until is None else f"until: {asked.until:g}"
+    return until if asked.seeds is None else f"{until}, seeds: {asked.seeds}"
 
 
 def _is(missing: list[str], name: str) -> str:
