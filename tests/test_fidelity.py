@@ -18,6 +18,7 @@ import pytest
 from sbt.config.source import ConfigError
 from sbt.errors import InputError, SbtError
 from sbt.estimators.two_level import TwoPhases, drawn, inclusion, split_as_if_normal
+from sbt.plugins import forget_changed
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.workflows.exporting import FORMS
@@ -174,6 +175,39 @@ def _finished(folder: Path) -> int:
         return len(rows(folder))
     except SbtError:
         return 0
+
+
+@pytest.mark.parametrize("executor", [{"kind": "serial"}, {"kind": "local", "workers": 1}], ids=["serial", "local"])
+@pytest.mark.parametrize("fine", ["model.py:FINE", "testbed:two_hollows_noisy"], ids=["own", "installed"])
+def test_a_coarse_model_that_was_changed_is_refused(tmp_path: Path, fine: str, executor: dict[str, Any]) -> None:
+    """It was not tried: a store mixed the runs of two."""
+    text = f"""import dataclasses
+from sbt.plugins import load
+
+FINE = load("scenarios", "{NOISY["scenario"]}")
+COARSE = load("scenarios", "{NOISY["scenario"]}:coarse")
+METRIC = COARSE.requirement.metric
+
+def evaluate(values, seed):
+    return {{METRIC: SIGN * COARSE.evaluate(values, seed)[METRIC]}}
+
+COARSE_ONE = dataclasses.replace(COARSE, evaluate=evaluate)
+"""
+    for name in ("model", "coarse"):
+        (tmp_path / f"{name}.py").write_text(text.replace("SIGN", "1.0"))
+    data = {**NOISY, "scenario": fine, "fidelity": {"scenario": "coarse.py:COARSE_ONE", "cost": 0.2}, "executor": executor}
+    run(tmp_path, data)
+    before = rows(tmp_path)
+    assert any(row[5] == 1 for row in before)
+    (tmp_path / "coarse.py").write_text(text.replace("SIGN", "-1.0"))
+    forget_changed()
+    with pytest.raises(InputError, match=r"but run \d+ \(a coarse one, at level 1\) now gives .*changed since: .*coarse\.py"):
+        run(tmp_path, data, budget=90)
+    assert rows(tmp_path) == before
+    (tmp_path / "coarse.py").write_text(text.replace("SIGN", "1.0 * 1.0"))
+    forget_changed()
+    run(tmp_path, data, budget=90)
+    assert len(rows(tmp_path)) > len(before)
 
 
 def test_what_does_not_pay_is_left_out_and_said(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from sbt.errors import InputError, StoreError
 from sbt.execution.spec import ScenarioSpec
 from sbt.plugins import read_files
 from sbt.sumo.warming import _read
-from sbt.workflows import running
+from sbt.workflows import rechecking, running
 
 IGNORING = r'<vType id="\1" jmIgnoreFoeProb="0.5" jmIgnoreFoeSpeed="20"'
 
@@ -63,7 +63,7 @@ def test_that_sumo_does_not_repeat_every_run_is_said(tmp_path: Path, changes: li
     scenario = ScenarioSpec(str(path)).resolve()
     scenario.simulate({"accel": 2.0, "tau": 1.0}, 1)
     assert any("jmIgnoreFoeProb and persons walk" in text for text in scenario.simulate.warnings()) is told
-    assert bool(running.not_repeated(scenario)) is told
+    assert bool(rechecking.not_repeated(scenario)) is told
 
 
 @pytest.mark.sumo
@@ -72,16 +72,16 @@ def test_a_run_that_sumo_does_not_repeat_ends_no_campaign(tmp_path: Path, monkey
     path = changed(tmp_path / "a", (r'<vType id="(car)"', IGNORING))
     given = {"campaign": "coverage", "scenario": str(path), "seed": 3, "initial": 4, "batch": 4, "executor": {"kind": "serial"}}
     sbt.run(**given, budget=4, store=tmp_path / "s")
-    again = running._again
+    again = rechecking._again
 
     def last_differs(*arguments):
         *some, (record, outcome) = again(*arguments)
         yield from some
         yield record, outcome.__class__(outcome.index, outcome.status, {**outcome.metrics, "distance_min": -1.0}, "", 0.0)
 
-    monkeypatch.setattr(running, "_again", last_differs)
+    monkeypatch.setattr(rechecking, "_again", last_differs)
     assert len(sbt.run(**given, budget=6, store=tmp_path / "s").frame) == 6
-    monkeypatch.setattr(running, "not_repeated", lambda scenario: "")
+    monkeypatch.setattr(rechecking, "not_repeated", lambda scenario: "")
     with pytest.raises(InputError, match="must give the runs"):
         sbt.run(**given, budget=8, store=tmp_path / "s")
     monkeypatch.undo()

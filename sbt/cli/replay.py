@@ -40,7 +40,8 @@ def replay(
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
         from sbt.workflows.judging import judge_run, judgement_line, stored_judgements, with_driver
-        from sbt.workflows.running import not_repeated, replay_run
+        from sbt.workflows.rechecking import not_repeated
+        from sbt.workflows.running import replay_run
         from sbt.workflows.showing import show_replay
         from sbt.workflows.study import changed_since
 

@@ -20,7 +20,8 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import JsonMapping
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import Record
-from sbt.workflows.running import Summary, check_code, keep_configuration, rebuild_report, summarise
+from sbt.workflows.rechecking import check_code
+from sbt.workflows.running import Summary, keep_configuration, rebuild_report, summarise
 from sbt.workflows.study import RESOLVED, Study, changed_since
 
 __all__ = ["merge_shards"]

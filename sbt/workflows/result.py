@@ -30,7 +30,8 @@ from sbt.workflows.exporting import export_store
 from sbt.workflows.judging import judge_run, with_driver
 from sbt.workflows.keywords import as_data
 from sbt.workflows.plots import Plots
-from sbt.workflows.running import Replay, not_repeated, rebuild_report, replay_run
+from sbt.workflows.rechecking import not_repeated
+from sbt.workflows.running import Replay, rebuild_report, replay_run
 from sbt.workflows.showing import net_of_run, save_film, shown_trace
 from sbt.workflows.study import Study, changed_since
 

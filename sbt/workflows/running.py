@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,14 +12,13 @@ import numpy as np
 from sbt.config.load import differences, dump
 from sbt.errors import InputError, PluginError
 from sbt.execution.code_print import code_print
-from sbt.execution.protocol import Executor
 from sbt.execution.warming import warm_up
 from sbt.execution.worker import run_traced, versions
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.running import Finished, check_shard, run_shard, run_stages
 from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard, sentences_of
-from sbt.plugins import OBJECT, Objects, forget_files
+from sbt.plugins import Objects, forget_files
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
 from sbt.problem.outcome import Doubt, Job, Outcome, Status
@@ -27,21 +26,19 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
-from sbt.store.history import History, Record
+from sbt.store.history import Record
 from sbt.workflows.asking import sensitivities_in
 from sbt.workflows.fidelity import COARSE_COST
 from sbt.workflows.filming import film_runs
 from sbt.workflows.judging import judge_campaign
 from sbt.workflows.portable import write_bundle
+from sbt.workflows.rechecking import check_code, check_earlier, own_code
 from sbt.workflows.study import RESOLVED, Study, changed_since
 
 __all__ = [
-    "Replay", "Summary", "bundle_store", "check_code", "keep_configuration", "not_repeated", "rebuild_report", "replay_run",
-    "run_study", "summarise",
+    "Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise",
 ]  # fmt: skip
 
-_TRIED = 20
-"""Runs that are tried again, spread over those that are there, before a campaign goes on whose files or code were changed."""
 CODE = "code"
 """Key under which a store remembers a print of the code of the user's own that its runs depend on."""
 _MAY_CHANGE = {CODE, COARSE_COST, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
@@ -116,7 +113,7 @@ def run_study(
         campaign = study.campaign
         if shard is not None:
             check_shard(campaign)
-        _check_earlier(study)
+        check_earlier(study)
         if study.scenario.pool is not None and study.config.validation.reference:
             raise InputError("validation.reference: recorded rows have no runs beside them; those that are left over score")
     with Store.open(Path(study.config.store)) as store:
@@ -164,73 +161,7 @@ def _tell(store: Store, study: Study, listener: Callable[[Progress], None], acti
 
 def _code_of(study: Study) -> Json:
     """Return what a store remembers of the code of the user's own; nothing where there is none."""
-    return {CODE: code_print(study.scenario)} if _own_code(study) else {}
-
-
-def check_code(store: Store, study: Study, executor: Executor, *, changed: bool) -> None:
-    """Refuse to go on with a store whose runs the user's code and files would not give again.
-
-    The first and the last with metrics are tried, where files or code were changed since as many as `_TRIED` of all, and the
-    first that could not be run: code may change just what is invalid. Where nothing was changed, and SUMO does not repeat every
-    run of such files, most of as many are enough.
-    """
-    history = store.history()
-    if not _own_code(study):
-        return
-    ok, invalid = np.flatnonzero(history.ok), np.flatnonzero(history.status == str(Status.INVALID))
-    unsure = "" if changed else not_repeated(study.runnable)
-    tried = ok[np.linspace(0, len(ok) - 1, min(_TRIED if changed or unsure else 2, len(ok))).round().astype(np.intp)]
-    again = list(_again(history, [*tried, *invalid[:1]], executor))
-    differing = [(record, outcome) for record, outcome in again if dict(outcome.metrics) != dict(record.metrics)]
-    if not unsure or 2 * len(differing) > len(again):
-        for record, outcome in differing:
-            now, stored = dict(outcome.metrics) or outcome.reason, dict(record.metrics) or record.reason
-            rule = f"code and files must give the runs of {store.folder} again to go on, but run {record.index} now gives {now}"
-            remedy = "choose another store for what has changed"
-            raise InputError(f"{rule}, not {stored}{changed_since(store.folder) or unsure}; {remedy}")
-
-
-def not_repeated(scenario: LogicalScenario) -> str:
-    """Return in words why a run may differ although nothing was changed; "" where no reason is known."""
-    from sbt.sumo.files import SumoFiles
-    from sbt.sumo.repeating import unrepeatable
-
-    files = getattr(scenario.simulate, "files", None)
-    why = unrepeatable(files) if isinstance(files, SumoFiles) else ""
-    return why and f"; {why}"
-
-
-def _check_earlier(study: Study) -> None:
-    """Refuse to learn from an earlier campaign as from this one where code has changed: its first and last run are tried.
-
-    With warmed traffic they are not, since another number of warm-ups is another beginning.
-    """
-    choice = study.config.warm_start
-    if choice is None or choice.transfer or not _own_code(study) or (study.isolation is not None and study.isolation.warm):
-        return
-    history = study.earlier_campaign().same_runs(study.scenario)
-    ok = np.flatnonzero(history.ok & history.drawn & (history.columns["level"] == 0))
-    with study.executor() as executor:
-        for record, outcome in _again(history, [*ok[:1], *ok[-1:]], executor):
-            stored = {name: value for name, value in record.metrics.items() if name in outcome.metrics or not outcome.metrics}
-            now = {name: outcome.metrics[name] for name in stored if outcome.metrics} or outcome.reason
-            if now != stored:
-                rule = f"warm_start.store must be of what is run now, but its run {record.index} now gives {now}, not {stored}"
-                raise InputError(f"{rule}: transfer: true takes it as another setup")
-
-
-def _own_code(study: Study) -> bool:
-    """Return whether runs depend on files or objects of the user's."""
-    config = study.config
-    code = [config.scenario, *config.metrics, *([] if config.ego is None else [config.ego.kind])]
-    return any(name.startswith((OBJECT, "table:")) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code)
-
-
-def _again(history: History, rows: Sequence[np.intp], executor: Executor) -> Iterator[tuple[Record, Outcome]]:
-    """Yield the runs in these rows, and how they go now."""
-    records = {record.index: record for record in (history.record(int(row)) for row in dict.fromkeys(rows))}
-    for outcome in executor.run([Job(record.index, record.inputs, record.seed) for record in records.values()]):
-        yield records[outcome.index], outcome
+    return {CODE: code_print(study.scenario)} if own_code(study) else {}
 
 
 def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> None:
