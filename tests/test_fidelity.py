@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
+from sbt.cli import app
 from sbt.config.source import ConfigError
 from sbt.errors import InputError, SbtError
 from sbt.estimators.two_level import TwoPhases, drawn, inclusion, split_as_if_normal
@@ -22,6 +24,8 @@ from sbt.plugins import forget_changed
 from sbt.seeds import stream
 from sbt.store.database import Store
 from sbt.workflows.exporting import FORMS
+from sbt.workflows.judging import judge_run, with_driver
+from sbt.workflows.pinning import pin_runs
 from sbt.workflows.running import Summary, replay_run, run_study
 from sbt.workflows.study import Study
 from tests.warm_networks import town
@@ -259,6 +263,45 @@ def test_the_cost_of_runs_of_milliseconds_is_measured(tmp_path: Path) -> None:
     found = study(tmp_path, given, fidelity={"step_length": [0.05, 0.2]})
     _, told = fidelity_findings(found.spec, found.scenario, 1)
     assert told.numbers["cost"] >= 0.3
+
+
+@pytest.mark.sumo
+def test_a_coarse_run_is_shown_as_one_judged_at_its_step_and_not_pinned(tmp_path: Path) -> None:
+    """A pin was refused as if SUMO did not repeat itself, and of a judged run it was said that it is not there."""
+    data = {"campaign": "estimation", "scenario": "cut_in", "budget": 20, "stop": {"cov": None}}
+    run(tmp_path, data, initial=12, fidelity={"step_length": [0.05, 0.2], "cost": 0.3})
+    folder = tmp_path / "store"
+    with Store.read(folder) as store:
+        fine, coarse = ([int(k) for k in store.history(level=level).index] for level in (0, 1))
+
+    def replayed(index: int, *more: str) -> str:
+        done = CliRunner().invoke(app, ["replay", str(folder), str(index), *more])
+        assert done.exit_code == 0, done.output
+        return done.stdout
+
+    assert replayed(coarse[0]).startswith(f"run {coarse[0]}, a coarse run (level 1 of fidelity), seed ")
+    assert replayed(fine[0]).startswith(f"run {fine[0]}, seed ")
+    assert json.loads(replayed(coarse[0], "--json"))["level"] == 1
+    assert "level" not in json.loads(replayed(fine[0], "--json"))
+    for index in coarse:
+        (judged,) = judge_run(folder, index, ["fsm"])
+        if judged.avoided is not None:
+            break
+    assert judged.avoided is not None, "the test needs a run that can be judged"
+    driven = with_driver(replay_run(folder, index), "fsm")
+    need = driven.scenario.requirement
+    assert judged.metric == need.told_of(driven.outcome.metrics)
+    again = study(tmp_path / "again", data).scenario.configured(ego={"kind": "fsm"})
+    at_fine = again.run(driven.record.inputs, driven.record.seed)
+    assert judged.metric != need.told_of(at_fine), "it was judged at the coarse step"
+    states = tmp_path / "states.csv"
+    said = json.loads(replayed(index, "--driver", "fsm", "--trace", str(states), "--json"))["preventable"]
+    assert [each["metric"] for each in said] == [judged.metric]
+    assert pd.read_csv(states)["time"].drop_duplicates().diff().dropna().round(6).unique().tolist() == [0.2]
+    with pytest.raises(InputError, match=rf"run {coarse[1]} is a coarse one \(level 1 of fidelity\), which counts as no failure"):
+        pin_runs(folder, [str(fine[0]), str(coarse[1])], tmp_path / "pins")
+    assert not (tmp_path / "pins").exists()
+    assert pin_runs(folder, [str(fine[0])], tmp_path / "pins").is_file()
 
 
 @pytest.mark.slow

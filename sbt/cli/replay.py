@@ -58,13 +58,15 @@ def replay(
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),
             "metrics": dict(outcome.metrics), "identical": same if again.executed else None, "reason": outcome.reason,
             "ended": states.ended if states is not None else "",
+            **({"level": record.level} if record.level else {}),
             **({} if gif is None else {"film": str(gif.resolve())}),
             **({"unconfirmed": outcome.unconfirmed} if outcome.unconfirmed else {}),
             **({"preventable": [vars(each) for each in judgements]} if judgements else {}),
         })  # fmt: skip
     else:
         ended = f", ended: {states.ended}" if states is not None else ""
-        print(f"run {record.index}, seed {record.seed}: {outcome.status}{ended}")
+        coarse = f", a coarse run (level {record.level} of fidelity)" if record.level else ""
+        print(f"run {record.index}{coarse}, seed {record.seed}: {outcome.status}{ended}")
         for name, value in outcome.metrics.items():
             print(f"  {name:<23} {value:.6g}")
         if outcome.unconfirmed:
@@ -74,7 +76,7 @@ def replay(
             print(f"film: {gif.resolve()}")
         if judgements:
             print("\n".join(["with a reference driver in the place of ego:", *map(judgement_line, judgements)]))
-        if same and outcome.status == "ok":
+        if same and outcome.status == "ok" and (gif is None or not record.level):  # a coarse run is no failure to pin
             film = ["sumo-sbt", "replay", str(folder), str(run), "--film", f"{run}.gif"]
             next_command(*(film if gif is None else ["sumo-sbt", "pin", str(folder), str(run), "--into", "tests"]))
     if not same:

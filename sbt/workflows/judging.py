@@ -25,6 +25,7 @@ from sbt.metrics.preventability import METRIC_NAME, why_not
 from sbt.plugins import Objects
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import JsonMapping
+from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History, Record
 from sbt.store.records import Judgement
@@ -104,7 +105,7 @@ def judge_campaign(
 def judge_run(
     folder: Path, run: int, drivers: Sequence[str] | None = None, *, objects: Objects | None = None
 ) -> tuple[Judgement, ...]:
-    """Judge one run of a store, whatever its verdict; the store is not changed.
+    """Judge one run of a store, whatever its verdict, at its level of fidelity; the store is not changed.
 
     Args:
         folder: of the store.
@@ -119,7 +120,7 @@ def judge_run(
         InputError: the store has no such run, or there is no such driver.
     """
     with Store.read(folder) as store:
-        study, history, known = Study.from_store(store, objects=objects), store.history(), store.judgements
+        study, history, known = Study.from_store(store, objects=objects), store.history(level=None), store.judgements
     chosen = tuple(drivers) if drivers is not None else study.config.judges or DRIVERS
     with nullcontext() if drivers is not None else study.loaded.scope.naming():
         judged = judge_runs(study, history, [run], chosen, known=known, workers=1)
@@ -182,19 +183,22 @@ def judge_runs(
     found = {(each.run, each.driver): each for each in known}
     missing = [run for run in dict.fromkeys(runs) if any((run, driver) not in found for driver in drivers)]
     records = [_record(history, run) for run in missing]
-    for each in _judged(study, records, drivers, workers) if records else ():
-        found.setdefault((each.run, each.driver), each)
+    for level in sorted({record.level for record in records}):
+        for each in _judged(study, [record for record in records if record.level == level], drivers, workers):
+            found.setdefault((each.run, each.driver), each)
     order = {driver: k for k, driver in enumerate(drivers)}
     return sorted(found.values(), key=lambda each: (each.run, order.get(each.driver, len(order)), each.driver))
 
 
 def _judged(study: Study, records: Sequence[Record], drivers: Sequence[str], workers: int | None) -> list[Judgement]:
-    """Return what every driver makes of these runs."""
-    panel, roles = _panel(study, drivers), study.runnable.roles
+    """Return what every driver makes of these runs, all of one level of fidelity."""
+    runnable, spec = study.runnable, replace(study.spec.at_level(records[0].level), only=None)
+    scenario = spec.resolve() if records[0].level else runnable
+    panel, roles = _panel(scenario, study.loaded.folder, drivers), scenario.roles
     reason = roles.not_judged or ("" if panel.egos else next(iter(panel.refused.values())))
     if reason:
         return [Judgement(r.index, driver, None, reason=reason) for r in records for driver in drivers]
-    spec = _exchanging(study, panel)
+    spec = _exchanging(spec, scenario, panel)
     jobs = {(k, d): Job(k * (len(panel.names) + 1) + d, {**r.inputs, DRIVER: float(d)}, r.seed)
             for k, r in enumerate(records) for d in range(len(panel.names) + 1)}  # fmt: skip
     with study.executor(spec, workers=workers) as executor:
@@ -214,9 +218,8 @@ def _judged(study: Study, records: Sequence[Record], drivers: Sequence[str], wor
     return judged
 
 
-def _panel(study: Study, drivers: Sequence[str]) -> _Panel:
-    """Return who can stand in for the ego."""
-    scenario, folder = study.runnable, study.loaded.folder
+def _panel(scenario: LogicalScenario, folder: Path, drivers: Sequence[str]) -> _Panel:
+    """Return who can stand in for the ego; files of drivers are looked up in the folder."""
     egos: list[JsonMapping] = []
     names: list[str] = []
     refused: dict[str, str] = {}
@@ -232,11 +235,10 @@ def _panel(study: Study, drivers: Sequence[str]) -> _Panel:
     return _Panel(tuple(drivers), tuple(egos), tuple(names), refused)
 
 
-def _exchanging(study: Study, panel: _Panel) -> ScenarioSpec:
+def _exchanging(spec: ScenarioSpec, scenario: LogicalScenario, panel: _Panel) -> ScenarioSpec:
     """Return the scenario in which the ego can be exchanged, with what a judgement needs measured."""
-    measured = study.runnable.measured
-    further = () if _COLLISION in measured else (_COLLISION,)
-    return replace(study.spec, drivers=panel.egos, metrics=(*study.spec.metrics, *further))
+    further = () if _COLLISION in scenario.measured else (_COLLISION,)
+    return replace(spec, drivers=panel.egos, metrics=(*spec.metrics, *further))
 
 
 def _why_not(again: Outcome, record: Record) -> str:

@@ -25,6 +25,7 @@ from sbt.problem.outcome import Job, Status
 from sbt.problem.plain import Json, JsonMapping, Value
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
+from sbt.store.history import History
 from sbt.workflows.portable import place_of
 from sbt.workflows.running import Replay, replay_run
 from sbt.workflows.study import Study
@@ -116,15 +117,16 @@ def pin_runs(folder: Path, runs: Sequence[str], into: Path) -> Path:
         into: folder of the tests, made where there is none.
 
     Raises:
-        InputError: there is no such run, it does not replay bit by bit, its code is not approved, or it was defined in a
-            notebook.
+        InputError: there is no such run, it is a coarse one, it does not replay bit by bit, its code is not approved, or it was
+            defined in a notebook.
     """
     with Store.read(folder) as store:
         kept, conclusion = dict(store.configuration), (store.conclusion or {}).get("conclusion", {})
         if OBJECT in json.dumps(kept.get("yaml", "")):
             raise InputError("a pinned test must find the scenario in files, but this campaign took it from Python objects")
         study, (place, text) = Study.from_store(store), place_of(kept, store.folder)
-    indices = list(dict.fromkeys(_index(run, conclusion) for run in runs))
+        indices = list(dict.fromkeys(_index(run, conclusion) for run in runs))
+        _check_levels(indices, store.history(level=None))
     replays = [replay_run(folder, index, execute=True) for index in indices]
     for again in replays:
         _check(again, folder)
@@ -182,6 +184,14 @@ def _index(run: str, conclusion: JsonMapping) -> int:
             return int(modes[int(number) - 1]["representative"])
         raise InputError(f"RUN mode:K needs a failure mode of the campaign's conclusion (it has {len(modes)}), but got '{run}'")
     raise InputError(f"RUN must be the index of a run, or mode:1 for the first failure mode, but got '{run}'")
+
+
+def _check_levels(indices: Sequence[int], history: History) -> None:
+    """Refuse coarse runs: a test executes the scenario itself, and a coarse run says nothing of whether it fails."""
+    level = history.columns["level"]
+    for row in np.flatnonzero(np.isin(history.index, indices) & (level > 0))[:1]:
+        rule = f"a pinned run must be one of the scenario itself, but run {history.index[row]} is a coarse one"
+        raise InputError(f"{rule} (level {level[row]} of fidelity), which counts as no failure")
 
 
 def _check(again: Replay, folder: Path) -> None:
