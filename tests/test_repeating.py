@@ -86,7 +86,7 @@ def test_a_run_that_sumo_does_not_repeat_ends_no_campaign(tmp_path: Path, monkey
         sbt.run(**given, budget=8, store=tmp_path / "s")
     monkeypatch.undo()
     result = sbt.open(tmp_path / "s")
-    monkeypatch.setattr(running.Replay, "identical", property(lambda replay: False))
+    monkeypatch.setattr(running.Replay, "as_stored", property(lambda replay: False))
     with pytest.raises(StoreError, match="jmIgnoreFoeProb"):
         result.replay(0)
 

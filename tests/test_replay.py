@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+import os
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_doors import files_of
 from typer.testing import CliRunner
 
+import sbt
 from sbt.cli import app
 from sbt.config.load import parse
-from sbt.errors import InputError
+from sbt.errors import InputError, StoreError
 from sbt.metrics.fcd import read_fcd
 from sbt.metrics.moments import metric_so_far
-from sbt.plugins import load, names
+from sbt.plugins import forget_files, load, names
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.sumo import gui
@@ -176,3 +180,107 @@ def test_lanes_are_where_the_network_has_them():
     assert [lane.shape[0][1] for lane in shapes] == [-8.75, -5.25, -1.75]
     assert {lane.width for lane in shapes} == {3.5}
     assert math.isclose(shapes[0].shape[-1][0], 4000.0)
+
+
+CAPPED = """
+from sbt import Parameter, Requirement, Scenario
+
+SCENARIO = Scenario(
+    "capped", inputs=[Parameter("gap", 0, 10, "m")], evaluate=lambda values, seed: {"room": min(4.0, FACTOR * values["gap"])},
+    requirement=Requirement("room", high=0.0),
+)
+"""
+
+
+def replayed(folder: Path, run: int, *more: str) -> tuple[int, str]:
+    forget_files()  # as another process, which has read nothing
+    done = CliRunner().invoke(app, ["replay", str(folder), str(run), "--trust", *more])
+    return done.exit_code, done.output
+
+
+def test_a_replay_from_files_that_were_changed_is_not_said_to_be_the_stored_run(tmp_path: Path):
+    """A metric at its cap is the same whatever traffic there is: it was said to be identical."""
+    file, folder = tmp_path / "capped.py", tmp_path / "store"
+    file.write_text(CAPPED.replace("FACTOR", "1.0"))
+    sbt.run(
+        campaign="coverage", scenario=f"{file}:SCENARIO", budget=8, batch=8, seed=2, store=folder, executor="serial", report=False
+    )  # fmt: skip
+    room = sbt.open(folder).frame["y.room"]
+    at_cap, below = int(room.idxmax()), int(room.idxmin())
+    assert room[at_cap] == 4.0 > room[below]
+    os.utime(file, (2e9, 2e9))  # a checkout has times of its own: what is in the file counts
+    code, said = replayed(folder, at_cap)
+    assert code == 0
+    assert "\nidentical to the stored run\n" in said
+    assert json.loads(replayed(folder, at_cap, "--json")[1])["identical"] is True
+    file.write_text(CAPPED.replace("FACTOR", "1.5"))
+    os.utime(file, (1e9, 1e9))
+    code, said = replayed(folder, at_cap)
+    assert code == 0
+    assert "identical" not in said
+    assert f"files were changed since: {file}" in said
+    told = json.loads(replayed(folder, at_cap, "--json")[1])
+    assert (told["identical"], told["changed"]) == (None, [str(file)])
+    again = sbt.open(folder, trust=True).replay(at_cap)
+    assert (again.as_stored, again.identical, again.changed) == (True, False, (file,))
+    code, said = replayed(folder, below)
+    assert code != 0
+    assert "NOT identical" in said
+    assert f"changed since: {file}" in said
+    assert json.loads(replayed(folder, below, "--json")[1].splitlines()[0])["identical"] is False
+    with pytest.raises(StoreError, match=r"changed since: .*capped\.py"):
+        sbt.open(folder, trust=True).replay(below)
+    file.write_text(CAPPED.replace("FACTOR", "1.0"))
+    assert "\nidentical to the stored run\n" in replayed(folder, at_cap)[1], "it is as it was"
+
+
+def test_files_of_a_store_that_was_moved_with_them_are_known(tmp_path: Path):
+    here = tmp_path / "here"
+    here.mkdir()
+    files_of("own_files", here)
+    text = "campaign: coverage\nscenario: scenario.yaml\nbudget: 2\nexecutor: {kind: serial}\n"
+    (here / "study.yaml").write_text(text)
+    sbt.run(here / "study.yaml", store=here / "store", report=False)
+    here.rename(tmp_path / "there")
+    for file in (tmp_path / "there").iterdir():
+        os.utime(file, (2e9, 2e9))
+    store = tmp_path / "there" / "store"
+    assert "\nidentical to the stored run\n" in replayed(store, 1)[1]
+    cars = tmp_path / "there" / "cars.rou.xml"
+    cars.write_text(cars.read_text().replace("<routes>", "<routes><!-- the same -->"))
+    code, said = replayed(store, 1)
+    assert code == 0
+    assert f"all that is stored of the run is the same, but what is not may differ, as files were changed since: {cars}" in said
+
+
+def test_files_of_another_campaign_are_not_those_of_a_replay(tmp_path: Path):
+    """In a Python session both were read; a file that runs alone read is one of the store's."""
+    for name in ("own", "other"):
+        (tmp_path / name).mkdir()
+        files_of("traci_loop", tmp_path / name)
+        text = "campaign: coverage\nscenario: scenario.yaml\nbudget: 2\nexecutor: {kind: local, workers: 1}\n"
+        (tmp_path / name / "study.yaml").write_text(text)
+        sbt.run(tmp_path / name / "study.yaml", store=tmp_path / name / "store", report=False)
+    for file in (tmp_path / "other").glob("*.*"):
+        file.write_text(file.read_text() + "\n")
+        os.utime(file, (2e9, 2e9))
+    own, other = (tmp_path / name / "store" for name in ("own", "other"))
+    sbt.simulate(tmp_path / "other" / "scenario.yaml")
+    assert {path.name for path in sbt.open(other, trust=True).replay(1).changed} >= {"loop.py", "road.net.xml", "scenario.yaml"}
+    assert sbt.open(own, trust=True).replay(1).identical
+    net = tmp_path / "own" / "road.net.xml"
+    net.write_text(net.read_text() + "\n")
+    assert sbt.open(own, trust=True).replay(1).changed == (net,)
+
+
+def test_contacts_of_a_replay_are_compared(stored: dict[str, Run]):
+    """Metrics alone were."""
+    folder = stored["jaywalking"][0]
+    again = replay_run(folder, 1)
+    assert again.identical
+    assert again.differing == ""
+    for field in ("collisions", "unconfirmed"):
+        other = dataclasses.replace(again, outcome=dataclasses.replace(again.outcome, **{field: "ego>child@1.2"}))
+        assert not other.identical
+        assert other.differing.startswith("contacts and doubts ")
+        assert "ego>child@1.2" in other.differing

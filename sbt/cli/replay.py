@@ -39,11 +39,11 @@ def replay(
 ) -> None:
     """Execute a stored run again and compare it with the store, bit by bit; show it or write it out."""
     with clean_stdout():
+        from sbt.workflows.changes import told
         from sbt.workflows.judging import judge_run, judgement_line, stored_judgements, with_driver
         from sbt.workflows.rechecking import not_repeated
         from sbt.workflows.running import replay_run
         from sbt.workflows.showing import show_replay
-        from sbt.workflows.study import changed_since
 
         again = replay_run(with_store(folder, trust=trust), run)
         asked = None if driver is None else [driver]
@@ -52,13 +52,14 @@ def replay(
         shown, view = gui or gif or export or trace, again if driver is None else with_driver(again, driver)
         if shown and not show_replay(view, gui=gui, gif=gif, folder=export, csv=trace):
             print("what sumo-gui showed differs from the run in the last digits", file=sys.stderr)
-    same = again.identical
+    same, changed = again.as_stored, [str(path) for path in again.changed]
+    verdict = None if same and not (again.identical and again.executed) else same  # of other files it is not known
     if as_json:
         print_json({
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),
-            "metrics": dict(outcome.metrics), "identical": same if again.executed else None, "reason": outcome.reason,
+            "metrics": dict(outcome.metrics), "identical": verdict, "reason": outcome.reason,
             "ended": states.ended if states is not None else "",
-            **({"level": record.level} if record.level else {}),
+            **({"changed": changed} if changed else {}), **({"level": record.level} if record.level else {}),
             **({} if gif is None else {"film": str(gif.resolve())}),
             **({"unconfirmed": outcome.unconfirmed} if outcome.unconfirmed else {}),
             **({"preventable": [vars(each) for each in judgements]} if judgements else {}),
@@ -80,12 +81,16 @@ def replay(
             film = ["sumo-sbt", "replay", str(folder), str(run), "--film", f"{run}.gif"]
             next_command(*(film if gif is None else ["sumo-sbt", "pin", str(folder), str(run), "--into", "tests"]))
     if not same:
-        now, stored = f"{outcome.status} {dict(outcome.metrics)}", f"{record.status} {dict(record.metrics)}"
-        why = changed_since(folder) or not_repeated(again.scenario)
-        raise fail(f"a replay must equal the stored run, but got {now}, not {stored}{why}", Exit.INTERNAL)
+        why = told(again.changed) or not_repeated(again.scenario)
+        raise fail(f"a replay must equal the stored run, but got {again.differing}{why}", Exit.INTERNAL)
 
 
 def _compared(again: Replay) -> str:
     if not again.executed:
         return "as stored: there is no trace to show, and the scenario's own code is executed only with --trust"
-    return "identical to the stored run" if again.identical else "NOT identical to the stored run"
+    if not again.as_stored:
+        return "NOT identical to the stored run"
+    if not again.changed:
+        return "identical to the stored run"
+    files = ", ".join(map(str, again.changed))
+    return f"all that is stored of the run is the same, but what is not may differ, as files were changed since: {files}"

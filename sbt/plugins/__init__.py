@@ -92,15 +92,19 @@ def read_files() -> list[Path]:
     return sorted({file for path in found for file in (modules_of(path) if path.suffix == ".py" else (path,))})
 
 
-def contents_read() -> dict[str, str]:
-    """Return what is in the user's files that this process has read: a hash, of large ones when they were changed."""
-    return {str(path): _content(path) for path in read_files()}
+def contents_read(*, whole: bool = False) -> dict[str, str]:
+    """Return what is in the user's files that this process has read: a hash, of large ones when they were changed.
+
+    Args:
+        whole: of large ones too it is a hash of what is in them.
+    """
+    return {str(path): _content(path, whole=whole) for path in read_files()}
 
 
-def _content(path: Path) -> str:
-    """Return a hash of what is in a file, of a large one of when it was changed."""
+def _content(path: Path, *, whole: bool = False) -> str:
+    """Return a hash of what is in a file, of a large one of when it was changed, unless the whole is asked for."""
     state = _stamp(path)
-    content = repr(state).encode() if state[1] > _LARGE else path.read_bytes()
+    content = repr(state).encode() if state[1] > _LARGE and not whole else path.read_bytes()
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 

@@ -20,13 +20,14 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import JsonMapping
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import Record
+from sbt.workflows.changes import CONTENTS, changed_since
 from sbt.workflows.rechecking import check_code
 from sbt.workflows.running import Summary, keep_configuration, rebuild_report, summarise
-from sbt.workflows.study import RESOLVED, Study, changed_since
+from sbt.workflows.study import RESOLVED, Study
 
 __all__ = ["merge_shards"]
 
-_OWN = {"folder", "yaml", "shard", "described"}
+_OWN = {"folder", "yaml", "shard", "described", CONTENTS}
 """What may differ in the configurations of shards."""
 _TOLD = 10
 
@@ -123,7 +124,7 @@ def _check_files(parts: Sequence[_Part], study: Study) -> None:
         except SbtError:
             return
         for part in parts:
-            if changed_since(part.folder):
+            if changed_since(part.folder, part.configuration):
                 with Store.read(part.folder) as store, study.executor() as executor:
                     check_code(store, study, executor, changed=True)
 
@@ -155,7 +156,7 @@ def _run(study: Study, parts: Sequence[_Part], folder: Path) -> Summary:
     """Run the campaign in a folder of its own, with the shards' outcomes."""
     study = replace(study, live=not is_complete(study.kept["described"]))
     records = [record for part in parts for record in part.records]
-    snapshot = study.snapshot()
+    snapshot = study.snapshot() | {CONTENTS: parts[0].configuration.get(CONTENTS, {})}
     with Store.open(folder, snapshot, durable=False) as store:
         keep_configuration(store, study, snapshot)
         finished = run_stages(

@@ -26,6 +26,7 @@ from sbt.problem.plain import Json, JsonMapping, Value
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import History
+from sbt.workflows.changes import told
 from sbt.workflows.portable import place_of
 from sbt.workflows.running import Replay, replay_run
 from sbt.workflows.study import Study
@@ -196,9 +197,10 @@ def _check_levels(indices: Sequence[int], history: History) -> None:
 
 def _check(again: Replay, folder: Path) -> None:
     record = again.record
-    if record.status != Status.OK or not again.identical:
-        now = f"{again.outcome.status} {dict(again.outcome.metrics)} {again.outcome.reason}".strip()
-        raise InputError(f"a pinned run must give metrics, and the stored ones, but run {record.index} gives {now}")
+    if record.status != Status.OK or not again.as_stored:
+        now = f"{again.differing or again.outcome.status} {again.outcome.reason}".strip()
+        rule = f"a pinned run must give metrics, and the stored ones, but run {record.index} gives {now}"
+        raise InputError(f"{rule}{told(again.changed)}")
 
 
 def _names_files(study: Study) -> bool:

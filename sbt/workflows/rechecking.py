@@ -13,7 +13,8 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History, Record
-from sbt.workflows.study import Study, changed_since
+from sbt.workflows.changes import changed_since
+from sbt.workflows.study import Study
 
 __all__ = ["check_code", "check_earlier", "not_repeated", "own_code"]
 
@@ -57,7 +58,7 @@ def _check_runs(store: Store, history: History, executor: Executor, *, changed: 
             run = f"run {record.index}" + (f" (a coarse one, at level {record.level})" if record.level else "")
             rule = f"code and files must give the runs of {store.folder} again to go on, but {run} now gives {now}"
             remedy = "choose another store for what has changed"
-            raise InputError(f"{rule}, not {stored}{changed_since(store.folder) or unsure}; {remedy}")
+            raise InputError(f"{rule}, not {stored}{changed_since(store.folder, store.configuration) or unsure}; {remedy}")
 
 
 def not_repeated(scenario: LogicalScenario) -> str:

@@ -26,6 +26,7 @@ from sbt.store.database import Store
 from sbt.store.history import History
 from sbt.store.records import FitRecord, Judgement
 from sbt.workflows.asking import Answer, estimate_again
+from sbt.workflows.changes import told
 from sbt.workflows.exporting import export_store
 from sbt.workflows.judging import judge_run, with_driver
 from sbt.workflows.keywords import as_data
@@ -33,7 +34,7 @@ from sbt.workflows.plots import Plots
 from sbt.workflows.rechecking import not_repeated
 from sbt.workflows.running import Replay, rebuild_report, replay_run
 from sbt.workflows.showing import net_of_run, save_film, shown_trace
-from sbt.workflows.study import Study, changed_since
+from sbt.workflows.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -206,7 +207,9 @@ class Result(Generic[C]):
         return estimate_again(self.store, given["inputs"], critical=interval, metric=metric, objects=self.objects)
 
     def replay(self, run: int) -> Replay:
-        """Execute a stored run again, and make sure that it is the same to the last bit.
+        """Execute a stored run again, and make sure that what is stored of it is the same to the last bit.
+
+        It is `identical` unless files were `changed` since: then what is not stored may differ.
 
         Args:
             run: its index, from 0.
@@ -216,10 +219,9 @@ class Result(Generic[C]):
             StoreError: it is not the same.
         """
         again = replay_run(self.store, run, objects=self.objects)
-        if not again.identical:
-            now, stored = f"{again.outcome.status} {dict(again.outcome.metrics)}", dict(again.record.metrics)
-            rule = f"a replay must equal the stored run {run}, but got {now}, not {again.record.status} {stored}"
-            raise StoreError(rule + (changed_since(self.store) or not_repeated(again.scenario)))
+        if not again.as_stored:
+            rule = f"a replay must equal the stored run {run}, but got {again.differing}"
+            raise StoreError(rule + (told(again.changed) or not_repeated(again.scenario)))
         return again
 
     def trace(self, run: int) -> pd.DataFrame:

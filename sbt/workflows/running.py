@@ -27,13 +27,15 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
 from sbt.store.database import Store
 from sbt.store.history import Record
+from sbt.store.planning import storable
 from sbt.workflows.asking import sensitivities_in
+from sbt.workflows.changes import CONTENTS, changed_files, changed_since, contents_in
 from sbt.workflows.fidelity import COARSE_COST
 from sbt.workflows.filming import film_runs
 from sbt.workflows.judging import judge_campaign
 from sbt.workflows.portable import write_bundle
 from sbt.workflows.rechecking import check_code, check_earlier, own_code
-from sbt.workflows.study import RESOLVED, Study, changed_since
+from sbt.workflows.study import RESOLVED, Study
 
 __all__ = [
     "Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise",
@@ -41,7 +43,7 @@ __all__ = [
 
 CODE = "code"
 """Key under which a store remembers a print of the code of the user's own that its runs depend on."""
-_MAY_CHANGE = {CODE, COARSE_COST, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
+_MAY_CHANGE = {CODE, COARSE_COST, CONTENTS, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
 
@@ -119,12 +121,14 @@ def run_study(
     with Store.open(Path(study.config.store)) as store:
         study = study.stored_in(store)
         campaign, snapshot = study.campaign, study.snapshot(shard) | _code_of(study)
+        snapshot |= {CONTENTS: contents_in(study.loaded.folder)}
         if shard is not None:
             check_shard(campaign)
         store.begin(snapshot)
         _check_same(store, snapshot)
-        before = store.configuration.get(CODE, snapshot.get(CODE))
-        changed = (store.folder / RESOLVED).is_file() and (bool(changed_since(store.folder)) or before != snapshot.get(CODE))
+        before = store.configuration
+        same_code = before.get(CODE, snapshot.get(CODE)) == snapshot.get(CODE)
+        changed = (store.folder / RESOLVED).is_file() and not (same_code and not changed_files(store.folder, before))
         if not changed:  # else what is written is newer, so that the runs are tried before
             keep_configuration(store, study, snapshot)
         common: Json = {
@@ -249,6 +253,7 @@ class Replay:
         trace: None where the scenario has none or the run fails.
         scenario: as it was configured.
         executed: False: there is nothing to show, and the user's code was not run for it; the outcome is the stored one.
+        changed: files that were changed since the campaign last began.
     """
 
     record: Record
@@ -256,11 +261,30 @@ class Replay:
     trace: Trace | None
     scenario: LogicalScenario
     executed: bool = True
+    changed: tuple[Path, ...] = ()
+
+    @property
+    def differing(self) -> str:
+        """What differs from the store in status, metrics (to the last bit), contacts and doubts, in words; "" for nothing.
+
+        The text of a reason may name temporary files, and is not compared.
+        """
+        now, record = self.outcome, self.record
+        if str(now.status) != record.status or dict(now.metrics) != dict(record.metrics):
+            return f"{now.status} {dict(now.metrics)}, not {record.status} {dict(record.metrics)}"
+        contacts = storable(now.collisions), storable(now.unconfirmed)
+        stored = contacts if not self.executed else (record.collisions, record.unconfirmed)
+        return "" if contacts == stored else f"contacts and doubts {contacts}, not {stored}"
+
+    @property
+    def as_stored(self) -> bool:
+        """Whether nothing of it is `differing` from the store."""
+        return not self.differing
 
     @property
     def identical(self) -> bool:
-        """Whether status and metrics are those of the store, to the last bit."""
-        return str(self.outcome.status) == self.record.status and dict(self.outcome.metrics) == dict(self.record.metrics)
+        """Whether it is the stored run: `as_stored`, from files that were not changed since; a metric at its cap tells little."""
+        return self.as_stored and not self.changed
 
 
 def replay_run(folder: Path, index: int, *, objects: Objects | None = None, execute: bool = False) -> Replay:
@@ -272,6 +296,15 @@ def replay_run(folder: Path, index: int, *, objects: Objects | None = None, exec
     Raises:
         InputError: the store has no finished run of this index, or its code is needed and not approved.
     """
+    again = _replayed(folder, index, objects, execute=execute)
+    if again.changed:  # or files of another campaign that this process has read: what is read from now on is of this one
+        forget_files()
+        again = _replayed(folder, index, objects, execute=execute)
+    return again
+
+
+def _replayed(folder: Path, index: int, objects: Objects | None, *, execute: bool) -> Replay:
+    """Return what `replay_run` does, with all files that were changed of those that this process has read."""
     with Store.read(folder) as store:
         study, history = Study.from_store(store, objects=objects), store.history(level=None)
     rows = np.flatnonzero(history.index == index)
@@ -287,7 +320,7 @@ def replay_run(folder: Path, index: int, *, objects: Objects | None = None, exec
         outcome, trace = run_traced(runs, Job(index, record.inputs, record.seed, record.level))
         if record.level:
             scenario = replace(scenario, simulate=runs.simulate, metrics=runs.metrics)
-    return Replay(record, outcome, trace, scenario)
+    return Replay(record, outcome, trace, scenario, changed=tuple(changed_files(folder, study.kept)))
 
 
 def bundle_store(folder: Path, target: Path) -> list[Path]:
@@ -311,7 +344,7 @@ def bundle_store(folder: Path, target: Path) -> list[Path]:
             outcome, _ = run_traced(scenario, Job(record.index, record.inputs, record.seed))
             if dict(outcome.metrics) != dict(record.metrics):
                 rule = f"a bundle must give the runs again, but run {record.index} now gives {dict(outcome.metrics)}"
-                raise InputError(f"{rule}, not {dict(record.metrics)}{changed_since(folder)}")
+                raise InputError(f"{rule}, not {dict(record.metrics)}{changed_since(folder, study.kept)}")
     return write_bundle(folder, study.loaded.folder, target)
 
 

@@ -22,7 +22,7 @@ from sbt.loop.earlier import EarlierRuns
 from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.running import ahead_of
 from sbt.loop.stages import Campaign, Conclusion, Shard
-from sbt.plugins import Objects, Scope, newer
+from sbt.plugins import Objects, Scope
 from sbt.problem.covariates import Covariates, telling_all
 from sbt.problem.description import describe_scenario, is_complete, rebuild_scenario
 from sbt.problem.isolation import Isolation, Warmable, warm_ups
@@ -36,7 +36,7 @@ from sbt.workflows.mistakes import further_mistakes
 from sbt.workflows.own_campaign import checked
 from sbt.workflows.portable import place_of, where_it_is
 
-__all__ = ["RESOLVED", "Study", "changed_since"]
+__all__ = ["RESOLVED", "Study"]
 
 STATES = "snapshots"
 """Folder of the warmed states in that of a store."""
@@ -44,12 +44,6 @@ COVARIATES, EARLIER = "covariate_names", "earlier"
 """Keys under which a store remembers that seeds are looked at, and the runs of an earlier campaign that it learns from."""
 RESOLVED = "config.resolved.yaml"
 """The configuration with its defaults, in a store's folder."""
-
-
-def changed_since(folder: Path) -> str:
-    """Return in words which of the scenario's files were changed after the campaign in a folder last began; "" for none."""
-    names = [str(path) for path in newer(folder / RESOLVED)]
-    return f"; changed since: {', '.join(names)}" if names else ""
 
 
 @dataclass(frozen=True, eq=False)

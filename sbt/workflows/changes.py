@@ -1,0 +1,51 @@
+"""Which of the user's files were changed since a campaign last began: its store remembers what was in those that it read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from sbt.plugins import contents_read, newer
+from sbt.plugins.source import is_installed
+from sbt.problem.plain import Json, JsonMapping
+from sbt.workflows.portable import place_of
+from sbt.workflows.study import RESOLVED
+
+__all__ = ["CONTENTS", "changed_files", "changed_since", "contents_in", "told"]
+
+CONTENTS = "contents"
+"""Key under which a store remembers a hash of each file, by its path seen from where the names of the configuration start."""
+
+
+def contents_in(folder: Path) -> Json:
+    """Return what a store remembers of the files that this process has read, by their paths seen from a folder."""
+    found = contents_read(whole=True)
+    return {os.path.relpath(path, folder.resolve()): was for path, was in found.items() if not is_installed(Path(path))}
+
+
+def changed_files(folder: Path, kept: JsonMapping) -> list[Path]:
+    """Return the user's files, of those that this process has read, that were changed after a campaign last began.
+
+    Of files that its store does not know, since its runs alone read them, the time tells.
+
+    Args:
+        folder: of the store.
+        kept: what it remembers.
+    """
+    place = place_of(kept, folder)[0].resolve()
+    known = {os.path.normpath(place / name): was for name, was in kept.get(CONTENTS, {}).items()}
+    differing = [Path(path) for path, now in contents_read(whole=True).items() if known.get(path, now) != now]
+    later = newer(folder / RESOLVED) if (folder / RESOLVED).is_file() else []
+    unknown = {path.resolve() for path in later if not is_installed(path)}
+    return sorted({*differing, *(path for path in unknown if str(path) not in known)})
+
+
+def changed_since(folder: Path, kept: JsonMapping) -> str:
+    """Return in words which files were changed after the campaign in a folder last began, for an error; "" for none."""
+    return told(changed_files(folder, kept))
+
+
+def told(changed: Sequence[Path]) -> str:
+    """Return changed files in words, for an error; "" for none."""
+    return f"; changed since: {', '.join(map(str, changed))}" if changed else ""
