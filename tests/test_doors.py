@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from sbt.cli import app
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
-from sbt.metrics.geometry import select_instants
+from sbt.metrics.geometry import rectangle_distance, select_instants
 from sbt.problem.outcome import Status
 from sbt.store.database import Store
 from sbt.sumo.files import options_of_command
@@ -515,8 +515,8 @@ def test_a_city_with_traffic_lights(city):
     assert not present.all(), "people and cars come and go"
     assert any(name.startswith("p.") for name in trace.actors)
     assert any(name.startswith("a.") for name in trace.actors)
-    distance = np.hypot(trace.x - ego.x[:, None], trace.y - ego.y[:, None])
-    assert np.nanmax(distance) <= 100.0 + 5.0
+    apart = {name: np.nanmax(rectangle_distance(ego, trace.actor(name))) for name in trace.actors[1:]}
+    assert max(apart.values()) <= 100.0 + 2.0, "between bodies, whose widths are taken in full"
     assert ego.speed.min() < 0.5, "a red light or its queue stops the ego"
     metrics = scenario.measure(trace)
     assert all(np.isfinite(list(metrics.values())))

@@ -156,7 +156,7 @@ class EgoEntry(_Open):
 class OthersEntry(_Strict):
     """Who is recorded beside the ego."""
 
-    within: float = Field(default=100.0, gt=0, description="Radius around the ego (m).")
+    within: float = Field(default=100.0, gt=0, description="Radius around the ego's body (m).")
     named: Names = Field(default=(), description="Ids recorded wherever they are.")
 
 

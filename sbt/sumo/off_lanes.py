@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sbt.errors import RunError
@@ -12,7 +11,7 @@ from sbt.sumo.guided import Placed
 from sbt.sumo.levels import is_known
 from sbt.sumo.session import INVALID_DOUBLE
 
-__all__ = ["ANGLE", "POSITION", "SPEED", "VEHICLE", "off_lanes", "parking", "placed_near", "read"]
+__all__ = ["ANGLE", "POSITION", "SPEED", "VEHICLE", "off_lanes", "parking", "placed_variables", "read"]
 
 POSITION, ANGLE, SPEED, VEHICLE = 0x39, 0x43, 0x40, 0xC3
 """TraCI variables: VAR_POSITION3D, VAR_ANGLE, VAR_SPEED, VAR_VEHICLE (the vehicle a person rides in)."""
@@ -24,41 +23,36 @@ def read(sumo: Any, vehicle: str) -> dict[int, Any]:
     return {POSITION: of.getPosition3D(vehicle), ANGLE: of.getAngle(vehicle), SPEED: of.getSpeed(vehicle)}
 
 
-def off_lanes(sumo: Any, ego: str, near: Mapping[str, Any], unseen: Iterable[str], within: float) -> dict[str, dict[int, Any]]:
-    """Return the variables of those who are on no lane, the ego among them, within a radius (m) around it.
+def off_lanes(sumo: Any, ego: str, near: Mapping[str, Any], unseen: Iterable[str]) -> dict[str, dict[int, Any]]:
+    """Return the variables of those who are on no lane, the ego among them, near or far. Who parks is beside the road.
 
     Args:
         sumo: libsumo or traci.
         ego: id.
         near: whom the ego's subscription sees, on lanes.
         unseen: who was there before, or was moved by poses, and is not among them.
-        within: radius (m). Parked vehicles are left out: they are beside the road.
 
     Raises:
         RunError: the ego is not there.
     """
     found = {name: read(sumo, name) for name in unseen if is_known(sumo, name) and _on_no_lane(sumo, name)}
     found = {name: one for name, one in found.items() if one[POSITION][0] != INVALID_DOUBLE}
-    own = near.get(ego) or found.get(ego)
-    if own is None:
+    if ego not in near and ego not in found:
         when = f"was gone at t = {sumo.simulation.getTime():g} s"
         moved = ": off the lanes SUMO keeps only whom the loop moves (moveToXY) in every step" if is_known(sumo, ego) else ""
         raise RunError(Status.FAILED, f"the ego '{ego}' must stay on the road, but it {when}{moved}")
-    return {name: one for name, one in found.items() if math.dist(one[POSITION][:2], own[POSITION][:2]) <= within}
+    return found
 
 
 def _on_no_lane(sumo: Any, vehicle: str) -> bool:
     return not sumo.vehicle.getLaneID(vehicle) and not sumo.vehicle.isStoppedParking(vehicle)
 
 
-def placed_near(
-    placed: Mapping[str, Placed], named: Collection[str], ego: Sequence[float], within: float
-) -> dict[str, dict[int, Any]]:
-    """Return the variables of the placed road users that are within a radius (m) of the ego (x, y, z), or named, on its level."""
+def placed_variables(placed: Mapping[str, Placed], z: float) -> dict[str, dict[int, Any]]:
+    """Return the variables of the placed road users, at the ego's height (m)."""
     return {
-        name: {POSITION: (s.x, s.y, ego[2]), ANGLE: s.angle, SPEED: s.speed, **({VEHICLE: ""} if s.person else {})}
+        name: {POSITION: (s.x, s.y, z), ANGLE: s.angle, SPEED: s.speed, **({VEHICLE: ""} if s.person else {})}
         for name, s in placed.items()
-        if name in named or math.hypot(s.x - ego[0], s.y - ego[1]) <= within
     }
 
 

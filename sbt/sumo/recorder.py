@@ -56,7 +56,7 @@ class RecordingSettings:
     Args:
         ego: the vehicle under test, and its driver.
         duration: time recorded, from the departure of the ego on (s).
-        within: radius around the ego in which other road users are recorded (m).
+        within: radius around the ego's body in which the bodies of other road users are recorded (m).
         named: vehicles that are recorded at any distance.
         wait: longest simulated time from the ego's `depart` until it departs; from the beginning where it has none (s).
         further: more vehicles under test (`sbt.sumo.several`).

@@ -1,9 +1,8 @@
 """The road users around the ego of a user's own simulation: their states at every step, and whether they touch it.
 
 Vehicles and persons within a radius are read by a context subscription, whose cost does not grow with the traffic
-elsewhere; named ones at any distance. Those on another level than the ego (a bridge) are left out. A long vehicle is
-recorded with the parts that follow its front (`sbt.sumo.trailing`); a very long one, such as a train, also while only
-its rear is within the radius.
+elsewhere (`sbt.sumo.nearby`); named ones at any distance. Those on another level than the ego (a bridge) are left out. A
+long vehicle is recorded with the parts that follow its front (`sbt.sumo.trailing`).
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
 from sbt.sumo.identity import check_sizes, refuse_twice, why_jumped
 from sbt.sumo.levels import is_known
-from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_near, read
+from sbt.sumo.nearby import Nearby
+from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_variables, read
 from sbt.sumo.overlaps import Rectangle, separate
 from sbt.sumo.session import INVALID_DOUBLE
 from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, part_traces, path_behind
@@ -32,10 +32,6 @@ from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
 
 __all__ = ["Surroundings"]
 
-_VEHICLES, _PERSONS = 0xA4, 0xAE
-"""TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
-_VERY_LONG = 20.0
-"""Length from which on a vehicle may be near although its front is not within the radius (m)."""
 _BESIDE = 0.5
 """How far who parks, or leaves its place, is moved beside what it drives, from which on it has jumped there (m)."""
 
@@ -51,7 +47,7 @@ class Surroundings:
     Args:
         sumo: libsumo or traci, started.
         ego: id of the vehicle under test.
-        within: radius (m).
+        within: radius around its body in which the bodies of others are (m).
         named: vehicles that are recorded at any distance.
         dt: step (s).
 
@@ -64,11 +60,10 @@ class Surroundings:
     """
 
     def __init__(self, sumo: Any, ego: str, within: float, named: Iterable[str], dt: float):
-        self._sumo, self._ego, self._within, self._dt = sumo, ego, within, dt
-        self._own_domain: Any = sumo.vehicle
+        self._sumo, self._ego, self._dt = sumo, ego, dt
+        self._nearby = Nearby(sumo, ego, within)
         self._named = frozenset(named)
         self._named_present: set[str] = set()
-        self._very_long: dict[str, float] = {}
         self._centre_offsets: dict[str, float] = {}
         self._bodies: dict[str, TrailingBody] = {}
         self._lanes = Lanes(sumo)
@@ -103,14 +98,13 @@ class Surroundings:
         """Note who came and who left, near or far."""
         self._arrived = frozenset(arrived)
         for name in arrived:
-            self._very_long.pop(name, None)
+            self._nearby.very_long.pop(name, None)
             self._named_present.discard(name)
         length = self._sumo.vehicle.getLength
         for name in departed:
             if self.is_person(name):
                 refuse_twice(name)
-            if (extent := length(name)) > _VERY_LONG:
-                self._very_long[name] = extent
+            self._nearby.depart(name, length(name))
             if name in self._named:
                 self._named_present.add(name)
 
@@ -132,9 +126,7 @@ class Surroundings:
 
     def subscribe(self, *, walks: bool = False) -> None:
         """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
-        self._own_domain = domain = self._sumo.person if walks else self._sumo.vehicle
-        domain.subscribeContext(self._ego, _VEHICLES, self._within, [POSITION, ANGLE, SPEED])
-        domain.subscribeContext(self._ego, _PERSONS, self._within, [POSITION, ANGLE, SPEED, VEHICLE])
+        self._nearby.subscribe(walks=walks)
 
     def record(self) -> None:
         """Append the states of all road users that are present.
@@ -142,18 +134,20 @@ class Surroundings:
         Raises:
             RunError: the ego is not on the road.
         """
-        ego, near = self._ego, self._own_domain.getContextSubscriptionResults(self._ego)
+        ego, near = self._ego, self._nearby.subscribed()
         unseen = {ego, *self.rigid, *self.present} - near.keys() - self.placed.keys()
-        off = off_lanes(self._sumo, ego, near, unseen, self._within) if unseen else {}
-        if off:
-            near = {**near, **off}
-            self.rigid.update(off)
-            self._moved.update(off)
+        off = off_lanes(self._sumo, ego, near, unseen) if unseen else {}
+        self._nearby.around(near.get(ego) or off[ego])
+        off = {name: variables for name, variables in off.items() if self._nearby.is_near(name, variables)}
+        near = {**{name: one for name, one in near.items() if self._nearby.is_near(name, one)}, **off}
+        self.rigid.update(off)
+        self._moved.update(off)
         if near[ego].get(VEHICLE):
             rule = f"the ego '{ego}' must walk while it is recorded"
             raise RunError(Status.FAILED, f"{rule}, but it rides in '{near[ego][VEHICLE]}'")
         if self.placed:
-            near = {**near, **placed_near(self.placed, self._named, near[ego][POSITION], self._within)}
+            placed = placed_variables(self.placed, near[ego][POSITION][2])
+            near.update((name, one) for name, one in placed.items() if name in self._named or self._nearby.is_near(name, one))
         row, parts = dict[str, _Row](), dict[str, int]()
         simulation, self.jumped = self._sumo.simulation, set()
         self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
@@ -166,7 +160,7 @@ class Surroundings:
             variables = near[name] if name in near else read(self._sumo, name)
             if name == ego or variables.get(VEHICLE):
                 continue
-            if name in self.placed or not self._level.is_other(name, variables, long=name in self._very_long):
+            if name in self.placed or not self._level.is_other(name, variables, long=name in self._nearby.very_long):
                 self._record(row, parts, before, name, variables)
         for name in self.present:
             if name in self.jumped:
@@ -209,17 +203,13 @@ class Surroundings:
 
     def _around(self, near: Mapping[str, Any]) -> list[str]:
         """Return who is near, whose rear may be, and who is named; whom a loop has removed is forgotten."""
-        gone = [name for name, length in self._very_long.items() if not self._level.trails.note(name, length)]
+        very_long = self._nearby.very_long
+        gone = [name for name, length in very_long.items() if not self._level.trails.note(name, length)]
         for name in (*gone, *(n for n in tuple(self._named_present) if not is_known(self._sumo, n))):
-            self._very_long.pop(name, None)
+            very_long.pop(name, None)
             self._named_present.discard(name)
-        around = sorted([*near, *self._far(near)] if self._very_long else near)
+        around = sorted([*near, *self._nearby.far(near)] if very_long else near)
         return [*around, *sorted(self._named_present - set(around))]
-
-    def _far(self, near: Mapping[str, Any]) -> list[str]:
-        """Return the very long vehicles whose rear may be within the radius although their front is not."""
-        own, at, far = near[self._ego][POSITION][:2], self._sumo.vehicle.getPosition, self._very_long.items()
-        return [n for n, length in far if n not in near and math.dist(at(n), own) <= self._within + length]
 
     def _record(
         self, row: dict[str, _Row], parts: dict[str, int], before: dict[str, _Row], name: str,

@@ -1,0 +1,102 @@
+"""Who is near the ego of a user's own simulation: by distances between bodies, as SUMO's subscriptions know fronts alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE
+from sbt.sumo.trailing import LONGEST_RIGID
+
+__all__ = ["Nearby"]
+
+_VEHICLES, _PERSONS = 0xA4, 0xAE
+"""TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
+_VERY_LONG = 20.0
+"""Length from which on every vehicle is followed one by one, so that a subscription need not reach to its front (m)."""
+_WIDTHS = 3.0
+"""Half the widths of two road users, at most (m)."""
+
+_Variables = Mapping[int, Any]
+_Ends = tuple[list[tuple[float, float]], float]
+"""Ends of the middle line of a body, and how far that may go on, by whatever bends, beyond them (m)."""
+
+
+class Nearby:
+    """Road users whose bodies are within a radius around that of the ego.
+
+    Args:
+        sumo: libsumo or traci, started.
+        ego: id of the vehicle under test.
+        within: radius (m).
+
+    Attributes:
+        very_long: lengths of the vehicles that may be near although no subscription tells of their fronts (m).
+    """
+
+    def __init__(self, sumo: Any, ego: str, within: float):
+        self._sumo, self._ego, self._within = sumo, ego, within
+        self._domain: Any = sumo.vehicle
+        self._longest = self._size = self._breadth = 0.0
+        self._own: _Ends = [], 0.0
+        self._subscribed = False
+        self.very_long: dict[str, float] = {}
+
+    def depart(self, name: str, length: float) -> None:
+        """Note a vehicle of this length (m)."""
+        if length > (self._longest if self._subscribed else _VERY_LONG):
+            self.very_long[name] = length
+        else:
+            self._longest = max(self._longest, length)
+
+    def subscribe(self, *, walks: bool) -> None:
+        """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
+        self._domain, ego = self._sumo.person if walks else self._sumo.vehicle, self._ego
+        self._size, self._breadth = self._domain.getLength(ego), 0.5 * self._domain.getWidth(ego)
+        kinds = map(self._sumo.vehicletype.getLength, self._sumo.vehicletype.getIDList())
+        self._longest = max((self._longest, *(length for length in kinds if length <= _VERY_LONG)))
+        self._subscribed = True
+        reach = self._within + self._size + self._longest + _WIDTHS
+        self._domain.subscribeContext(ego, _VEHICLES, reach, [POSITION, ANGLE, SPEED])
+        self._domain.subscribeContext(ego, _PERSONS, reach, [POSITION, ANGLE, SPEED, VEHICLE])
+
+    def subscribed(self) -> Mapping[str, _Variables]:
+        """Return the variables of those whom the subscriptions tell of, near and somewhat farther."""
+        found: Mapping[str, _Variables] = self._domain.getContextSubscriptionResults(self._ego)
+        return found
+
+    def around(self, own: _Variables) -> None:
+        """Take the ego to have these variables in this step."""
+        self._own = _ends(own, self._size)
+
+    def is_near(self, name: str, variables: _Variables) -> bool:
+        """Return whether the body of a road user may be within the radius around that of the ego."""
+        if name == self._ego or self._apart(variables) <= self._within:
+            return True
+        domain = self._sumo.person if VEHICLE in variables else self._sumo.vehicle
+        return self._is_body_near(variables, domain.getLength(name), domain.getWidth(name))
+
+    def _apart(self, variables: _Variables) -> float:
+        """Return the distance of a front from that of the ego (m)."""
+        return math.dist(self._own[0][0], variables[POSITION][:2])
+
+    def _is_body_near(self, variables: _Variables, length: float, width: float) -> bool:
+        (own, slack), (ends, more) = self._own, _ends(variables, length)
+        reach = self._within + slack + more + self._breadth + 0.5 * width
+        nearest = min(math.dist(a, b) for a in own for b in ends)  # of the bodies' sides no point is nearer than so
+        return nearest <= math.hypot(reach, 0.5 * (self._size + length))
+
+    def far(self, near: Mapping[str, Any]) -> Iterator[str]:
+        """Yield the very long vehicles of which a part may be within the radius although they are not among those near."""
+        at, own = self._sumo.vehicle.getPosition, self._own[0][0]
+        reach = self._within + self._size + _WIDTHS
+        return (n for n, length in self.very_long.items() if n not in near and math.dist(at(n), own) <= reach + length)
+
+
+def _ends(variables: _Variables, length: float) -> _Ends:
+    x, y = variables[POSITION][:2]
+    if length > LONGEST_RIGID:
+        return [(x, y)], length
+    angle = math.radians(variables[ANGLE])
+    return [(x, y), (x - length * math.sin(angle), y - length * math.cos(angle))], 0.0
