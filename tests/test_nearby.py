@@ -10,6 +10,7 @@ import pytest
 from test_evidence import deaf, net, simulation, vehicle
 from test_off_lanes import moving
 
+from sbt.errors import RunError
 from sbt.metrics.geometry import rectangle_distance
 from sbt.problem.trace import Trace
 from sbt.sumo.user_simulation import Loop
@@ -82,3 +83,97 @@ def test_who_is_farther_than_the_radius_is_not_recorded(tmp_path: Path):
     vehicles += vehicle("o", "road", "other", departPos=100, departSpeed=0, departLane=1)
     trace = around(tmp_path, vehicles, deaf("ego", "o"), 50.0, 2.0)
     assert trace.actors == ("ego",), "62 m between the bodies"
+
+
+PASSING = vehicle("ego", "road", departPos=20, departSpeed=20) + vehicle("lead", "road", departPos=90, departSpeed=22)
+PASSING += vehicle("far", "road", departPos=120, departSpeed=2, departLane=1)
+VEHICLES, PERSONS, LANES, VAR_SPEED, VAR_LANE = 0xA4, 0xAE, 0xA3, 0x40, 0x51
+
+
+def passing(*, before=lambda sumo: None, each=lambda sumo, k: None) -> Loop:
+    """A loop in which the ego passes `far`, which is on the lane beside, and which subscribes."""
+
+    def loop(sumo, values, rng):
+        sumo.simulationStep()
+        for name, speed in (("ego", 20.0), ("lead", 22.0), ("far", 2.0)):
+            sumo.vehicle.setSpeedMode(name, 32)
+            sumo.vehicle.setLaneChangeMode(name, 0)
+            sumo.vehicle.setSpeed(name, speed)
+        before(sumo)
+        for k in range(100):
+            each(sumo, k)
+            sumo.simulationStep()
+
+    return loop
+
+
+def own(sumo, dist=100.0, variables=(VAR_SPEED,), domain=VEHICLES):
+    sumo.vehicle.subscribeContext("ego", domain, dist, list(variables))
+
+
+def filtered(sumo, *, dist=100.0):
+    own(sumo, dist)
+    sumo.vehicle.addSubscriptionFilterLanes([0])
+
+
+SUBSCRIBING = {
+    "own": own,
+    "far": lambda sumo: own(sumo, 5000.0),
+    "other variables": lambda sumo: own(sumo, 100.0, (VAR_LANE,)),
+    "lanes": lambda sumo: own(sumo, 100.0, (0x44,), LANES),
+    "filtered": filtered,
+    "filtered, another radius": lambda sumo: filtered(sumo, dist=10.0),
+    "downstream": lambda sumo: (own(sumo), sumo.vehicle.addSubscriptionFilterDownstreamDistance(5.0)),
+    "lead and follow": lambda sumo: (own(sumo), sumo.vehicle.addSubscriptionFilterLeadFollow([0])),
+    "manoeuvre": lambda sumo: (own(sumo), sumo.vehicle.addSubscriptionFilterLCManeuver()),
+    "class": lambda sumo: (own(sumo), sumo.vehicle.addSubscriptionFilterVClass(["bus"])),
+    "of another one": lambda sumo: (
+        sumo.vehicle.subscribeContext("lead", VEHICLES, 100.0, [VAR_SPEED]), sumo.vehicle.addSubscriptionFilterLanes([0])
+    ),
+    "ended": lambda sumo: (own(sumo), sumo.vehicle.unsubscribeContext("ego", VEHICLES, 100.0)),
+    "ended by its name": lambda sumo: (own(sumo), sumo.vehicle.unsubscribeContext(objectID="ego", domain=VEHICLES, dist=1.0)),
+    "ended by a list without variables": lambda sumo: (own(sumo), own(sumo, 50.0, ())),
+    "ended, then filtered": lambda sumo: (
+        own(sumo), sumo.vehicle.unsubscribeContext("ego", VEHICLES, 100.0), filtered(sumo)
+    ),
+    "another one ended, then filtered": lambda sumo: (
+        sumo.vehicle.subscribeContext("lead", VEHICLES, 90.0, [VAR_SPEED]), own(sumo),
+        sumo.vehicle.unsubscribeContext("lead", VEHICLES, 90.0), sumo.vehicle.addSubscriptionFilterLanes([0]),
+    ),
+    "lanes, then filtered": lambda sumo: (
+        own(sumo), own(sumo, 100.0, (0x44,), LANES), sumo.vehicle.addSubscriptionFilterLanes([0])
+    ),
+    "variables alone": lambda sumo: (sumo.vehicle.subscribe("ego", [VAR_SPEED]), sumo.vehicle.unsubscribe("ego")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", SUBSCRIBING)
+@pytest.mark.parametrize("later", [False, True], ids=["at first", "later and again"])
+def test_what_a_loop_subscribes_to_changes_nothing(tmp_path: Path, how: str, later: bool):
+    """SUMO merged it with what the recorder subscribes to, filters too: whom it filtered out was gone from the record."""
+    call = SUBSCRIBING[how]
+    some = passing(each=lambda sumo, k: call(sumo) if k in (5, 20) else None) if later else passing(before=call)
+    plain, found = (around(tmp_path, PASSING, loop, 100.0) for loop in (passing(), some))
+    assert "far" in plain.actors
+    assert rectangle_distance(plain.actor("ego"), plain.actor("far")).min() < 2.0
+    assert found.identical(plain)
+
+
+def test_a_filter_of_no_own_subscription_is_refused(tmp_path: Path):
+    loop = passing(before=lambda sumo: sumo.vehicle.addSubscriptionFilterLanes([0]))
+    with pytest.raises(RunError, match=r"must subscribe to the vehicles.*before sumo\.vehicle\.addSubscriptionFilterLanes, but it did not"):
+        around(tmp_path, PASSING, loop, 100.0)
+
+
+def test_a_loop_still_sees_what_it_subscribes_to(tmp_path: Path):
+    seen = []
+
+    def before(sumo):
+        sumo.vehicle.subscribeContext("lead", VEHICLES, 100.0, [VAR_LANE])
+        sumo.vehicle.addSubscriptionFilterLanes([0])
+
+    def each(sumo, k):
+        seen.append(sorted(sumo.vehicle.getContextSubscriptionResults("lead")) if k == 1 else None)
+
+    around(tmp_path, PASSING, passing(before=before, each=each), 100.0)
+    assert seen[1] == ["ego", "lead"], "and not who is on the other lane"

@@ -17,6 +17,9 @@ _VERY_LONG = 20.0
 """Length from which on every vehicle is followed one by one, so that a subscription need not reach to its front (m)."""
 _WIDTHS = 3.0
 """Half the widths of two road users, at most (m)."""
+_APART = 1e-6
+"""SUMO merges subscriptions of one road user with the same range (m), and their filters: no loop asks for such a range."""
+_KNOWN = (POSITION, ANGLE, SPEED)
 
 _Variables = Mapping[int, Any]
 _Ends = tuple[list[tuple[float, float]], float]
@@ -57,14 +60,16 @@ class Nearby:
         kinds = map(self._sumo.vehicletype.getLength, self._sumo.vehicletype.getIDList())
         self._longest = max((self._longest, *(length for length in kinds if length <= _VERY_LONG)))
         self._subscribed = True
-        reach = self._within + self._size + self._longest + _WIDTHS
-        self._domain.subscribeContext(ego, _VEHICLES, reach, [POSITION, ANGLE, SPEED])
-        self._domain.subscribeContext(ego, _PERSONS, reach, [POSITION, ANGLE, SPEED, VEHICLE])
+        reach = self._within + self._size + self._longest + _WIDTHS + _APART
+        self._domain.subscribeContext(ego, _VEHICLES, reach, _KNOWN)
+        self._domain.subscribeContext(ego, _PERSONS, reach, (*_KNOWN, VEHICLE))
 
     def subscribed(self) -> Mapping[str, _Variables]:
         """Return the variables of those whom the subscriptions tell of, near and somewhat farther."""
         found: Mapping[str, _Variables] = self._domain.getContextSubscriptionResults(self._ego)
-        return found
+        if all(SPEED in one and POSITION in one and ANGLE in one for one in found.values()):
+            return found
+        return {name: one for name, one in found.items() if all(known in one for known in _KNOWN)}  # a loop asks for others
 
     def around(self, own: _Variables) -> None:
         """Take the ego to have these variables in this step."""

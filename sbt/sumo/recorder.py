@@ -157,6 +157,11 @@ class Recorder:
         """Do not compare the departure of a vehicle that the loop moves or removes."""
         self._departures.ignore(name)
 
+    def subscribe_again(self, name: str) -> None:
+        """Subscribe once more to the surroundings of the ego, if it is this road user: the loop has ended all subscriptions."""
+        if self._departed and name == self._ego:
+            self._surroundings.subscribe(walks=self._walks is True)
+
     def take_as_rigid(self, name: str) -> None:
         """Take the body of a vehicle that the loop moves by poses as a rectangle, however long it is."""
         self._surroundings.move(name)

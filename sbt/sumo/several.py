@@ -85,6 +85,11 @@ class Recorders:
         for recorder in self._all:
             recorder.ignore_departure(name)
 
+    def subscribe_again(self, name: str) -> None:
+        """Subscribe once more to the surroundings of this one, if it is under test: the loop has ended all subscriptions."""
+        for recorder in self._all:
+            recorder.subscribe_again(name)
+
     def take_as_rigid(self, name: str) -> None:
         """Take the body of a vehicle that the loop moves by poses as a rectangle, however long it is."""
         for recorder in self._all:

@@ -30,6 +30,8 @@ from sbt.sumo.several import Recorders, further_recorders
 
 __all__ = ["Loop", "TraciProxy", "step_until_over"]
 
+_FILTERED, _PARAMETERS = (0xA4, 0xAE), ("objectID", "domain", "dist", "varIDs")
+"""Domains of subscriptions that SUMO filters, vehicles and persons, and what the calls take first."""
 Loop = Callable[[Any, Values, np.random.Generator], object]
 """The user's `simulate(sumo, values, rng)`."""
 
@@ -203,6 +205,7 @@ class _CommandProxy:
 
     def __init__(self, proxy: TraciProxy, domain: str):
         self._proxy, self._domain = proxy, domain
+        self._subscribed: tuple[tuple[Any, Any], Callable[[], Any]] | None = None
 
     def __getattr__(self, name: str) -> Any:
         function = getattr(self._proxy.__getattr__(self._domain), name)
@@ -216,7 +219,11 @@ class _CommandProxy:
             if isinstance(value, float) and not math.isfinite(value):  # SUMO accepts it silently
                 shown = ", ".join(map(repr, (*args, *kwargs.values())))
                 raise RunError(Status.FAILED, f"a loop must give finite numbers, but called sumo.{self._domain}.{name}({shown})")
+        if name.startswith("addSubscriptionFilter"):
+            self._filter_own(name)
         result = function(*args, **kwargs)
+        if name in ("subscribeContext", "unsubscribeContext"):
+            self._note_subscription(partial(function, *args, **kwargs), ends=name.startswith("un"))
         if self._domain == "vehicle" and name == "add":
             self._expect(*args, **kwargs)
         elif name.startswith(("moveTo", "remove")):
@@ -228,6 +235,26 @@ class _CommandProxy:
             elif name == "moveTo":
                 self._proxy.recorder.take_as_put(who)
         return result
+
+    def _filter_own(self, name: str) -> None:
+        """Make the loop's subscription of surroundings the last one again: SUMO filters that, which may be the recorder's."""
+        if self._subscribed is None:
+            call = f"sumo.{self._domain}.{name}"
+            rule = f"a loop must subscribe to the vehicles or persons around one (subscribeContext) before {call}"
+            raise RunError(Status.FAILED, f"{rule}, but it did not")
+        self._subscribed[1]()
+
+    def _note_subscription(self, call: partial[Any], *, ends: bool) -> None:
+        """Note that the loop subscribes to surroundings, or no longer, which ends all of a road user, the recorder's too."""
+        given = dict(zip(_PARAMETERS, call.args, strict=False)) | call.keywords
+        whose = given["objectID"], given["domain"]
+        variables = given.get("varIDs")
+        if ends or (variables is not None and not len(variables)):
+            if self._subscribed is not None and self._subscribed[0] == whose:
+                self._subscribed = None
+            self._proxy.recorder.subscribe_again(str(whose[0]))
+        elif self._domain == "vehicle" and whose[1] in _FILTERED:
+            self._subscribed = whose, call
 
     def _expect(
         self, vehID: str, routeID: str = "", typeID: str = "", depart: Any = None, departLane: Any = "first",  # noqa: N803
