@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,13 @@ from sbt.sumo.actors import State
 from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
 from sbt.sumo.identity import check_sizes, refuse_twice, why_jumped
+from sbt.sumo.lanes_behind import Lanes, path_behind
 from sbt.sumo.levels import is_known
 from sbt.sumo.nearby import Nearby
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_variables, read
 from sbt.sumo.overlaps import Rectangle, separate
 from sbt.sumo.session import INVALID_DOUBLE
-from sbt.sumo.trailing import LONGEST_RIGID, Lanes, TrailingBody, part_traces, path_behind
+from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, part_traces
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
 
 __all__ = ["Surroundings"]
@@ -221,7 +223,7 @@ class Surroundings:
             return
         state = self.states.get(name)
         if state is None:
-            state = self._first_seen(name, (x, y), variables)
+            state = self._first_seen(name, variables)
         elif VEHICLE in variables and not self.is_person(name):
             refuse_twice(name)
         if variables[ANGLE] != state.angle:
@@ -268,7 +270,7 @@ class Surroundings:
         text = f"{TELEPORTED}'{name}' at {t:.3f} s: it was moved by {moved:.0f} m, and its track is interrupted"
         self._teleported.setdefault(name, text)
 
-    def _first_seen(self, name: str, front: tuple[float, float], variables: Mapping[int, Any]) -> State:
+    def _first_seen(self, name: str, variables: Mapping[int, Any]) -> State:
         person = VEHICLE in variables
         if person and is_known(self._sumo, name):
             refuse_twice(name)
@@ -276,7 +278,7 @@ class Surroundings:
         state = self.states[name] = State(name, float(domain.getLength(name)), float(domain.getWidth(name)), self._dt)
         self._centre_offsets[name] = 0.0 if person else 0.5 * state.length
         if not person and state.length > LONGEST_RIGID:
-            behind = path_behind(self._sumo, name, front, state.length)
+            behind = partial(path_behind, self._sumo, self._lanes, name, length=state.length)
             self._bodies[name] = TrailingBody(state.length, behind, self._lanes.leads_to)
         return state
 

@@ -2,22 +2,21 @@
 
 SUMO keeps the front and the rear of a vehicle on the lanes that it drives; a straight rectangle between them cuts
 the inside of a bend by length^2 / (8 radius), 3 m for a bus of 12 m on a radius of 6 m, where no driver of a real
-bus would be. So the rear parts follow the path of the front. The body at first sight is taken from the lane.
+bus would be. So the rear parts follow the path of the front. Where that is not known, at first sight and after a jump, they
+are on the lanes behind (`sbt.sumo.lanes_behind`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from sbt.metrics.geometry import LANE_CHANGE
 from sbt.problem.trace import ActorTrace
 
-__all__ = ["LONGEST_RIGID", "Lanes", "TrailingBody", "part_traces", "path_behind"]
+__all__ = ["LONGEST_RIGID", "TrailingBody", "part_traces"]
 
 LONGEST_RIGID = 6.0
 """Length up to which a vehicle is one rectangle (m); above, no part is longer than 5 m, unless that takes too many."""
@@ -27,9 +26,6 @@ _SPACING = 0.5
 """Distance of the stored points of a path (m)."""
 _JUMP = 3.0
 """Distance (m) beyond what the speed explains, from which on a vehicle has been moved and not driven."""
-
-_BESIDE = 4.0
-"""Distance (m) that a vehicle may be beside the middle of its lane, and its lane's end beside the junction."""
 
 Point = tuple[float, float]
 Pose = tuple[float, float, float]
@@ -44,15 +40,18 @@ class TrailingBody:
 
     Args:
         length: of the vehicle (m).
-        behind: points of the path behind its front at first sight, the nearest first; straight on beyond the last one.
+        behind: gives points of the path behind its front (m) now, the nearest first; straight on beyond the last one.
         leads_to: whether a lane leads to another within some metres of a point (`Lanes.leads_to`).
     """
 
-    def __init__(self, length: float, behind: Sequence[Point] = (), leads_to: _LeadsTo | None = None):
+    def __init__(
+        self, length: float, behind: Callable[[Point], Sequence[Point]] = lambda _: (), leads_to: _LeadsTo | None = None
+    ):
         self.count = min(_MOST_PARTS, math.ceil(length / _PART))
         self.part_length = length / self.count
         self._kept = math.ceil(length / _SPACING) + 2
-        self._paths = [_Path(behind[::-1])]
+        self._paths = list[_Path]()
+        self._behind = behind
         self._instants: list[_Instant] = []
         self._lane = ""
         self._leads_to = leads_to
@@ -73,6 +72,8 @@ class TrailingBody:
             if (x, y) == front and previous == lane:
                 return len(self._instants) - 1
             self._drive((x, y), front, cos, sin, changed=self._changes(previous, lane, travelled, (x, y)), travelled=travelled)
+        else:
+            self._begin(front)
         self._instants.append((len(self._paths) - 1, len(self._paths[-1].x), *front, cos, sin))
         return len(self._instants) - 1
 
@@ -93,7 +94,7 @@ class TrailingBody:
         path = self._paths[-1]
         u, v = path.direction(before) or (cos, sin)
         if math.hypot(dx, dy) > 1.5 * travelled + (LANE_CHANGE if changed else _JUMP):
-            self._paths.append(_Path())  # moved, or away meanwhile: straight
+            self._begin(front)  # moved, or away meanwhile
             return
         if changed:  # sideways at once, and the body with it
             along = dx * u + dy * v
@@ -106,6 +107,10 @@ class TrailingBody:
             self._paths.append(_Path())  # backwards (in a tight turn the front drives against the chord): straight
             return
         path.extend(before, _SPACING)
+
+    def _begin(self, front: Point) -> None:
+        """Begin a path that ends at the front: what is behind it has not been seen."""
+        self._paths.append(_Path(self._behind(front)[::-1]))
 
     def poses(self, instants: Sequence[int]) -> np.ndarray:
         """Return the poses of the parts in these steps, the front one first: (instants, parts, 3)."""
@@ -173,82 +178,6 @@ class _Path:
         jy = np.where(before, np.where(there, y[0], fy) + at * unit_y, jy)
         ahead_x, ahead_y = np.hstack([fx, jx[:, :-1]]), np.hstack([fy, jy[:, :-1]])
         return np.stack([0.5 * (ahead_x + jx), 0.5 * (ahead_y + jy), np.arctan2(ahead_y - jy, ahead_x - jx)], axis=2)
-
-
-class Lanes:
-    """Which lanes of a network lead to which others; looked up once.
-
-    Args:
-        sumo: libsumo or traci.
-    """
-
-    def __init__(self, sumo: Any):
-        self._lane = sumo.lane
-        self._known: dict[tuple[str, str, float], bool] = {}
-        self._ends: dict[str, Point] = {}
-
-    def leads_to(self, lane: str, other: str, travelled: float, front: Point) -> bool:
-        """Return whether one leads to the other, over lanes that are no longer together than what is driven (m).
-
-        Args:
-            lane: id.
-            other: id.
-            travelled: speed times step (m).
-            front: where the vehicle was on the first lane, whose end must not be farther.
-        """
-        room = math.ceil(1.5 * travelled) + 1.0
-        if (lane, other, room) not in self._known:
-            self._known[lane, other, room] = self._found(lane, other, room)
-        return self._known[lane, other, room] and math.dist(front, self._end(lane)) <= room + _BESIDE
-
-    def _end(self, lane: str) -> Point:
-        if lane not in self._ends:
-            self._ends[lane] = self._lane.getShape(lane)[-1]
-        return self._ends[lane]
-
-    def _found(self, lane: str, other: str, room: float) -> bool:
-        following = {link[4] or link[0] for link in self._lane.getLinks(lane)}
-        if other in following:
-            return True
-        rooms = {name: room - self._lane.getLength(name) for name in following}
-        return any(left >= 0.0 and self._found(name, other, left) for name, left in rooms.items())
-
-
-def path_behind(sumo: Any, name: str, front: Point, length: float) -> list[Point]:
-    """Return points of the lane behind the front of a vehicle, the nearest first; none where it is on no lane.
-
-    The lane's own shape only: beyond its beginning the body is straight.
-    """
-    lane = sumo.vehicle.getLaneID(name)
-    if not lane:
-        return []
-    shape = sumo.lane.getShape(lane)
-    position = sumo.vehicle.getLanePosition(name) * _length(shape) / max(sumo.lane.getLength(lane), 1e-3)
-    (ax, ay), side = _at(shape, position)
-    shift_x, shift_y = front[0] - ax, front[1] - ay
-    if math.hypot(shift_x, shift_y) > max(3.2, 0.1 * length) or side is None:
-        return []  # beside its lane
-    points, start = [], 0.0
-    for a, b in pairwise(shape):
-        end = start + math.hypot(b[0] - a[0], b[1] - a[1])
-        if start < position - 1e-3 and end > position - length - 1.0:
-            points.append((a[0] + shift_x, a[1] + shift_y))
-        start = end
-    return points[::-1]
-
-
-def _length(shape: Sequence[Point]) -> float:
-    return sum(math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(shape))
-
-
-def _at(shape: Sequence[Point], position: float) -> tuple[Point, int | None]:
-    """Return the point at a distance along a line, and the segment that it lies on."""
-    for k, (a, b) in enumerate(pairwise(shape)):
-        step = math.hypot(b[0] - a[0], b[1] - a[1])
-        if position <= step + 1e-6 and step > 0:
-            return (a[0] + position / step * (b[0] - a[0]), a[1] + position / step * (b[1] - a[1])), k
-        position -= step
-    return shape[-1], None
 
 
 def part_traces(

@@ -1,0 +1,102 @@
+"""The body of a long vehicle that has not been seen to drive, or was moved, is on the lanes behind its front."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from own_networks import run_program
+from test_evidence import deaf, simulation, vehicle
+
+from sbt.problem.trace import ActorTrace, Trace
+from sbt.sumo.user_simulation import Loop, step_until_over
+
+pytestmark = pytest.mark.sumo
+NODES = "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, x, y in (("w", -200, 0), ("e", 200, 0), ("s", 0, -200), ("n", 0, 200)))
+ENDS = [(f"{a}m", a, "m") for a in "wesn"] + [(f"m{a}", "m", a) for a in "wesn"]
+EDGES = "".join(f'<edge id="{name}" from="{a}" to="{b}" numLanes="2" speed="14"/>' for name, a, b in ENDS)
+BEFORE, AFTER = "sm", {"right": "me", "left": "mw", "straight": "mn"}
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A crossing with internal lanes, two lanes on each road."""
+    folder = tmp_path_factory.mktemp("crossing")
+    (folder / "n.nod.xml").write_text(f'<nodes>{NODES}<node id="m" x="0" y="0"/></nodes>')
+    (folder / "e.edg.xml").write_text(f"<edges>{EDGES}</edges>")
+    run_program(folder, "netconvert", "-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.net.xml")
+    return (folder / "net.net.xml").read_text()
+
+
+def driven(folder: Path, network: str, turn: str, length: float, depart: float, loop: Loop = step_until_over) -> Trace:
+    """A bus that turns; the ego, which stands on the other side, sees it from its departure on."""
+    lane = {"right": 0, "straight": 0, "left": 1}[turn]
+    vehicles = f'<vType id="longer" length="{length}" width="2.5" sigma="0" maxSpeed="8"/>'
+    vehicles += vehicle("o", f"{BEFORE} {AFTER[turn]}", "longer", departPos=150, departSpeed=8, departLane=lane)
+    vehicles += '<vType id="slow" maxSpeed="0.01"/>'
+    vehicles += vehicle("ego", "nm ms", "slow", depart=depart, departPos=150, departSpeed=0)
+    (own := folder / f"{depart:g}").mkdir()
+    return simulation(own, network, vehicles, loop, 20.0, step_length="0.1")({}, 1)
+
+
+def body(actor: ActorTrace, k: int) -> np.ndarray:
+    """Return the (parts, 2) middles of the parts at an instant."""
+    return np.array([(part.x[k], part.y[k]) for part in actor.parts])
+
+
+@pytest.mark.parametrize("turn", AFTER)
+@pytest.mark.parametrize("length", [12.0, 18.0, 30.0])
+def test_a_body_in_a_turn_is_where_it_is_whenever_it_is_first_seen(tmp_path: Path, crossing: str, turn: str, length: float):
+    """It was straight beyond the begin of the lane that its front is on, as long as its own length."""
+    seen = driven(tmp_path, crossing, turn, length, 0.0)
+    worst = []
+    for depart in np.arange(3.0, 11.0, 0.5):
+        late = driven(tmp_path, crossing, turn, length, float(depart))
+        a, b = seen.actor("o"), late.actor("o")
+        first = int(np.flatnonzero(np.isfinite(b.x))[0])
+        k = int(np.nanargmin(np.hypot(a.x - b.x[first], a.y - b.y[first])))
+        assert (a.x[k], a.y[k]) == pytest.approx((b.x[first], b.y[first]), abs=1e-9)
+        worst.append(np.hypot(*(body(a, k) - body(b, first)).T).max())
+    assert max(worst) < 0.5
+
+
+def middle(crossing_file: str, lanes: list[str]) -> np.ndarray:
+    """Return the middle of some lanes as one line."""
+    shapes = [crossing_file.split(f'<lane id="{lane}"')[1].split('shape="')[1].split('"')[0] for lane in lanes]
+    return np.array([[float(v) for v in point.split(",")[:2]] for shape in shapes for point in shape.split()])
+
+
+def beside(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Return how far points are from a line (m)."""
+    found = []
+    for a, b in pairwise(line):
+        along = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-9), 0.0, 1.0)
+        found.append(np.hypot(*(points - a - along[:, None] * (b - a)).T))
+    return np.min(found, axis=0)
+
+
+@pytest.mark.parametrize("position", [1.0, 4.0, 8.0])
+def test_a_body_that_was_moved_is_on_the_lanes_behind_it(tmp_path: Path, crossing: str, position: float):
+    def loop(sumo, values, rng):
+        for k in range(100):
+            if k == 20:
+                sumo.vehicle.moveTo("o", "me_0", position)
+            sumo.simulationStep()
+
+    trace = driven(tmp_path, crossing, "right", 18.0, 0.0, loop)
+    bus = trace.actor("o")
+    back = int(np.flatnonzero(np.isnan(bus.x))[-1]) + 1
+    inside = crossing.split('from="sm" to="me" fromLane="0"')[1].split('via="')[1].split('"')[0]
+    line = middle(crossing, ["sm_0", inside, "me_0"])
+    assert 15 < back < 30
+    for k in range(back, back + 5):
+        assert beside(body(bus, k), line).max() < 0.6, "parts are chords of the turn"
+
+
+def test_beyond_the_begin_of_its_route_a_body_is_straight(tmp_path: Path, crossing: str):
+    vehicles = '<vType id="longer" length="18" width="2.5"/>' + vehicle("o", "me", "longer", departPos=3, departSpeed=0)
+    vehicles += vehicle("ego", "nm ms", departPos=100, departSpeed=0)
+    parts = simulation(tmp_path, crossing, vehicles, deaf("o", "ego"), 1.0, step_length="0.1")({}, 1).actor("o").parts
+    assert [part.heading[0] for part in parts] == [0.0] * 4
