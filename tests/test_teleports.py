@@ -14,6 +14,7 @@ import sbt
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
 from sbt.problem.outcome import Doubt, Job, doubts
+from sbt.sumo.teleports import Teleports
 
 NODES = '<nodes><node id="a" x="0" y="0"/><node id="b" x="200" y="0"/><node id="c" x="212" y="0"/><node id="d" x="600" y="0"/></nodes>'
 EDGES = '<edges><edge id="ab" from="a" to="b" numLanes="1"/><edge id="bc" from="b" to="c" numLanes="1"/><edge id="cd" from="c" to="d" numLanes="1"/></edges>'
@@ -60,6 +61,66 @@ def test_who_is_teleported_past_the_ego_has_not_touched_it(jammed: sbt.Scenario)
     assert outcome.metrics["ttc_path_min"] > 0.5
     assert doubts(outcome.unconfirmed) == (Doubt.TELEPORTED,)
     assert "'g' at " in outcome.unconfirmed
+
+
+BLOCKED = ROUTES.replace('<route id="r"', """<vType id="train" length="380"/>
+<vehicle id="b" type="train" depart="0" departPos="385" departSpeed="0"><route edges="cd"/><stop lane="cd_0" endPos="386" duration="100"/></vehicle>
+<route id="r\"""")
+FREEING = """
+def simulate(sumo, values, rng):
+    while True:
+        if abs(sumo.simulation.getTime() - 25.0) < 1e-6:
+            sumo.vehicle.remove("b")
+        sumo.simulationStep()
+"""
+
+
+def test_a_teleport_that_lasts_is_told(jammed: sbt.Scenario, tmp_path: Path):
+    """SUMO takes a vehicle off the road and finds a place for it seconds later: the row said nothing of it."""
+    folder = Path(jammed.simulate.folder)
+    for name in ("net.net.xml", "my.sumocfg"):
+        (tmp_path / name).write_text((folder / name).read_text())
+    (tmp_path / "my.rou.xml").write_text(BLOCKED.format(kind="t", length=4.5))
+    (tmp_path / "mine.py").write_text(FREEING)
+    (tmp_path / "scenario.yaml").write_text(YAML.replace("sumo: my.sumocfg", "sumo: my.sumocfg\nsimulate: mine.py:simulate").replace("duration: 25", "duration: 35"))
+    scenario = ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve()
+    x = scenario.simulate({"tau": 1.0}, 1).actor("g").x
+    there = np.flatnonzero(np.isfinite(x))
+    away = np.flatnonzero(np.diff(there) > 1)
+    assert len(away) == 1
+    assert there[away[0] + 1] - there[away[0]] > 20, "it is away for more than 2 s"
+    outcome = run_job(scenario, Job(0, {"tau": 1.0}, 1))
+    assert outcome.status == "ok"
+    assert outcome.unconfirmed == (
+        f"teleported: 'g' at {0.1 * (there[away[0]] + 1):.3f} s: SUMO took it off the road, and its track is interrupted"
+    )
+
+
+class _Simulation:
+    """SUMO's lists of teleports in a step."""
+
+    def __init__(self, begun: tuple[str, ...], ending: tuple[str, ...]):
+        self.getStartingTeleportIDList, self.getEndingTeleportIDList = (lambda: begun), (lambda: ending)
+        self.getStartingTeleportNumber, self.getEndingTeleportNumber = (lambda: len(begun)), (lambda: len(ending))
+
+
+@pytest.mark.parametrize(
+    ("begun", "ending", "before", "now", "told"),
+    [
+        (("g",), (), {"ego", "g"}, {"ego"}, "SUMO took it off the road, and its track is interrupted"),
+        ((), ("g",), {"ego"}, {"ego", "g"}, "SUMO put it there"),
+        (("g",), (), {"ego"}, {"ego"}, ""),
+        ((), ("g",), {"ego"}, {"ego"}, ""),
+        (("g",), ("g",), {"ego"}, {"ego"}, ""),
+        ((), (), {"ego"}, {"ego", "g"}, ""),
+    ],
+)
+def test_half_a_teleport_is_told_where_it_is_near(begun, ending, before, now, told):
+    teleports = Teleports(_Simulation(begun, ending))
+    teleports.look()
+    teleports.compare(before, now, 0.5)
+    teleports.compare(before, now, 0.6)
+    assert teleports.notes == ((f"teleported: 'g' at 0.500 s: {told}",) if told else ())
 
 
 def test_a_conclusion_tells_of_teleports(jammed: sbt.Scenario, tmp_path: Path):

@@ -17,7 +17,7 @@ import numpy as np
 
 from sbt.errors import RunError
 from sbt.metrics.geometry import LANE_CHANGE, contact_part, farthest, rectangle_distance
-from sbt.problem.outcome import TELEPORTED, Status
+from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.ego_level import EgoLevel
@@ -29,6 +29,7 @@ from sbt.sumo.nearby import Nearby
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_variables, read
 from sbt.sumo.overlaps import Rectangle, separate
 from sbt.sumo.session import INVALID_DOUBLE
+from sbt.sumo.teleports import Teleports
 from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, part_traces
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
 
@@ -78,8 +79,7 @@ class Surroundings:
         self.placed: Mapping[str, Placed] = {}
         self.jumped: set[str] = set()
         self._farthest, self._recorded_at = float(farthest(dt)), 0.0
-        self._teleported: dict[str, str] = {}
-        self._ending: Sequence[str] = ()
+        self._teleports = Teleports(sumo.simulation)
         self._parking: Sequence[str] = ()
         self._left: Sequence[str] = ()
         self._leaving: Sequence[str] = ()
@@ -152,7 +152,7 @@ class Surroundings:
             near.update((name, one) for name, one in placed.items() if name in self._named or self._nearby.is_near(name, one))
         row, parts = dict[str, _Row](), dict[str, int]()
         simulation, self.jumped = self._sumo.simulation, set()
-        self._ending = simulation.getEndingTeleportIDList() if simulation.getEndingTeleportNumber() else ()
+        self._teleports.look()
         begins, ends = parking(simulation)
         self._parking, self._left, self._leaving = (*begins, *self._leaving), self._leaving, ends
         before = self._rows[-1] if self._rows else {}
@@ -169,6 +169,8 @@ class Surroundings:
                 self._ways.pop(name, None)
             elif name not in row:
                 self._keep_way(name)
+        if before:
+            self._teleports.compare(before, row, len(self) * self._dt)
         self.present, self._recorded_at = list(row), simulation.getTime()
         self._rows.append(row)
         self._parts.append(parts)
@@ -235,7 +237,7 @@ class Surroundings:
             moved = min(moved, math.hypot(x - last[0] - half * math.cos(last[2]), y - last[1] - half * math.sin(last[2])))
         parks = last is not None and name in self._parking and moved > (last[3] + speed) * self._dt + _BESIDE
         put = last is not None and name in self._put and moved > (last[3] + speed) * self._dt + LANE_CHANGE
-        if moved > self._farthest or put or (last is not None and name in self._ending):
+        if moved > self._farthest or put or (last is not None and name in self._teleports.ending):
             self._note_jump(name, moved)
             return
         if parks and name != self._ego and (name not in self._left or self._is_far(state, moved)):
@@ -267,8 +269,7 @@ class Surroundings:
             how = f"was moved by {moved:.0f} m within a step at {t:.3f} s{why_jumped(self._sumo)}"
             raise RunError(Status.INVALID, f"the ego '{name}' must stay on its way, but {how}")
         self.jumped.add(name)
-        text = f"{TELEPORTED}'{name}' at {t:.3f} s: it was moved by {moved:.0f} m, and its track is interrupted"
-        self._teleported.setdefault(name, text)
+        self._teleports.jump(name, t, moved)
 
     def _first_seen(self, name: str, variables: Mapping[int, Any]) -> State:
         person = VEHICLE in variables
@@ -373,7 +374,7 @@ class Surroundings:
             np.array([self.states[n].length for n in names]), np.array([self.states[n].width for n in names]),
             ended, tuple(reported), ways={name: ways[0] for name, ways in self._ways.items()},
             parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
-            unconfirmed=(*unconfirmed, *self._level.notes, *self._teleported.values()),
+            unconfirmed=(*unconfirmed, *self._level.notes, *self._teleports.notes),
             unreacting=tuple(n for n in names if n in self._unreacting),
         )  # fmt: skip
 

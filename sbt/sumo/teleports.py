@@ -1,0 +1,54 @@
+"""Who near the ego is moved to another place, by SUMO (a teleport) or by a loop, and what is told of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+from sbt.problem.outcome import TELEPORTED
+
+__all__ = ["Teleports"]
+
+
+class Teleports:
+    """What is told of road users that were moved to another place, each once.
+
+    Args:
+        simulation: of libsumo or traci.
+
+    Attributes:
+        ending: whom SUMO puts to another place in this step.
+    """
+
+    def __init__(self, simulation: Any):
+        self._simulation = simulation
+        self._begun: Sequence[str] = ()
+        self.ending: Sequence[str] = ()
+        self._notes: dict[str, str] = {}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The doubts of a run, as `Outcome.unconfirmed` has them."""
+        return tuple(self._notes.values())
+
+    def look(self) -> None:
+        """Ask SUMO whom it teleports in this step: it may take a vehicle off the road and put it there steps later."""
+        of = self._simulation
+        self._begun = of.getStartingTeleportIDList() if of.getStartingTeleportNumber() else ()
+        self.ending = of.getEndingTeleportIDList() if of.getEndingTeleportNumber() else ()
+
+    def jump(self, name: str, t: float, moved: float) -> None:
+        """Note one who was moved that far (m) within the step to t (s)."""
+        self._note(name, t, f"it was moved by {moved:.0f} m, and its track is interrupted")
+
+    def compare(self, before: Collection[str], now: Collection[str], t: float) -> None:
+        """Note whom SUMO has taken off the road next to the ego, or put there: those recorded before and now, at t (s)."""
+        for name in self._begun:
+            if name in before and name not in now:
+                self._note(name, t, "SUMO took it off the road, and its track is interrupted")
+        for name in self.ending:
+            if name in now and name not in before:
+                self._note(name, t, "SUMO put it there")
+
+    def _note(self, name: str, t: float, what: str) -> None:
+        self._notes.setdefault(name, f"{TELEPORTED}'{name}' at {t:.3f} s: {what}")
