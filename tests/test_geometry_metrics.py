@@ -76,6 +76,8 @@ def _in_order(shape: shapely.Polygon, p: tuple[float, float, float]) -> list[tup
 @settings(max_examples=300)
 def test_swept_contact_is_that_of_shapely(a0, a1, b0, b1, length, width):
     """In the frame of b, a moves on a straight line: contact there is overlap with the convex hull of its way."""
+    pairs = (a0, a1, LENGTH, WIDTH), (b0, b1, length, width)  # nobody turns on the spot
+    a0, b0 = ((*p[:2], q[2]) if math.dist(p[:2], q[:2]) < 0.5 * math.hypot(*size) else p for p, q, *size in pairs)
     away = (a0[0] - b0[0] + b1[0], a0[1] - b0[1] + b1[1], a0[2])
     way, other = swept(away, a1, LENGTH, WIDTH), polygon(b1, length, width)
     gap, depth = way.distance(other), way.intersection(other).area
@@ -304,6 +306,23 @@ def test_gap_and_path_are_those_of_the_corners_whatever_the_headings(one, other,
     assert bool((found.ahead | found.beside)[0]) <= (clear < 0)
     if found.contact is None and along.min() > 0.5 * LENGTH:
         assert bool(found.ahead[0]) == (clear < 0)
+
+
+@pytest.mark.parametrize("beside", np.arange(0.95, 1.3, 0.05).round(3).tolist())
+@pytest.mark.parametrize("turn", [0.5 * math.pi, -0.5 * math.pi, 0.75 * math.pi])
+@pytest.mark.parametrize("at", np.arange(-3.5, 3.25, 0.25).tolist())
+def test_who_turns_on_the_spot_touches_only_who_is_there_meanwhile(beside, turn, at):
+    """A person who stands beside a car that goes by: it had the heading of the end of the step during all of it."""
+    s, still = np.linspace(0.0, 1.0, 401), np.zeros(2)
+    path = np.stack([at + 0.9 * s, 0.0 * s, 0.0 * s], axis=1)
+    person = np.stack([0.05 * s, 0.0 * s + beside, 0.5 * math.pi + turn * s], axis=1)
+    truth = rectangle_distance(box(path.tolist()), box(person.tolist(), 0.215, 0.478)).min()
+    ends = [ActorTrace(each[[0, -1], 0], each[[0, -1], 1], each[[0, -1], 2], still + v, still, *size)
+            for each, v, size in ((path, 9.0, (LENGTH, WIDTH)), (person, 0.0, (0.215, 0.478)))]  # fmt: skip
+    now = rectangle_distance(*ends)
+    found = contact_index(*ends)
+    assert found == (0 if now[0] == 0.0 else 1 if now[1] == 0.0 else found)
+    assert found is None or truth < 0.02, "a step is 16 parts, each with its last heading"
 
 
 def test_a_part_in_the_path_behind_the_ego_is_not_beside_it():

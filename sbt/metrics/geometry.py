@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.trace import ActorTrace, select_parts
 
 __all__ = [
@@ -41,8 +41,8 @@ LANE_CHANGE = 8.0
 """How far SUMO may move a road user beside what it drives, where it changes lanes within a step (m)."""
 _MAX_SPEED = 150.0
 _DRIVES, _TURNED, _SWINGS, _ARCS = 0.5, 0.05, 0.3, 16
-"""A step of who drives (m/s) in which a corner moves by more than this (m) because its rectangle turns is one along an arc, of so
-many parts; by more than the second, also where nothing touches on the chord."""
+"""A step in which a corner moves by more than this (m) because its rectangle turns is one along an arc, of so many parts; by more
+than the second, if it drives (m/s), also where nothing touches on the chord."""
 
 
 def farthest(elapsed: Any) -> Any:
@@ -207,26 +207,31 @@ def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
     first = max(int(near[0]) - 1, 0)
     i = slice(first, int(near[-1]) + 1)
     touch = np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i)))
-    swing = np.fmax(_swing(a, i), _swing(b, i))
-    found = (k for k in (first + np.flatnonzero(touch | (swing > _SWINGS))).tolist())
+    turns, drives = zip(_swing(a, i), _swing(b, i), strict=True)
+    swing, wide = np.fmax(*turns), np.fmax(*(np.where(d, turn, 0.0) for turn, d in zip(turns, drives, strict=True))) > _SWINGS
+    found = (k for k in (first + np.flatnonzero(touch | wide)).tolist())
     return next((k for k in found if _touch_in(a, b, k, turning=swing[k - first] > _TURNED, slid=bool(touch[k - first]))), None)
 
 
-def _swing(actor: ActorTrace, i: slice) -> Vector:
-    """Return by how much (m) a corner moves because its rectangle turns, in the steps before some instants; 0 where it stands."""
+def _swing(actor: ActorTrace, i: slice) -> tuple[Vector, Mask]:
+    """Return by how much (m) a corner moves because its rectangle turns, in the steps before some instants, and if it drives."""
     before = slice(max(i.start - 1, 0), i.stop)
-    heading, drives = actor.heading[before], np.abs(actor.speed[before]) > _DRIVES
-    turn = np.abs(np.remainder(heading[1:] - heading[:-1] + math.pi, math.tau) - math.pi)
-    swing = np.where(drives[1:] | drives[:-1], turn * 0.5 * math.hypot(actor.length, actor.width), 0.0)
-    return swing if i.start else np.concatenate([[0.0], swing])  # nothing is known before the first instant
+    x, y, heading, drives = actor.x[before], actor.y[before], actor.heading[before], np.abs(actor.speed[before]) > _DRIVES
+    turn, moves = np.abs(np.remainder(heading[1:] - heading[:-1] + math.pi, math.tau) - math.pi), drives[1:] | drives[:-1]
+    radius = 0.5 * math.hypot(actor.length, actor.width)
+    stays = np.hypot(x[1:] - x[:-1], y[1:] - y[:-1]) < radius  # it turns on the spot
+    swing = np.where(moves | stays, radius * turn, 0.0)
+    if i.start:
+        return swing, moves
+    return np.concatenate([[0.0], swing]), np.concatenate([[False], moves])  # nothing is known before the first instant
 
 
 def _touch_in(a: ActorTrace, b: ActorTrace, k: int, *, turning: bool, slid: bool) -> bool:
     """Return whether rectangles touch in the step before an instant; `slid`: they do on chords, with the headings at their ends.
 
     Where one is turning, they turn evenly, on arcs: on the chord with the heading at its end a car that turns within a step of a
-    second touches what it drives around. Where they do not touch there, they must on the chord, too, with headings that change
-    evenly: parts of long vehicles move beside their headings.
+    second touches what it drives around, and a person who turns on the spot what has gone by. Where they do not touch there, they
+    must on the chord, too, with headings that change evenly: parts of long vehicles move beside their headings.
     """
     if not turning or k == 0 or np.isnan(a.x[k - 1] + b.x[k - 1]):  # who comes has no step before: the end counts alone
         return slid
