@@ -18,6 +18,7 @@ from sbt.cli import app
 from sbt.execution.worker import run_job
 from sbt.metrics.geometry import contact_index, corners, rectangle_distance, rectangles
 from sbt.metrics.longitudinal import COLLISION, encounter
+from sbt.metrics.traffic import any_impact_speed
 from sbt.problem.metric import Metric
 from sbt.problem.outcome import LISTED_ONLY, UNCONFIRMED, Job
 from sbt.problem.parameter import Parameter
@@ -103,6 +104,38 @@ def deaf(*names: str) -> Loop:
 
 WEST_EAST, SOUTH_NORTH = [(-100.0, 0.0), (100.0, 0.0)], [(0.0, -100.0), (0.0, 100.0)]
 MEETING = vehicle("ego", "we", departPos=20) + vehicle("other", "sn", departPos=20)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("step", ["0.1", "0.5", "1"])
+@pytest.mark.parametrize("ballistic", [True, False])
+def test_the_impact_speed_is_that_of_the_braking_that_sumo_simulates(simulate, step, ballistic):
+    """With Euler a step has one speed; ballistic, it falls evenly within the step: v^2 = v0^2 - 2 a s."""
+    road = net({"we": [(0.0, 0.0), (300.0, 0.0)]})
+    kind = '<vType id="bad" length="5" width="1.8" minGap="0" decel="6" emergencyDecel="6" tau="0.1" sigma="0"/>'
+    wall = vehicle("wall", "we", departPos=110, departSpeed=0)
+
+    def loop(sumo, values, rng):
+        for k in range(200):
+            if k == 1:
+                for name in ("ego", "wall"):
+                    sumo.vehicle.setSpeedMode(name, 0)
+                sumo.vehicle.slowDown("ego", 0.0, 25.0 / 6.0)
+                sumo.vehicle.setSpeed("wall", 0.0)
+            sumo.simulationStep()
+
+    vehicles = kind + vehicle("ego", "we", "bad", departPos=60, departSpeed=25) + wall
+    trace = simulate(road, vehicles, loop, step_length=step, **{"step-method.ballistic": str(ballistic).lower()})
+    assert trace.ended == "collision"
+    assert trace.ballistic is ballistic
+    ego, said = trace.actor("ego"), any_impact_speed()(trace)
+    if not ballistic:
+        assert said == ego.speed[-1]
+        return
+    v, way = ego.speed[-2:], float(trace.actor("wall").x[-1] - 5.0 - ego.x[-2])
+    assert v[1] < v[0]
+    assert said == pytest.approx(math.sqrt(v[0] ** 2 - way * (v[0] ** 2 - v[1] ** 2) / (ego.x[-1] - ego.x[-2])), abs=1e-3)
+    assert v[1] < said < v[0]
 
 
 @pytest.mark.sumo

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -25,6 +26,7 @@ from sbt.metrics.longitudinal import (
     thw_min,
     ttc_min,
 )
+from sbt.metrics.planar import severity
 from sbt.problem.trace import ActorTrace, Trace
 
 shapely = pytest.importorskip("shapely", reason="geometry is compared with shapely, which is not installed")
@@ -335,3 +337,65 @@ def test_a_part_in_the_path_behind_the_ego_is_not_beside_it():
     assert not encounter(trace).beside.any()
     assert ttc_min()(trace) == HORIZON
     assert d_min()(trace) == FAR
+
+
+def _braking(speeds: list[list[float]], gap: float, step: float, *, ballistic: bool = True) -> tuple[Trace, float]:
+    """Two on a line, 5 m long each, with (t, 2) speeds that change evenly within steps: their trace up to the contact, and the
+    closing speed at the contact by small steps."""
+    v = np.array(speeds)
+    fine = np.linspace(0.0, 1.0, 20_001)[1:]
+    x, way, closing = [np.zeros(2)], np.zeros(2), 0.0
+    for before, after in itertools.pairwise(v):
+        within = before + (after - before) * fine[:, None]
+        path = way + step * np.cumsum(within, axis=0) / len(fine)
+        way = path[-1]
+        x.append(way.copy())
+        touch = path[:, 0] - path[:, 1] >= gap
+        if touch.any():
+            closing = float(np.abs(np.subtract(*within[int(touch.argmax())])))
+            break
+    n = len(x)
+    at = np.array(x) + np.array([0.0, gap + 5.0])
+    zero = np.zeros((n, 2))
+    size = np.full(2, 5.0), np.full(2, 1.8)
+    made = Trace(step * np.arange(n), ("ego", "co"), at, zero, zero, v[:n], zero, *size, ballistic=ballistic)
+    return made, closing
+
+
+@given(
+    st.lists(st.tuples(st.floats(5, 30), st.floats(0, 4)), min_size=3, max_size=6), st.floats(0.5, 40),
+    st.sampled_from([0.05, 0.1, 0.5, 1.0]),
+)  # fmt: skip
+@settings(max_examples=150)
+def test_the_impact_speed_is_that_at_the_contact_where_speeds_change_evenly_within_steps(speeds, gap, step):
+    """It was that at the end of the step: too low by up to the braking times the step."""
+    trace, closing = _braking([list(pair) for pair in speeds], gap, step)
+    assume(closing > 0.0)
+    assert impact_speed()(trace) == pytest.approx(closing, abs=5e-3)
+    assert severity()(trace) == -impact_speed()(trace)
+    by_jumps = replace(trace, ballistic=False)
+    assert impact_speed()(by_jumps) == abs(trace.speed[-1, 0] - trace.speed[-1, 1])
+
+
+@pytest.mark.parametrize("gap", [3.0, 12.0, 12.4])
+def test_who_stops_within_the_step_of_the_contact_has_hit_before(gap):
+    """From 20 m/s by 16 m/s^2 it stands after 12.5 m and 1.25 s, in a step of 2 s at whose end it has no speed."""
+    x, speed = np.array([[0.0, gap + 5.0], [12.5, gap + 5.0]]), np.array([[20.0, 0.0], [0.0, 0.0]])
+    zero, size = np.zeros((2, 2)), (np.full(2, 5.0), np.full(2, 1.8))
+    trace = Trace(np.array([0.0, 2.0]), ("ego", "co"), x, zero, zero, speed, zero, *size, ballistic=True)
+    assert impact_speed()(trace) == pytest.approx(math.sqrt(400.0 - 2.0 * 16.0 * gap), abs=0.02)
+
+
+def test_who_is_moved_by_poses_has_the_speed_of_its_step():
+    x, speed = np.array([[0.0, 15.0], [12.0, 15.0]]), np.array([[20.0, 0.0], [12.0, 0.0]])
+    zero, size = np.zeros((2, 2)), (np.full(2, 5.0), np.full(2, 1.8))
+    trace = Trace(np.array([0.0, 1.0]), ("ego", "co"), x, zero, zero, speed, zero, *size, ballistic=True)
+    assert impact_speed()(trace) == 12.0
+
+
+def test_a_selection_of_a_trace_knows_how_speeds_change():
+    trace, closing = _braking([[20.0, 0.0], [14.0, 0.0], [8.0, 0.0], [2.0, 0.0]], 20.0, 1.0)
+    assert closing > 8.0
+    part = trace.select(slice(1, None), {"ego": "a", "co": "b"})
+    assert impact_speed("a", "b")(part) == impact_speed()(trace) == pytest.approx(closing, abs=5e-3)
+    assert not trace.identical(replace(trace, ballistic=False))

@@ -23,6 +23,7 @@ __all__ = [
     "LANE_CHANGE",
     "Rectangles",
     "contact_index",
+    "contact_moment",
     "contact_part",
     "contact_share",
     "corners",
@@ -195,6 +196,16 @@ def contact_part(a: ActorTrace, b: ActorTrace) -> tuple[int, ActorTrace, ActorTr
     """Return the index of the first contact (as `contact_index`) and the rectangles that touch; None if there is none."""
     found = [(k, p, q) for p, q in part_pairs(a, b) if (k := _rectangle_contact(p, q)) is not None]
     return min(found, key=lambda one: one[0], default=None)
+
+
+def contact_moment(a: ActorTrace, b: ActorTrace, k: int) -> float:
+    """Return after which fraction of the step before an instant, the first at which they have touched, two actors touch.
+
+    1 where no rectangles do on chords with their last headings.
+    """
+    step = slice(max(k - 1, 0), k + 1)
+    pairs = part_pairs(select_instants(a, step), select_instants(b, step))
+    return float(np.fmin(min(swept_contact(p, q)[-1] for p, q in pairs), 1.0))
 
 
 def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.metrics.cache import per_trace
-from sbt.metrics.geometry import contact_index, rectangles
+from sbt.metrics.geometry import contact_index, contact_moment, rectangles
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
@@ -36,6 +36,8 @@ FAR = 1000.0
 """Gap of road users that never share a path (m)."""
 DRAC_LIMIT = 100.0
 """Largest DRAC reported (m/s^2); the formula has no limit as the gap approaches 0."""
+_MOMENTS = 1001
+"""Times within the step of a contact at which speeds are looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,14 +222,48 @@ def collision(ego: str = "ego") -> Metric:
 
 
 def relative_speed_at_contact(trace: Trace, ego: str, other: str) -> float:
-    """Return the relative speed of two actors at their first contact (m/s), 0 without one."""
+    """Return the relative speed of two actors at their first contact (m/s), 0 without one.
+
+    Where speeds change evenly within a step, those at the moment of the contact, else those of the step.
+    """
     k = first_contact(trace, ego, other)
     if k is None:
         return 0.0
     a, b = trace.actor(ego), trace.actor(other)
-    dx = a.speed[k] * np.cos(a.heading[k]) - b.speed[k] * np.cos(b.heading[k])
-    dy = a.speed[k] * np.sin(a.heading[k]) - b.speed[k] * np.sin(b.heading[k])
+    u, v = a.speed[k], b.speed[k]
+    if trace.ballistic and k > 0 and np.isfinite(a.x[k - 1] + b.x[k - 1]):
+        u, v = _speeds_at_contact(a, b, k, float(trace.time[k] - trace.time[k - 1]))
+    dx = u * np.cos(a.heading[k]) - v * np.cos(b.heading[k])
+    dy = u * np.sin(a.heading[k]) - v * np.sin(b.heading[k])
     return float(np.hypot(dx, dy))
+
+
+def _speeds_at_contact(a: ActorTrace, b: ActorTrace, k: int, step: float) -> tuple[float, float]:
+    """Return the speeds with which two actors touch within the step (s) before an instant, in which speeds change evenly."""
+    time = np.linspace(0.0, 1.0, _MOMENTS)
+    (way_a, speed_a), (way_b, speed_b) = (_within_step(each, k, step, time) for each in (a, b))
+    x_a, y_a, x_b, y_b = a.x[k] - a.x[k - 1], a.y[k] - a.y[k - 1], b.x[k] - b.x[k - 1], b.y[k] - b.y[k - 1]
+    dx, dy = x_b - x_a, y_b - y_a
+    along = way_b * (x_b * dx + y_b * dy) - way_a * (x_a * dx + y_a * dy)  # how they have come together, times all of it
+    reached = contact_moment(a, b, k) * (dx * dx + dy * dy)
+    together = np.append(along >= reached, True)
+    at = min(max(int(together.argmax()), 1), _MOMENTS - 1)
+    moment = np.interp(reached, along[at - 1 : at + 1], time[at - 1 : at + 1])
+    return float(np.interp(moment, time, speed_a)), float(np.interp(moment, time, speed_b))
+
+
+def _within_step(actor: ActorTrace, k: int, step: float, time: Vector) -> tuple[Vector, Vector]:
+    """Return which part of the way of a step an actor has driven after parts of its time, and how fast it is then (m/s).
+
+    Who stops within it stands for the rest; who is moved by poses moves evenly, at the speed of the step.
+    """
+    before, after = float(actor.speed[k - 1]), float(actor.speed[k])
+    way, mean = float(np.hypot(actor.x[k] - actor.x[k - 1], actor.y[k] - actor.y[k - 1])), 0.5 * (before + after)
+    stops = after == 0.0 and 0.0 < way < mean * step
+    if mean == 0.0 or not (stops or abs(way - abs(mean) * step) <= abs(way - abs(after) * step)):
+        return time, np.full(len(time), after)
+    done = np.minimum(time * mean * step / way, 1.0) if stops else time
+    return done * (before + 0.5 * (after - before) * done) / mean, before + (after - before) * done
 
 
 def impact_speed(ego: str = "ego", other: str = "co") -> Metric:

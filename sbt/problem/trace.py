@@ -107,6 +107,7 @@ class Trace:
         unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`); other doubts.
         unreacting: actors that are moved as they were recorded, whatever happens.
         flat: actors that are driven over, such as what hides a marking: films show them, metrics do not see them.
+        ballistic: speeds change evenly within a step (SUMO's option `step-method.ballistic`), else in jumps at its begin.
         view: where the sensor of the first actor sees something, for films (not compared); None: unknown.
 
     In traffic road users come and go: where one is not there, all its states are NaN (`present`).
@@ -135,6 +136,7 @@ class Trace:
     unreacting: tuple[str, ...] = ()
     view: FieldOfView | None = None
     flat: tuple[str, ...] = ()
+    ballistic: bool = False
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.actors))
@@ -192,6 +194,7 @@ class Trace:
         some = Trace(
             self.time[i], tuple(new.values()), self.x[i][:, at], self.y[i][:, at], self.heading[i][:, at], self.speed[i][:, at],
             self.acceleration[i][:, at], self.length[at], self.width[at], self.ended, ways=ways, parts=parts,
+            ballistic=self.ballistic,
         )  # fmt: skip
         if actors is not None:
             return some
@@ -230,7 +233,7 @@ class Trace:
         same = same and all(np.array_equal(values, other.signals[name]) for name, values in self.signals.items())
         same = same and self.ways.keys() == other.ways.keys()
         same = same and all(np.array_equal(way, other.ways[name], equal_nan=True) for name, way in self.ways.items())
-        texts = ("actors", "ended", "reported", "unconfirmed", "unreacting", "flat")
+        texts = ("actors", "ended", "reported", "unconfirmed", "unreacting", "flat", "ballistic")
         same = same and all(getattr(self, name) == getattr(other, name) for name in texts)
         return same and self.parts.keys() == other.parts.keys() and self._part_states() == other._part_states()
 

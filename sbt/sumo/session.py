@@ -37,7 +37,8 @@ from sbt.sumo.formatting import format_number
 from sbt.sumo.replicas import replicated_net
 
 __all__ = [
-    "INVALID_DOUBLE", "Loadable", "Session", "Setup", "check_options", "libsumo", "scratch_folder", "session", "unwrapped",
+    "INVALID_DOUBLE", "Loadable", "Session", "Setup", "check_options", "is_ballistic", "libsumo", "scratch_folder", "session",
+    "unwrapped",
 ]  # fmt: skip
 
 INVALID_DOUBLE = -1073741824.0
@@ -87,6 +88,11 @@ def unwrapped(sumo: Any, domain: str, name: str) -> Any:
 def _compiled(domain: str, name: str) -> Any:
     module = libsumo()
     return getattr(module.libsumo._libsumo, f"{domain}_{name}", None) or getattr(getattr(module, domain), name)
+
+
+def is_ballistic(sumo: Any) -> bool:
+    """Return whether speeds change evenly within the steps of the running simulation, and not at their begins (Euler)."""
+    return bool(sumo.simulation.getOption("step-method.ballistic") == "true")
 
 
 class Loadable(Protocol):

@@ -20,7 +20,7 @@ from sbt.sumo.dead_ends import refuse_dead_ends
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
 from sbt.sumo.reading import ROW, Onlooker, observer, table
-from sbt.sumo.session import unwrapped
+from sbt.sumo.session import is_ballistic, unwrapped
 
 __all__ = ["SumoRun"]
 
@@ -152,6 +152,7 @@ class SumoRun:
             tuple(self._collisions),
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
             unconfirmed=self._unconfirmed,
+            ballistic=is_ballistic(self._sumo),
             flat=tuple(o.name for o in scene.obstacles if not o.solid),
             view=view_of(actors[0].driver, float(actors[0].type.length), float(actors[0].type.width)),
         )

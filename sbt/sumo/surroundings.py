@@ -28,7 +28,7 @@ from sbt.sumo.levels import is_known
 from sbt.sumo.nearby import Nearby
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_variables, read
 from sbt.sumo.overlaps import Rectangle, separate
-from sbt.sumo.session import INVALID_DOUBLE
+from sbt.sumo.session import INVALID_DOUBLE, is_ballistic
 from sbt.sumo.teleports import Teleports
 from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, part_traces
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
@@ -375,7 +375,7 @@ class Surroundings:
             ended, tuple(reported), ways={name: ways[0] for name, ways in self._ways.items()},
             parts={name: self._parts_of(name, table[:, column[name]]) for name in self._bent()},
             unconfirmed=(*unconfirmed, *self._level.notes, *self._teleports.notes),
-            unreacting=tuple(n for n in names if n in self._unreacting),
+            unreacting=tuple(n for n in names if n in self._unreacting), ballistic=is_ballistic(self._sumo),
         )  # fmt: skip
 
     def _bent(self) -> list[str]:
