@@ -169,6 +169,35 @@ def test_check_tells_a_user_which_laws_an_own_scenario_breaks(tmp_path: Path) ->
         check_physics(scenario.simulate({"aside": 3.5}, 0))
 
 
+@pytest.mark.parametrize(
+    ("speed", "aside", "cause"),
+    [
+        ("np.full(30, 20.0)", "np.where(x > 20.0, 3.5, 0.0)", "SUMO changes lanes within a step unless"),
+        ("np.clip(20.0 - 10.0 * t, 0.0, None)", "np.where(t > 2.05, 3.5, 0.0)", "who stands there parks, or leaves its place"),
+        ("np.clip(10.0 * t - 5.0, 0.0, None)", "np.where(t > 0.45, 3.5, 0.0)", "who stands there parks, or leaves its place"),
+        ("np.full(30, 20.0)", "0.5 * 8.0 * t**2 * np.clip(t, 0.0, 1.0)", ""),
+    ],
+    ids=["drives", "comes to a stop", "leaves its place", "bend"],
+)
+def test_check_tells_why_somebody_jumps_beside_its_lane(tmp_path: Path, speed: str, aside: str, cause: str) -> None:
+    """An ego that parked was said to change lanes, and an option for that was named; so was one in a sharp bend."""
+    heading = "np.arctan2(np.gradient(y), np.gradient(x))" if not cause else "0.0 * x"
+    (tmp_path / "own.py").write_text(
+        "import numpy as np\nfrom sbt import Parameter, Requirement, Scenario\nfrom sbt.problem.trace import Trace\n\n\n"
+        f"def simulate(values, seed):\n    t = 0.1 * np.arange(30)\n    v = {speed}\n"
+        "    x = 0.1 * np.cumsum(v) + 1e-9 * values['a']\n"
+        f"    y = {aside}\n    heading = {heading}\n    columns = (x, y, heading, v, 0.0 * v)\n"
+        "    return Trace(t, ('ego',), *(c[:, None] for c in columns), np.array([5.0]), np.array([1.8]))\n\n\n"
+        "def x_max(trace):\n    return float(trace.x.max())\n\n\n"
+        "SCENARIO = Scenario('own', [Parameter('a', 0.0, 3.5, 'm')], Requirement('x_max', high=-1.0), simulate, [x_max])\n"
+    )
+    told = next(f for f in check_scenario(ScenarioSpec(f"{tmp_path}/own.py:SCENARIO")) if "laws of motion" in f.rule).detail
+    assert "lateral must be" in told
+    assert ("sideways must be" in told) == bool(cause)
+    causes = ("SUMO changes lanes within a step unless", "who stands there parks, or leaves its place")
+    assert [one for one in causes if one in told] == ([cause] if cause else [])
+
+
 def test_who_is_stopped_dead_near_the_ego_is_told_in_the_row() -> None:
     """SUMO stops who would drive over a red light; a walker halts in one step, and who is moved as recorded has noise."""
     time = 0.1 * np.arange(20.0)

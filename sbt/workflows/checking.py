@@ -17,7 +17,7 @@ from sbt.errors import RunError, SbtError, described
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.tasks import DiedError, elsewhere
 from sbt.execution.warming import keeping_states
-from sbt.metrics.physics import breaches
+from sbt.metrics.physics import Breach, breaches
 from sbt.metrics.stl import FORMULA
 from sbt.metrics.stl_grammar import horizon, parse
 from sbt.problem.outcome import TELEPORTED, Status
@@ -44,6 +44,9 @@ _CORNERS_UP_TO = 4
 _FEW_INVALID = 0.25
 """Largest share of the centre and corners that may be invalid."""
 _INSTANTLY = "; SUMO changes lanes within a step unless its option lanechange.duration is set (such as 3 s)"
+_PARKS = "; who stands there parks, or leaves its place, or changes lanes in a queue, which SUMO does within a step"
+_STANDS = 0.1
+"""Speed below which who jumps beside its lane may park (m/s)."""
 _MOVED = "; SUMO moves walkers, and who parks or rides, from one place to another within a step"
 _STEP = 1.0
 """How much shorter than a formula's horizon a run may be (s): a step of SUMO at most."""
@@ -61,7 +64,11 @@ _WORKER_DEADLINE = 300.0
 
 @dataclass(frozen=True)
 class _Run:
-    """One run as plain data: metrics, digest and length (s) of its trace, laws of motion it breaks, teleports; or a problem."""
+    """One run as plain data: metrics, digest and length (s) of its trace, laws of motion it breaks, teleports; or a problem.
+
+    Attributes:
+        beside: why somebody jumps beside its lane, where it does so most.
+    """
 
     metrics: tuple[tuple[str, float], ...] = ()
     digest: str = ""
@@ -69,6 +76,7 @@ class _Run:
     problem: str = ""
     length: float = math.inf
     teleports: tuple[str, ...] = ()
+    beside: str = ""
 
 
 @dataclass(frozen=True)
@@ -205,16 +213,25 @@ def _run(scenario: LogicalScenario, execute: Callable[[], Trace | dict[str, floa
         result = execute()
         if not isinstance(result, Trace):
             return _Run(tuple(result.items()))
-        broken = tuple(map(str, breaches(result, (scenario.roles.other or "",))))
+        broken = breaches(result, (scenario.roles.other or "",))
+        beside = next((_why_beside(result, breach) for breach in broken if breach.law == "sideways"), "")
         length = float(result.time[-1] - result.time[0])
         moved = tuple(text.removeprefix(TELEPORTED) for text in result.unconfirmed if text.startswith(TELEPORTED))
-        return _Run(tuple(scenario.measure(result).items()), _digest(result), broken, length=length, teleports=moved)
+        measured = tuple(scenario.measure(result).items())
+        return _Run(measured, _digest(result), tuple(map(str, broken)), length=length, teleports=moved, beside=beside)
     except RunError as error:
         return _Run(problem=f"{error.status}: {error.reason}")
     except BaseException as error:
         if interruption.is_interruption(error):
             raise
         return _Run(problem=f"failed: {described(error)}")
+
+
+def _why_beside(trace: Trace, breach: Breach) -> str:
+    """Return why somebody is moved across its heading: as it drives it changes lanes."""
+    k = int(np.argmin(np.abs(trace.time - breach.time)))
+    speed = np.abs(trace.actor(breach.actor).speed[max(k - 1, 0) : k + 1])
+    return _PARKS if speed.min() < _STANDS else _INSTANTLY
 
 
 def _digest(trace: Trace) -> str:
@@ -341,8 +358,8 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]], spec: ScenarioSpe
     first = {breach.partition(" must")[0]: (breach, values) for breach, values in broken[::-1]}
     detail = "; ".join(f"{breach} ({written(values)})" for breach, values in first.values())
     options = getattr(getattr(spec.resolve().simulate, "files", None), "options", {})
-    if any(name.startswith(("sideways", "lateral")) for name in first) and "lanechange.duration" not in options:
-        detail += _INSTANTLY
+    causes = dict.fromkeys(run.beside for run in runs if run.beside)
+    detail += "".join(cause for cause in causes if cause != _INSTANTLY or "lanechange.duration" not in options)
     if any(name.startswith("walking") for name in first):
         detail += _MOVED
     return [Finding("for information: laws of motion are broken", ok=True, detail=f"in {share}: {detail}")]
