@@ -54,7 +54,8 @@ def btn(trace: Trace, ego: str, other: str, margin: float, capability: float = C
     """Return the (t,) brake threat number: the constant deceleration that the ego needs, divided by the one it can reach.
 
     The other keeps its acceleration, and stays where it comes to a standstill if it brakes. Without an acceleration of
-    the other this is DRAC divided by `capability`.
+    the other this is DRAC divided by `capability`; so it is of one that comes towards the ego, whom no braking of the ego
+    alone avoids.
     """
     e, b = encounter(trace, ego, other, margin), trace.actor(other)
     turn = np.cos(b.heading - trace.actor(ego).heading)
