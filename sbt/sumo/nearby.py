@@ -77,14 +77,13 @@ class Nearby:
 
     def is_near(self, name: str, variables: _Variables) -> bool:
         """Return whether the body of a road user may be within the radius around that of the ego."""
-        if name == self._ego or self._apart(variables) <= self._within:
+        apart = math.dist(self._own[0][0], variables[POSITION][:2])
+        if name == self._ego or apart <= self._within:
             return True
+        if apart > self._within + self._size + self.very_long.get(name, self._longest) + _WIDTHS:
+            return False
         domain = self._sumo.person if VEHICLE in variables else self._sumo.vehicle
         return self._is_body_near(variables, domain.getLength(name), domain.getWidth(name))
-
-    def _apart(self, variables: _Variables) -> float:
-        """Return the distance of a front from that of the ego (m)."""
-        return math.dist(self._own[0][0], variables[POSITION][:2])
 
     def _is_body_near(self, variables: _Variables, length: float, width: float) -> bool:
         (own, slack), (ends, more) = self._own, _ends(variables, length)
