@@ -53,7 +53,7 @@ def test_who_runs_into_a_long_ego_is_met(tmp_path: Path):
 
 
 def test_a_long_vehicle_that_departs_later_than_the_ego_is_met(tmp_path: Path):
-    """When the ego's surroundings are subscribed to nothing is known of a type that a loop makes."""
+    """Nothing was known of its type, which a loop makes, when the ego's surroundings were subscribed to."""
     vehicles = bodies(5.0) + vehicle("ego", "road", "own", departPos=20, departSpeed=10)
     deaf_ego = deaf("ego", "o")
 

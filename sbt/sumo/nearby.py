@@ -14,7 +14,7 @@ __all__ = ["Nearby"]
 _VEHICLES, _PERSONS = 0xA4, 0xAE
 """TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
 _VERY_LONG = 20.0
-"""Length from which on every vehicle is followed one by one, so that a subscription need not reach to its front (m)."""
+"""Length from which on every vehicle is followed one by one, as no subscription reaches to its front (m)."""
 _WIDTHS = 3.0
 """Half the widths of two road users, at most (m)."""
 _APART = 1e-6
@@ -35,32 +35,26 @@ class Nearby:
         within: radius (m).
 
     Attributes:
-        very_long: lengths of the vehicles that may be near although no subscription tells of their fronts (m).
+        very_long: lengths of the vehicles that may be near although the subscription does not tell of their fronts (m).
     """
 
     def __init__(self, sumo: Any, ego: str, within: float):
         self._sumo, self._ego, self._within = sumo, ego, within
         self._domain: Any = sumo.vehicle
-        self._longest = self._size = self._breadth = 0.0
+        self._size = self._breadth = 0.0
         self._own: _Ends = [], 0.0
-        self._subscribed = False
         self.very_long: dict[str, float] = {}
 
     def depart(self, name: str, length: float) -> None:
         """Note a vehicle of this length (m)."""
-        if length > (self._longest if self._subscribed else _VERY_LONG):
+        if length > _VERY_LONG:
             self.very_long[name] = length
-        else:
-            self._longest = max(self._longest, length)
 
     def subscribe(self, *, walks: bool) -> None:
         """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
         self._domain, ego = self._sumo.person if walks else self._sumo.vehicle, self._ego
         self._size, self._breadth = self._domain.getLength(ego), 0.5 * self._domain.getWidth(ego)
-        kinds = map(self._sumo.vehicletype.getLength, self._sumo.vehicletype.getIDList())
-        self._longest = max((self._longest, *(length for length in kinds if length <= _VERY_LONG)))
-        self._subscribed = True
-        reach = self._within + self._size + self._longest + _WIDTHS + _APART
+        reach = self._within + self._size + _VERY_LONG + _WIDTHS + _APART
         self._domain.subscribeContext(ego, _VEHICLES, reach, _KNOWN)
         self._domain.subscribeContext(ego, _PERSONS, reach, (*_KNOWN, VEHICLE))
 
@@ -80,7 +74,7 @@ class Nearby:
         apart = math.dist(self._own[0][0], variables[POSITION][:2])
         if name == self._ego or apart <= self._within:
             return True
-        if apart > self._within + self._size + self.very_long.get(name, self._longest) + _WIDTHS:
+        if apart > self._within + self._size + self.very_long.get(name, _VERY_LONG) + _WIDTHS:
             return False
         domain = self._sumo.person if VEHICLE in variables else self._sumo.vehicle
         return self._is_body_near(variables, domain.getLength(name), domain.getWidth(name))
