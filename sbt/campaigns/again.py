@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN, NOMINAL, Seen
+from sbt.campaigns.crude import nominal_rows
 from sbt.campaigns.known import Known
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
@@ -109,7 +110,7 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
     history, old, hits = log.history, settings.scenario.space, settings.scenario.requirement.critical_runs(log.history)
     x = space.sample(_RATIOS, stream(settings.seed, "ratio"))
     crude = NOMINAL in history.stage
-    plain = np.flatnonzero(history.stage == NOMINAL)
+    plain = np.flatnonzero(nominal_rows(log))
     if took_sum(log):
         plain, log_q = counted_with(log, old)
         history = replace(history, columns={**history.columns, "log_q": log_q})

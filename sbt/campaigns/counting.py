@@ -20,12 +20,17 @@ from sbt.problem.requirement import Requirement
 from sbt.store.history import History
 from sbt.store.records import Iteration
 
-__all__ = ["DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "Seen", "counted_batches", "counted_iterations", "held", "with_event"]
+__all__ = [
+    "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "counted_batches", "counted_iterations", "held",
+    "random_draws", "with_event",
+]  # fmt: skip
 
 DRAWN = "estimation"
 """Stage of runs that were drawn with a known density."""
 NOMINAL = "monte_carlo"
 """Stage of runs that were drawn from the inputs' distribution."""
+RANDOM = "random"
+"""Stage of such draws of a campaign with many inputs before it is known how it goes on, or after what counts has ended."""
 LEARNED = "learn"
 """Stage of draws that only teach."""
 FEW_KNOWN = 10
@@ -81,6 +86,12 @@ def _counted(log: Log) -> Iterator[tuple[Iteration, PoolSummary, CountedDraws]]:
             yield batch, proposal.pool or PoolSummary(len(proposal.counted.pi), 0.0, 0.0, 1), proposal.counted
 
 
+def random_draws(history: History) -> int:
+    """Return how many runs an estimate by crude Monte Carlo has, where all of its draws count."""
+    crude = int((history.stage == NOMINAL).sum())
+    return crude + int((history.stage == RANDOM).sum()) if crude else 0
+
+
 def counted_iterations(log: Log) -> list[int]:
     """Return the numbers of the batches that count."""
     return [batch.number for batch, _, _ in _counted(log)]
@@ -121,7 +132,7 @@ class Seen:
         history = log.history
         critical = settings.scenario.requirement.critical_runs(history)
         drawn = np.isin(history.stage, (DRAWN, LEARNED))
-        plain = np.flatnonzero(history.stage == NOMINAL)  # until values came that can be followed
+        plain = np.flatnonzero(np.isin(history.stage, (NOMINAL, RANDOM)))  # until values came that can be followed
         rows, surprising, surprised = [plain], [np.zeros(len(plain), dtype=np.bool_)], -1
         for batch in log.iterations:
             proposal = batch.read(EstimationProposal)

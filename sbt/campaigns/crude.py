@@ -7,22 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.campaigns.clustering import spread_of_share
-from sbt.campaigns.counting import NOMINAL
+from sbt.campaigns.counting import NOMINAL, RANDOM
 from sbt.campaigns.records import COUNT, EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.estimators.monte_carlo import Proportion
-from sbt.estimators.subset import SubsetRun
+from sbt.estimators.subset import SubsetRun, next_levels
 from sbt.loop.stages import Batch, Log
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 from sbt.store.records import Iteration
 
-__all__ = ["NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "repeats_of", "took_monte_carlo"]
+__all__ = [
+    "FIRST_LEVEL", "NOMINAL_STAGES", "MonteCarloStage", "SubsetStage", "nominal_proportion", "nominal_rows", "points_a_level",
+    "repeats_of", "took_monte_carlo",
+]  # fmt: skip
 
-NOMINAL_STAGES = (NOMINAL, "subset level 0")
+FIRST_LEVEL = "subset level 0"
+"""Stage of the draws that subset simulation begins with."""
+NOMINAL_STAGES = (NOMINAL, FIRST_LEVEL)
 """Stages of runs that are drawn from the inputs' distribution, whatever the results."""
 _REPEATS = 5  # independent runs of subset simulation: their spread is the error
 _FEWEST_HITS = 10  # before the coefficient of variation is believed: its own error is a sixth then
@@ -49,7 +54,7 @@ class MonteCarloStage:
         if target is not None and log.iteration >= _FEWEST_BATCHES:
             share, history = nominal_proportion(log, self.settings), log.history
             critical = self.settings.scenario.requirement.critical_runs(history)
-            between = spread_of_share(history, history.stage == NOMINAL, critical)
+            between = spread_of_share(history, nominal_rows(log), critical)
             differing = between is not None and between.exceeds(target, share.value)
             if share.hits >= _FEWEST_HITS and share.cov is not None and share.cov <= target and not differing:
                 return "cov"
@@ -77,21 +82,23 @@ class SubsetStage:
         repeats = repeats_of(log, self.settings)
         if all(r.finished for r in repeats):
             return "converged"
-        size = sum(_width(r) for r in repeats if not r.finished)
+        size = sum(r.width for r in repeats if r.asks)
         return "budget" if len(log.history) + size > self.settings.budget else None
 
     def propose(self, log: Log) -> Batch:
-        """Return one step of every chain that is not finished."""
+        """Return one step of every chain that does not wait for the level of others."""
         s, space = self.settings, self.settings.scenario.space
         runs: list[PlannedRun] = []
-        for k, repeat in enumerate(repeats_of(log, s)):
-            if not repeat.finished:
+        repeats = repeats_of(log, s)
+        for k, repeat in enumerate(repeats):
+            if repeat.asks:
                 z = repeat.ask(stream(s.seed, "subset", k, log.iteration))
-                stage = "subset level 0" if repeat.levels == 0 else "subset"
+                stage = FIRST_LEVEL if repeat.levels == 0 else "subset"
                 x = space.from_normal(z)
                 log_q = space.log_density(x) if repeat.levels == 0 and not space.constraints else None
                 runs += _runs(space, x, stage, log_q)
-        return Batch(tuple(runs), EstimationProposal("subset", "subset"))
+        level = None if repeats[0].alone else repeats[0].n
+        return Batch(tuple(runs), EstimationProposal("subset", "subset", level=level))
 
 
 def took_monte_carlo(log: Log) -> bool:
@@ -105,20 +112,26 @@ def repeats_of(log: Log, settings: Settings) -> list[SubsetRun]:
     requirement, space = settings.scenario.requirement, settings.scenario.space
     steps = [batch for batch in log.iterations if _is_step(batch)]
     before = log.history.iteration < (steps[0].number if steps else log.iteration)
-    budget = max(settings.budget - int(before.sum()), 1)  # other runs may have come first
-    level = max(budget // (4 * _REPEATS) // 10, 2) * 10
-    if budget < _REPEATS * level:
-        level = max(budget // _REPEATS, 1)
-    repeats = [SubsetRun(level, space.dimension) for _ in range(_REPEATS)]
+    level = steps[0].read(EstimationProposal).level if steps else None
+    alone = bool(steps) and level is None  # of a store of once
+    level = level or points_a_level(max(settings.budget - int(before.sum()), 1))  # other runs may have come first
+    repeats = [SubsetRun(level, space.dimension, alone=alone) for _ in range(_REPEATS)]
     margin = requirement.margins(log.history)
     for batch in steps:
         rows, start = np.flatnonzero(log.history.iteration == batch.number), 0
         for k, repeat in enumerate(repeats):
-            if not repeat.finished:
+            if repeat.asks:
                 z = repeat.ask(stream(settings.seed, "subset", k, batch.number))
                 outcomes = _outcomes(margin[rows[start : start + len(z)]], z, space)
                 repeats[k], start = repeat.tell(z, outcomes), start + len(z)
+        repeats = repeats if alone else next_levels(repeats)
     return repeats
+
+
+def points_a_level(budget: int) -> int:
+    """Return the points a level of every repeat of subset simulation, so that four levels fit in the budget."""
+    level = max(budget // (4 * _REPEATS) // 10, 2) * 10
+    return level if budget >= _REPEATS * level else max(budget // _REPEATS, 1)
 
 
 def _is_step(batch: Iteration) -> bool:
@@ -129,18 +142,31 @@ def _outcomes(margin: Vector, z: Points, space: ParameterSpace) -> Vector:
     return np.where(space.feasible(space.from_normal(z)), margin, np.inf) if space.constraints else margin
 
 
-def _width(repeat: SubsetRun) -> int:
-    return repeat.n if repeat.levels == 0 else len(repeat.front)
-
-
 def _runs(space: ParameterSpace, x: Points, stage: str, log_q: Vector | None) -> tuple[PlannedRun, ...]:
     return tuple(PlannedRun(stage, space.named(row), None if log_q is None else float(log_q[k])) for k, row in enumerate(x))
+
+
+def nominal_rows(log: Log, stage: str = NOMINAL) -> Mask:
+    """Return which runs were drawn from the inputs' distribution: of this stage, and those of many inputs that count with it.
+
+    Beside the first level of subset simulation all do; in crude Monte Carlo those halves of the first draws that do not count
+    because of their own results.
+    """
+    rows = log.history.stage == stage
+    first = np.flatnonzero(log.history.stage == RANDOM)
+    if stage == FIRST_LEVEL:
+        rows[first] = True
+    elif stage == NOMINAL and len(first):
+        counts = log.iterations[1].read(EstimationProposal).trial if log.iteration > 1 else (True, True)
+        for half, counted in zip(np.array_split(first, 2), counts or (False, False), strict=True):
+            rows[half] = counted
+    return rows
 
 
 def nominal_proportion(
     log: Log, settings: Settings, stage: str = NOMINAL, requirement: Requirement | None = None
 ) -> Proportion:  # fmt: skip
-    """Return the hits among the runs of a stage that were drawn from the inputs' distribution; None: of the campaign's own."""
-    runs = log.history.where(log.history.stage == stage)
+    """Return the hits among these runs; `requirement` None: of the campaign's own."""
+    runs = log.history.where(nominal_rows(log, stage))
     hits = int((requirement or settings.scenario.requirement).critical_runs(runs).sum())
     return Proportion(len(runs), hits, int((~runs.ok).sum()))

@@ -9,7 +9,7 @@ import numpy as np
 
 from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
 from sbt.campaigns.counting import DRAWN, FEW_KNOWN, Seen, counted_batches, counted_iterations, with_event
-from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion
+from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion, nominal_rows
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.parts import CriticalShare, share_of
 from sbt.campaigns.records import EstimationProposal
@@ -79,7 +79,7 @@ def _from_nominal(log: Log, settings: Settings, stage: str, confidence: float) -
     tail, found = 0.5 * (1.0 + confidence), []
     for part in settings.scenario.requirement.parts:
         share = nominal_proportion(log, settings, stage, part)
-        between = spread_of_share(log.history, log.history.stage == stage, part.critical_runs(log.history))
+        between = spread_of_share(log.history, nominal_rows(log, stage), part.critical_runs(log.history))
         limits, worst = Limits(share.lower, share.upper), (share.hits + share.failed) / max(share.n, 1)
         limits = limits if between is None else between.widened(limits, share.value, worst)
         found.append(RequirementEstimate(part.label, share.value, limits.lower(tail), limits.upper(tail), share.hits))

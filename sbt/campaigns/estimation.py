@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sbt.campaigns.clustering import Spread
-from sbt.campaigns.counting import DRAWN, FEW_KNOWN, NOMINAL, Seen, counted_batches, counted_iterations, held
-from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, repeats_of, took_monte_carlo
+from sbt.campaigns.counting import DRAWN, FEW_KNOWN, NOMINAL, RANDOM, Seen, counted_batches, counted_iterations, held
+from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
@@ -17,6 +17,7 @@ from sbt.campaigns.likeness import EarlierTold, earlier_told
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
 from sbt.campaigns.pairing import PairStage, pairs_of, pairs_words
 from sbt.campaigns.precision import cautions
+from sbt.campaigns.repeated import NOTHING_CRITICAL, told_by_repeats
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -28,7 +29,6 @@ from sbt.campaigns.warmed import warmed_traffic
 from sbt.campaigns.wording import number, plural
 from sbt.errors import InputError
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
-from sbt.estimators.subset import combine_repeats
 from sbt.loop.stages import Campaign, Facts, Log, Stage
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.plain import Json
@@ -38,7 +38,6 @@ __all__ = ["ESTIMATION", "EstimateStep", "EstimationConclusion", "conclude_sum",
 
 _HIGH_DIMENSION = 20  # inputs from which on the metamodels learn less than the chains of subset simulation find
 _CONFIDENCE = 0.95
-_NOTHING = "no draw that counts was critical: the probability is only bounded from above, by draws from the inputs' distribution"
 
 
 @dataclass(frozen=True)
@@ -134,8 +133,8 @@ Concluded = tuple[EstimationConclusion, Limits]
 def recipe(settings: Settings) -> Campaign:
     """Return the campaign: `difference` (the sequential estimator), `monte_carlo`, or `subset`.
 
-    `auto` is `subset` from 20 inputs on, `difference` below; where the budget is enough to run every combination of whole
-    numbers and choices, it runs them.
+    `auto` is `difference` below 20 inputs; from 20 on it draws in a subspace, or is `monte_carlo` or `subset`. Where the budget
+    is enough to run every combination of whole numbers and choices, it runs them.
 
     Raises:
         InputError: recorded rows, which have no distribution to draw from, or an unknown method.
@@ -235,7 +234,7 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
     if not seen.critical:
         limits, value = _nothing_critical(seen), 0.0
         exact_bound = limits.upper(_CONFIDENCE)
-        warnings.append(_NOTHING)
+        warnings.append(NOTHING_CRITICAL)
     elif not seen.safe:
         value = 1.0 if log.history.ok.all() else value
         limits = Limits(lambda c: 1.0 - seen.most(seen.failed, c), lambda _: 1.0)
@@ -301,7 +300,7 @@ def _uncounted(log: Log, settings: Settings) -> Concluded:
         limits = Limits(lambda _: 0.0, lambda _: 1.0)
         return _conclusion(None, limits, warnings=(few,)), limits
     limits = _nothing_critical(seen)
-    return _conclusion(None, limits, warnings=(few, _NOTHING), exact_bound=limits.upper(_CONFIDENCE)), limits
+    return _conclusion(None, limits, warnings=(few, NOTHING_CRITICAL), exact_bound=limits.upper(_CONFIDENCE)), limits
 
 
 def _nothing_critical(seen: Seen) -> Limits:
@@ -315,7 +314,7 @@ def _from_nominal(log: Log, settings: Settings, stage: str = NOMINAL) -> Conclud
     limits = Limits(share.lower, share.upper)
     rest: Json = {}
     if share.hits == 0:
-        rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": (_NOTHING,)}
+        rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": (NOTHING_CRITICAL,)}
     return _conclusion(
         share.value if share.n else None, limits, cov=share.cov, effective_sample_size=float(share.n), hits=share.hits,
         failed_as_safe=share.value, failed_as_critical=(share.hits + share.failed) / max(share.n, 1),
@@ -324,8 +323,11 @@ def _from_nominal(log: Log, settings: Settings, stage: str = NOMINAL) -> Conclud
 
 
 def _from_either(log: Log, settings: Settings) -> Concluded:
-    """Return what subset simulation says where it was taken, else the draws in the subspace."""
-    return _from_repeats(log, settings) if took_subset(log) else _from_batches(log, settings)
+    """Return what subset simulation or crude Monte Carlo says where it was taken, else the draws in the subspace."""
+    if took_subset(log):
+        return _from_repeats(log, settings)
+    crude = took_monte_carlo(log) or (len(log.history) > 0 and bool((log.history.stage == RANDOM).all()))
+    return _from_nominal(log, settings) if crude else _from_batches(log, settings)
 
 
 def _from_draws(log: Log, settings: Settings) -> Concluded:
@@ -351,35 +353,8 @@ def conclude_sum(log: Log, settings: Settings) -> Concluded:
 
 def _from_repeats(log: Log, settings: Settings) -> Concluded:
     """Return what the repeats of subset simulation say."""
-    repeats = repeats_of(log, settings)
-    unfinished = sum(not r.finished for r in repeats)
-    n = len(log.history)
-    first = nominal_proportion(log, settings, stage="subset level 0")
-    undetected = 1.0 - (1.0 - _CONFIDENCE) ** (1.0 / max(first.n, 1))
-    hits = int(sum(r.hits for r in repeats))
-    if unfinished:
-        limits = Limits(lambda _: 0.0, first.upper)
-        warning = (
-            f"{unfinished} of {len(repeats)} repeats of subset simulation did not reach the critical interval in {n} runs: "
-            "only the draws from the inputs' distribution bound the probability; give a larger budget"
-        )
-        rest = {"exact_bound": limits.upper(_CONFIDENCE)} if hits == 0 else {}
-        return _conclusion(None, limits, hits=hits, undetected_mass_bound=undetected, warnings=(warning,), **rest), limits
-    found = combine_repeats([r.share for r in repeats])
-    if found.value == 0.0:
-        limits = Limits(lambda _: 0.0, first.upper)
-        warning = _NOTHING + "; subset simulation came to a level from which no run got lower"
-        return _conclusion(
-            0.0, limits, undetected_mass_bound=undetected, exact_bound=limits.upper(_CONFIDENCE), warnings=(warning,)
-        ), limits  # fmt: skip
-    failed = int((~log.history.ok).sum())
-    limits = Limits(lambda c: found.limit(c, side=-1), lambda c: first.upper(c) if failed else found.limit(c, side=1))
-    caution = ("the interval is that of independent repeats: it cannot see a region that no chain has met",)
-    return _conclusion(
-        found.value, limits, cov=found.std_error / found.value, hits=hits, effective_sample_size=float(found.repeats),
-        failed_as_critical=first.upper(_CONFIDENCE) if failed else found.value, undetected_mass_bound=undetected,
-        warnings=caution,
-    ), limits  # fmt: skip
+    value, limits, rest = told_by_repeats(log, settings, _CONFIDENCE)
+    return _conclusion(value, limits, **rest), limits
 
 
 def _clipped(value: float) -> float:

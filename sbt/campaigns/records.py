@@ -217,7 +217,7 @@ class EstimationProposal:
     """How a batch of an estimation was chosen.
 
     Attributes:
-        phase: initial, explore (search for modes), learn (draws that only teach), count or subset.
+        phase: initial, explore (search for modes), learn (draws that only teach, or bound), count or subset.
         method: sobol, explore, uncertainty, difference, meta, monte_carlo or subset.
         modes: failure modes that were known, in the phase of exploration.
         pool: what the draws came from.
@@ -227,6 +227,8 @@ class EstimationProposal:
         drawn_coarse: with two levels of fidelity, the coarse runs of the batch.
         levels: and what they were worth.
         pairs: the batch has pairs of inputs and seed; so many came from the pool, the others were searched for.
+        level: of subset simulation, points a level, where levels come from other repeats; None: from their own, as once.
+        trial: of many inputs left to crude Monte Carlo, whether the first and the second half of the first draws count.
     """
 
     phase: str
@@ -239,3 +241,5 @@ class EstimationProposal:
     drawn_coarse: CoarseDraws | None = optional()
     levels: LevelsRecord | None = optional()
     pairs: int | None = optional()
+    level: int | None = optional()
+    trial: tuple[bool, bool] | None = optional()

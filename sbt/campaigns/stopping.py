@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sbt.campaigns.clustering import spread_of_draws
-from sbt.campaigns.counting import NOMINAL, Seen, counted_batches, counted_iterations
+from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, random_draws
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
@@ -156,7 +156,7 @@ def not_met(log: Log, settings: Settings, counted: int | None, bound: float) -> 
         counted: runs of the estimate; where they are all random draws, their limits have what no run has met.
         bound: `undetected_mass_bound` of the conclusion, where no draws tell.
     """
-    if settings.gate is None or counted == int((log.history.stage == NOMINAL).sum()) > 0:
+    if settings.gate is None or counted == random_draws(log.history) > 0:
         return 0.0
     seen = Seen.of(log, settings)
     return seen.most(seen.surprises, settings.gate.confidence) if seen.draws else bound

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sbt.campaigns.combinations import none_left
-from sbt.campaigns.counting import NOMINAL
+from sbt.campaigns.counting import random_draws
 from sbt.campaigns.gate import CONDITION
 from sbt.campaigns.lost import (
     decides_bound,
@@ -304,7 +304,7 @@ def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
         f" {confidence} confidence they hold at most {number(missed, 3)} more, which bounds the unseen and is no second"
         " estimate"
     )
-    if found.counted and found.counted == int((facts.history.stage == NOMINAL).sum()):
+    if found.counted and found.counted == random_draws(facts.history):
         silent = "This trusts no search: the interval is that of random draws, and covers what none of them has met"
     if missed <= 0.0:
         silent = f"This does not tell that every run is critical: {number(1.0 - found.low, 3)} may not be, which no run met"

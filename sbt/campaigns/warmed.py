@@ -6,6 +6,7 @@ import numpy as np
 
 from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
 from sbt.campaigns.counting import NOMINAL, counted_batches
+from sbt.campaigns.crude import nominal_rows
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.wording import plural
 from sbt.loop.stages import Log
@@ -32,6 +33,6 @@ def warmed_traffic(log: Log, settings: Settings) -> Spread | None:
     if batches:
         return spread_of_draws(log, batches, counted_batches(log, settings, failed_critical=True))
     if (history.stage == NOMINAL).any():
-        return spread_of_share(history, history.stage == NOMINAL, settings.scenario.requirement.critical_runs(history))
+        return spread_of_share(history, nominal_rows(log), settings.scenario.requirement.critical_runs(history))
     numbers = history.columns["warm_up"]
     return Spread(len(np.unique(numbers)), None) if (numbers >= 0).any() else None

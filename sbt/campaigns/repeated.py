@@ -1,0 +1,67 @@
+"""What the repeats of subset simulation say, and the draws from the inputs' distribution beside them."""
+
+from __future__ import annotations
+
+from sbt.campaigns.crude import FIRST_LEVEL, nominal_proportion, repeats_of
+from sbt.campaigns.gate import Limits
+from sbt.campaigns.settings import Settings
+from sbt.estimators.subset import combine_repeats
+from sbt.loop.stages import Log
+from sbt.problem.plain import Json
+
+__all__ = ["NOTHING_CRITICAL", "are_precise", "told_by_repeats"]
+
+NOTHING_CRITICAL = (
+    "no draw that counts was critical: the probability is only bounded from above, by draws from the inputs' distribution"
+)
+
+
+def are_precise(log: Log, settings: Settings, target: float | None) -> bool:
+    """Return whether all repeats have finished, with an estimate of this coefficient of variation."""
+    repeats = repeats_of(log, settings)
+    if target is None or not all(r.finished for r in repeats):
+        return False
+    found = combine_repeats([r.estimate for r in repeats])
+    return 0.0 < found.std_error <= target * found.value
+
+
+def told_by_repeats(log: Log, settings: Settings, confidence: float) -> tuple[float | None, Limits, Json]:
+    """Return the estimate, its limits, and what else a conclusion has, by name.
+
+    A repeat that the budget cut off states what its last full level holds. Where no repeat met anything critical, the draws
+    from the inputs' distribution are all that is known. They also bound what repeats say, with half of the error.
+    """
+    repeats = repeats_of(log, settings)
+    cut, n = sum(not r.finished for r in repeats), len(log.history)
+    found, first = combine_repeats([r.estimate for r in repeats]), nominal_proportion(log, settings, FIRST_LEVEL)
+    rest: Json = {"undetected_mass_bound": 1.0 - (1.0 - confidence) ** (1.0 / max(first.n, 1))}
+    if found.value == 0.0 and first.hits:
+        said = f"no chain of subset simulation met anything critical: this is the share of {first.n:,} random draws"
+        worst = (first.hits + first.failed) / first.n
+        rest |= {"cov": first.cov, "hits": first.hits, "failed_as_critical": worst, "effective_sample_size": float(first.n)}
+        return first.value, Limits(first.lower, first.upper), rest | {"warnings": (said,)}
+    if found.value == 0.0:
+        said = NOTHING_CRITICAL + "; subset simulation came to a level from which no run got lower"
+        if cut:
+            said = (
+                f"{cut} of {len(repeats)} repeats of subset simulation did not reach the critical interval in {n} runs: "
+                "only the draws from the inputs' distribution bound the probability; give a larger budget"
+            )
+        limits = Limits(lambda _: 0.0, first.upper)
+        return None if cut else 0.0, limits, rest | {"exact_bound": limits.upper(confidence), "warnings": (said,)}
+    failed, reached = bool((~log.history.ok).any()), not cut or all(r.estimate > 0.0 for r in repeats)
+    limits = Limits(lambda c: found.limit(c, side=-1), lambda c: found.limit(c, side=1))
+    if not settings.scenario.space.constraints:
+        limits = limits.within(Limits(first.lower, first.upper), found.value, found.value)
+    if failed or not reached:
+        limits = Limits(limits.lower, lambda c: max(first.upper(c), found.value))
+    warnings = ["the interval is that of repeats: it cannot see a region that no chain has met"]
+    if cut:
+        warnings.append(
+            f"the budget cut off {cut} of {len(repeats)} repeats of subset simulation: what their last full levels hold is stated"
+        )
+    return found.value, limits, rest | {
+        "cov": found.std_error / found.value, "hits": int(sum(r.hits for r in repeats)), "warnings": tuple(warnings),
+        "effective_sample_size": float(found.repeats),
+        "failed_as_critical": first.upper(confidence) if failed else found.value,
+    }  # fmt: skip
