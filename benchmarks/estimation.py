@@ -2,6 +2,7 @@
 
     python benchmarks/estimation.py [--seeds 50] [--problems four_branch_7@124,rp38@200] [--table runs/estimation.jsonl]
     python benchmarks/estimation.py --cov 0.1 [--seeds 50] ...      # with the stop rule, at the default budget
+    python benchmarks/estimation.py --cov 0.1 --problems many       # with many inputs, at the runs of the cell; bar: crude
 
 Every cell (problem, runs, seed) is a campaign with default settings, through the public way. Finished
 cells are lines of the table: run again to go on where it stopped, or split seeds over processes (`resumed.py`).
@@ -19,7 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from resumed import arguments, collect, seeds
 from scipy.integrate import quad
-from scipy.stats import gamma, norm
+from scipy.stats import chi2, gamma, norm
 from scipy.stats import t as student_t
 
 import sbt
@@ -90,13 +91,41 @@ LAWS = {
     "noisy@200": ("testbed:four_branch_noisy", {}, truth("four_branch_noisy").probability),
 }  # fmt: skip
 """Name@runs: scenario, what the configuration changes of it, and the probability; the testbeds' own inputs are unbounded."""
+
+
+def _many(kind: str, d: int, p: float) -> sbt.Scenario:
+    """Return a problem of d normal inputs and this probability: beyond a sphere, in the largest input, by a flag, with noise."""
+    rest = 1.0 - (1.0 - p) ** (1.0 / d)
+    edge = {"sphere": chi2(d).isf(p), "linear": norm.isf(p), "noise": math.sqrt(2.0) * norm.isf(p)}.get(kind, norm.isf(rest))
+
+    def evaluate(values: dict, seed: int) -> dict:
+        z = np.array([*values.values()], dtype=float)
+        top = z.max()
+        by = {
+            "sphere": (z**2).sum(), "linear": z.sum() / math.sqrt(d), "max": top, "flag": edge + (1 if top > edge else -1),
+            "noise": z[0] + np.random.default_rng(seed).standard_normal(),
+        }  # fmt: skip
+        return {"m": float(edge - by[kind])}
+
+    inputs = [sbt.Parameter(f"x{k}", -9.0, 9.0, "", sbt.Normal(0, 1)) for k in range(d)]
+    return sbt.Scenario(f"{kind}_{d}", inputs, sbt.Requirement("m", high=0.0), evaluate=evaluate, metrics=["m"])
+
+
+_CASES = [
+    *(("sphere", 20, p, 300) for p in (0.5, 0.2, 0.02)), ("max", 20, 0.027, 300), ("flag", 20, 0.05, 300),
+    ("noise", 20, 0.08, 300),
+    *(("sphere", 20, p, runs) for runs in (300, 1000, 2000) for p in (0.001, 0.0002)), ("sphere", 20, 0.005, 2000),
+    *(("linear", d, p, runs) for d in (20, 30, 80) for runs in (300, 1000, 2000) for p in (0.001, 0.0002)),
+]  # fmt: skip
+MANY = {f"{kind}_{d}_{p:g}@{runs}": (_many(kind, d, p), {}, p) for kind, d, p, runs in _CASES}
+"""With many inputs: what no few directions explain, beside planes that one explains."""
 KEPT = ("probability", "low", "high", "cov", "hits", "undetected_mass_bound", "warnings")
 
 
 def campaign(cell: str, seed: int, stop: float | None) -> dict:
     name, _, runs = cell.partition("@")
-    size = {"budget": int(runs)} if stop is None else {}
-    name, changed, _ = LAWS.get(cell, (f"testbed:{name}", {}, 0.0))
+    size = {"budget": int(runs)} if stop is None or cell in MANY else {}
+    name, changed, _ = (LAWS | MANY).get(cell, (f"testbed:{name}", {}, 0.0))
     with tempfile.TemporaryDirectory() as folder:
         start, cpu = time.perf_counter(), time.process_time()
         result = sbt.run(
@@ -113,6 +142,10 @@ def one_sided(row: dict) -> bool:
     return any("bound is given" in w or "only bounded" in w for w in row["warnings"])
 
 
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else math.nan
+
+
 def show(rows: list[dict]) -> None:
     head = (
         "problem@runs", "seeds", "runs", "rel. RMSE", "bar", "mean error (std. error)", "median CoV", "half width / (1.96 RMSE)",
@@ -121,18 +154,19 @@ def show(rows: list[dict]) -> None:
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     every, ratios = [], []
     for cell in dict.fromkeys(row["cell"] for row in rows):
-        p = LAWS[cell][2] if cell in LAWS else truth(cell.partition("@")[0]).probability
+        p = (LAWS | MANY)[cell][2] if cell in LAWS | MANY else truth(cell.partition("@")[0]).probability
+        crude = f"{math.sqrt((1.0 - p) / p / int(cell.partition('@')[2])):.2f}" if cell in MANY else "-"
         mine = [row for row in rows if row["cell"] == cell]
-        error = np.array([row["probability"] / p - 1.0 for row in mine])
+        error = np.array([(row["probability"] or 0.0) / p - 1.0 for row in mine])
         covered = [row["low"] <= p <= row["high"] for row in mine]
         every += covered
         rmse = float(np.sqrt(np.mean(error**2)))
         half = np.median([0.5 * (row["high"] - row["low"]) for row in mine]) / p
         ratios.append(half / (1.96 * rmse))
         keys = ("runs", "cov", "undetected_mass_bound", "cpu")
-        runs, cov, undetected, cpu = (np.median([row[key] for row in mine if row[key] is not None]) for key in keys)
+        runs, cov, undetected, cpu = (_median([row[key] for row in mine if row[key] is not None]) for key in keys)
         print(
-            f"| {cell} | {len(mine)} | {runs:.0f} | {rmse:.3f} | {({**BARS, **HARD}).get(cell, '-')} | {error.mean():+.3f} "
+            f"| {cell} | {len(mine)} | {runs:.0f} | {rmse:.3f} | {({**BARS, **HARD}).get(cell, crude)} | {error.mean():+.3f} "
             f"({error.std(ddof=1) / np.sqrt(len(error)) if len(error) > 1 else math.nan:.3f}) | {cov:.3f} | {ratios[-1]:.1f} | "
             f"{sum(covered)} of {len(covered)} | {np.mean([one_sided(row) for row in mine]):.2f} | {undetected:.2f} | {cpu:.1f} |"
         )
@@ -147,9 +181,9 @@ def main() -> None:
     parser.add_argument("--problems", default=",".join((*BARS, *LAWS)))
     parser.add_argument("--cov", type=float, help="the stop rule; default: none, all runs of the cell are used")
     args = parser.parse_args()
-    cells = args.problems.split(",")
-    if unknown := set(cells) - {*BARS, *HARD, *LAWS}:
-        parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join((*BARS, *HARD, *LAWS))}")
+    cells = [*MANY] if args.problems == "many" else args.problems.split(",")
+    if unknown := set(cells) - {*BARS, *HARD, *LAWS, *MANY}:
+        parser.error(f"--problems: {', '.join(sorted(unknown))} is none of {', '.join((*BARS, *HARD, *LAWS, *MANY))}")
     jobs = [{"cell": cell, "seed": seed, "stop": args.cov} for seed in seeds(args) for cell in cells]
     rows = collect(args, jobs, campaign)
     show([row for cell in cells for row in rows if row["cell"] == cell])

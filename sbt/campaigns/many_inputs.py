@@ -68,7 +68,8 @@ class ManyInputsStage:
         why = SubsetStage(self.settings).stop(log)
         if why is not None and are_precise(log, self.settings, self.settings.stop.get("cov")):
             return "cov"
-        return why if len(log.history) >= self.settings.budget else None
+        of_once = log.iterations[1].read(EstimationProposal).level is None  # a store that ended here: nothing is added to it
+        return why if of_once or len(log.history) >= self.settings.budget else None
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch; on one thread, so that the machine does not decide the last digit."""

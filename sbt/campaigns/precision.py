@@ -64,7 +64,8 @@ def width(found: EstimationConclusion) -> float:
     if value <= 0.0:
         return 0.0
     error, half = (found.cov or 0.0) / PRECISE, 0.5 * (found.high - found.low) / (PRECISE * value)
-    return max(error, half / 2.0 if half > WIDEST else 0.0)
+    skewed = found.counted is None  # repeats of subset simulation: limits come together faster than runs grow
+    return max(error, half / 2.0 if half > WIDEST and not skewed else 0.0)
 
 
 def rounded(value: float) -> int:
