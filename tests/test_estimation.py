@@ -8,18 +8,20 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 from studies import run_loaded, settings_of
 from typer.testing import CliRunner
 
 import sbt
 from sbt.campaigns.counting import counted_batches
 from sbt.campaigns.gate import Limits, gate_verdict
+from sbt.campaigns.many_inputs import ManyInputsStage
 from sbt.campaigns.settings import Gate
 from sbt.cli import app
 from sbt.config.load import ConfigError, load, parse
@@ -179,6 +181,85 @@ def test_many_inputs_are_estimated_where_they_matter(tmp_path):
     found = on_testbed("linear_d30", tmp_path, budget=240, stop={"cov": None})["conclusion"]
     assert found["probability"] == pytest.approx(p, rel=0.1)
     assert found["low"] <= p <= found["high"]
+
+
+def _of_twenty(p: float, *, flag: bool = False) -> sbt.Scenario:
+    """Beyond a sphere in twenty normal inputs, with this probability: no few directions explain it."""
+    edge = float(chi2(20).isf(p))
+
+    def evaluate(values: dict[str, Any], seed: int) -> dict[str, float]:
+        m = edge - sum(float(v) ** 2 for v in values.values())
+        return {"m": (1.0 if m > 0 else -1.0) if flag else m}
+
+    inputs = [sbt.Parameter(f"x{k}", -9, 9, "", sbt.Normal(0, 1)) for k in range(20)]
+    return sbt.Scenario("sphere", inputs, sbt.Requirement("m", high=0.0), evaluate=evaluate, metrics=["m"])
+
+
+def _campaigns(scenario: sbt.Scenario, folder: Path, seeds: int, budget: int) -> list[Any]:
+    return [
+        sbt.run(
+            campaign="estimation", scenario=scenario, seed=seed, budget=budget, executor="serial", report=False,
+            store=str(folder / f"{seed}"),
+        ) for seed in range(seeds)
+    ]  # fmt: skip
+
+
+def test_many_inputs_are_no_worse_than_crude_monte_carlo(tmp_path):
+    """Subset simulation stated nothing in 14 of 50 such campaigns, had twice the error in the others, and stopped early."""
+    p, budget = 0.02, 300
+    found = _campaigns(_of_twenty(p), tmp_path, 10, budget)
+    error = np.array([(r.conclusion.probability or 0.0) / p - 1.0 for r in found])
+    assert np.sqrt(np.mean(error**2)) < 1.3 * math.sqrt((1.0 - p) / p / budget)
+    assert sum(r.conclusion.low <= p <= r.conclusion.high for r in found) >= 9
+    for r in found:
+        assert (len(r.frame), r.conclusion.counted) == (budget, budget)  # the first draws count, too
+        assert r.conclusion.hits == int(r.frame["critical"].sum())
+        assert "This trusts no search" in r.sentences()[1]
+        assert not any("chosen by results" in said for said in r.sentences())
+
+
+def test_common_critical_runs_of_many_inputs_end_by_the_stop_rule(tmp_path):
+    (found,) = _campaigns(_of_twenty(0.5), tmp_path, 1, 300)
+    assert found.conclusion.cov <= 0.1
+    assert found.conclusion.counted == len(found.frame) < 300
+
+
+def test_a_flag_of_many_inputs_has_no_levels(tmp_path):
+    """It would be crude Monte Carlo with a fifth of the runs."""
+    (found,) = _campaigns(_of_twenty(0.0005, flag=True), tmp_path, 1, 2000)
+    assert set(found.frame["stage"]) == {"random", "monte_carlo"}
+    assert found.conclusion.counted == 2000
+
+
+def test_rare_critical_runs_of_many_inputs_take_subset_simulation_and_the_whole_budget(tmp_path):
+    """Crude Monte Carlo with as many runs would have an error of 1.6 P; subset simulation once ended with runs left."""
+    p = 0.0002
+    (found,) = _campaigns(_of_twenty(p), tmp_path, 1, 2000)
+    counts = found.frame["stage"].value_counts()
+    assert counts["subset"] > 500
+    assert counts["random"] >= 333  # the trial, and what subset simulation left
+    assert len(found.frame) == 2000
+    assert 0.2 * p < found.conclusion.probability < 4.0 * p
+    assert found.conclusion.low <= p <= found.conclusion.high < 0.01
+    random = counts["random"] + counts["subset level 0"]
+    assert found.conclusion.undetected_mass_bound == pytest.approx(1.0 - 0.05 ** (1.0 / random))
+
+
+@pytest.mark.parametrize(
+    ("hits", "says"), [((0, 0), (False, False)), ((1, 0), (False, True)), ((0, 2), (True, False)), ((1, 1), (True, True))]
+)
+def test_no_draw_decides_whether_it_counts_itself(hits, says):
+    """A half of the first draws counts where the other half has critical runs."""
+    s = SimpleNamespace(
+        budget=2000, scenario=SimpleNamespace(
+            space=SimpleNamespace(constraints=()), requirement=SimpleNamespace(margins=lambda history: history)
+        ),
+    )  # fmt: skip
+    margin = np.random.default_rng(0).random(332) + 0.1
+    margin[: hits[0]] = margin[166 : 166 + hits[1]] = -1.0
+    stage, log = ManyInputsStage(cast(Any, s)), cast(Any, SimpleNamespace(history=margin))
+    assert stage.trial(log) == says
+    assert ManyInputsStage(cast(Any, SimpleNamespace(**{**vars(s), "budget": 1000}))).trial(log) == (True, True)
 
 
 def test_subset_simulation_says_when_it_was_too_short(tmp_path):

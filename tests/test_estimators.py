@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 from scipy.special import gammaincinv, log_ndtr, ndtr
-from scipy.stats import binomtest
+from scipy.stats import binomtest, chi2
 
 from sbt.campaigns.pools import Frame, draw_pool, fit_proposal
 from sbt.campaigns.stopping import spared
@@ -22,7 +22,7 @@ from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch
 from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
 from sbt.estimators.mixture import Mixture, Near, Normals, fit_mixture, particles, wide_scales
 from sbt.estimators.monte_carlo import Proportion
-from sbt.estimators.subset import SubsetRun, combine_repeats
+from sbt.estimators.subset import SubsetRun, combine_repeats, has_levels, next_levels
 from sbt.estimators.subspace import find_subspace, inputs_that_matter
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.seeds import stream
@@ -409,8 +409,56 @@ def test_subset_simulation_is_unbiased_where_values_are_equal(margin):
     assert abs(spread.value - truth) < 3 * spread.std_error + 0.1 * truth < 0.6 * truth
 
 
+def _repeats(n: int, margin, seed: int, most: int = 10**6) -> list[SubsetRun]:
+    """Five repeats in 20 inputs that set each other's levels, until they end or the next step needs more than `most` runs."""
+    repeats, spent = [SubsetRun(n, 20, alone=False) for _ in range(5)], 0
+    rngs = [stream(seed, "others", k) for k in range(5)]
+    while (width := sum(r.width for r in repeats if r.asks)) and spent + width <= most:
+        z = [r.ask(rng) if r.asks else None for r, rng in zip(repeats, rngs, strict=True)]
+        told = [r if at is None else r.tell(at, margin(at)) for r, at in zip(repeats, z, strict=True)]
+        repeats, spent = next_levels(told), spent + width
+    return repeats
+
+
+@pytest.mark.parametrize(
+    ("margin", "p"),
+    [
+        (lambda z: chi2(20).isf(1e-3) - (z**2).sum(axis=1), 1e-3),
+        (lambda z: 3.0 - np.floor(z.sum(axis=1) / math.sqrt(20)), float(ndtr(-3.0))),
+    ],
+    ids=["sphere", "whole"],
+)
+def test_levels_that_other_repeats_set_leave_no_bias(margin, p):
+    """With 80 points a level, own levels gave 1.35 times the truth of the first one."""
+    groups = [combine_repeats([r.estimate for r in _repeats(80, margin, seed)]) for seed in range(100)]
+    spread = combine_repeats([g.value for g in groups])
+    assert abs(spread.value - p) < 2.5 * spread.std_error < 0.25 * p
+    assert np.mean([g.limit(0.975, side=-1) <= p <= g.limit(0.975, side=1) for g in groups]) >= 0.9
+
+
+def test_repeats_that_the_budget_cuts_off_state_their_last_full_levels():
+    """A tenth of the fourth level is critical; the budget is that of three, or of two where one took longer."""
+    p = 2e-4
+
+    def margin(z):
+        return chi2(20).isf(p) - (z**2).sum(axis=1)
+
+    found = [_repeats(80, margin, seed, most=1200) for seed in range(60)]
+    assert np.mean([r.finished for repeats in found for r in repeats]) < 0.1  # few, that none of their points went on from
+    spread = combine_repeats([r.estimate for repeats in found for r in repeats])
+    assert abs(spread.value - p) < 2.5 * spread.std_error < 0.6 * p
+
+
+def test_what_has_no_levels():
+    assert has_levels(np.arange(100.0))
+    assert has_levels(np.r_[np.arange(1.0, 8.0), np.full(93, 9.0)])  # the next lower value is one
+    for margin in (np.ones(100), np.full(100, np.nan), np.r_[np.arange(1.0, 3.0), np.full(98, 9.0)], np.full(100, np.inf)):
+        assert not has_levels(margin)
+
+
 def test_subset_simulation_ends_on_a_plateau_and_without_a_run():
     for margin in (np.ones(100), np.full(100, np.nan)):
+        assert all(r.finished and r.share == 0.0 for r in _repeats(100, lambda z, given=margin: given[: len(z)], 1))
         repeat = SubsetRun(100, 3)
         for _ in range(300):
             if repeat.finished:

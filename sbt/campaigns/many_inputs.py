@@ -87,10 +87,10 @@ class ManyInputsStage:
         axes = self._axes(log) if log.iteration == 1 else log.iterations[1].read(EstimationProposal).axes
         if axes is not None:
             return self._drawn(log, axes)
-        counts = self._trial(log)
+        counts = self.trial(log)
         return self._crude(log, counts) if any(counts) else SubsetStage(self.settings).propose(log)
 
-    def _trial(self, log: Log) -> tuple[bool, bool]:
+    def trial(self, log: Log) -> tuple[bool, bool]:
         """Return which halves of the first runs count with crude Monte Carlo: each as the other one says; none: not chosen."""
         s = self.settings
         if points_a_level(s.budget - len(log.history)) < _FEWEST_POINTS or s.scenario.space.constraints:
