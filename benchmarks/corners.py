@@ -1,6 +1,7 @@
 """Campaigns in corners: chains of subset simulation on equal values, large batches, failures by chance, waves, idle choices.
 
     python benchmarks/corners.py ties [--seeds 300]
+    python benchmarks/corners.py many [--seeds 300]
     python benchmarks/corners.py batches [--seeds 16]
     python benchmarks/corners.py chance [--seeds 30]
     python benchmarks/corners.py waves [--seeds 12]
@@ -8,10 +9,12 @@
     python benchmarks/corners.py idle [--seeds 12]
 
 `ties` repeats one subset simulation of 200 points a level on a plane in two and ten normal inputs whose margin is rounded or cut
-off. `batches` runs campaigns on P(x >= 2) of a normal x beside a second input that moves the edge, or makes the metric jump.
-`chance` has a smooth region of P = .001, and a sixth of the space where one seed in ten fails, which no metric shows, with a gate
-of .012; `waves` a deterministic metric with seven periods along an input. `sometimes` are falsifications of 100 runs where the
-conflict arises with some seeds only; `idle` such of wells beside choices that change nothing.
+off. `many` is what campaigns with many inputs do where no few directions explain the metric, without the store: the choice
+between crude Monte Carlo and subset simulation, and both. `batches` runs campaigns on P(x >= 2) of a normal x beside a second
+input that moves the edge, or makes the metric jump. `chance` has a smooth region of P = .001, and a sixth of the space where one
+seed in ten fails, which no metric shows, with a gate of .012; `waves` a deterministic metric with seven periods along an input.
+`sometimes` are falsifications of 100 runs where the conflict arises with some seeds only; `idle` such of wells beside choices
+that change nothing.
 """
 
 from __future__ import annotations
@@ -22,9 +25,15 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.special import ndtr
+from scipy.stats import chi2, norm
 
 import sbt
-from sbt.estimators.subset import SubsetRun
+from sbt.campaigns.crude import points_a_level
+from sbt.campaigns.gate import Limits
+from sbt.campaigns.many_inputs import halves_that_count
+from sbt.campaigns.repeated import limits_by_repeats
+from sbt.estimators.monte_carlo import Proportion
+from sbt.estimators.subset import SubsetRun, combine_repeats, next_levels
 from sbt.seeds import stream
 
 MARGINS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -57,6 +66,65 @@ def ties(seeds: int) -> None:
                 shares.append(repeat.share / float(ndtr(-3.0)))
             mean, std = np.mean(shares), np.std(shares)
             print(f"| {d} | {name} | {mean:.2f} ({std / np.sqrt(seeds):.2f}) | {std:.2f} | {runs / seeds:.0f} |", flush=True)
+
+
+def _by_repeats(margin, d: int, budget: int, rng: np.random.Generator) -> tuple[list[SubsetRun], int, int]:
+    """Return five repeats within the budget, how many runs they took, and critical ones of their first level."""
+    repeats, spent, hits = [SubsetRun(points_a_level(budget), d, alone=False) for _ in range(5)], 0, 0
+    while (width := sum(r.width for r in repeats if r.asks)) and spent + width <= budget:
+        told = []
+        for r in repeats:
+            z = r.ask(rng) if r.asks else None
+            y = None if z is None else margin(z)
+            hits += int((y <= 0).sum()) if y is not None and r.levels == 0 else 0
+            told.append(r if z is None else r.tell(z, y))
+        repeats, spent = next_levels(told), spent + width
+    return repeats, spent, hits
+
+
+def _campaign(margin, d: int, budget: int, rng: np.random.Generator) -> tuple[float, Limits, bool]:
+    """Return estimate, limits, and whether it is crude Monte Carlo."""
+    first = margin(rng.standard_normal((min(max(budget // 6, 3 * d), budget // 2), d)))
+    left, counts = budget - len(first), halves_that_count(first, budget)
+    if any(counts):
+        kept = [half for half, counted in zip(np.array_split(first, 2), counts, strict=True) if counted]
+        y = np.concatenate([*kept, margin(rng.standard_normal((left, d)))])
+        share = Proportion(len(y), int((y <= 0).sum()))
+        return share.value, Limits(share.lower, share.upper), True
+    repeats, spent, hits = _by_repeats(margin, d, left, rng)
+    rest = margin(rng.standard_normal((left - spent, d)))
+    hits += int((first <= 0).sum() + (rest <= 0).sum())
+    share = Proportion(len(first) + 5 * repeats[0].n + len(rest), hits)
+    found = combine_repeats([r.estimate for r in repeats])
+    if found.value == 0.0:
+        return share.value, Limits(share.lower, share.upper), False
+    limits = limits_by_repeats(found, share)
+    reached = all(r.finished for r in repeats) or all(r.estimate > 0.0 for r in repeats)
+    return found.value, limits if reached else Limits(limits.lower, share.upper), False
+
+
+def many(seeds: int) -> None:
+    print("| problem | P | runs | crude chosen | RMSE / P | crude | mean error (std. error) | covered | half width / P |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for budget in (300, 2000, 4000):
+        for p in (0.2, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0002, 0.00003):
+            edge, plane, top = chi2(20).isf(p), norm.isf(p), norm.isf(1.0 - (1.0 - p) ** (1.0 / 20))
+            problems = {
+                "sphere 20": (20, lambda z, edge=edge: edge - (z**2).sum(axis=1)),
+                "largest of 20": (20, lambda z, top=top: top - z.max(axis=1)),
+                "plane 80": (80, lambda z, plane=plane: plane - z.sum(axis=1) / np.sqrt(80)),
+            }
+            for name, (d, margin) in problems.items():
+                rows = [_campaign(margin, d, budget, stream(k, "corners", "many", name)) for k in range(seeds)]
+                error = np.array([value / p - 1.0 for value, _, _ in rows])
+                ends = [(limits.lower(0.975), limits.upper(0.975)) for _, limits, _ in rows]
+                print(
+                    f"| {name} | {p:g} | {budget} | {np.mean([row[2] for row in rows]):.2f} | {np.sqrt(np.mean(error**2)):.2f} | "
+                    f"{np.sqrt((1.0 - p) / p / budget):.2f} | {error.mean():+.3f} ({error.std() / np.sqrt(seeds):.3f}) | "
+                    f"{np.mean([low <= p <= high for low, high in ends]):.3f} | "
+                    f"{np.median([0.5 * (high - low) / p for low, high in ends]):.2f} |",
+                    flush=True,
+                )  # fmt: skip
 
 
 def batches(seeds: int) -> None:
@@ -191,7 +259,7 @@ def idle(seeds: int) -> None:
         print(f"| {choices or 'none'} | 2 | {told} | {met} |", flush=True)
 
 
-CORNERS = {"ties": ties, "batches": batches, "chance": chance, "waves": waves, "sometimes": sometimes, "idle": idle}
+CORNERS = {"many": many, "ties": ties, "batches": batches, "chance": chance, "waves": waves, "sometimes": sometimes, "idle": idle}
 
 
 def main() -> None:

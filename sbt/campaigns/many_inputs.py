@@ -37,7 +37,7 @@ from sbt.problem.arrays import Points, Vector
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
 
-__all__ = ["ManyInputsStage", "took_subset"]
+__all__ = ["ManyInputsStage", "halves_that_count", "took_subset"]
 
 _FIRST, _ROWS_AN_INPUT = 6, 3
 """The first batch: a sixth of the budget, at least three rows an input, at most half of the budget."""
@@ -87,21 +87,14 @@ class ManyInputsStage:
         axes = self._axes(log) if log.iteration == 1 else log.iterations[1].read(EstimationProposal).axes
         if axes is not None:
             return self._drawn(log, axes)
-        counts = self.trial(log)
+        counts = self._trial(log)
         return self._crude(log, counts) if any(counts) else SubsetStage(self.settings).propose(log)
 
-    def trial(self, log: Log) -> tuple[bool, bool]:
-        """Return which halves of the first runs count with crude Monte Carlo: each as the other one says; none: not chosen."""
+    def _trial(self, log: Log) -> tuple[bool, bool]:
+        """Return which halves of the first runs count with crude Monte Carlo; none: it is not chosen."""
         s = self.settings
-        if points_a_level(s.budget - len(log.history)) < _FEWEST_POINTS or s.scenario.space.constraints:
-            return True, True
-        first, second = (self._prefers_crude(half) for half in np.array_split(s.scenario.requirement.margins(log.history), 2))
-        return second, first
-
-    @staticmethod
-    def _prefers_crude(margin: Vector) -> bool:
-        """Return whether critical runs are common among these, or nothing tells of most runs how far they are from critical."""
-        return (margin <= 0).sum() >= max(math.ceil(_COMMON * len(margin)), 1) or not has_levels(margin)
+        margin = s.scenario.requirement.margins(log.history)
+        return (True, True) if s.scenario.space.constraints else halves_that_count(margin, s.budget)
 
     def _crude(self, log: Log, counts: tuple[bool, bool] | None = None) -> Batch:
         """Return draws that count from the inputs' distribution; `counts`: the halves of the first ones that do."""
@@ -173,6 +166,24 @@ class ManyInputsStage:
         shares = BLIND if not hit.any() or hit.all() else SHARES
         frame = Frame(wide_scales(np.zeros(v.shape[1])), lift=subspace.lift)
         return frame, fit_proposal(s.scenario.space, frame, learned, v[hit], shares, rng), shares
+
+
+def halves_that_count(margin: Vector, budget: int) -> tuple[bool, bool]:
+    """Return which halves of the first runs count with crude Monte Carlo: each as the other one says; none: not chosen.
+
+    Args:
+        margin: (n,) distances of these runs to the critical interval, NaN of failed ones.
+        budget: of the campaign, runs.
+    """
+    if points_a_level(budget - len(margin)) < _FEWEST_POINTS:
+        return True, True
+    first, second = (_prefers_crude(half) for half in np.array_split(margin, 2))
+    return second, first
+
+
+def _prefers_crude(margin: Vector) -> bool:
+    """Return whether critical runs are common among these, or nothing tells of most runs how far they are from critical."""
+    return (margin <= 0).sum() >= max(math.ceil(_COMMON * len(margin)), 1) or not has_levels(margin)
 
 
 def took_subset(log: Log) -> bool:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from sbt.campaigns.crude import FIRST_LEVEL, nominal_proportion, repeats_of
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.settings import Settings
-from sbt.estimators.subset import combine_repeats
+from sbt.estimators.monte_carlo import Proportion
+from sbt.estimators.subset import RepeatedEstimate, combine_repeats
 from sbt.loop.stages import Log
 from sbt.problem.plain import Json
 
-__all__ = ["NOTHING_CRITICAL", "are_precise", "told_by_repeats"]
+__all__ = ["NOTHING_CRITICAL", "are_precise", "limits_by_repeats", "told_by_repeats"]
 
 NOTHING_CRITICAL = (
     "no draw that counts was critical: the probability is only bounded from above, by draws from the inputs' distribution"
@@ -23,6 +24,12 @@ def are_precise(log: Log, settings: Settings, target: float | None) -> bool:
         return False
     found = combine_repeats([r.estimate for r in repeats])
     return 0.0 < found.std_error <= target * found.value
+
+
+def limits_by_repeats(found: RepeatedEstimate, first: Proportion | None) -> Limits:
+    """Return the limits by the repeats, or those of draws from the inputs' distribution, with half of the error, if nearer."""
+    limits = Limits(lambda c: found.limit(c, side=-1), lambda c: found.limit(c, side=1))
+    return limits if first is None else limits.within(Limits(first.lower, first.upper), found.value, found.value)
 
 
 def told_by_repeats(log: Log, settings: Settings, confidence: float) -> tuple[float | None, Limits, Json]:
@@ -50,9 +57,8 @@ def told_by_repeats(log: Log, settings: Settings, confidence: float) -> tuple[fl
         limits = Limits(lambda _: 0.0, first.upper)
         return None if cut else 0.0, limits, rest | {"exact_bound": limits.upper(confidence), "warnings": (said,)}
     failed, reached = bool((~log.history.ok).any()), not cut or all(r.estimate > 0.0 for r in repeats)
-    limits = Limits(lambda c: found.limit(c, side=-1), lambda c: found.limit(c, side=1))
-    if not settings.scenario.space.constraints:
-        limits = limits.within(Limits(first.lower, first.upper), found.value, found.value)
+    plain = None if settings.scenario.space.constraints else first
+    limits = limits_by_repeats(found, plain)
     if failed or not reached:
         limits = Limits(limits.lower, lambda c: max(first.upper(c), found.value))
     warnings = ["the interval is that of repeats: it cannot see a region that no chain has met"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sbt.campaigns.combinations import none_left
-from sbt.campaigns.counting import random_draws
+from sbt.campaigns.counting import RANDOM, random_draws
 from sbt.campaigns.gate import CONDITION
 from sbt.campaigns.lost import (
     decides_bound,
@@ -276,6 +276,7 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     elif found.probability is None:
         said = f"The probability of {subject} is not known yet: no draw counts"
         how = "only fill the space" if (facts.history.stage == "initial").all() else "were chosen by results"
+        how = "only taught, or were chosen by results" if (facts.history.stage == RANDOM).any() else how
         silent = f"The critical runs so far {how}, so their share is no estimate"
     else:
         ends = f"{confidence} interval {number(found.low, 3)} to {number(found.high, 3)}"
