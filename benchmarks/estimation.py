@@ -20,6 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from resumed import arguments, collect, seeds
 from scipy.integrate import quad
+from scipy.special import ndtri
 from scipy.stats import chi2, gamma, norm
 from scipy.stats import t as student_t
 
@@ -103,7 +104,7 @@ def _many(kind: str, d: int, p: float) -> sbt.Scenario:
         top = z.max()
         by = {
             "sphere": (z**2).sum(), "linear": z.sum() / math.sqrt(d), "max": top, "flag": edge + (1 if top > edge else -1),
-            "noise": z[0] + np.random.default_rng(seed).standard_normal(),
+            "noise": z[0] + ndtri(np.random.default_rng(seed).random()),
         }  # fmt: skip
         return {"m": float(edge - by[kind])}
 
@@ -112,8 +113,8 @@ def _many(kind: str, d: int, p: float) -> sbt.Scenario:
 
 
 _CASES = [
-    *(("sphere", 20, p, 300) for p in (0.5, 0.2, 0.02)), ("max", 20, 0.027, 300), ("flag", 20, 0.05, 300),
-    ("noise", 20, 0.08, 300),
+    *(("sphere", 20, p, 300) for p in (0.5, 0.2, 0.0198)), ("max", 20, 0.0267, 300), ("flag", 20, 0.05, 300),
+    ("noise", 20, 0.079, 300),
     *(("sphere", 20, p, runs) for runs in (300, 1000, 2000) for p in (0.001, 0.0002)), ("sphere", 20, 0.005, 2000),
     *(("linear", d, p, runs) for d in (20, 30, 80) for runs in (300, 1000, 2000) for p in (0.001, 0.0002)),
 ]  # fmt: skip
