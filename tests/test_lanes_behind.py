@@ -97,6 +97,6 @@ def test_a_body_that_was_moved_is_on_the_lanes_behind_it(tmp_path: Path, crossin
 
 def test_beyond_the_begin_of_its_route_a_body_is_straight(tmp_path: Path, crossing: str):
     vehicles = '<vType id="longer" length="18" width="2.5"/>' + vehicle("o", "me", "longer", departPos=3, departSpeed=0)
-    vehicles += vehicle("ego", "nm ms", departPos=100, departSpeed=0)
+    vehicles += vehicle("ego", "nm ms", departPos=150, departSpeed=0)
     parts = simulation(tmp_path, crossing, vehicles, deaf("o", "ego"), 1.0, step_length="0.1")({}, 1).actor("o").parts
     assert [part.heading[0] for part in parts] == [0.0] * 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +114,7 @@ def test_failed_combinations_widen_the_interval_by_their_probability(tmp_path):
     said = result.conclusion
     known = truth() - KINDS["tram"] * sum(p for n, p in lanes().items() if margin({"kind": "tram", "lane": n}) <= 0)
     assert (said.failed_as_safe, said.failed_as_critical) == pytest.approx((known, known + KINDS["tram"]), rel=1e-9)
+    assert "exact" not in result.sentences()[0]  # what fails has no outcome, however often it is run
     assert known - 0.1 < said.low < known < known + KINDS["tram"] < said.high < known + KINDS["tram"] + 0.1
 
 
@@ -154,3 +156,12 @@ def test_limits_of_noisy_sums_cover():
             found = Summed(share, share, 0.0, 4, True)
             missed += found.lower(0.975) > p @ rate, found.upper(0.975) < p @ rate
         assert (missed / 600 < 0.035).all()
+
+
+def test_a_sum_says_how_many_runs_make_it_precise_and_its_sensitivities_have_an_error(tmp_path):
+    result = campaign(tmp_path, budget=24)
+    (advice,) = (said for said in result.sentences() if said.startswith("Next:"))
+    asked = int(re.search(r"budget: ([\d,]+)", advice)[1].replace(",", ""))
+    enough = campaign(tmp_path / "enough", budget=2 * asked)
+    assert 0.5 * asked < len(enough.history) < 1.5 * asked
+    assert (result.sensitivity()["std_error"] > 0.0).all()

@@ -18,7 +18,7 @@ from sbt.campaigns.crude import nominal_rows
 from sbt.campaigns.known import Known
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
-from sbt.campaigns.summing import counted_with, summed, took_sum
+from sbt.campaigns.summing import counted_with, took_sum
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores, log_normal
 from sbt.estimators.events import events
@@ -66,7 +66,6 @@ class Reused:
         critical, safe: runs of the whole campaign where the new distribution has mass.
         warm_up: (n,) that each draw began with, -1 without one.
         least: effective sample size below which the draws say nothing.
-        exact: all combinations of inputs were run, and no noise was met: sums have no error.
         taught: further draws from the campaign's distribution, which taught and do not count.
         met: of all draws from the campaign's distribution, those that were critical or failed.
         known: different inputs of critical runs.
@@ -83,7 +82,6 @@ class Reused:
     safe: int
     warm_up: Vector
     least: float
-    exact: bool = False
     taught: int = 0
     met: int = 0
     known: int = 0
@@ -131,15 +129,9 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         space, batches, worst, int((~history.ok[every]).sum()), nominal,
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
-        history.columns["warm_up"][every], least, took_sum(log) and _exact(log, settings),
+        history.columns["warm_up"][every], least,
         seen.draws - round(float(nominal.sum())) if not plainly else 0, seen.hits + seen.failed, seen.known,
     )  # fmt: skip
-
-
-def _exact(log: Log, settings: Settings) -> bool:
-    """Return whether every combination was run, by a simulator without noise."""
-    found = summed(log, settings)
-    return found.missing == 0.0 and not found.noisy
 
 
 def _least(drawn: History, old: ParameterSpace, space: ParameterSpace) -> float:

@@ -180,4 +180,4 @@ def _combined(found: Reused, batches: list[CountedBatch]) -> tuple[float, float]
     if found.crude:
         return batches[0].value, float((batches[0].errors ** 2).sum() + batches[0].pool_variance) ** 0.5
     combined = combine_estimates(batches)
-    return combined.value, 0.0 if found.exact else combined.std_error
+    return combined.value, combined.std_error

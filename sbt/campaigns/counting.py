@@ -69,7 +69,7 @@ def with_event(batch: CountedBatch, stated: EventDraws) -> CountedBatch:
     """Return a batch with what the metamodel states of another event of its draws."""
     return replace(
         batch, prior=stated.probability, anticipated=stated.anticipated, pool_variance=stated.pool_variance,
-        control_variate=np.array(stated.pi), by_warm_up=_array(stated.by_warm_up),
+        control_variate=np.array(stated.pi), by_warm_up=_array(stated.by_warm_up) if stated.by_warm_up else batch.by_warm_up,
     )  # fmt: skip
 
 

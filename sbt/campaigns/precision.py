@@ -13,7 +13,7 @@ from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 if TYPE_CHECKING:
     from sbt.campaigns.estimation import EstimationConclusion
 
-__all__ = ["NO_BETTER", "PRECISE", "as_many_draws", "cautions", "rounded", "runs_for_precision", "too_wide", "width"]
+__all__ = ["NO_BETTER", "PRECISE", "always_agree", "cautions", "more_runs", "rounded", "too_wide", "width"]
 
 PRECISE = 0.1
 """Coefficient of variation that is asked for by default."""
@@ -23,7 +23,27 @@ _HEAVY = 0.25  # of the estimate: what one draw may move it by before the reader
 _FAR = 100.0  # times the runs there are, beyond which a number of runs that would be enough is a guess
 
 
-def as_many_draws(found: EstimationConclusion, n: int) -> str:
+def always_agree(found: EstimationConclusion) -> bool:
+    """Return whether runs of equal inputs always ended alike, with values that show noise."""
+    noise = found.simulator_noise
+    return noise is not None and noise.noisy is False and noise.silent is None and noise.lost is None
+
+
+def more_runs(found: EstimationConclusion, n: int) -> str:
+    """Return how many more runs than n give an estimate its precision, whose error is too large.
+
+    What runs of a sum over combinations may miss, as long as they agree, falls with their number; other errors with its root.
+    """
+    if found.combinations is not None and found.probability and always_agree(found):
+        total = rounded(max(-math.log(0.025) / (2.0 * PRECISE * found.probability), n + 1.0))
+        more = f"about {rounded(total - n):,} more runs (budget: {total:,})"
+        return f"{more}, which repeat combinations, give it to \N{PLUS-MINUS SIGN}20 % (95 %)"
+    counted, known, narrow = found.counted or n, bool(found.probability), bool(found.probability) and width(found) <= 1.0
+    more = _runs_for_precision(counted * (too_wide(found) ** 2 - 1.0), n or counted, known=known, narrow=narrow)
+    return more + _as_many_draws(found, n)
+
+
+def _as_many_draws(found: EstimationConclusion, n: int) -> str:
     """Return the advice to draw from the inputs' distribution alone, where the upper end would be much lower by as many runs."""
     if n == 0 or not found.probability or found.probability >= 1.0:
         return ""
@@ -32,7 +52,7 @@ def as_many_draws(found: EstimationConclusion, n: int) -> str:
     return better if found.high > NO_BETTER * crude else ""
 
 
-def runs_for_precision(more: float, made: int, *, known: bool, narrow: bool = False) -> str:
+def _runs_for_precision(more: float, made: int, *, known: bool, narrow: bool = False) -> str:
     """Return how many more runs, beside those that were made, give the estimate its precision.
 
     Args:

@@ -24,7 +24,7 @@ from sbt.campaigns.lost import (
     why_they_fail,
 )  # fmt: skip
 from sbt.campaigns.modes import most_often, single
-from sbt.campaigns.precision import NO_BETTER, PRECISE, as_many_draws, rounded, runs_for_precision, too_wide, width
+from sbt.campaigns.precision import NO_BETTER, PRECISE, always_agree, more_runs, rounded, too_wide
 from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
@@ -280,7 +280,7 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         silent = f"The critical runs so far {how}, so their share is no estimate"
     else:
         ends = f"{confidence} interval {number(found.low, 3)} to {number(found.high, 3)}"
-        if every and _agree(found):
+        if every and always_agree(found) and found.failed_as_critical in (None, found.probability):
             ends += ", exact if the simulator is deterministic"
         said = f"The probability of {subject} is {number(found.probability, 3)} ({ends})"
         if found.counted and not found.hits and found.combinations is None:
@@ -288,12 +288,6 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
             said = f"The probability of {subject} is at most {number(found.high, 3)} ({confidence} interval from 0): {guess}"
         silent = _not_told(found, facts, every)
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
-
-
-def _agree(found: EstimationConclusion) -> bool:
-    """Return whether runs of equal inputs always ended alike, with values that show noise."""
-    noise = found.simulator_noise
-    return noise is not None and noise.noisy is False and noise.silent is None and noise.lost is None
 
 
 def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
@@ -312,7 +306,7 @@ def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
     if every:
         silent = "This is a sum over all combinations: none is unseen"
         silent += ", and what seeds may decide is in its interval"
-        silent += ", though no repeat came out otherwise" if _agree(found) else ""
+        silent += ", though no repeat came out otherwise" if always_agree(found) else ""
     elif found.low == 0.0 and found.hits:
         traffic, why = found.warmed_traffic, "of unequal weight"
         why = "of so few warm-ups" if traffic is not None and traffic.decides(found.cov, p) else why
@@ -356,13 +350,11 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
         ends = f", with stop: {{cov: null}} as the campaign ends at {percent(PRECISE)} of the estimate otherwise"
         ends = ends if found.cov is not None and found.cov <= PRECISE else ""
         return f"a larger budget than {n:,} runs{ends}: it narrows the interval until it lies on one side of the gate"
-    wide, counted = too_wide(found), found.counted or n
+    wide = too_wide(found)
     if wide > 1.0 and traffic is not None and by_traffic:
         return _more_warm_ups(max(traffic.warm_ups, there))
-    if wide > 1.0 and counted:
-        known, narrow = bool(found.probability), bool(found.probability) and width(found) <= 1.0
-        more = runs_for_precision(counted * (wide**2 - 1.0), n or counted, known=known, narrow=narrow)
-        return more + as_many_draws(found, n)
+    if wide > 1.0 and (found.counted or n):
+        return more_runs(found, n)
     return _where_narrow(found)
 
 

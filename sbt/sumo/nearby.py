@@ -41,20 +41,30 @@ class Nearby:
     def __init__(self, sumo: Any, ego: str, within: float):
         self._sumo, self._ego, self._within = sumo, ego, within
         self._domain: Any = sumo.vehicle
-        self._size = self._breadth = 0.0
+        self._size = self._breadth = self._longest = 0.0
+        self._subscribed = False
+        self._sizes: dict[str, tuple[float, float]] = {}
         self._own: _Ends = [], 0.0
         self.very_long: dict[str, float] = {}
 
     def depart(self, name: str, length: float) -> None:
         """Note a vehicle of this length (m)."""
-        if length > _VERY_LONG:
+        if length > (self._longest if self._subscribed else _VERY_LONG):
             self.very_long[name] = length
+        else:
+            self._longest = max(self._longest, length)
+
+    def forget(self, name: str) -> None:
+        """Forget a vehicle that has left: another one may have its name."""
+        self.very_long.pop(name, None)
+        self._sizes.pop(name, None)
 
     def subscribe(self, *, walks: bool) -> None:
         """Subscribe to the surroundings of the ego, which has just departed; walks: it is a person."""
         self._domain, ego = self._sumo.person if walks else self._sumo.vehicle, self._ego
         self._size, self._breadth = self._domain.getLength(ego), 0.5 * self._domain.getWidth(ego)
-        reach = self._within + self._size + _VERY_LONG + _WIDTHS + _APART
+        self._subscribed = True
+        reach = self._within + self._size + self._longest + _WIDTHS + _APART
         self._domain.subscribeContext(ego, _VEHICLES, reach, _KNOWN)
         self._domain.subscribeContext(ego, _PERSONS, reach, (*_KNOWN, VEHICLE))
 
@@ -67,20 +77,21 @@ class Nearby:
 
     def around(self, own: _Variables) -> None:
         """Take the ego to have these variables in this step."""
-        self._own = _ends(own, self._size)
+        self._own = _ends(own, self._size, self._within)
 
     def is_near(self, name: str, variables: _Variables) -> bool:
         """Return whether the body of a road user may be within the radius around that of the ego."""
         apart = math.dist(self._own[0][0], variables[POSITION][:2])
         if name == self._ego or apart <= self._within:
             return True
-        if apart > self._within + self._size + self.very_long.get(name, _VERY_LONG) + _WIDTHS:
-            return False
-        domain = self._sumo.person if VEHICLE in variables else self._sumo.vehicle
-        return self._is_body_near(variables, domain.getLength(name), domain.getWidth(name))
+        size = self._sizes.get(name)
+        if size is None:
+            domain = self._sumo.person if VEHICLE in variables else self._sumo.vehicle
+            size = self._sizes[name] = domain.getLength(name), domain.getWidth(name)
+        return apart <= self._within + self._size + size[0] + _WIDTHS and self._is_body_near(variables, *size)
 
     def _is_body_near(self, variables: _Variables, length: float, width: float) -> bool:
-        (own, slack), (ends, more) = self._own, _ends(variables, length)
+        (own, slack), (ends, more) = self._own, _ends(variables, length, self._within)
         reach = self._within + slack + more + self._breadth + 0.5 * width
         nearest = min(math.dist(a, b) for a in own for b in ends)  # of the bodies' sides no point is nearer than so
         return nearest <= math.hypot(reach, 0.5 * (self._size + length))
@@ -92,9 +103,12 @@ class Nearby:
         return (n for n, length in self.very_long.items() if n not in near and math.dist(at(n), own) <= reach + length)
 
 
-def _ends(variables: _Variables, length: float) -> _Ends:
+def _ends(variables: _Variables, length: float, within: float) -> _Ends:
+    """Return the ends of a body, straight behind its front, and how far it may be beyond them, in a bend.
+
+    A radius (m) of twice its length or more takes it for straight: with a smaller one no body that touches is missed.
+    """
     x, y = variables[POSITION][:2]
-    if length > LONGEST_RIGID:
-        return [(x, y)], length
     angle = math.radians(variables[ANGLE])
-    return [(x, y), (x - length * math.sin(angle), y - length * math.cos(angle))], 0.0
+    ends = [(x, y), (x - length * math.sin(angle), y - length * math.cos(angle))]
+    return ends, max(length - 0.5 * within, 0.0) if length > LONGEST_RIGID else 0.0

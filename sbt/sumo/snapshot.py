@@ -173,7 +173,7 @@ def snapshot_of(
     _check_sorted(files, moving)
     moving.sort(key=lambda each: each[0])
     before = tuple(piece for time, piece in moving if time < end)
-    if not before:
+    if not before and until is None:
         raise NoSnapshot(f"nothing departs before t = {end:g} s: there is no traffic to warm up")
     _check_kept(before)
     if asked is None and until is None:
@@ -302,18 +302,28 @@ def _departures(piece: Piece, space: ParameterSpace) -> tuple[float, float]:
     ends = np.array(list(itertools.product((0.0, 0.5, 1.0), *[(0.0, 1.0)] * (min(len(used), _ENDS) - 1))))
     ends = np.pad(ends, ((0, 0), (0, len(used) - ends.shape[1])), constant_values=0.5)
     box = stream(0, "departures").random((_WITHIN, len(used)))
-    u, width, earliest, latest, best = np.vstack([ends, ends[:, ::-1], box]), 1.0, math.inf, -math.inf, box[0]
-    for _ in range(_ROUNDS):
-        times = _departures_at(piece, space, used, u)
-        if times.min() < earliest:
-            earliest, best = float(times.min()), u[times.argmin()]
-        latest, width = max(latest, float(times.max())), 0.25 * width
-        u = np.clip(best + width * (box - 0.5), 0.0, 1.0)
-    return earliest, latest
+    u = np.vstack([ends, ends[:, ::-1], box])
+    times = _departures_at(piece, space, used, u)
+    if np.isnan(times).all() or np.nanmin(times) == -np.inf:
+        raise NoSnapshot(f"{piece.place}: '{piece.id}' departs at \"{piece.departs}\", which is no time")
+    for k in range(1, _ROUNDS + 2):
+        best, earliest = u[np.nanargmin(times)], np.nanmin(times)
+        if k < _ROUNDS:
+            further = np.clip(best + 0.25**k * (box - 0.5), 0.0, 1.0)
+        else:  # each input at either end, and all of them where that is earlier
+            further = np.repeat(best[None], 2 * len(used), axis=0)
+            further[np.arange(2 * len(used)), np.arange(2 * len(used)) // 2] = np.tile([0.0, 1.0], len(used))
+            either = np.nan_to_num(_departures_at(piece, space, used, further), nan=np.inf).reshape(-1, 2)
+            further = np.vstack([further, np.where(either.min(axis=1) < earliest, either.argmin(axis=1), best)])
+        u, times = np.vstack([u, further]), np.concatenate([times, _departures_at(piece, space, used, further)])
+    return float(np.nanmin(times)), float(np.nanmax(times))
 
 
 def _departures_at(piece: Piece, space: ParameterSpace, used: Sequence[int], u: Points) -> Vector:
-    """Return when a piece departs (s) at points u (n, k) of the inputs that are used, the others in the middle of their range."""
+    """Return when a piece departs (s) at points u (n, k) of the inputs that are used, the others in the middle of their range.
+
+    NaN where a formula has no value: such a run is invalid whenever it begins.
+    """
     points = np.full((len(u), space.dimension), 0.5)
     points[:, used] = u
     x, text = space.from_unit(points), (piece.departs or "").strip()
@@ -322,10 +332,17 @@ def _departures_at(piece: Piece, space: ParameterSpace, used: Sequence[int], u: 
         columns = {p.name: x[:, k] for k, p in enumerate(space.parameters)}
         columns |= {name: np.array(choices)[columns[name].astype(int)] for name, choices in space.choices.items()}
         with np.errstate(all="ignore"):
-            times = np.broadcast_to(np.asarray(formula(columns), dtype=np.float64), len(x))
-        if np.isfinite(times).all():
-            return times
-    return np.array([_departure(piece, space.named(row)) for row in x])
+            times = np.array(np.broadcast_to(np.asarray(formula(columns), dtype=np.float64), len(x)))
+        times[np.isposinf(times)] = np.nan
+        return times
+    return np.array([_departure_or_nan(piece, space.named(row)) for row in x])
+
+
+def _departure_or_nan(piece: Piece, values: Values) -> float:
+    try:
+        return _departure(piece, values)
+    except RunError:
+        return math.nan
 
 
 def _departure(piece: Piece, values: Values) -> float:

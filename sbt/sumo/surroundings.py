@@ -100,7 +100,7 @@ class Surroundings:
         """Note who came and who left, near or far."""
         self._arrived = frozenset(arrived)
         for name in arrived:
-            self._nearby.very_long.pop(name, None)
+            self._nearby.forget(name)
             self._named_present.discard(name)
         length = self._sumo.vehicle.getLength
         for name in departed:
