@@ -100,3 +100,20 @@ def test_beyond_the_begin_of_its_route_a_body_is_straight(tmp_path: Path, crossi
     vehicles += vehicle("ego", "nm ms", departPos=150, departSpeed=0)
     parts = simulation(tmp_path, crossing, vehicles, deaf("o", "ego"), 1.0, step_length="0.1")({}, 1).actor("o").parts
     assert [part.heading[0] for part in parts] == [0.0] * 4
+
+
+def test_a_body_that_overtakes_on_an_opposite_lane_is_behind_its_front(tmp_path: Path):
+    """What is before it on that lane is ahead of it: the oncoming ego was taken to depart within it."""
+    (tmp_path / "n.nod.xml").write_text('<nodes><node id="a" x="0" y="0"/><node id="b" x="600" y="0"/></nodes>')
+    edges = "".join(f'<edge id="{a}{b}" from="{a}" to="{b}" numLanes="1" speed="25"/>' for a, b in ("ab", "ba"))
+    (tmp_path / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
+    run_program(tmp_path, "netconvert", "-n", "n.nod.xml", "-e", "e.edg.xml", "--opposites.guess", "-o", "net.net.xml")
+    vehicles = '<vType id="truck" length="16" sigma="0" lcOpposite="10" vClass="truck"/><vType id="slow" maxSpeed="5" sigma="0"/>'
+    vehicles += vehicle("lead", "ab", "slow", departPos=60, departSpeed=5)
+    vehicles += vehicle("o", "ab", "truck", departPos=30, departSpeed=8)
+    vehicles += vehicle("ego", "ba", "slow", depart=4, departPos=505, departSpeed=3)
+    trace = simulation(tmp_path, (tmp_path / "net.net.xml").read_text(), vehicles, step_until_over, 0.5, step_length="0.1")({}, 1)
+    truck = trace.actor("o")
+    assert truck.y[0] > 0.0, "it is on the opposite lane"
+    assert body(truck, 0)[:, 0] == pytest.approx([truck.x[0] + dx for dx in (6.0, 2.0, -2.0, -6.0)], abs=0.3)
+    assert [part.heading[0] for part in truck.parts] == pytest.approx([0.0] * 4, abs=0.1)

@@ -159,6 +159,13 @@ def test_what_a_loop_subscribes_to_changes_nothing(tmp_path: Path, how: str, lat
     assert found.identical(plain)
 
 
+def test_a_loop_may_ask_for_less_of_persons_who_are_far(tmp_path: Path):
+    """They were taken for vehicles, of which SUMO knows none by that name."""
+    away = '<person id="p" depart="0" departPos="400"><walk edges="road" arrivalPos="500"/></person>'
+    ask = passing(before=lambda sumo: own(sumo, 600.0, (0x39, 0x43, 0x40), 0xAE))
+    assert "p" not in around(tmp_path, PASSING + away, ask, 100.0).actors
+
+
 def test_a_filter_of_no_own_subscription_is_refused(tmp_path: Path):
     loop = passing(before=lambda sumo: sumo.vehicle.addSubscriptionFilterLanes([0]))
     with pytest.raises(RunError, match=r"must subscribe to the vehicles.*before .*FilterLanes, but it did not"):

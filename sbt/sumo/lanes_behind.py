@@ -100,9 +100,12 @@ def path_behind(sumo: Any, lanes: Lanes, name: str, front: Point, length: float)
     if side is None or math.dist(front, (ax, ay)) > max(3.2, 0.1 * length):
         return []  # beside its lane
     ux, uy = _direction(shape[side], shape[side + 1])
+    angle = math.radians(sumo.vehicle.getAngle(name))
+    against = ux * math.sin(angle) + uy * math.cos(angle) < 0.0  # it overtakes on an opposite lane
+    ux, uy = (-ux, -uy) if against else (ux, uy)
     left = ux * (front[1] - ay) - uy * (front[0] - ax)
     points, last, covered = list[Point](), (ax, ay), 0.0
-    for x, y in _middles(sumo, lanes, name, lane, shape[side::-1]):
+    for x, y in shape[side + 1 :] if against else _middles(sumo, lanes, name, lane, shape[side::-1]):
         if (step := math.dist(last, (x, y))) > 1e-3:
             ux, uy = _direction((x, y), last)
             points.append((x - left * uy, y + left * ux))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from sbt.sumo.levels import is_known
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE
 from sbt.sumo.trailing import LONGEST_RIGID
 
@@ -86,7 +87,8 @@ class Nearby:
             return True
         size = self._sizes.get(name)
         if size is None:
-            domain = self._sumo.person if VEHICLE in variables else self._sumo.vehicle
+            walks = VEHICLE in variables or not is_known(self._sumo, name)  # whom a loop asks for it may ask for less
+            domain = self._sumo.person if walks else self._sumo.vehicle
             size = self._sizes[name] = domain.getLength(name), domain.getWidth(name)
         return apart <= self._within + self._size + size[0] + _WIDTHS and self._is_body_near(variables, *size)
 
