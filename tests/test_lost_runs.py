@@ -110,7 +110,8 @@ def test_a_repetition_without_a_metric_is_not_told_as_uncritical(tmp_path):
     assert "may give a metric or none" in said
 
 
-def test_sums_over_all_combinations_have_exact_derivatives(tmp_path):
+def test_sums_over_all_combinations_have_derivatives_with_an_error(tmp_path):
+    """It was 0, although no repeat proves that seeds decide nothing."""
     from sbt.workflows.asking import estimate_again
 
     inputs = [sbt.Parameter("n", 1, 6, kind="integer"), sbt.Parameter("c", choices={"a": 0.8, "b": 0.2})]
@@ -120,7 +121,7 @@ def test_sums_over_all_combinations_have_exact_derivatives(tmp_path):
     result = sbt.run(campaign="estimation", scenario=scenario, budget=40, seed=1, store=tmp_path / "s", executor="serial")
     told = estimate_again(result.store, objects=result.objects).sensitivity
     assert told
-    assert all(each.std_error == 0.0 for each in told)
+    assert all(each.std_error > 0.0 for each in told)
 
 
 def test_held_out_runs_that_fail_tell_nothing_of_the_share_among_those_that_give_a_metric():

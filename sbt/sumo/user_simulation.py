@@ -357,7 +357,8 @@ class UserSimulation:
             files.launch(values, folder, self.step).write(seed, folder / "run.sumocfg")
             return
         warmed, state = self._warmed, self._begun(files, values, self._state(seed))
-        warmed.write(state, folder, warmed.snapshot.last_departure(values) + self.recording.duration)
+        latest = warmed.snapshot.last_departure(values) + (self.recording.ego.delay or 0.0)
+        warmed.write(state, folder, latest + self.recording.duration)
 
     def files_of_run(self, values: Values, seed: int) -> SumoFiles:
         """Return the files that SUMO is started with in a run, without starting it; a loop runs until it calls `sumo.start`.
