@@ -13,6 +13,8 @@ from test_doors import files_of
 import sbt
 from sbt.errors import InputError
 from sbt.execution.code_print import code_print
+from sbt.store.database import Store
+from sbt.testbeds.problem import _Pointwise
 
 FUNCTION = """import sbt
 SCENARIO = sbt.Scenario('s', [sbt.Parameter('a', 0, 1, 'm')], sbt.Requirement('gap', high=0.0),
@@ -104,6 +106,32 @@ def test_a_changed_function_of_a_notebook_is_tried_at_more_runs(tmp_path):
     with pytest.raises(InputError, match=r"must give the runs of .* again to go on"):
         sbt.run(**keys, scenario=_scenario(_cell("x if not 0.3 < x < 0.6 else -1.0")), budget=50)
     assert len(sbt.open(tmp_path / "s", scenario=_scenario(_cell("x"))).history) == 44
+
+
+@pytest.mark.parametrize("kind", ["resumed", "warm start"])
+def test_runs_that_another_state_of_the_package_would_not_give_are_refused(tmp_path, monkeypatch, kind):
+    def campaign(budget: int, **options: object) -> sbt.Result:
+        name = "second" if "warm_start" in options else "first"
+        settings = {"campaign": "coverage", "scenario": "testbed:four_branch_7", "executor": "serial", "report": False} | options
+        return sbt.run(budget=budget, store=tmp_path / name, **settings)
+
+    def again() -> sbt.Result:
+        options = {} if kind == "resumed" else {"campaign": "boundary", "warm_start": {"store": str(tmp_path / "first")}}
+        return campaign(8, **options)
+
+    for place in ("running", "changes"):
+        monkeypatch.setattr(f"sbt.workflows.{place}.package_print", lambda: "earlier")
+    campaign(6)
+    monkeypatch.undo()
+    before = _Pointwise.__call__
+    with monkeypatch.context() as patch:
+        patch.setattr(_Pointwise, "__call__", lambda self, values, seed: {"y": before(self, values, seed)["y"] + 1e-9})
+        for _ in range(2):
+            with pytest.raises(InputError, match="this package or SUMO was another one then"):
+                again()
+    assert len(again().history) >= 8  # the same runs: it goes on
+    with Store.read(tmp_path / "first") as store:
+        assert (store.configuration["package"] == "earlier") == (kind != "resumed")
 
 
 def test_a_print_of_code_is_that_of_any_process():

@@ -1,21 +1,39 @@
-"""Which of the user's files were changed since a campaign last began: its store remembers what was in those that it read."""
+"""What was changed since a campaign last began, of the user's files and of this package: its store remembers what was in them."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
+from sbt.execution.worker import versions
 from sbt.plugins import contents_read, newer
 from sbt.plugins.source import is_installed
 from sbt.problem.plain import Json, JsonMapping
 from sbt.workflows.portable import place_of
 from sbt.workflows.study import RESOLVED
 
-__all__ = ["CONTENTS", "changed_files", "changed_since", "contents_in", "told"]
+__all__ = ["CONTENTS", "PACKAGE", "changed_files", "changed_since", "contents_in", "package_print", "told"]
 
 CONTENTS = "contents"
 """Key under which a store remembers a hash of each file, by its path seen from where the names of the configuration start."""
+
+PACKAGE = "package"
+"""Key under which a store remembers `package_print`; stores of before have none."""
+
+
+@cache
+def package_print() -> str:
+    """Return a digest of what runs depend on beside the user's files: this package, its networks, the version of SUMO."""
+    from sbt.sumo.nets import nets_folder
+
+    digest, package = hashlib.blake2b(versions().encode(), digest_size=16), Path(__file__).resolve().parents[1]
+    for folder, pattern in ((package, "*.py"), (nets_folder(), "*.xml")):
+        for path in sorted(folder.rglob(pattern)):
+            digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
 
 
 def contents_in(folder: Path) -> Json:
@@ -42,8 +60,9 @@ def changed_files(folder: Path, kept: JsonMapping) -> list[Path]:
 
 
 def changed_since(folder: Path, kept: JsonMapping) -> str:
-    """Return in words which files were changed after the campaign in a folder last began, for an error; "" for none."""
-    return told(changed_files(folder, kept))
+    """Return in words what was changed after the campaign in a folder last began, for an error; "" for nothing."""
+    package = "" if kept.get(PACKAGE) == package_print() else "; this package or SUMO was another one then"
+    return told(changed_files(folder, kept)) + package
 
 
 def told(changed: Sequence[Path]) -> str:

@@ -27,12 +27,14 @@ class EarlierCampaign:
         scenario: with its own inputs.
         history: its runs.
         choice: how another campaign learns from it.
+        package: print of the package that it was run with; "" where its store remembers none.
     """
 
     folder: Path
     scenario: LogicalScenario
     history: History
     choice: WarmStart
+    package: str = ""
 
     def pooled(self, learner: Learner, config: Configuration) -> EarlierRuns:
         """Return its runs, without the held-out ones, for a metamodel that learns from them beside those of its own campaign.

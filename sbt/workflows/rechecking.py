@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbt.errors import InputError
 from sbt.execution.protocol import Executor
@@ -13,23 +14,25 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import Store
 from sbt.store.history import History, Record
-from sbt.workflows.changes import changed_since
+from sbt.workflows.changes import changed_since, package_print
 from sbt.workflows.study import Study
 
 __all__ = ["check_code", "check_earlier", "not_repeated", "own_code"]
 
 _TRIED = 20
-"""Runs that are tried again, spread over those that are there, before a campaign goes on whose files or code were changed."""
+"""Runs that are tried again, spread over those that are there, before a campaign goes on whose files or code, the package's and
+SUMO's too, were changed."""
 
 
 def check_code(store: Store, study: Study, executor: Executor, *, changed: bool) -> None:
-    """Refuse to go on with a store whose runs the user's code and files would not give again.
+    """Refuse to go on with a store whose runs would not come again, by code and files as they are now.
 
-    Of each level of fidelity the first and the last with metrics are tried, where files or code were changed since as many as
-    `_TRIED` of all, and the first that could not be run: code may change just what is invalid. Where nothing was changed, and
-    SUMO does not repeat every run of such files, most of as many are enough.
+    Of each level of fidelity the first and the last with metrics are tried where there is code of the user's; where files or
+    code were changed since, this package or SUMO included, as many as `_TRIED` of all, and the first that could not be run: code
+    may change just what is invalid. Where nothing was changed, and SUMO does not repeat every run of such files, most of as many
+    are enough.
     """
-    if not own_code(study):
+    if not (changed or own_code(study)):
         return
     history = store.history(level=None)
     for level in np.unique(history.columns["level"]):
@@ -45,11 +48,11 @@ def _check_runs(store: Store, history: History, executor: Executor, *, changed: 
         store: named in the refusal.
         history: the runs.
         executor: runs them.
-        changed: files or code were.
+        changed: files or code were, or the package.
         unsure: why a run may differ all the same; "" for no reason.
     """
     ok, invalid = np.flatnonzero(history.ok), np.flatnonzero(history.status == str(Status.INVALID))
-    tried = ok[np.linspace(0, len(ok) - 1, min(_TRIED if changed or unsure else 2, len(ok))).round().astype(np.intp)]
+    tried = _spread(ok, _TRIED if changed or unsure else 2)
     again = list(_again(history, [*tried, *invalid[:1]], executor))
     differing = [(record, outcome) for record, outcome in again if dict(outcome.metrics) != dict(record.metrics)]
     if not unsure or 2 * len(differing) > len(again):
@@ -74,19 +77,25 @@ def not_repeated(scenario: LogicalScenario) -> str:
 def check_earlier(study: Study) -> None:
     """Refuse to learn from an earlier campaign as from this one where code has changed: its first and last run are tried.
 
-    With warmed traffic they are not, since another number of warm-ups is another beginning.
+    Where this package or SUMO was another one then, as many as `_TRIED` are. With warmed traffic none is, since another number
+    of warm-ups is another beginning.
     """
     choice = study.config.warm_start
-    if choice is None or choice.transfer or not own_code(study) or (study.isolation is not None and study.isolation.warm):
+    if choice is None or choice.transfer or (study.isolation is not None and study.isolation.warm):
         return
-    history = study.earlier_campaign().same_runs(study.scenario)
+    earlier = study.earlier_campaign()
+    same_package = earlier.package == package_print()
+    if same_package and not own_code(study):
+        return
+    history = earlier.same_runs(study.scenario)
     ok = np.flatnonzero(history.ok & history.drawn & (history.columns["level"] == 0))
     with study.executor() as executor:
-        for record, outcome in _again(history, [*ok[:1], *ok[-1:]], executor):
+        for record, outcome in _again(history, _spread(ok, 2 if same_package else _TRIED), executor):
             stored = {name: value for name, value in record.metrics.items() if name in outcome.metrics or not outcome.metrics}
             now = {name: outcome.metrics[name] for name in stored if outcome.metrics} or outcome.reason
             if now != stored:
                 rule = f"warm_start.store must be of what is run now, but its run {record.index} now gives {now}, not {stored}"
+                rule += "" if same_package else " (this package or SUMO was another one then)"
                 raise InputError(f"{rule}: transfer: true takes it as another setup")
 
 
@@ -99,7 +108,12 @@ def own_code(study: Study) -> bool:
     return any(name.startswith((OBJECT, "table:")) or ".py:" in name or name.endswith((".yaml", ".yml")) for name in code)
 
 
-def _again(history: History, rows: Sequence[np.intp], executor: Executor) -> Iterator[tuple[Record, Outcome]]:
+def _spread(rows: NDArray[np.intp], n: int) -> NDArray[np.intp]:
+    """Return n of the rows, the first and the last among them, or all where there are fewer."""
+    return rows[np.linspace(0, len(rows) - 1, min(n, len(rows))).round().astype(np.intp)]
+
+
+def _again(history: History, rows: Iterable[np.intp], executor: Executor) -> Iterator[tuple[Record, Outcome]]:
     """Yield the runs in these rows, and how they go now."""
     records = {record.index: record for record in (history.record(int(row)) for row in dict.fromkeys(rows))}
     for outcome in executor.run([Job(r.index, r.inputs, r.seed, r.level) for r in records.values()]):

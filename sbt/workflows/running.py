@@ -29,12 +29,12 @@ from sbt.store.database import Store
 from sbt.store.history import Record
 from sbt.store.planning import storable
 from sbt.workflows.asking import sensitivities_in
-from sbt.workflows.changes import CONTENTS, changed_files, changed_since, contents_in
+from sbt.workflows.changes import CONTENTS, PACKAGE, changed_files, changed_since, contents_in, package_print
 from sbt.workflows.fidelity import COARSE_COST
 from sbt.workflows.filming import film_runs
 from sbt.workflows.judging import judge_campaign
 from sbt.workflows.portable import write_bundle
-from sbt.workflows.rechecking import check_code, check_earlier, own_code
+from sbt.workflows.rechecking import check_code, check_earlier
 from sbt.workflows.study import RESOLVED, Study
 
 __all__ = [
@@ -43,7 +43,9 @@ __all__ = [
 
 CODE = "code"
 """Key under which a store remembers a print of the code of the user's own that its runs depend on."""
-_MAY_CHANGE = {CODE, COARSE_COST, CONTENTS, "budget", "folder", "place", "sources", "yaml", "described", "kind", "judges"}
+_MAY_CHANGE = {
+    CODE, PACKAGE, CONTENTS, COARSE_COST, "budget", "described", "folder", "judges", "kind", "place", "sources", "yaml",
+}  # fmt: skip
 """What may differ when a campaign is resumed; `described` is compared by `scenario_differences`."""
 
 
@@ -127,7 +129,7 @@ def run_study(
         store.begin(snapshot)
         _check_same(store, snapshot)
         before = store.configuration
-        same_code = before.get(CODE, snapshot.get(CODE)) == snapshot.get(CODE)
+        same_code = before.get(CODE, snapshot[CODE]) == snapshot[CODE] and before.get(PACKAGE) == snapshot[PACKAGE]
         changed = (store.folder / RESOLVED).is_file() and not (same_code and not changed_files(store.folder, before))
         if not changed:  # else what is written is newer, so that the runs are tried before
             keep_configuration(store, study, snapshot)
@@ -164,8 +166,8 @@ def _tell(store: Store, study: Study, listener: Callable[[Progress], None], acti
 
 
 def _code_of(study: Study) -> Json:
-    """Return what a store remembers of the code of the user's own; nothing where there is none."""
-    return {CODE: code_print(study.scenario)} if own_code(study) else {}
+    """Return what a store remembers of the code that its runs depend on."""
+    return {CODE: code_print(study.scenario), PACKAGE: package_print()}
 
 
 def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> None:

@@ -271,6 +271,7 @@ class Study:
         try:
             with Store.read(folder) as store:
                 before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
+                package = store.configuration.get("package", "")
         except StoreError as error:
             raise StoreError(f"warm_start.store: {error}") from None
         if not finished:
@@ -279,7 +280,7 @@ class Study:
             names = f"{before.config.scenario} there, {self.config.scenario} here"
             rule = f"warm_start.store must have the same scenario, ego and step, but {folder} has another ({names})"
             raise InputError(f"{rule}; transfer: true takes it as another setup")
-        return EarlierCampaign(folder, before.scenario, history, choice)
+        return EarlierCampaign(folder, before.scenario, history, choice, package)
 
     def _taught(self) -> dict[str, Any]:
         """Return what an earlier campaign gives the settings; nothing where its runs are learned beside the campaign's own.
