@@ -216,3 +216,29 @@ def test_the_pages_work_in_a_browser(served: Served, width: int) -> None:
             assert faults(browser) == []
         assert browser.errors == []
         assert {url.split("/")[2] for url in browser.requests if url.startswith("http")} == {served.address.split("/")[2]}
+
+
+@pytest.mark.sumo
+@pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium")
+def test_a_report_can_be_looked_at_and_asks_for_nothing(served: Served, folder: Path) -> None:
+    """A report comes with a store, maybe somebody else's: its scripts draw, and reach neither the view nor its campaigns."""
+    asked = "fetch('/api/campaigns').then(() => window.got = 'all', () => window.got = 'nothing')"
+    report = folder / "cut_in" / "report.html"
+    whole = report.read_text(encoding="utf-8")
+    with Browser() as browser:
+        browser.open(f"{served.address}/?token={TOKEN}")
+        browser.open(f"{served.address}/c/{served.key('cut_in')}/report")
+        browser.wait("window.explorer && document.querySelector('[data-part=scatter] .main-svg')")
+        assert browser.errors == []
+        try:
+            report.write_text(whole.replace("</body>", f"<script>window.got = ''; {asked}</script></body>"), encoding="utf-8")
+            browser.open(f"{served.address}/c/{served.key('cut_in')}/report?again")
+            browser.wait("window.got")
+            assert browser.ask("window.got") == "nothing"
+            report.rename(folder / "elsewhere.html")
+            report.symlink_to(folder / "elsewhere.html")
+            assert served.ask(f"/c/{served.key('cut_in')}/report")[0] == 404
+        finally:
+            report.unlink()
+            report.write_text(whole, encoding="utf-8")
+            (folder / "elsewhere.html").unlink(missing_ok=True)

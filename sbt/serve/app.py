@@ -32,6 +32,11 @@ _SAFE = {
     "img-src data:; connect-src 'self'; frame-ancestors 'none'; form-action 'none'; base-uri 'none'",
     "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Cache-Control": "no-store",
 }  # fmt: skip
+_REPORT = {
+    "Content-Security-Policy": "sandbox allow-scripts allow-downloads; default-src 'none'; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline' 'unsafe-eval'; img-src data:; frame-ancestors 'none'",
+}  # fmt: skip
+"""Of a report: it came with a store, maybe somebody else's, so it may not ask for what the view may ask for."""
 _OWN = {"style": "serve.css", "script": "serve.js"}
 Next = Callable[[Request], Awaitable[Response]]
 
@@ -114,7 +119,7 @@ class _View:
                 raise InputError("there is no report yet: it is written when the campaign ends")
         except InputError as error:
             return Response(str(error), 404)
-        return HTMLResponse(await run_in_threadpool(path.read_bytes))
+        return HTMLResponse(await run_in_threadpool(path.read_bytes), headers=_REPORT)
 
     async def library(self, request: Request) -> Response:
         content, how = await run_in_threadpool(packed_library), {"Cache-Control": "private, max-age=3600"}

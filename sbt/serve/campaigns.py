@@ -172,9 +172,9 @@ class Campaigns:
         return watched.counted[1]
 
     def page(self, key: str) -> Path | None:
-        """Return the report of a campaign, None where there is none yet."""
+        """Return the report of a campaign, None where there is none yet; a link leads out of its folder, and is none."""
         path = self[key].folder / "report.html"
-        return path if path.is_file() else None
+        return path if path.is_file() and not path.is_symlink() else None
 
     def film(self, key: str, run: int) -> Json:
         """Execute a run in a process of its own and return its film, or why there is none."""
