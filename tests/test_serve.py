@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import importlib.util
 import json
+import signal
 import subprocess
 import sys
 import threading
@@ -24,8 +25,9 @@ uvicorn = pytest.importorskip("uvicorn", reason="the extra serve is not installe
 from browser import PROGRAM, Browser  # noqa: E402
 from test_accessibility import faults  # noqa: E402
 
+from sbt.errors import InputError  # noqa: E402
 from sbt.serve.app import application  # noqa: E402
-from sbt.serve.campaigns import Campaigns  # noqa: E402
+from sbt.serve.campaigns import Campaigns, _heeded  # noqa: E402
 
 TOKEN = "a-token"
 
@@ -160,14 +162,18 @@ def _until(server: Served, key: str, state: str) -> Any:
 
 
 def test_a_campaign_is_stopped_and_resumed(tmp_path: Path) -> None:
-    """It ends in order, goes on to its end, with the rows of one that was never stopped; what does not run is not stopped."""
+    """It ends in order, goes on to its end, with the rows of one that was never stopped; what does not run is not stopped.
+
+    It was begun as by a script in the background (`&`), which lets it ignore Ctrl-C.
+    """
     (tmp_path / "slow.py").write_text(SLOW)
     text = {"campaign": "coverage", "scenario": "slow.py:SCENARIO", "budget": 40, "seed": 1, "executor": {"kind": "serial"}}
     (tmp_path / "slow.yaml").write_text(json.dumps(text))
     run = [sys.executable, "-m", "sbt", "run", str(tmp_path / "slow.yaml"), "--quiet", "--store", str(tmp_path / "runs" / "slow")]
     (tmp_path / "runs").mkdir()
     (tmp_path / "hold").touch()
-    driver, server = subprocess.Popen(run, stdout=subprocess.DEVNULL), Served(tmp_path / "runs")
+    begin = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); os.execv(sys.argv[1], sys.argv[1:])"
+    driver, server = subprocess.Popen([sys.executable, "-c", begin, *run], stdout=subprocess.DEVNULL), Served(tmp_path / "runs")
     try:
         deadline = time.monotonic() + 120
         while not (found := server.json("/api/campaigns")) or found[0]["done"] < 2:
@@ -220,6 +226,24 @@ def test_the_pages_work_in_a_browser(served: Served, width: int) -> None:
 
 @pytest.mark.sumo
 @pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium")
+@pytest.mark.parametrize(("handlers", "heeded"), [
+    ("", signal.SIGINT), ("signal.signal(signal.SIGINT, signal.SIG_IGN)", None),
+    ("signal.signal(signal.SIGINT, signal.SIG_IGN); signal.signal(signal.SIGTERM, lambda *_: sys.exit())", signal.SIGTERM),
+])  # fmt: skip
+def test_a_process_is_sent_the_signal_that_it_heeds(handlers: str, heeded: signal.Signals | None) -> None:
+    script = f"import signal, sys, time\n{handlers}\nprint(flush=True)\ntime.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as process:
+        try:
+            process.stdout.readline()
+            if heeded is None:
+                with pytest.raises(InputError, match="must heed a signal"):
+                    _heeded(process.pid)
+            else:
+                assert _heeded(process.pid) == heeded
+        finally:
+            process.kill()
+
+
 def test_a_report_can_be_looked_at_and_asks_for_nothing(served: Served, folder: Path) -> None:
     """A report comes with a store, maybe somebody else's: its scripts draw, and reach neither the view nor its campaigns."""
     asked = "fetch('/api/campaigns').then(() => window.got = 'all', () => window.got = 'nothing')"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
+import logging
 import secrets
 import socket
 import sys
@@ -49,12 +51,19 @@ def serve(
     print(f"ctrl-c ends the view, campaigns go on{others}", file=sys.stderr)
     app = application(campaigns, token=token, hosts=frozenset({"localhost", "127.0.0.1", "::1", host} if local else ()))
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1))
+    logging.getLogger("uvicorn.error").addFilter(_is_fault)
     try:
         server.run(sockets=[listening])
     except KeyboardInterrupt:
         pass
     finally:
         campaigns.close()
+
+
+def _is_fault(record: logging.LogRecord) -> bool:
+    """Return whether something went wrong: a request that the end of the view cuts off is told of with a long traceback."""
+    kind = record.exc_info[0] if record.exc_info else None
+    return kind is None or not issubclass(kind, asyncio.CancelledError)
 
 
 def _is_local(host: str) -> bool:

@@ -195,12 +195,12 @@ class Campaigns:
         """Ask the process of a campaign to end in order, as Ctrl-C does; return what was done.
 
         Raises:
-            InputError: no process of this machine works for it.
+            InputError: no process of this machine works for it, or it heeds no signal.
         """
         writer = writer_of(self[key].folder)
         if writer is None or not writer.alive:
             raise InputError("only a campaign that runs on this machine can be stopped")
-        os.kill(writer.pid, signal.SIGINT)
+        os.kill(writer.pid, _heeded(writer.pid))
         return "stopping after the runs that are under way; resume goes on from there"
 
     def resume(self, key: str) -> str:
@@ -224,6 +224,24 @@ class Campaigns:
     def _environment(self) -> dict[str, str]:
         own = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
         return {**os.environ, **own, **({"SBT_TRUST": "1"} if self._trusted else {})}
+
+
+def _heeded(pid: int) -> signal.Signals:
+    """Return the signal that ends the campaign of a process in order: Ctrl-C's is ignored by what a script began with `&`.
+
+    Raises:
+        InputError: it heeds neither.
+    """
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:  # not Linux
+        return signal.SIGINT
+    mask = {name: int(bits, 16) for name, _, bits in (line.partition(":\t") for line in lines) if name in ("SigIgn", "SigCgt")}
+    if not mask["SigIgn"] >> (signal.SIGINT - 1) & 1:
+        return signal.SIGINT
+    if mask["SigCgt"] >> (signal.SIGTERM - 1) & 1:
+        return signal.SIGTERM
+    raise InputError(f"a campaign that is stopped must heed a signal, but its process {pid} ignores Ctrl-C and SIGTERM")
 
 
 def _look(folder: Path) -> None:
