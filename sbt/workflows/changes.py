@@ -15,7 +15,8 @@ from sbt.problem.plain import Json, JsonMapping
 from sbt.workflows.portable import place_of
 from sbt.workflows.study import RESOLVED
 
-__all__ = ["CONTENTS", "PACKAGE", "changed_files", "changed_since", "contents_in", "package_print", "told"]
+__all__ = ["CONTENTS", "PACKAGE", "changed_files", "changed_since", "contents_in", "package_changed", "package_print",
+           "told"]  # fmt: skip
 
 CONTENTS = "contents"
 """Key under which a store remembers a hash of each file, by its path seen from where the names of the configuration start."""
@@ -61,8 +62,12 @@ def changed_files(folder: Path, kept: JsonMapping) -> list[Path]:
 
 def changed_since(folder: Path, kept: JsonMapping) -> str:
     """Return in words what was changed after the campaign in a folder last began, for an error; "" for nothing."""
-    package = "" if kept.get(PACKAGE) == package_print() else "; this package or SUMO was another one then"
-    return told(changed_files(folder, kept)) + package
+    return told(changed_files(folder, kept)) + package_changed(kept)
+
+
+def package_changed(kept: JsonMapping) -> str:
+    """Return in words, for an error, that a store was made with another package; "" where it was not."""
+    return "" if kept.get(PACKAGE) == package_print() else "; this package or SUMO was another one then"
 
 
 def told(changed: Sequence[Path]) -> str:

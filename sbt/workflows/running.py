@@ -29,7 +29,7 @@ from sbt.store.database import Store
 from sbt.store.history import Record
 from sbt.store.planning import storable
 from sbt.workflows.asking import sensitivities_in
-from sbt.workflows.changes import CONTENTS, PACKAGE, changed_files, changed_since, contents_in, package_print
+from sbt.workflows.changes import CONTENTS, PACKAGE, changed_files, changed_since, contents_in, package_changed, package_print
 from sbt.workflows.fidelity import COARSE_COST
 from sbt.workflows.filming import film_runs
 from sbt.workflows.judging import judge_campaign
@@ -359,4 +359,5 @@ def _check_same(store: Store, snapshot: JsonMapping) -> None:
     fixed = {*snapshot, *before} - (_MAY_CHANGE - {"budget"} if "shard" in snapshot else _MAY_CHANGE)
     changed = differences(before, snapshot, fixed) or scenario_differences(before.get("described", {}), snapshot["described"])
     if changed:
-        raise InputError(f"a store belongs to one configuration, but {store.folder} was made with another ({changed})")
+        rule = f"a store belongs to one configuration, but {store.folder} was made with another ({changed})"
+        raise InputError(f"{rule}{package_changed(before)}")
