@@ -6,6 +6,7 @@ import importlib.util
 import math
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -382,3 +383,23 @@ def test_compare_is_continued_and_tells_the_first_failure(tmp_path: Path):
     done = CliRunner().invoke(app, ["compare", str(tmp_path / "c.yaml"), "--samplers", "rando", "--into", str(tmp_path)])
     assert done.exit_code == 2
     assert "a sampler must be one of" in done.output
+
+
+def test_compare_tells_failed_runs_and_what_is_missing_first(tmp_path, monkeypatch):
+    file = tmp_path / "fails.py"
+    file.write_text(
+        "import sbt\ndef evaluate(values, seed):\n    if values['a'] > 0.5:\n        raise RuntimeError('broken')\n"
+        "    return {'y': 1.0}\n"
+        "SCENARIO = sbt.Scenario('s', [sbt.Parameter('a', 0, 1)], sbt.Requirement('y', high=0.5), evaluate=evaluate)\n"
+    )
+    loaded = parse(f"campaign: falsification\nscenario: {file}:SCENARIO\nbudget: 10\n")
+    cells = compare(loaded, ["sobol", "sobol"], 1, tmp_path / "cells")
+    assert [(c.sampler, c.runs, c.failed) for c in cells] == [("sobol", 10, 5)]
+    assert table(cells).endswith("| 50 % |")
+    assert table([replace(cells[0], failed=None)]).endswith("| not known |")  # of a table that was begun before
+    with pytest.raises(InputError, match="a sampler must be one of"):
+        compare(loaded, [], 1, tmp_path / "cells")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match="needs the library"):
+        compare(loaded, ["random", "tpe"], 1, tmp_path / "others")
+    assert not (tmp_path / "others").exists()

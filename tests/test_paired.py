@@ -35,6 +35,19 @@ def test_failed_runs_widen_it_on_both_sides():
     assert wide[0] < low < 0 < high < wide[1]
 
 
+def test_one_number_in_two_units_is_not_compared(configured, tmp_path):
+    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + """
+
+from dataclasses import replace
+from sbt.problem.metric import Metric
+OTHER = replace(scenario(disc), metrics=tuple(replace(m, unit="km") for m in scenario(disc).metrics))
+""")
+    command = ["compare-ego", str(configured("a")), str(configured("b", "OTHER")), "--store", str(tmp_path / "both")]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 2
+    assert "one requirement, but y is in no unit in" in done.output.replace("\n", " ")
+
+
 def test_one_change_through_the_command(configured, tmp_path):
     """The critical disc shrinks when the metric is shifted: only fixed failures, none new."""
     (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + '''

@@ -249,3 +249,21 @@ def test_the_noise_of_repeats_is_that_of_each_metric():
     assert plain[0] < 1e-3
     assert of_the_first[0] > 0.05  # (1 - 0.5) / 0.5: one standard deviation from critical
     assert of_the_first[1] == plain[1]
+
+
+def test_what_is_predicted_of_a_margin_has_the_units_of_the_runs(tmp_path, monkeypatch):
+    """Held-out and failed runs teach nothing, but margins of runs are told in the unit that is usual among all of them."""
+    kept = {}
+    monkeypatch.setattr("sbt.report.explorer.slices_through", lambda *given: kept.update(predict=given[0], need=given[1]))
+    scenario = sbt.Scenario(
+        "two", [sbt.Parameter(n, 0.0, 1.0) for n in "ab"], any_of(Requirement("left", high=0.0), Requirement("right", high=0.0)),
+        metrics=["left", "right"], evaluate=lambda values, seed: {"left": values["a"] - 0.2, "right": values["b"] - 0.1},
+    )  # fmt: skip
+    keys = {"campaign": "boundary", "budget": 40, "seed": 1, "executor": "serial", "validation": {"share": 0.3}}
+    result = sbt.run(scenario=scenario, store=tmp_path / "store", report=True, **keys)
+    u, margin = result.history.x, result.frame["margin"]  # the space is the unit cube
+    teaching = result.scenario.requirement.critical.usual(result.scenario.requirement.values(result.history.training))
+    assert kept["need"].scale != teaching
+    for predicted in (kept["predict"](u), result.fitted.predict(u)):
+        np.testing.assert_allclose(predicted.mu, margin, atol=0.05)
+    np.testing.assert_allclose(result.predict(u)["mean"], margin, atol=0.05)

@@ -20,6 +20,7 @@ from sbt.errors import InputError
 from sbt.execution.protocol import SerialExecutor
 from sbt.files import scratch_in
 from sbt.problem.arrays import Points, Vector
+from sbt.problem.cube import CONTINUOUS
 from sbt.problem.outcome import Job, Status
 from sbt.problem.plain import Json, JsonMapping
 from sbt.samplers.search import DEFLATION
@@ -45,6 +46,7 @@ class Cell:
         critical: runs.
         distinct: critical runs that are farther than the deflation radius from all earlier ones so counted.
         seconds: wall clock.
+        failed: runs without a metric; None: not known.
     """
 
     scenario: str
@@ -56,6 +58,7 @@ class Cell:
     critical: int
     distinct: int
     seconds: float
+    failed: int | None = None
 
 
 def compare(
@@ -71,15 +74,18 @@ def compare(
         listener: called after every cell.
 
     Raises:
-        InputError: not a falsification, an unknown sampler, recorded rows, a combined requirement, or a library that is not
+        InputError: not a falsification, no or an unknown sampler, recorded rows, a combined requirement, or a library that is not
             installed.
     """
     config = loaded.config
     if config.campaign != "falsification":
         raise InputError(f"compare needs campaign falsification, but got {config.campaign}")
-    for name in samplers:
+    samplers = tuple(dict.fromkeys(samplers))
+    for name in samplers or ("",):
         if name not in SAMPLERS:
             raise InputError(f"a sampler must be one of {', '.join(SAMPLERS)}, but got '{name}'")
+        if name in OUTSIDE:  # what is not installed is found before the first run
+            OUTSIDE[name](2, config.seed, config.initial, CONTINUOUS)
     if scenario_of(loaded).requirement.combined:
         raise InputError(f"compare needs a requirement on one metric, but got {scenario_of(loaded).requirement.metric}")
     if scenario_of(loaded).pool is not None:
@@ -127,7 +133,7 @@ def _run(loaded: Loaded, name: str, seed: int) -> Cell:
     first = int(hits[0]) + 1 if len(hits) else None
     return Cell(
         config.scenario, name, seed, config.budget, len(margin), first, len(hits), _distinct(u[hits]),
-        round(time.perf_counter() - start, 3),
+        round(time.perf_counter() - start, 3), int(np.isnan(margin).sum()),
     )  # fmt: skip
 
 
@@ -179,8 +185,8 @@ def _distinct(u: Points) -> int:
 def table(cells: Sequence[Cell]) -> str:
     """Return the cells as a Markdown table: a row a sampler; a seed without a critical run counts as infinite."""
     lines = [
-        "| sampler | seeds | found | median runs to the first | 90th percentile | distinct failures | seconds |",
-        "|" + "---|" * 7,
+        "| sampler | seeds | found | median runs to the first | 90th percentile | distinct failures | seconds | failed runs |",
+        "|" + "---|" * 8,
     ]
     for name in dict.fromkeys(cell.sampler for cell in cells):
         mine = [cell for cell in cells if cell.sampler == name]
@@ -189,5 +195,7 @@ def table(cells: Sequence[Cell]) -> str:
         shown = [f"{v:.0f}" if v <= budget else f"> {budget}" for v in np.quantile(first, (0.5, 0.9))]
         found, distinct = np.mean(first <= budget), np.mean([c.distinct for c in mine])
         seconds = np.median([c.seconds for c in mine])
-        lines.append(f"| {name} | {len(mine)} | {100 * found:.0f} % | {shown[0]} | {shown[1]} | {distinct:.1f} | {seconds:.2g} |")
+        told = f"{name} | {len(mine)} | {100 * found:.0f} % | {shown[0]} | {shown[1]} | {distinct:.1f} | {seconds:.2g}"
+        lost = sum(c.failed or 0 for c in mine) / sum(c.runs for c in mine)
+        lines.append(f"| {told} | {'not known' if any(c.failed is None for c in mine) else f'{100 * lost:.3g} %'} |")
     return "\n".join(lines)

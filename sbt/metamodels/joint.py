@@ -23,7 +23,9 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.combination import CombinedInterval
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["JointMetamodel", "JointPrediction", "JointPredictor", "LogPair", "joined_log_probability", "metamodel_for"]
+__all__ = [
+    "JointMetamodel", "JointPrediction", "JointPredictor", "LogPair", "in_units", "joined_log_probability", "metamodel_for",
+]  # fmt: skip
 
 _LEAST = 1e-6
 """Of a metric's standard deviation: its noise, at least, where that of another one is asked for."""
@@ -176,6 +178,21 @@ class JointPrediction(Prediction):
             else:
                 pairs.append(part.log_probability(CriticalInterval(low, high)) if low <= high else empty)
         return joined_log_probability(self._whole, pairs)
+
+
+def in_units(predict: Predictor, critical: CriticalInterval) -> Predictor:
+    """Return a predictor of margins in the units of a critical set, as those of runs are told; of one metric itself."""
+    if not isinstance(critical, CombinedInterval) or critical.scale is None:
+        return predict
+    scale = critical.scale
+
+    def told(u: Points) -> Prediction:
+        found = predicted(predict, u)
+        if not isinstance(found, JointPrediction) or found.critical is None:
+            return found
+        return JointPrediction.of(found.parts, found.critical.with_leaves(found.critical.leaves, scale))
+
+    return told
 
 
 _Moments = tuple[Vector, Vector]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import Any, TypeVar
 
@@ -133,6 +133,7 @@ class CombinedRequirement(Requirement):
         metric: how it is written, such as `any(ttc_min, pet)`; given by the others.
         how: one of `KINDS`.
         items: requirements on one metric each, or combinations themselves.
+        scale: (q,) units of the margins of the metrics; None: what is usual among the runs that are asked of.
 
     Raises:
         InputError: no items, one name or one metric twice.
@@ -148,6 +149,7 @@ class CombinedRequirement(Requirement):
     name: str = ""
     how: str = "any"
     items: tuple[Requirement, ...] = ()
+    scale: tuple[float, ...] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.how not in KINDS or not self.items:
@@ -166,7 +168,11 @@ class CombinedRequirement(Requirement):
     @cached_property
     def critical(self) -> CombinedInterval:
         """The critical set M_c of the metrics together."""
-        return CombinedInterval(how=self.how, parts=tuple(item.critical for item in self.items))
+        return CombinedInterval(how=self.how, parts=tuple(item.critical for item in self.items), scale=self.scale)
+
+    def in_units_of(self, runs: Measured) -> CombinedRequirement:
+        """Return the requirement whose margins, of whatever runs, are in the units that those of these runs have."""
+        return replace(self, scale=self.critical.usual(self.values(runs)))
 
     @property
     def parts(self) -> tuple[Requirement, ...]:

@@ -252,6 +252,11 @@ class Requirement:
         """Return (n,) signed distances to M_c, <= 0 where critical; NaN for a run without the metric."""
         return self.critical.margin(self.values(runs))
 
+    def in_units_of(self, runs: Measured) -> Requirement:
+        """Return the requirement whose margins, of whatever runs, are in the units that those of these runs have."""
+        del runs  # the unit of the metric
+        return self
+
     def depths(self, runs: Measured) -> Vector:
         """Return (n,) margins by which runs are ranked: an end of M_c that no run lies beyond does not count (`as_passed`)."""
         y = self.values(runs)

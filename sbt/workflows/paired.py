@@ -222,6 +222,11 @@ def _check(one: Study, other: Study, paths: tuple[Path, Path]) -> None:
     if one.scenario.requirement != other.scenario.requirement:
         found = f"{one.scenario.requirement} in {paths[0]}, {other.scenario.requirement} in {paths[1]}"
         raise InputError(f"compare-ego needs one requirement, but got {found}")
+    for part in one.scenario.requirement.parts:
+        units = [study.scenario.units.get(part.metric, "") or "no unit" for study in (one, other)]
+        if units[0] != units[1]:
+            there = f"in {units[0]} in {paths[0]}, in {units[1]} in {paths[1]}"
+            raise InputError(f"compare-ego needs one requirement, but {part.metric} is {there}")
 
 
 def _estimated(summary: Summary, folder: Path) -> Json:

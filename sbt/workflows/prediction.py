@@ -22,7 +22,7 @@ from sbt.errors import InputError, did_you_mean
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor, predicted
 from sbt.metamodels.ended import ended
-from sbt.metamodels.joint import JointPrediction
+from sbt.metamodels.joint import JointPrediction, in_units
 from sbt.metamodels.persistence import load, read_info, save
 from sbt.plugins import Objects
 from sbt.problem.arrays import Points, Vector
@@ -118,16 +118,15 @@ def predict_inputs(
     learner, choice = study.learner, study.config.metamodel
     if learner is None or choice is None:
         raise InputError(f"predict needs a campaign with a metamodel, but {folder} has none (add metamodel: {{kind: auto}})")
-    space, requirement = study.scenario.space, study.scenario.requirement
+    space, requirement = study.scenario.space, study.scenario.requirement.in_units_of(history)
     x, ignored = read(space)
     training = history.finished
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
     predictor, source = _predictor(folder, learner, training, json.dumps(choice.model_dump(mode="json"), sort_keys=True), device)
-    u = learner.inputs(space.to_unit(x))
-    parts = []
+    u, predict, parts = learner.inputs(space.to_unit(x)), in_units(predictor, requirement.critical), []
     for k in range(0, len(u), _CHUNK):
-        p = predicted(predictor, u[k : k + _CHUNK])
+        p = predicted(predict, u[k : k + _CHUNK])
         each = p.parts if isinstance(p, JointPrediction) else ()
         single = [one.probability(need.critical) for one, need in zip(each, requirement.parts, strict=False)]
         told = ended(p)

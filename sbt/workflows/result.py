@@ -7,7 +7,7 @@ import html
 import math
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -18,6 +18,7 @@ from sbt.campaigns.wording import plural
 from sbt.errors import InputError, StoreError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Facts, sentences_of
+from sbt.metamodels.joint import in_units
 from sbt.plugins import OBJECT, Objects
 from sbt.problem.plain import Json
 from sbt.problem.scenario import LogicalScenario
@@ -136,7 +137,9 @@ class Result(Generic[C]):
     @cached_property
     def fitted(self) -> FittedMetamodel | None:
         """The metamodel that learned from all runs but the held-out ones, with its scores on those; None without one."""
-        return self.study.fit(self.history)
+        fitted = self.study.fit(self.history)
+        told = self.scenario.requirement.in_units_of(self.history).critical
+        return None if fitted is None else replace(fitted, predict=in_units(fitted.predict, told))
 
     @property
     def plot(self) -> Plots:
