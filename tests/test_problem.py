@@ -499,3 +499,22 @@ def test_text_is_no_metric():
 def _of(inputs=None, requirement=None, evaluate=lambda values, seed: {"m": values["a"]}, metrics=()):
     inputs = [sbt.Parameter("a", 0, 1)] if inputs is None else inputs
     return sbt.Scenario("x", inputs, requirement or sbt.Requirement("m", high=0.0), evaluate=evaluate, metrics=metrics)
+
+
+@pytest.mark.parametrize(("low", "high", "distribution", "logarithmic"), [
+    (1e-9, 1e-3, Distribution.of("scipy", name="loguniform", a=1e-9, b=1e-3), True),
+    (0.1, 1000.0, Distribution.of("lognormal", mean=5.0, std=5.0), True),
+    (0.1, 1000.0, Distribution.of("uniform"), False), (0.1, 1000.0, None, False),  # every value counts the same
+    (0.0, 1000.0, Distribution.of("exponential", mean=5.0), False),  # there is no logarithm
+    (0.1, 5.0, Distribution.of("lognormal", mean=0.3, std=0.3), False),
+    (0.1, 1000.0, Distribution.of("normal", mean=500.0, std=100.0), False),
+])  # fmt: skip
+def test_an_input_over_decades_is_searched_in_its_logarithm(low, high, distribution, logarithmic):
+    parameter, u = Parameter("a", low, high, distribution=distribution), np.linspace(0.0, 1.0, 9)
+    x = parameter.from_unit(u)
+    assert parameter.logarithmic == logarithmic
+    assert (x[0], x[-1]) == (low, high)
+    np.testing.assert_allclose(parameter.to_unit(x), u, atol=1e-12)
+    even = np.diff(np.log(x)) if logarithmic else np.diff(x)
+    np.testing.assert_allclose(even, even[0])
+    assert parameter.centre == pytest.approx(x[4])

@@ -201,7 +201,7 @@ def _cut(probability: Probability, log_success: LogOdds | None, line: Vector, ax
     stretches = tuple(Stretch(_edge(x, p, a, 0), _edge(x, p, b, -1)) for a, b in ends)
     unsure = np.flatnonzero(np.diff(np.concatenate([[0], ((p > 1 - _SURE) & (p < _SURE)).astype(int), [0]]))).reshape(-1, 2)
     edges = [e for s in stretches for e in (s.low, s.high)]
-    step = float(x[1] - x[0])
+    step = max((float(x[k] - x[k - 1]) for pair in ends for k in np.clip(pair, 1, _CELLS)), default=float(x[1] - x[0]))
     wide = [float(x[b - 1] - x[a]) for a, b in unsure if any(x[a] - step <= e <= x[b - 1] + step for e in edges)]
     at = float(space.parameters[axes[1]].from_unit(np.array([line[axes[1]]]))[0]) if len(axes) > 1 else None
     return Cut(at, stretches, 0.5 * max([*wide, step]), any(lost) or None)

@@ -25,6 +25,8 @@ _APART = 1e-12
 """Least width of a range relative to its ends: below, its values are all the same to a metamodel and a figure."""
 _FARTHEST_SCORE = 37.5
 """Normal score beyond which a probability is below the smallest number: of an infinite range the value there stands for all."""
+_DECADES = 100.0
+"""High over low end of a range, from which on `logarithmic` is asked."""
 _SUM = 1e-6  # by which probabilities that were written with six digits may miss 1
 
 Kind = Literal["continuous", "integer", "categorical"]
@@ -221,10 +223,23 @@ class Parameter:
         high = self.high if math.isfinite(self.high) else float(self.truncated.isf(np.array(TAIL)))
         return low, high
 
+    @cached_property
+    def logarithmic(self) -> bool:
+        """Whether designs, searches and axes are even in the logarithm: the values that are usual fill no tenth of the bounds.
+
+        A range over two decades or more, of whose distribution half lies in the lowest tenth, would hardly be searched there.
+        """
+        low, high = self.bounds
+        if self.discrete or self.truncated is None or not 0.0 < low * _DECADES <= high:
+            return False
+        return float(self.truncated.cdf(np.array(low + 0.1 * (high - low)))) >= 0.5
+
     @property
     def centre(self) -> float:
         """Middle of the bounds, a whole number for integer inputs; the likeliest choice, of equally likely ones the first."""
         low, high = self.bounds
+        if self.logarithmic:
+            return math.sqrt(low * high)
         if self.choices:
             return float(np.argmax(self.shares))
         return float(math.floor((low + high) / 2)) if self.kind == "integer" else (low + high) / 2
@@ -236,8 +251,10 @@ class Parameter:
         return inside & (x % 1 == 0) if self.discrete else inside
 
     def from_unit(self, u: Vector) -> Vector:
-        """Map [0, 1] onto the bounds: linearly, in equal cells for integers and choices."""
+        """Map [0, 1] onto the bounds: linearly, evenly in the logarithm where `logarithmic`, in equal cells of whole numbers."""
         low, high = self.bounds
+        if self.logarithmic:
+            return np.clip(low * (high / low) ** np.asarray(u), low, high)
         if self.discrete:
             return np.clip(np.floor(low + u * (high - low + 1)), low, high)
         return np.clip(low + u * (high - low), low, high)
@@ -245,6 +262,8 @@ class Parameter:
     def to_unit(self, x: Vector) -> Vector:
         """Map the bounds onto [0, 1]; integers and choices to the middle of their cell."""
         low, high = self.bounds
+        if self.logarithmic:
+            return np.log(np.maximum(x, np.finfo(np.float64).tiny) / low) / math.log(high / low)
         if self.discrete:
             return (x - low + 0.5) / (high - low + 1)
         return (x - low) / (high - low)

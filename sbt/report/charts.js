@@ -18,8 +18,11 @@ const axisOf = column => {
   const axis = { title: { text: safe(titled(column)) } };
   if (column.choices.length)
     return { ...axis, tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(safe), range: [-0.5, column.choices.length - 0.5] };
+  if (column.log) return { ...axis, type: "log", exponentformat: "power" };
   return column.whole && column.high - column.low < 12 ? { ...axis, tick0: Math.ceil(column.low), dtick: 1 } : axis;
 };
+// Ranges of a column on its axis in parallel, or back: that of an input over decades has logarithms.
+const brushed = (column, ranges, change) => column.log && ranges ? ranges.map(range => range.map(change)) : ranges;
 // Values of a column; whole numbers and choices are spread around their value, so that runs do not hide each other.
 const spread = (column, rows, index, step) => rows.map(row =>
   column.whole ? column.values[row] + 0.5 * ((index[row] * step) % 1 - 0.5) : column.values[row]);
@@ -62,12 +65,13 @@ const drawParallel = (place, data, view) => {
   place.dataset.lines = rows.length < all.length ? `Shown are ${rows.length} of ${all.length} runs; ranges filter all.` : "";
   const columns = [data.told, ...data.ranked];
   const dimensions = columns.map(column => {
-    const values = rows.map(row => column.values[row]);
+    const values = rows.map(row => column.log ? Math.log10(column.values[row]) : column.values[row]);
     let low = Infinity, high = -Infinity;
     for (const value of values) { low = Math.min(low, value); high = Math.max(high, value); }
     if (!(high > low)) { low -= 0.5; high += 0.5; }
-    const named = column.choices.length ? { tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(c => shortened(c, 12)) } : {};
-    return { label: shortened(titled(column), 18), values, range: [low, high], constraintrange: view.brushes.get(column.name), ...named };
+    const decades = column.log ? Array.from({ length: Math.floor(high) - Math.ceil(low) + 1 }, (_, k) => Math.ceil(low) + k) : [];
+    const named = column.log ? { tickvals: decades, ticktext: decades.map(k => `1e${k}`) } : column.choices.length ? { tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(c => shortened(c, 12)) } : {};
+    return { label: shortened(titled(column), 18), values, range: [low, high], constraintrange: brushed(column, view.brushes.get(column.name), Math.log10), ...named };
   });
   const [safeColour, criticalColour] = shades();
   place.style.minWidth = `${96 * columns.length}px`;
@@ -79,7 +83,7 @@ const drawParallel = (place, data, view) => {
     const brushes = new Map();
     place.data[0].dimensions.forEach((dimension, k) => {
       const range = dimension.constraintrange;
-      if (range) brushes.set(columns[k].name, Array.isArray(range[0]) ? range : [range]);
+      if (range) brushes.set(columns[k].name, brushed(columns[k], Array.isArray(range[0]) ? range : [range], at => 10 ** at));
     });
     view.brushed(brushes);
   });
@@ -110,7 +114,7 @@ const drawInfluence = (place, data, chosen) => {
 const drawSlice = (place, data, row, k) => {
   const { slices } = data, at = slices.runs.indexOf(data.index[row]), input = data.inputs[k];
   const [mean, low, high, score] = slices.of[at][k], grid = slices.grid[k], here = input.values[row];
-  const discrete = input.whole, fine = discrete ? grid : finer(grid), mode = discrete ? "markers" : "lines";
+  const discrete = input.whole, fine = discrete ? grid : finer(grid, input.log), mode = discrete ? "markers" : "lines";
   const frame = look({}), model = colour("--model");
   const traces = [
     { x: grid, y: low, mode, line: { width: 0 }, marker: { color: model, size: 4 }, hoverinfo: "skip" },
@@ -135,7 +139,10 @@ const drawSlice = (place, data, row, k) => {
     return [m, l, h, normal(z)];
   };
 };
-const finer = grid => Array.from({ length: 241 }, (_, k) => grid[0] + k / 240 * (grid[grid.length - 1] - grid[0]));
+const finer = (grid, log) => {
+  const first = grid[0], last = grid[grid.length - 1];
+  return Array.from({ length: 241 }, (_, k) => log ? first * (last / first) ** (k / 240) : first + k / 240 * (last - first));
+};
 // The distribution function of the normal: Abramowitz and Stegun 26.2.17, off by less than 1e-7.
 const normal = z => {
   const t = 1 / (1 + 0.2316419 * Math.abs(z));

@@ -205,19 +205,21 @@ class Explorer {
     this.part("slice-title").textContent = row === view.run ? "The metamodel through this run" : `The metamodel through run ${run}, the nearest of ${data.slices.runs.length} runs with slices in this file`;
     const k = Number(select.value), input = data.inputs[k], grid = data.slices.grid[k], { error_p: p, error_mean: mean } = data.slices;
     const off = p < 0.001 ? "by less than 0.001" : p < 0.05 ? `by up to ${digits(p, 1)}`
+      : input.log ? `at its edges, which may lie up to ${digits(100 * ((grid[grid.length - 1] / grid[0]) ** (1 / Math.max(grid.length - 1, 1)) - 1), 1)} % beside`
       : `at its edges, which may lie up to ${withUnit(digits((grid[grid.length - 1] - grid[0]) / Math.max(grid.length - 1, 1), 1), input.unit)} beside`;
     this.part("slice-note").textContent = input.whole ? "" : `Both are interpolated: the metric is off by up to ${withUnit(digits(mean, 2), data.told.unit)}, P(critical) ${off}.`;
     const move = drawSlice(this.part("slice"), data, row, k);
-    Object.assign(slider, { min: grid[0], max: grid[grid.length - 1], step: input.whole ? 1 : "any" });
+    const place_of = input.log ? Math.log10 : value => value, value_at = input.log ? at => 10 ** at : at => at;
+    Object.assign(slider, { min: place_of(grid[0]), max: place_of(grid[grid.length - 1]), step: input.whole ? 1 : "any" });
     const tell = value => {
       const [mean, low, high, p] = move(value);
       const written = input.choices.length ? input.choices[Math.round(value)] : withUnit(digits(value), input.unit);
       says.textContent = `${input.name} = ${written}, else as run ${run}: ${data.told.name} ${digits(mean, 3)} `
         + `(90 % between ${digits(low, 3)} and ${withUnit(digits(high, 3), data.told.unit)}), P(critical) ${percent(p)}`;
     };
-    slider.value = input.values[row];
-    slider.oninput = () => tell(Number(slider.value));
-    tell(Number(slider.value));
+    slider.value = place_of(input.values[row]);
+    slider.oninput = () => tell(value_at(Number(slider.value)));
+    tell(value_at(Number(slider.value)));
   }
 }
 

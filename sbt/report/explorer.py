@@ -105,7 +105,8 @@ def _input(parameter: Parameter, k: int, influence: Influence | None) -> Json:
     }  # fmt: skip
     return {
         "name": parameter.name, "unit": parameter.unit, "low": _number(low), "high": _number(high),
-        "choices": list(parameter.choices), "whole": parameter.discrete, "description": parameter.description, **known,
+        "choices": list(parameter.choices), "whole": parameter.discrete, "log": parameter.logarithmic,
+        "description": parameter.description, **known,
     }  # fmt: skip
 
 

@@ -7,6 +7,7 @@ crosses failed; hollow ones are held out.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -189,12 +190,14 @@ def _hollow(marker: str, colour: str, scale: float) -> dict[str, Any]:
 
 
 def whole_ticks(ax: Axes, *inputs: Parameter) -> None:
-    """Let the axes of integer inputs have whole ticks only, those of inputs with choices the choices."""
+    """Let the axes of integer inputs have whole ticks only, those with choices the choices, those over decades logarithms."""
     from matplotlib.ticker import MaxNLocator
 
     for axis, parameter in zip((ax.xaxis, ax.yaxis), inputs, strict=False):
         if parameter.choices:
             axis.set_ticks(range(len(parameter.choices)), [escaped(choice) for choice in parameter.choices])
+        if parameter.logarithmic:
+            ax.set(**{"xscale" if axis is ax.xaxis else "yscale": "log"})
         if parameter.kind == "integer":
             axis.set_major_locator(MaxNLocator("auto", integer=True))
 
@@ -213,7 +216,11 @@ def _limits(parameter: Parameter, x: Vector) -> tuple[float, float]:
     low, high = parameter.bounds
     if parameter.choices:
         return low - 0.5, high + 0.5
-    return padded(float(np.min(x, initial=low)), float(np.max(x, initial=high)))
+    low, high = float(np.min(x, initial=low)), float(np.max(x, initial=high))
+    if parameter.logarithmic:
+        low, high = padded(math.log(low), math.log(high))
+        return math.exp(low), math.exp(high)
+    return padded(low, high)
 
 
 def escaped(text: str) -> str:

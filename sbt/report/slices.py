@@ -78,6 +78,8 @@ def slices_through(
 
 def _grid(parameter: Parameter, size: int) -> Vector:
     low, high = parameter.bounds
+    if parameter.logarithmic:
+        return parameter.from_unit(np.linspace(0.0, 1.0, size))
     if not parameter.discrete:
         return np.linspace(low, high, size)
     return np.unique(np.round(np.linspace(low, high, min(size, round(high - low) + 1))))

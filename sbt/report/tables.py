@@ -100,10 +100,10 @@ def input_table(scenario: LogicalScenario, influence: Influence | None) -> Table
 
 
 def _input(parameter: Parameter) -> tuple[Cell, ...]:
-    whole = ", whole numbers" if parameter.kind == "integer" else ""
+    scale = ", whole numbers" if parameter.kind == "integer" else ", logarithmic" if parameter.logarithmic else ""
     return (
         Cell(parameter.name),
-        Cell(", ".join(parameter.choices) or f"[{parameter.low:g}, {parameter.high:g}]{whole}"),
+        Cell(", ".join(parameter.choices) or f"[{parameter.low:g}, {parameter.high:g}]{scale}"),
         Cell(written_unit(parameter.unit) or NOTHING),
         Cell(distribution_words(parameter)),
         Cell(parameter.description),

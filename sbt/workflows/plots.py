@@ -145,6 +145,8 @@ class Plots:
         k = int(np.argmax(self._influence)) if x is None else self._column(x)
         low, high = space.parameters[k].bounds
         along = np.linspace(low, high, _SLICE_POINTS)
+        if space.parameters[k].logarithmic:
+            along = space.parameters[k].from_unit(np.linspace(0.0, 1.0, _SLICE_POINTS))
         if space.parameters[k].discrete:
             along = np.unique(along.round())
         point = np.tile(self._point(at), (len(along), 1))
