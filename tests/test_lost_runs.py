@@ -13,7 +13,7 @@ from sbt.campaigns.telling import tell_boundary, tell_estimation, tell_share
 from sbt.cli import app
 from sbt.loop.stages import Facts
 from sbt.problem.requirement import Requirement
-from sbt.store.history import History
+from sbt.store.history import History, Rows
 
 LOW = Requirement("m", high=0.0)
 NARROW = {"probability": 0.1, "low": 0.09, "high": 0.11, "cov": 0.05, "hits": 40, "counted": 60, "undetected_mass_bound": 0.05}
@@ -134,3 +134,15 @@ def test_held_out_runs_that_fail_tell_nothing_of_the_share_among_those_that_give
     said = " ".join(tell_boundary(found, share, Facts(History.of(("a",)), LOW, "m", "s")))
     assert "of what gives a metric" in said
     assert "the 4 held-out runs that gave one alone say 50" in said
+
+
+@pytest.mark.parametrize("safe", [0, 9])
+def test_that_nearly_all_is_critical_does_not_deny_the_runs_that_were_not(safe):
+    """The weights of draws may sum to more than 1 although some were safe: P is not 1 then, and these runs were met."""
+    rows, n = Rows(("a",)), 60
+    rows.append(np.zeros((n, 1)), {"status": ["ok"] * n, "index": range(n)}, [{"m": 1.0 if k < safe else -1.0} for k in range(n)])
+    all_but = {**NARROW, "probability": 1.0, "low": 0.905, "high": 1.0, "hits": 58, "failed_as_critical": 1.0}
+    said = tell_estimation(EstimationConclusion(**all_but), Facts(rows.history(), LOW, "m", "s"))
+    assert ("which no run met" in said[1]) == (safe == 0)
+    assert ("is 1 (" in said[0]) == (safe == 0)
+    assert safe == 0 or ("is at least 0.905" in said[0] and "9 runs were not critical" in said[1])
