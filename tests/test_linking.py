@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,13 +33,15 @@ def bow(x: np.ndarray) -> float:
     return float(np.hypot(np.hypot(*v) - 0.3, max(-v[1], 0.0)) - 0.05)
 
 
-def found(folder: Path, metric: Callable[[np.ndarray], float], seed: int, budget: int = 100) -> tuple[sbt.Result, Log]:
+def found(
+    folder: Path, metric: Callable[[np.ndarray], float], seed: int, budget: int = 100, **settings: Any
+) -> tuple[sbt.Result, Log]:  # fmt: skip
     def evaluate(values: dict, _: int) -> dict:
         return {"y": metric(np.array([values["a"], values["b"]]))}
 
     inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
     scenario = sbt.Scenario("s", inputs, sbt.Requirement("y", high=0.0), evaluate=evaluate, metrics=["y"])
-    keys = {"campaign": "falsification", "executor": "serial", "report": False}
+    keys = {"campaign": "falsification", "executor": "serial", "report": False, **settings}
     result = sbt.run(scenario=scenario, budget=budget, seed=seed, store=folder / f"{seed}", **keys)
     with Store.read(folder / f"{seed}") as store:
         return result, Log(store.history(), tuple(store.iterations()), tuple(store.fits()))
@@ -73,6 +76,36 @@ def test_links_come_beside_the_budget_follow_from_the_log_and_are_told(tmp_path:
         assert [dict(run.inputs) for run in stage.propose(known).runs] == [dict(rows.inputs(k)) for k in range(len(rows))]
     assert stage.stop(log) == "budget"
     assert seed >= 0
+
+
+@pytest.mark.parametrize(("ahead", "seed"), [(0, 7), (1, 7)])
+def test_a_campaign_that_is_to_end_at_so_many_modes_goes_on_where_runs_between_them_join_them(
+    tmp_path: Path, ahead: int, seed: int
+):  # fmt: skip
+    """It was told as two modes, and joined; to the same rows, whenever it is killed."""
+    keys = {"stop": {"modes": 2}, "batch": {"size": 10, "ahead": ahead}, "judges": []}
+    result, log = found(tmp_path / "whole", bow, seed, 50, **keys)
+    stages, history = [batch.stage for batch in log.iterations], log.history
+    assert len(result.conclusion.failure_modes) >= 2 or int((history.stage != CONFIRM).sum()) == 50
+    assert "search" in stages[stages.index(CONFIRM) :]
+    done: list[int] = []
+
+    def kill(progress: sbt.Progress) -> None:
+        if progress.done - done[-1] >= 9:
+            done.append(progress.done)
+            raise KeyboardInterrupt
+
+    while len(done) < 20:
+        done.append(done[-1] if done else 0)
+        try:
+            again = found(tmp_path / "killed", bow, seed, 50, **keys, progress=kill)[1]
+            break
+        except KeyboardInterrupt:
+            continue
+    assert len(done) > 5
+    assert [batch.stage for batch in again.iterations] == stages
+    assert again.history.x.tolist() == history.x.tolist()
+    assert again.history.seed.tolist() == history.seed.tolist()
 
 
 def test_equal_inputs_are_one_mode_whatever_the_metamodel_says_there():

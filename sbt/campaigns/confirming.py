@@ -12,7 +12,7 @@ from sbt.campaigns.modes import Mode
 from sbt.campaigns.parts import named_inputs
 from sbt.campaigns.rates import next_repetitions
 from sbt.campaigns.records import CONFIRM, LINK, RACE, SearchProposal
-from sbt.loop.stages import Batch, Log, Stage
+from sbt.loop.stages import BACK, Batch, Log, Stage
 from sbt.store.database import PlannedRun
 from sbt.store.history import History
 
@@ -42,8 +42,9 @@ class ConfirmStage:
     name: str = CONFIRM
 
     def stop(self, log: Log) -> str | None:
-        """Return why the search was over, once the first ten modes are repeated."""
-        return None if self._links(log) or self._missing(log)[1] else self.search.stop(log)
+        """Return why the search was over, once the first ten modes are repeated; `BACK` if runs between critical ones deny it."""
+        over = self.search.stop(log)
+        return BACK if over is None else None if self._links(log) or self._missing(log)[1] else over
 
     def propose(self, log: Log) -> Batch:
         """Return three runs a mode, of a noisy simulator up to ten, or a round of the race before these, beside the budget."""
@@ -79,9 +80,10 @@ class ConfirmStage:
 
     def _links(self, log: Log) -> list[Way]:
         """Return ways between critical runs on which a run tells whether they are of one mode; none after repetitions."""
-        rounds, search = len(batches_by(log, LINK)), self.failure_search
+        search, searched = self.failure_search, max(batch.number for batch in log.iterations if batch.stage != CONFIRM)
         scenario, runs = search.settings.scenario, with_links(log)
-        if scenario.pool is not None or rounds >= _LINK_ROUNDS or batches_by(log, RACE, _TOLD) or search.noisy(runs):
+        rounds, repeated = ([n for n in batches_by(log, *methods) if n > searched] for methods in ((LINK,), (RACE, _TOLD)))
+        if scenario.pool is not None or len(rounds) >= _LINK_ROUNDS or repeated or search.noisy(runs):
             return []
         if scenario.requirement.critical_runs(runs)[runs.ok].all():  # nothing is known to be between modes
             return []

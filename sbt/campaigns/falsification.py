@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from sbt.acquisitions import even, is_greedy, log_scores
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.confirming import ConfirmStage
-from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, search_runs
+from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, links_of, search_runs, with_links
 from sbt.campaigns.levels import coarse_runs, screening_told
 from sbt.campaigns.likeness import TRANSFERRED, earlier_told
 from sbt.campaigns.parts import held_out_runs, named_inputs
@@ -91,13 +91,13 @@ class SearchStage:
         return s.ahead if s.method == "portfolio" or s.acquisition is not None else 0
 
     def stop(self, log: Log) -> str | None:
-        """Return `failures` or `modes` once so many are found, `budget` once it is used up."""
-        s, runs = self.failure_search.settings, search_runs(log.history)
-        critical = int((self.failure_search.margin(runs) <= 0).sum())
+        """Return `failures` or `modes` once so many are found, as the conclusion tells them, `budget` once it is used up."""
+        s, found, known = self.failure_search.settings, self.failure_search, with_links(log)
         failures, modes = s.stop.get("failures"), s.stop.get("modes")
-        if failures is not None and critical >= failures:
+        if failures is not None and int((found.margin(search_runs(log.history)) <= 0).sum()) >= failures:
             return "failures"
-        if modes is not None and critical >= modes and len(self.failure_search.modes(runs)) >= modes:
+        many = modes is not None and int((found.margin(known) <= 0).sum()) >= modes
+        if modes is not None and many and len(found.modes(known, links=links_of(log))) >= modes:
             return "modes"
         asked = search_runs(log.planned)
         if log.iterations and s.budget - self.spent(log) < 1.0:

@@ -5,7 +5,8 @@ that was killed and run again ends with the same rows as one that was not.
 
 A stage that looks ahead chooses batch k from the runs of the batches up to k - 1 - ahead, from how all earlier batches were
 chosen, and from where the runs in between lie, whose outcomes it does not see even where they are known. So its rows, too,
-are the same with any number of workers. The first batch is always waited for.
+are the same with any number of workers. The first batch is always waited for, and so are those of a later stage, which sent
+the campaign back.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -21,7 +22,7 @@ from sbt.errors import InputError
 from sbt.execution.protocol import Executor, groups_of, is_apart
 from sbt.loop.driver import Counter, Driver
 from sbt.loop.learner import FittedMetamodel
-from sbt.loop.stages import Batch, Campaign, Conclusion, Facts, Log, LooksAhead, Progress, Shard, Stage, proposed
+from sbt.loop.stages import BACK, Batch, Campaign, Conclusion, Facts, Log, LooksAhead, Progress, Shard, Stage, proposed
 from sbt.problem.outcome import Job
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
@@ -79,10 +80,12 @@ def run_stages(
     versions: str, listener: Callable[[Progress], None], workers: int | None = None,
 ) -> Finished:  # fmt: skip
     """Run all stages to their end, resuming what the store holds; `workers` are what the use of their time is counted of."""
-    driver, reason = Driver(store, Counter(listener, requirement, budget), seed, versions), ""
+    driver, reason, k = Driver(store, Counter(listener, requirement, budget), seed, versions), "", 0
     driver.counter.count_all(store.history())
-    for stage in campaign.stages:
-        reason = _StageLoop(stage, driver, executor).run()
+    while k < len(campaign.stages):
+        later = {stage.name for stage in campaign.stages[k + 1 :]} - {stage.name for stage in campaign.stages[: k + 1]}
+        reason = _StageLoop(campaign.stages[k], driver, executor, frozenset(later)).run(sent_back=reason == BACK)
+        k = 0 if reason == BACK else k + 1
     log = _log(store, 0)
     driver.counter.tell("concluding")
     start = time.perf_counter()
@@ -97,20 +100,21 @@ def ahead_of(stage: Stage) -> int:
     return stage.ahead if isinstance(stage, LooksAhead) else 0
 
 
-def _log(store: Store, ahead: int) -> Log:
+def _log(store: Store, ahead: int, later: frozenset[str] = frozenset()) -> Log:
     """Return the log as a stage sees it that chooses the next batch; all of it where it does not look ahead."""
     iterations, fits = tuple(store.iterations()), tuple(store.fits())
     if ahead == 0 or not iterations:
         coarse = store.history(level=1)
         return Log(store.history(), iterations, fits, coarse=coarse if len(coarse) else None)
-    history = store.history(until=_last_visible(len(iterations), ahead))
+    history = store.history(until=_last_visible(iterations, ahead, later))
     pending = store.pending(since=len(history))
     return Log(history, iterations, fits, pending if len(pending) else None)
 
 
-def _last_visible(batch: int, ahead: int) -> int:
-    """Return the number of the last batch whose outcomes the choice of a batch depends on; -1: of none."""
-    return max(batch - 1 - ahead, 0) if batch else -1
+def _last_visible(iterations: Sequence[Iteration], ahead: int, later: frozenset[str]) -> int:
+    """Return the number of the last batch whose outcomes the choice of the next one depends on; -1: of none."""
+    waited_for = (batch.number for batch in iterations if batch.stage in later)
+    return max(len(iterations) - 1 - ahead, 0, *waited_for) if iterations else -1
 
 
 @dataclass
@@ -121,19 +125,23 @@ class _StageLoop:
         stage: proposes the batches.
         driver: writes them.
         executor: runs them; where that leaves this process idle, a stage that looks ahead chooses meanwhile.
+        later: stages after it, whose batches it waits for.
     """
 
     stage: Stage
     driver: Driver
     executor: Executor
+    later: frozenset[str]
     _queue: deque[Job] = field(default_factory=deque)
     _planned: deque[Iterator[Job]] = field(default_factory=deque)
     _thought: _Thought | None = None
     _reason: str | None = None
 
-    def run(self) -> str:
-        """Run the stage to its end; return why it was over."""
+    def run(self, *, sent_back: bool = False) -> str:
+        """Run the stage to its end; return why it was over. `sent_back`: a later one has seen that it was not, from all runs."""
         ahead = ahead_of(self.stage)
+        if sent_back:
+            self._advance(0)
         while True:
             if not self._queue:
                 self._queue.extend(self._coming())
@@ -169,13 +177,13 @@ class _StageLoop:
         store, counter = self.driver.store, self.driver.counter
         while self._reason is None:
             if self._thought is None:
-                number, unfinished = len(store.iterations()), store.first_unfinished
-                if unfinished is not None and unfinished <= _last_visible(number, ahead):
+                iterations, unfinished = store.iterations(), store.first_unfinished
+                if unfinished is not None and unfinished <= _last_visible(iterations, ahead, self.later):
                     return
-                counter.iteration = number
+                counter.iteration = len(iterations)
                 if unfinished is None:
                     counter.tell(f"{self.stage.name}: choosing")
-                self._thought = _Thought(self.stage, _log(store, ahead), apart=ahead > 0 and is_apart(self.executor))
+                self._thought = _Thought(self.stage, _log(store, ahead, self.later), apart=ahead > 0 and is_apart(self.executor))
             if not self._thought.ended:
                 return
             thought, self._thought = self._thought, None

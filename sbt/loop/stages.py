@@ -18,12 +18,15 @@ from sbt.store.history import History
 from sbt.store.records import FitRecord, Iteration
 
 __all__ = [
-    "Batch", "Campaign", "Conclusion", "Facts", "Log", "LooksAhead", "Progress", "Shard", "Stage", "few_combinations", "proposed",
-    "sentences_of",
+    "BACK", "Batch", "Campaign", "Conclusion", "Facts", "Log", "LooksAhead", "Progress", "Shard", "Stage", "few_combinations",
+    "proposed", "sentences_of",
 ]  # fmt: skip
 
 _FEW = 4096
 """Combinations of whole numbers and choices that are kept account of."""
+
+BACK = "back to the first stage"
+"""What a later stage says instead of why it is over: its runs have told that an earlier one is not."""
 
 T = TypeVar("T")
 
@@ -156,7 +159,7 @@ class Stage(Protocol):
         ...
 
     def stop(self, log: Log) -> str | None:
-        """Return why the stage is over, None while it goes on."""
+        """Return why the stage is over, None while it goes on; of a later stage `BACK` where the first one goes on."""
         ...
 
     def propose(self, log: Log) -> Batch:
@@ -191,7 +194,7 @@ class Campaign:
     """Stages one after the other, and what to conclude from the log in the end.
 
     Args:
-        stages: propose the batches.
+        stages: propose the batches, one after the other; a later one may send the campaign back to the first.
         conclude: gives the conclusion, and the metamodel that was fitted for it.
         depends: how batches, or when they end, depend on results; None: not at all, so that all runs
             can be planned ahead and shared out.
