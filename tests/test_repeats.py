@@ -141,6 +141,26 @@ def test_a_failure_of_one_seed_in_fifty_gives_its_noise_away(campaign: str, tmp_
     assert result.conclusion.simulator_noise.noisy
 
 
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_campaign_that_is_to_end_at_so_many_failures_counts_different_inputs(tmp_path: Path, noisy: bool):
+    def evaluate(values: dict, seed: int) -> dict:
+        inside = np.hypot(values["a"] - 0.3, values["b"] - 0.4) < 0.35
+        return {"y": float(inside) + (0.1 * float(seed % 2) if noisy else 0.0)}
+
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
+    scenario = sbt.Scenario("flag", inputs, sbt.Requirement("y", low=0.5), evaluate=evaluate, metrics=["y"])
+    keys = {"campaign": "falsification", "seed": 2, "executor": "serial", "report": False, "judges": []}
+    result = sbt.run(scenario=scenario, budget=60, stop={"failures": 5}, store=tmp_path / "s", **keys)
+    hits = result.frame.query("critical == True and stage != 'confirm'")
+    different = len(hits.drop_duplicates(["x.a", "x.b"]))
+    assert 5 <= different < len(hits) == result.conclusion.critical_runs
+    before = hits[hits["iteration"] < result.frame.query("stage != 'confirm'")["iteration"].max()]
+    assert len(before.drop_duplicates(["x.a", "x.b"])) < 5
+    assert result.conclusion.critical_inputs == different
+    assert f", at {different} different inputs, in " in result.sentences()[0]
+    assert f" They have {different} different inputs." in result.conclusion.statement
+
+
 def test_modes_of_one_input_each_may_be_parts_of_one_region(tmp_path: Path):
     def bent(x: np.ndarray) -> np.ndarray:
         return abs(x[:, 1] - 0.5 - 0.3 * np.sin(2.0 * np.pi * x[:, 0])) - 0.01

@@ -110,6 +110,7 @@ class FalsificationConclusion:
         raced: repetitions that helped to order the modes and count in no rate; None: there are none.
         links: runs that asked whether critical runs are of one mode; None: there are none.
         earlier: what a campaign of another setup told; None: there is none.
+        critical_inputs: different inputs of the critical runs; None: of each its own.
     """
 
     first_critical_run: int | None
@@ -128,6 +129,7 @@ class FalsificationConclusion:
     raced: int | None = optional()
     links: LinksTold | None = optional()
     earlier: EarlierTold | None = optional()
+    critical_inputs: int | None = optional()
 
     @property
     def look_at(self) -> int | None:
@@ -186,6 +188,10 @@ class FailureSearch:
     def margin(self, history: History) -> Vector:
         """Return (n,) distance to M_c in the metric's unit, NaN where a run failed."""
         return self.settings.scenario.requirement.margins(history)
+
+    def critical_inputs(self, history: History) -> int:
+        """Return how many different inputs critical runs among these have."""
+        return len(np.unique(history.x[self.margin(history) <= 0], axis=0))
 
     def modes(self, history: History, raced: History | None = None, links: Links = ()) -> list[Mode]:
         """Return the failure modes among these runs, some of them `links`; with noise `raced` repetitions help to order them."""
@@ -257,16 +263,16 @@ class FailureSearch:
         for mode in self.modes(known, raced, links_of(log)):
             again = history.where(confirmations(history, known.x[mode.representative], aside))
             modes.append(describe(mode, known, scenario, again, noisy=self.noisy(history)))
-        first = int(hits[0]) if len(hits) else None
+        first, inputs = int(hits[0]) if len(hits) else None, self.critical_inputs(searched)
         bound = None if len(hits) else SearchBound.of(searched)
         return FalsificationConclusion(
             None if first is None else int(searched.index[first]), None if first is None else first + 1, len(hits), tuple(modes),
             bound, None if len(hits) else _closest(searched, margin, scenario.requirement),
-            _statement(searched, len(hits), modes, bound), None if fit is None else fit.validation,
+            _statement(searched, len(hits), inputs, modes, bound), None if fit is None else fit.validation,
             stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
             None if fit is None else fit.independence,
             explained_variance(self.settings, history, (history.iteration == 0) | (history.stage == VALIDATION)),
-            raced=len(raced) or None, links=self._links_told(log),
+            raced=len(raced) or None, links=self._links_told(log), critical_inputs=inputs if inputs < len(hits) else None,
         )  # fmt: skip
 
     def _links_told(self, log: Log) -> LinksTold | None:
@@ -345,7 +351,7 @@ def _closest(runs: History, margin: Vector, requirement: Requirement) -> Closest
     return ClosestRun(int(runs.index[k]), runs.inputs(k), float(requirement.told(runs)[k]), float(margin[k]))
 
 
-def _statement(runs: History, hits: int, modes: list[FailureMode], bound: SearchBound | None) -> str:
+def _statement(runs: History, hits: int, inputs: int, modes: list[FailureMode], bound: SearchBound | None) -> str:
     """Return what follows from the runs, and no more."""
     n, failed = len(runs), int((~runs.ok).sum())
     hidden = f" {failed} runs failed and say nothing about safety." if failed else ""
@@ -363,16 +369,15 @@ def _statement(runs: History, hits: int, modes: list[FailureMode], bound: Search
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
     unsure = [m for m in modes if m.confirmed is not None and _uncritical(m.confirmed, m)]
     unconfirmed = f" Repeats with fresh seeds did not all fail in {plural(len(unsure), 'mode')}." if unsure else ""
-    return f"{_counted(hits, n, len(modes))}{unconfirmed}{hidden}"
+    counted = f"{hits} of {n} runs of the search were critical, in {plural(len(modes), 'failure mode')}"
+    same = "the same inputs" if inputs == 1 else f"{inputs} different inputs"
+    different = f" They have {same}." if inputs < hits else ""
+    return f"{counted}.{different}{unconfirmed}{hidden}"
 
 
 def _uncritical(confirmed: float, mode: FailureMode) -> bool:
     """Return whether some repetition gave a metric and was not critical."""
     return round(confirmed * mode.confirmation_runs) + (mode.confirmations_lost or 0) < mode.confirmation_runs
-
-
-def _counted(hits: int, n: int, modes: int) -> str:
-    return f"{hits} of {n} runs of the search were critical, in {plural(modes, 'failure mode')}."
 
 
 def _more(found: FalsificationConclusion, facts: Facts) -> list[str]:

@@ -94,7 +94,7 @@ class SearchStage:
         """Return `failures` or `modes` once so many are found, as the conclusion tells them, `budget` once it is used up."""
         s, found, known = self.failure_search.settings, self.failure_search, with_links(log)
         failures, modes = s.stop.get("failures"), s.stop.get("modes")
-        if failures is not None and int((found.margin(search_runs(log.history)) <= 0).sum()) >= failures:
+        if failures is not None and found.critical_inputs(search_runs(log.history)) >= failures:
             return "failures"
         many = modes is not None and int((found.margin(known) <= 0).sum()) >= modes
         if modes is not None and many and len(found.modes(known, links=links_of(log))) >= modes:

@@ -177,10 +177,12 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     searched = int((facts.history.stage != CONFIRM).sum())
     most = "up to " if single(modes, facts.history) > 1 else ""
     between = ", with critical runs that were met on the way between them" if len(modes) > found.critical_runs else ""
+    inputs = found.critical_inputs
+    at = "" if inputs is None else ", all at one input" if inputs == 1 else f", at {inputs:,} different inputs"
     said = (
         f"The requirement{_of(facts)} is falsified: {found.critical_runs:,} of {plural(searched, 'run')} of the search"
         f" {'was' if found.critical_runs == 1 else 'were'} critical ({_condition(facts)}), the first after"
-        f" {plural(found.runs_to_first or 0, 'run')}, in {most}{plural(len(modes), 'distinct failure mode')}{between}{worst}."
+        f" {plural(found.runs_to_first or 0, 'run')}{at}, in {most}{plural(len(modes), 'distinct failure mode')}{between}{worst}."
     )
     exhausted, silent = none_left(facts), "This does not tell how probable a failure is, since results chose the runs"
     silent += "" if exhausted else ", nor that there is no other mode"

@@ -179,7 +179,7 @@ class ValidationChoice(_Strict):
 class StopRules(_Strict):
     """When to stop before the budget is used up; null switches a rule off."""
 
-    failures: int | None = Field(default=None, ge=1, le=MOST_RUNS, description="Falsification: number of critical runs.")
+    failures: int | None = Field(default=None, ge=1, le=MOST_RUNS, description="Falsification: different critical inputs.")
     modes: int | None = Field(default=None, ge=1, le=MOST_RUNS, description="Falsification: number of distinct failure modes.")
     stable: float | None = Field(default=None, gt=0, lt=1, description="Boundary: share of the space that still changes sides.")
     misclassified: float | None = Field(
