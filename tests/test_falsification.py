@@ -144,7 +144,8 @@ def test_both_holes_are_found_confirmed_and_told_apart(falsified: Run):
         assert kept[safe["run"]][5]["y"] > 0
         assert {k: v + safe["change"].get(k, 0.0) for k, v in mode["inputs"].items()} == pytest.approx(safe["inputs"])
     assert centres == set()
-    assert result["runs"] == 80 + 6
+    assert found["links"] == {"runs": 1, "critical": 0, "left": 0}
+    assert result["runs"] == 80 + 6 + 1
     assert found["bound"] is None
     assert found["statement"].startswith(f"{found['critical_runs']} of 80 runs of the search were critical, in 2 failure modes.")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sbt
-from sbt.campaigns.linking import Link, Way, connected, doubtful, pairs_joined
+from sbt.campaigns.linking import Link, LinksTold, Way, connected, doubtful, pairs_joined, unasked
 from sbt.campaigns.records import CONFIRM, LINK, SearchProposal
 from sbt.loop.stages import Facts, Log
 from sbt.metamodels.gaussian_process import GaussianProcess
@@ -78,6 +78,21 @@ def test_links_come_beside_the_budget_follow_from_the_log_and_are_told(tmp_path:
     assert seed >= 0
 
 
+def cliff(x: np.ndarray) -> float:
+    """One ellipse, beyond which the metric jumps, and is cut off."""
+    r = float(np.hypot((x[0] - 0.7) / 0.25, (x[1] - 0.4) / 0.12))
+    return 8.5 if r > 1.3 else r - 1.0 if r < 1.0 else 2.5 + 3.0 * (r - 1.0)
+
+
+@pytest.mark.parametrize("seed", [3, 7, 10])
+def test_one_region_behind_a_cliff_is_one_mode_or_up_to_so_many(tmp_path: Path, seed: int):
+    """The metamodel excludes the way between its runs."""
+    result = found(tmp_path, cliff, seed, 40, judges=[])[0]
+    many = len(result.conclusion.failure_modes)
+    assert (many == 1) == (seed != 3)
+    assert many == 1 or (result.conclusion.links.untested and f"in up to {many} distinct" in result.sentences()[0])
+
+
 @pytest.mark.parametrize(("ahead", "seed"), [(0, 7), (1, 7)])
 def test_a_campaign_that_is_to_end_at_so_many_modes_goes_on_where_runs_between_them_join_them(
     tmp_path: Path, ahead: int, seed: int
@@ -108,6 +123,11 @@ def test_a_campaign_that_is_to_end_at_so_many_modes_goes_on_where_runs_between_t
     assert again.history.seed.tolist() == history.seed.tolist()
 
 
+def test_runs_between_critical_ones_that_gave_no_metric_are_told():
+    assert LinksTold(2, 0, 0, lost=2).sentence().endswith(": 0 were critical, 2 gave no metric.")
+    assert LinksTold(2, 1, 1).sentence().endswith(": 1 was critical; 1 way between them is still in doubt.")
+
+
 def test_equal_inputs_are_one_mode_whatever_the_metamodel_says_there():
     rng = stream(1, "equal")
     u, interval = rng.random((30, 2)), CriticalInterval(high=0.0)
@@ -133,6 +153,16 @@ def test_a_critical_run_between_two_joins_them_until_one_between_it_and_them_is_
     assert pairs_joined(links[:1], [5, 2, 7]) == [(1, 2), (0, 2)]
     assert pairs_joined(links[:2], [2, 5, 7]) == [(0, 2)]
     assert pairs_joined(links, [2, 5, 7, 9]) == [(0, 3), (2, 3)]
+    assert pairs_joined(links, [2, 5, 7, 9], nested=2) == [(0, 3), (2, 3)]
+    assert pairs_joined(links[:2], [2, 5, 7, 8], nested=2) == [(1, 3), (2, 3)]
+    assert pairs_joined(links[:1], [2, 5, 7], nested=2) == []
+
+
+def test_of_all_ways_between_modes_the_shortest_that_join_them_are_asked_once():
+    given = ((1, 2), 1e-9, True), ((2, 5), 0.4, True), ((1, 5), 0.4, False)
+    ways = [Way(ends, p, np.zeros(1), untested=False, nearest=nearest) for ends, p, nearest in given]
+    assert [way.ends for way in unasked(ways, [])] == [(1, 2), (2, 5)]
+    assert [way.ends for way in unasked(ways, [Link(7, (2, 5)), Link(8, (5, 7))])] == [(1, 2)]
 
 
 @pytest.mark.parametrize(("shift", "groups"), [(1.0, [0, 0, 2]), (9.0, [0, 1, 2])])
@@ -147,3 +177,4 @@ def test_runs_that_one_between_them_has_joined_are_of_one_mode_unless_the_metamo
     assert connected(fitted, u[:3], np.zeros(3)).tolist() == [0, 1, 2]
     assert connected(fitted, u[:3], np.zeros(3), tested=[(0, 1)]).tolist() == groups
     assert connected(fitted, u[:3], np.arange(3.0), tested=[(0, 1)]).tolist() == [0, 1, 2]  # other conflict types
+    assert connected(fitted, u[:3], np.zeros(3), tested=[(0, 1)], sure=[(0, 1)]).tolist() == [0, 0, 2]

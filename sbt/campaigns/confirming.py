@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.campaigns.failures import FailureSearch, batches_by, confirmations, links_of, with_links
+from sbt.campaigns.beside import batches_by, confirmations, links_of, with_links
+from sbt.campaigns.failures import FailureSearch
 from sbt.campaigns.linking import Way
 from sbt.campaigns.modes import Mode
 from sbt.campaigns.parts import named_inputs
@@ -91,7 +93,7 @@ class ConfirmStage:
         most = min(max(int(_LINK_SHARE * (len(runs) - asked)), _FEWEST_LINKS), _MOST_LINKS)
         known = {tuple(row) for row in runs.x}  # whole numbers: the way may lead through a run
         new: dict[tuple[float, ...], Way] = {}
-        for way in search.doubtful_ways(log):
+        for way in (way for both in itertools.zip_longest(*search.ways_to_ask(log)) for way in both if way is not None):
             new.setdefault(tuple(scenario.space.from_unit(way.at[None])[0]), way)
         return [way for row, way in new.items() if row not in known][: min(most - asked, -(-most // _LINK_BATCH))]
 

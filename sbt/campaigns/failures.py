@@ -8,17 +8,18 @@ from functools import cached_property
 
 import numpy as np
 
+from sbt.campaigns.beside import Links, batches_by, confirmations, links_of, with_links
 from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.levels import ScreeningTold
 from sbt.campaigns.likeness import EarlierTold
-from sbt.campaigns.linking import Link, LinksTold, Way, doubtful, pairs_joined, ways_between
+from sbt.campaigns.linking import LinksTold, Way, doubtful, pairs_joined, unasked, ways_between
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.modes import FailureMode, Mode, critical_groups, describe, modes_of, most_often, single, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.rates import LocalRates, local_rates
-from sbt.campaigns.records import CONFIRM, LINK, RACE, SearchProposal
+from sbt.campaigns.records import CONFIRM, LINK, RACE
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.telling import tell_failures
@@ -27,7 +28,7 @@ from sbt.campaigns.wording import percent, plural
 from sbt.errors import InputError
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Facts, Log
-from sbt.problem.arrays import Mask, Vector
+from sbt.problem.arrays import Vector
 from sbt.problem.plain import Json, Value
 from sbt.problem.requirement import Requirement
 from sbt.samplers.search import Search, WarpedModel, fit_warped
@@ -36,11 +37,8 @@ from sbt.store.history import VALIDATION, History
 from sbt.store.records import FitRecord, Independence, Validation, optional, to_json
 
 __all__ = [
-    "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "batches_by", "confirmations",
-    "links_of", "search_runs", "with_links",
+    "FILLING", "ClosestRun", "FailureSearch", "FalsificationConclusion", "SearchBound", "batches_by", "search_runs",
 ]  # fmt: skip
-
-Links = tuple[Link, ...]
 
 _TOLD = 5  # failure rates in the sentences; all of them are in the conclusion
 FILLING = ("initial", "even", VALIDATION)
@@ -201,26 +199,27 @@ class FailureSearch:
         """Return the failure rates at these runs of a noisy simulator, some of them critical; NaN where there is no metric."""
         return self._learned(history, raced).rates
 
-    def doubtful_ways(self, log: Log) -> list[Way]:
+    def ways_to_ask(self, log: Log) -> tuple[list[Way], list[Way]]:
         """Return the ways between critical runs on which a run would tell whether they are of one mode; none with noise.
 
-        Their ends are indices of runs.
+        Their ends are indices of runs. First those in doubt, then the shortest between modes on which no run was made.
         """
         history, links, space = with_links(log), links_of(log), self.settings.scenario.space
         fitted = self._learned(history, None, links).fitted
         if fitted is None:
-            return []
+            return [], []
         chosen, kind = critical_groups(history, self.settings.scenario)
         runs = history.index[chosen].tolist()
-        ways = doubtful(ways_between(
-            fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM, pairs_joined(links, runs),
-            space.cube,
-        ))  # fmt: skip
-        return [
+        ways = [
             replace(way, ends=(min(ends), max(ends)))
-            for way in ways if space.feasible(space.from_unit(way.at[None]))[0]
+            for way in ways_between(
+                fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM,
+                pairs_joined(links, runs), pairs_joined(links, runs, nested=2), space.cube,
+            )
+            if space.feasible(space.from_unit(way.at[None]))[0]
             for ends in [[runs[k] for k in way.ends]]
         ]  # fmt: skip
+        return doubtful(ways), unasked(ways, links)
 
     def _learned(self, history: History, raced: History | None, links: Links = ()) -> _Learned:
         runs = tuple(history.index.tolist()), () if raced is None else tuple(raced.index.tolist()), links
@@ -280,8 +279,9 @@ class FailureSearch:
         asked = log.history.where(np.isin(log.history.iteration, batches_by(log, LINK)))
         if not len(asked):
             return None
-        critical = int(self.settings.scenario.requirement.critical_runs(asked).sum())
-        return LinksTold(len(asked), critical, len(self.doubtful_ways(log)))
+        critical, (doubt, open_) = int(self.settings.scenario.requirement.critical_runs(asked).sum()), self.ways_to_ask(log)
+        left = len(doubt) + sum(way.excluded for way in open_)
+        return LinksTold(len(asked), critical, left, int((~asked.ok).sum()) or None, len(open_) or None)
 
 
 @dataclass(frozen=True)
@@ -296,34 +296,6 @@ class _Learned:
 def search_runs(history: History) -> History:
     """Return the runs of the search, without the confirmations."""
     return history.where(history.stage != CONFIRM)
-
-
-def with_links(log: Log) -> History:
-    """Return the runs of the search, and those between critical ones."""
-    history = log.history
-    return history.where((history.stage != CONFIRM) | np.isin(history.iteration, batches_by(log, LINK)))
-
-
-def links_of(log: Log) -> Links:
-    """Return the runs between critical ones, and between which."""
-    found = []
-    for batch in log.iterations:
-        ends = batch.read(SearchProposal).ends if batch.stage == CONFIRM else None
-        if ends is not None:
-            runs = np.sort(log.history.index[log.history.iteration == batch.number]).tolist()
-            found += [Link(run, pair) for run, pair in zip(runs, ends, strict=True)]
-    return tuple(found)
-
-
-def batches_by(log: Log, *methods: str) -> tuple[int, ...]:
-    """Return the numbers of the batches beside the budget that are by one of these methods."""
-    beside = (batch for batch in log.iterations if batch.stage == CONFIRM)
-    return tuple(batch.number for batch in beside if batch.read(SearchProposal).method in methods)
-
-
-def confirmations(history: History, x: Vector, aside: tuple[int, ...]) -> Mask:
-    """Return (n,) booleans: the run repeated the inputs x (d,) to confirm a failure mode, in no batch of those set aside."""
-    return (history.stage == CONFIRM) & (history.x == x).all(axis=1) & ~np.isin(history.iteration, aside)
 
 
 def _rates(found: FalsificationConclusion) -> list[str]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from sbt.acquisitions import even, is_greedy, log_scores
+from sbt.campaigns.beside import links_of, with_links
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.confirming import ConfirmStage
-from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, links_of, search_runs, with_links
+from sbt.campaigns.failures import FILLING, FailureSearch, FalsificationConclusion, search_runs
 from sbt.campaigns.levels import coarse_runs, screening_told
 from sbt.campaigns.likeness import TRANSFERRED, earlier_told
 from sbt.campaigns.parts import held_out_runs, named_inputs

@@ -15,8 +15,9 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.samplers.search import WarpedModel
 from sbt.seeds import stream
+from sbt.store.records import optional
 
-__all__ = ["Link", "LinksTold", "Way", "connected", "doubtful", "pairs_joined", "ways_between"]
+__all__ = ["Link", "LinksTold", "Way", "connected", "doubtful", "pairs_joined", "unasked", "ways_between"]
 
 _PROBES = 9  # on the segment between two runs
 _CHUNK = 100  # segments asked for at once
@@ -47,12 +48,19 @@ class Way:
         least: smallest P(critical) on it.
         at: (d,) where that is, in the unit cube; of a way between two modes, the point over which it leads.
         untested: the metamodel is sure of it, but no run was made on it: it is long, or bends.
+        nearest: it is between two modes, and one of the shortest that would make all of them one.
     """
 
     ends: tuple[int, int]
     least: float
     at: Vector
     untested: bool
+    nearest: bool = False
+
+    @property
+    def excluded(self) -> bool:
+        """Whether the metamodel excludes that the way is critical."""
+        return self.least <= _DOUBT[0]
 
 
 @dataclass(frozen=True)
@@ -63,16 +71,21 @@ class LinksTold:
         runs: how many.
         critical: of them.
         left: ways in doubt that were not asked about.
+        lost: of the runs, those that gave no metric; None: all gave one.
+        untested: shortest ways between modes on which no run was made: there may be fewer modes; None: there are none.
     """
 
     runs: int
     critical: int
     left: int
+    lost: int | None = optional()
+    untested: int | None = optional()
 
     def sentence(self) -> str:
         """Return in words what was asked, and what remains open."""
         asked = f"{plural(self.runs, 'run')} between critical ones tested whether they are of one failure mode"
         found = f"{self.critical} {'was' if self.critical == 1 else 'were'} critical"
+        found += "" if self.lost is None else f", {self.lost} gave no metric"
         still = f"; {plural(self.left, 'way')} between them {'is' if self.left == 1 else 'are'} still in doubt"
         return f"{asked}: {found}{still if self.left else ''}."
 
@@ -81,26 +94,29 @@ Pairs = Sequence[tuple[int, int]]
 """Of n critical runs, two that are joined."""
 
 
-def pairs_joined(links: Sequence[Link], runs: Sequence[int]) -> list[tuple[int, int]]:
+def pairs_joined(links: Sequence[Link], runs: Sequence[int], *, nested: int = 1) -> list[tuple[int, int]]:
     """Return the pairs of critical runs, as places in `runs` (n,), that runs between them tell: a critical one and its ends.
 
-    Those between which a run was made later are no pair any more: that run decides.
+    Those between which a run was made later are no pair any more: that run decides. `nested`: only pairs that so many critical
+    runs, each between the run before and an end of its, have told.
     """
-    place, pairs = {run: k for k, run in enumerate(runs)}, dict[tuple[int, int], None]()
+    place, pairs = {run: k for k, run in enumerate(runs)}, dict[tuple[int, int], int]()
     for link in links:
-        pairs.pop(link.ends, None)
+        depth = pairs.pop(link.ends, 0) + 1
         if link.run in place:
-            pairs |= {(min(end, link.run), max(end, link.run)): None for end in link.ends}
-    return [(place[a], place[b]) for a, b in pairs if a in place and b in place]
+            pairs |= {(min(end, link.run), max(end, link.run)): depth for end in link.ends}
+    return [(place[a], place[b]) for (a, b), depth in pairs.items() if depth >= nested and a in place and b in place]
 
 
 def connected(
-    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False, tested: Pairs = (), cube: Cube = CONTINUOUS
-) -> NDArray[np.int64]:
+    fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False, tested: Pairs = (), sure: Pairs = (),
+    cube: Cube = CONTINUOUS,
+) -> NDArray[np.int64]:  # fmt: skip
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes; equal inputs are one.
 
     With a noisy simulator P(critical) is small even where runs fail most: there it must exceed half of the smaller P at the two
-    ends. Of two runs that a run between critical ones has joined it is enough that the metamodel does not exclude it.
+    ends. Of two runs that a run between critical ones has joined it is enough that the metamodel does not exclude it, whatever
+    it says where another one between these was critical too.
 
     Args:
         fitted: of the metamodel.
@@ -108,13 +124,14 @@ def connected(
         kind: (n,) only runs of the same kind are joined.
         noisy: see above.
         tested: of `pairs_joined`.
+        sure: those of them that are nested twice.
         cube: in which u is. There is nothing between choices: a way begins with those of its end.
     """
-    return _linked(fitted, u, kind, cube, noisy=noisy, tested=tested)[0]
+    return _linked(fitted, u, kind, cube, noisy=noisy, tested=tested, sure=sure)[0]
 
 
 def ways_between(
-    fitted: WarpedModel, u: Points, kind: Vector, link: Mask, tested: Pairs = (), cube: Cube = CONTINUOUS
+    fitted: WarpedModel, u: Points, kind: Vector, link: Mask, tested: Pairs = (), sure: Pairs = (), cube: Cube = CONTINUOUS
 ) -> list[Way]:  # fmt: skip
     """Return the ways that decide which of n critical runs are of one mode, of a simulator without noise.
 
@@ -125,10 +142,11 @@ def ways_between(
         u: (n, d) critical runs in the unit cube.
         kind: (n,) only runs of the same kind can be of one mode.
         link: (n,) the run was between others.
-        tested: of `pairs_joined`.
+        tested: as in `connected`.
+        sure: as in `connected`.
         cube: as in `connected`.
     """
-    group, joined = _linked(fitted, u, kind, cube, tested=tested)
+    group, joined = _linked(fitted, u, kind, cube, tested=tested, sure=sure)
     distance = cdist(u, u)
     apart = sorted(_between_groups(group, kind, distance), key=lambda pair: float(distance[pair]))[:_APART]
     first, second = np.array([pair for pair in joined if distance[pair] > 0.0], dtype=np.intp).reshape(-1, 2).T
@@ -137,7 +155,18 @@ def ways_between(
     untested = (distance[first, second] > _LONG) & ~link[first] & ~link[second]
     ends = list(zip(first.tolist(), second.tolist(), strict=True))
     straight = [Way(ends[k], float(p[k].min()), probes[k, i], bool(untested[k])) for k, i in enumerate(at)]
-    return [*straight, *(Way((i, j), *_bent(fitted, u[i], u[j], cube)) for i, j in apart)]
+    tree = _tree(apart, group)
+    return [*straight, *(Way((i, j), *_bent(fitted, u[i], u[j], cube), (i, j) in tree) for i, j in apart)]
+
+
+def _tree(ways: Sequence[tuple[int, int]], group: NDArray[np.int64]) -> set[tuple[int, int]]:
+    """Return those of ways between runs of different groups, shortest first, that join what those before have not."""
+    group, found = group.copy(), set[tuple[int, int]]()
+    for i, j in ways:
+        if group[i] != group[j]:
+            found.add((i, j))
+            group[group == group[j]] = group[i]
+    return found
 
 
 def _between_groups(group: NDArray[np.int64], kind: Vector, distance: Points) -> Iterator[tuple[int, int]]:
@@ -161,7 +190,7 @@ def _bent(fitted: WarpedModel, a: Vector, b: Vector, cube: Cube) -> tuple[float,
     over = np.clip(np.vstack([middle, middle + _REACH * np.linalg.norm(b - a) * (a != b) * steps]), 0.0, 1.0)
     least = np.minimum(*(_probed(fitted, np.broadcast_to(end, over.shape), over)[1].min(axis=1) for end in (a, b)))
     least = np.minimum(least, fitted.probability(over))
-    best = int(least.argmax())
+    best = int(least.argmax()) if least.max() > _DOUBT[0] else 0  # excluded: straight
     return float(least[best]), over[best], bool(least[best] > _JOINED)
 
 
@@ -171,8 +200,17 @@ def doubtful(ways: list[Way]) -> list[Way]:
     return sorted(found, key=lambda way: abs(way.least - 0.5))
 
 
+def unasked(ways: list[Way], links: Sequence[Link]) -> list[Way]:
+    """Return the shortest ways that would make all modes one and on which no run was made, whatever the metamodel says there.
+
+    Where a metric jumps, a metamodel knows little beside its runs, and yet excludes most. Ends of both are indices of runs.
+    """
+    known = {link.ends for link in links}
+    return [way for way in ways if way.nearest and way.ends not in known]
+
+
 def _linked(
-    fitted: WarpedModel, u: Points, kind: Vector, cube: Cube, *, noisy: bool = False, tested: Pairs = ()
+    fitted: WarpedModel, u: Points, kind: Vector, cube: Cube, *, noisy: bool = False, tested: Pairs = (), sure: Pairs = ()
 ) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
     """Return (n,) group numbers, and the pairs that join them."""
     n, pairs = len(u), list[tuple[int, int]]()
@@ -186,7 +224,7 @@ def _linked(
             group[group == group[j]] = group[i]
 
     for i, j in tested:
-        if kind[i] == kind[j] and _probed(fitted, u[[i]], u[[j]], cube)[1].min() > _DOUBT[0]:
+        if kind[i] == kind[j] and ((i, j) in sure or _probed(fitted, u[[i]], u[[j]], cube)[1].min() > _DOUBT[0]):
             join(i, j)
     first, second = np.triu_indices(n, 1)
     alike = kind[first] == kind[second]

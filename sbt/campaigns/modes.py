@@ -174,8 +174,8 @@ def modes_of(
     u, cube = scenario.space.to_unit(history.x), scenario.space.cube
     at = cube.embedded(u)
     depth, worse = scenario.requirement.depths(history), severity(history)
-    tested = pairs_joined(links, history.index[chosen].tolist())
-    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested, cube=cube)
+    tested, sure = (pairs_joined(links, history.index[chosen].tolist(), nested=times) for times in (1, 2))
+    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested, sure=sure, cube=cube)
     log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]

@@ -175,7 +175,8 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
         worst += f"; run {often.representative} came back more often, in {again}"
     searched = int((facts.history.stage != CONFIRM).sum())
-    most = "up to " if single(modes, facts.history) > 1 else ""
+    fewer = single(modes, facts.history) > 1 or (found.links is not None and found.links.untested is not None)
+    most = "up to " if fewer else ""
     between = ", with critical runs that were met on the way between them" if len(modes) > found.critical_runs else ""
     inputs = found.critical_inputs
     at = "" if inputs is None else ", all at one input" if inputs == 1 else f", at {inputs:,} different inputs"
