@@ -27,6 +27,7 @@ from sbt.estimators.reweighting import Predicted, ReusedBatch, effective_size
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.cells import MOST_GIVEN, MOST_JOINED
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.history import History
@@ -113,7 +114,9 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         plain, log_q = counted_with(log, old)
         history = replace(history, columns={**history.columns, "log_q": log_q})
     plainly = crude or took_sum(log)
-    draws = [_Draws(-1, plain, len(plain) if crude else 0)] if plainly else [*_counted(log)]
+    draws = [_Draws(-1, plain, np.ones(len(plain)), len(plain) if crude else 0)] if plainly else [*_counted(log)]
+    if old.joined:
+        history = _with_densities(history, old, draws)
     every, reached = np.concatenate([d.rows for d in draws]), np.isfinite(space.log_density(history.x))
     least = 0.0 if took_sum(log) else _least(history.where(np.isin(np.arange(len(history)), every)), old, space)
     predicted = [(_NOTHING_SAID, _NOTHING_SAID)]
@@ -166,10 +169,11 @@ _NOTHING_SAID = _Said()
 
 @dataclass(frozen=True, eq=False)
 class _Draws:
-    """A batch that counts: its number, its rows in the log, how many of them, the first, follow the campaign's distribution."""
+    """A batch that counts: its number, its rows in the log, their weights; of the first `nominal` that is 1."""
 
     number: int
     rows: Rows
+    coefficient: Vector
     nominal: int
 
 
@@ -181,7 +185,15 @@ def _counted(log: Log) -> Iterator[_Draws]:
         draws, nominal = proposal.counted, proposal.nominal
         rows = np.flatnonzero((history.stage == DRAWN) & (history.iteration == batch.number))
         if draws is not None and len(rows) == len(draws.coefficient):
-            yield _Draws(batch.number, rows, 0 if nominal is None else len(nominal.pi))
+            yield _Draws(batch.number, rows, np.array(draws.coefficient), 0 if nominal is None else len(nominal.pi))
+
+
+def _with_densities(history: History, old: ParameterSpace, draws: list[_Draws]) -> History:
+    """Return a history with the densities of draws by their weights: stores of before have others of correlated whole numbers."""
+    log_q = history.log_q.copy()
+    for each in draws:
+        log_q[each.rows] = old.log_density(history.x[each.rows]) - np.log(each.coefficient)
+    return replace(history, columns={**history.columns, "log_q": log_q})
 
 
 def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
@@ -193,12 +205,23 @@ def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
     for metric in (part.metric for part in settings.scenario.requirement.parts):
         if metric not in history.metrics and history.ok.any():
             raise InputError(f"a metric must be one that the runs measured ({', '.join(history.metrics)}), but got '{metric}'")
+    _check_joined(settings.scenario.space, space)
     for old, new in zip(settings.scenario.space.parameters, space.parameters, strict=True):
         x = np.arange(len(new.choices), dtype=np.float64) if new.choices else new.from_normal(_SCORES)
         outside = x[~np.isfinite(old.log_density(x))]
         if len(outside):
             rule = f"input {new.name} must stay where the campaign drew it, in {old.range}"
             raise InputError(f"{rule}, but is to reach {outside.min():.6g} to {outside.max():.6g}: run a campaign there")
+
+
+def _check_joined(old: ParameterSpace, space: ParameterSpace) -> None:
+    """Refuse other distributions of correlated whole numbers whose joint probability is not computed."""
+    names, pairs = old.uncounted or space.uncounted, zip(old.parameters, space.parameters, strict=True)
+    changed = any(p != q for p, q in pairs if p.name in old.correlated | space.correlated)
+    if names and (changed or old.correlation != space.correlation):
+        most = f"{MOST_JOINED} correlated whole numbers ({MOST_GIVEN} where they are correlated with continuous inputs)"
+        rule = f"runs can be asked for another distribution of at most {most}"
+        raise InputError(f"{rule}, but {', '.join(names)} are {len(names)}: run a campaign with these distributions")
 
 
 def _predicted(log: Log, settings: Settings, space: ParameterSpace, draws: list[_Draws]) -> Iterator[tuple[_Said, _Said]]:

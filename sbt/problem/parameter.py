@@ -298,6 +298,12 @@ class Parameter:
             below, above = self.truncated.cdf(x), self.truncated.sf(x)
         return np.where(below <= above, ndtri(below), -ndtri(above))
 
+    def cell(self, x: Vector) -> tuple[Vector, Vector]:
+        """Return the standard-normal scores (n,) between which the whole number x is taken; that of the range next to others."""
+        x = np.clip(np.asarray(x, dtype=np.float64), self.low, self.high)
+        lower = np.where(x <= self.low, -np.inf, self.to_normal(x - 0.5))
+        return lower, np.where(x >= self.high, np.inf, self.to_normal(x + 0.5))
+
     def log_density(self, x: Vector) -> Vector:
         """Return (n,) log density of the value, log mass for integers and choices, -inf outside the range."""
         x = np.asarray(x, dtype=np.float64)

@@ -100,8 +100,13 @@ class SpaceParameter:
 
 
 def space_parameters(space: ParameterSpace) -> Iterator[SpaceParameter]:
-    """Yield every number by which the distribution of the inputs is given, but the ends of ranges."""
+    """Yield every number by which the distribution of the inputs is given, but the ends of ranges.
+
+    None of correlated inputs where whole numbers among them are `uncounted`.
+    """
     for k, p in enumerate(space.parameters):
+        if space.uncounted and p.name in space.correlated:
+            continue
         if p.choices:
             for choice, share in zip(p.choices, p.shares.tolist(), strict=True):
                 yield SpaceParameter(space, p.name, choice, share, min(share, 1.0 - share), _chosen(space, k, choice))
@@ -111,7 +116,8 @@ def space_parameters(space: ParameterSpace) -> Iterator[SpaceParameter]:
                 if isinstance(value, int | float):
                     scale = min(abs(value), std) or std
                     yield SpaceParameter(space, p.name, name, float(value), scale, _distributed(space, k, p.distribution, name))
-    matrix = np.eye(space.dimension) if space.correlation is None else np.asarray(space.correlation)
+    known = space.correlation is not None and not space.uncounted
+    matrix = np.asarray(space.correlation) if known else np.eye(space.dimension)
     for i, j in zip(*np.nonzero(np.tril(matrix, -1)), strict=True):
         pair, value = f"{space.names[j]}, {space.names[i]}", float(matrix[i, j])
         yield SpaceParameter(space, pair, "correlation", value, min(abs(value), 1.0 - abs(value)), _correlated(space, i, j))

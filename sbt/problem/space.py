@@ -12,6 +12,7 @@ from scipy.linalg import solve_triangular
 
 from sbt.errors import InputError, did_you_mean, must_be
 from sbt.problem.arrays import Mask, Points, Vector, as_points
+from sbt.problem.cells import JoinedCells
 from sbt.problem.cube import Cube
 from sbt.problem.expression import Expression
 from sbt.problem.parameter import Parameter
@@ -151,6 +152,26 @@ class ParameterSpace:
         return None if self.correlation is None else np.linalg.cholesky(np.asarray(self.correlation))
 
     @cached_property
+    def _joined(self) -> JoinedCells | None:
+        return None if self.correlation is None else JoinedCells.of(self.parameters, self.correlation)
+
+    @property
+    def joined(self) -> bool:
+        """Whether a whole-number input is in a correlation."""
+        return self._joined is not None
+
+    @cached_property
+    def correlated(self) -> frozenset[str]:
+        """Names of the inputs that are in a correlation."""
+        rows = np.eye(self.dimension) if self.correlation is None else np.asarray(self.correlation)
+        return frozenset(name for name, row in zip(self.names, rows, strict=True) if np.count_nonzero(row) > 1)
+
+    @property
+    def uncounted(self) -> tuple[str, ...]:
+        """Names of correlated whole-number inputs that are too many for the probability of a combination to be computed."""
+        return () if self._joined is None else self._joined.too_many
+
+    @cached_property
     def _feasible_share(self) -> float:
         """Share of the box (uniform measure) that satisfies the constraints."""
         u = _even_points(self.dimension, _MASS_POINTS)
@@ -236,18 +257,25 @@ class ParameterSpace:
         """Return (n,) log p(x): the marginals, the copula, the constraints.
 
         -inf outside the ranges and constraints. With integer inputs and choices it is a density in the
-        continuous and a mass in the others; the copula term of integers is that of the cell's middle.
+        continuous and a mass in the others; of integers that are `uncounted` the copula term is that of the cell's middle.
         """
         x = as_points(x, self.dimension)
+        if self._joined is not None and not self.uncounted:
+            log_p = self._joined.log_density(x, self._scores(x))
+        else:
+            log_p = self._log_density(x)
+        if self.constraints:
+            log_p = np.where(self.feasible(x), log_p - np.log(self.feasible_mass), -np.inf)
+        return log_p
+
+    def _log_density(self, x: Points) -> Vector:
         log_p = np.sum([p.log_density(x[:, k]) for k, p in enumerate(self.parameters)], axis=0)
         if self._factor is not None:
             scores = self._scores(x)
             whitened = solve_triangular(self._factor, scores.T, lower=True)
             log_p += 0.5 * (scores**2).sum(axis=1) - 0.5 * (whitened**2).sum(axis=0)
             log_p -= np.log(np.diag(self._factor)).sum()
-        if self.constraints:
-            log_p = np.where(self.feasible(x), log_p - np.log(self.feasible_mass), -np.inf)
-        return log_p
+        return np.asarray(log_p)
 
     def sample(self, n: int, rng: np.random.Generator) -> Points:
         """Return (n, d) values drawn from the distribution, constraints included (by rejection)."""
