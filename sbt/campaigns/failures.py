@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sbt.campaigns.beside import Links, batches_by, confirmations, links_of, with_links
+from sbt.campaigns.crowding import crowded_inputs, crowded_words
 from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.levels import ScreeningTold
@@ -109,6 +110,7 @@ class FalsificationConclusion:
         links: runs that asked whether critical runs are of one mode; None: there are none.
         earlier: what a campaign of another setup told; None: there is none.
         critical_inputs: different inputs of the critical runs; None: of each its own.
+        crowded: of inputs whose distribution lies in a small part of their range, the share that holds half of it; None: of none.
     """
 
     first_critical_run: int | None
@@ -128,6 +130,7 @@ class FalsificationConclusion:
     links: LinksTold | None = optional()
     earlier: EarlierTold | None = optional()
     critical_inputs: int | None = optional()
+    crowded: Mapping[str, float] | None = optional()
 
     @property
     def look_at(self) -> int | None:
@@ -145,7 +148,7 @@ class FalsificationConclusion:
         if none_gave_a_metric(facts):
             return nothing_known(facts)
         said = tell_failures(self, share_among_held_out(facts), facts)
-        said += _more(self, facts)
+        said += [*_more(self, facts), *crowded_words(self.crowded)]
         if self.simulator_noise is not None:
             said += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         said += [*violations_words(self.violates), *independence_words(self.independence)]
@@ -272,6 +275,7 @@ class FailureSearch:
             None if fit is None else fit.independence,
             explained_variance(self.settings, history, (history.iteration == 0) | (history.stage == VALIDATION)),
             raced=len(raced) or None, links=self._links_told(log), critical_inputs=inputs if inputs < len(hits) else None,
+            crowded=crowded_inputs(scenario.space),
         )  # fmt: skip
 
     def _links_told(self, log: Log) -> LinksTold | None:
