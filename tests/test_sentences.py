@@ -151,6 +151,7 @@ def test_an_exported_boundary_says_what_it_rests_on(campaign, tmp_path):
 
 
 def test_a_falsification_says_whose_distribution_it_hardly_looks_at(tmp_path: Path):
+    """One over decades is searched in its logarithm."""
     decades = sbt.Distribution.of(kind="scipy", name="loguniform", a=1e-6, b=1.0)
     inputs = [
         sbt.Parameter("a", 1e-6, 1.0, "", decades), sbt.Parameter("b", -np.inf, np.inf, "", sbt.Normal(0, 1)),
@@ -158,10 +159,10 @@ def test_a_falsification_says_whose_distribution_it_hardly_looks_at(tmp_path: Pa
         sbt.Parameter("k", 0, 9, kind="integer"),
     ]  # fmt: skip
     keys = {"campaign": "falsification", "budget": 10, "executor": "serial", "report": False, "judges": []}
-    for names, told in (("abcdk", {"a": 0.001, "c": 0.0067}), ("bdk", None)):
+    for names, told in (("abcdk", {"c": 0.0067}), ("abdk", None)):
         chosen = [each for each in inputs if each.name in names]
         scenario = sbt.Scenario("s", chosen, sbt.Requirement("y", high=0.0), evaluate=lambda v, seed: {"y": v["d"] - 2.0})
         result = sbt.run(scenario=scenario, store=tmp_path / names, seed=1, **keys)
         crowded = result.conclusion.crowded
         assert crowded is None if told is None else crowded == pytest.approx(told, rel=0.01)
-        assert any("half of that of c lies in 0.67" in said for said in result.sentences()) == (told is not None)
+        assert any("Half of the distribution of c lies in 0.67" in said for said in result.sentences()) == (told is not None)

@@ -12,7 +12,7 @@ from sbt.problem.space import ParameterSpace
 
 __all__ = ["crowded_inputs", "crowded_words"]
 
-_CROWDED = 0.02  # of a range, that holds half of the distribution: two decades of four, log-uniformly, are 1 %
+_CROWDED = 0.02  # of a range, that holds half of the distribution
 _STEPS = 51
 
 
@@ -23,13 +23,14 @@ def crowded_inputs(space: ParameterSpace) -> dict[str, float] | None:
 
 
 def _half(parameter: Parameter) -> float:
-    """Return the share of its range that the shortest interval with half of the distribution of a continuous input takes."""
+    """Return the share of its range, as it is searched, of the shortest interval with half of an input's distribution."""
     if parameter.truncated is None:
         return 0.5
     low, high = parameter.bounds
     begin = np.linspace(0.0, 0.5, _STEPS)
     x = np.clip([parameter.truncated.ppf(begin), parameter.truncated.ppf(begin + 0.5)], low, high)
-    return float((x[1] - x[0]).min() / (high - low))
+    u = parameter.to_unit(x)
+    return float((u[1] - u[0]).min())
 
 
 def crowded_words(shares: Mapping[str, float] | None) -> list[str]:
@@ -43,4 +44,4 @@ def crowded_words(shares: Mapping[str, float] | None) -> list[str]:
     first, *others = [f"of {name} lies in {percent(share)} of its range" for name, share in shares.items()]
     told = "; ".join([f"Half of the distribution {first}", *(f"half of that {each}" for each in others)])
     spreads = "the search spreads over ranges evenly, and hardly looks there"
-    return [f"{told}, but {spreads}: narrow the ranges, or make logarithms the inputs where they span decades."]
+    return [f"{told}, but {spreads}: narrow the ranges."]

@@ -7,7 +7,7 @@ import numpy as np
 from sbt.campaigns.wording import plural
 from sbt.loop.stages import Facts
 
-__all__ = ["all_critical", "few_of_a_side", "met", "none_critical"]
+__all__ = ["all_critical", "few_of_a_side", "met", "none_critical", "safe_runs"]
 
 _FEW = 5  # runs of a side, below which edges are told with reserve, however sure the metamodel is
 
@@ -34,6 +34,11 @@ def all_critical(facts: Facts) -> bool:
 def none_critical(facts: Facts) -> bool:
     """Return whether there are runs with a metric, and none of them was critical."""
     return bool(facts.history.ok.any() and not facts.requirement.critical_runs(facts.history).any())
+
+
+def safe_runs(facts: Facts) -> int:
+    """Return how many runs gave a metric and were not critical."""
+    return int((facts.history.ok & ~facts.requirement.critical_runs(facts.history)).sum())
 
 
 def met(facts: Facts) -> str:

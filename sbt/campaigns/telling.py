@@ -28,7 +28,7 @@ from sbt.campaigns.precision import NO_BETTER, PRECISE, always_agree, more_runs,
 from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
-from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical
+from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical, safe_runs
 from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.loop.stages import Facts
@@ -289,15 +289,10 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         if found.counted and not found.hits and found.combinations is None:
             guess = f"no draw that counts was critical, and {number(found.probability, 3)} is the metamodel's own guess"
             said = f"The probability of {subject} is at most {number(found.high, 3)} ({confidence} interval from 0): {guess}"
-        if found.probability >= 1.0 and _safe_runs(facts):
+        if found.probability >= 1.0 and safe_runs(facts):
             said = f"The probability of {subject} is at least {number(found.low, 3)} ({confidence} interval to 1)"
         silent = _not_told(found, facts, every)
     return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
-
-
-def _safe_runs(facts: Facts) -> int:
-    """Return how many runs gave a metric and were not critical."""
-    return int((facts.history.ok & ~facts.requirement.critical_runs(facts.history)).sum())
 
 
 def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
@@ -312,7 +307,7 @@ def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
     if found.counted and found.counted == random_draws(facts.history):
         silent = "This trusts no search: the interval is that of random draws, and covers what none of them has met"
     if missed <= 0.0:
-        safe, most = _safe_runs(facts), f"{number(1.0 - found.low, 3)} may not be"
+        safe, most = safe_runs(facts), f"{number(1.0 - found.low, 3)} may not be"
         silent = f"This does not tell that every run is critical: {most}, which no run met"
         if safe:
             how = "was not critical, but its weight is" if safe == 1 else "were not critical, but their weights are"
