@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import sbt
+from sbt.campaigns.counting import crude_rows
 from sbt.seeds import stream
+from sbt.store.history import History, Record
 
 INPUTS = [sbt.Parameter("n", 1, 5, kind="integer"), sbt.Parameter("k", choices={"x": 0.7, "y": 0.3})]
 
@@ -94,3 +96,37 @@ def test_draws_that_count_end_where_values_come_that_can_be_followed(tmp_path: P
     assert {"monte_carlo", "estimation"} <= stages
     assert result.conclusion.probability == pytest.approx(exact, rel=0.1)
     assert result.conclusion.low <= exact <= result.conclusion.high
+    assert result.estimate().probability == pytest.approx(result.conclusion.probability, rel=0.1)  # not by the draws before
+
+
+def test_whether_draws_were_critical_does_not_decide_if_they_count(tmp_path: Path):
+    """Those that had met none were left out, and those that had met one counted: 1.3 times P (90 campaigns)."""
+
+    def drawn(told: dict[int, float]) -> int:
+        """Return the number of random draws of a campaign where all runs but these have the metric 0."""
+        calls = iter(range(1000))
+        scenario = sbt.Scenario(
+            "levels", [sbt.Parameter("a", -6, 6, "", sbt.Normal(0, 1))], sbt.Requirement("m", low=1.5),
+            evaluate=lambda values, seed: {"m": told.get(next(calls), 0.0)},
+        )  # fmt: skip
+        result = sbt.run(
+            campaign="estimation", scenario=scenario, budget=90, stop={"cov": None}, executor="serial", report=False,
+            store=tmp_path / str(len(list(tmp_path.iterdir()))),
+        )  # fmt: skip
+        return int((result.history.stage == "monte_carlo").sum())
+
+    stays = drawn({32: 2.0})
+    assert drawn({32: 1.0}) == drawn({32: 1.0, 33: 2.0}) == 15  # one batch: then a metamodel draws
+    assert drawn({60: 1.0}) == stays == 65  # half of the budget is gone
+
+
+def test_draws_before_a_metamodel_drew_count_for_no_crude_monte_carlo_after_it():
+    """As they do not where it goes on to draw."""
+
+    def met(*stages: str) -> list[bool]:
+        records = [Record(k, stage, k, {"a": 0.0}, 0, "ok", {"m": 0.0}) for k, stage in enumerate(stages)]
+        return crude_rows(History.of(["a"], records)).tolist()
+
+    assert met("hunt", "monte_carlo", "monte_carlo") == [False, True, True]
+    assert met("monte_carlo", "learn", "hunt") == [True, False, False]
+    assert met("monte_carlo", "learn", "monte_carlo", "monte_carlo") == [False, False, True, True]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN, NOMINAL, Seen
-from sbt.campaigns.crude import nominal_rows
+from sbt.campaigns.crude import nominal_rows, took_monte_carlo
 from sbt.campaigns.known import Known
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
@@ -108,7 +108,7 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
     _check(log, settings, space)
     history, old, hits = log.history, settings.scenario.space, settings.scenario.requirement.critical_runs(log.history)
     x = space.sample(_RATIOS, stream(settings.seed, "ratio"))
-    crude = NOMINAL in history.stage
+    crude = NOMINAL in history.stage and took_monte_carlo(log)
     plain = np.flatnonzero(nominal_rows(log))
     if took_sum(log):
         plain, log_q = counted_with(log, old)
@@ -199,7 +199,8 @@ def _with_densities(history: History, old: ParameterSpace, draws: list[_Draws]) 
 def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
     """Refuse what cannot be answered from these runs."""
     history = log.history
-    if NOMINAL not in history.stage and not took_sum(log) and next(_counted(log), None) is None:
+    crude = NOMINAL in history.stage and took_monte_carlo(log)
+    if not crude and not took_sum(log) and next(_counted(log), None) is None:
         rule = "only draws with known densities can be counted again, but this campaign has none that count"
         raise InputError(f"{rule}: run an estimation with acquisition.kind difference or monte_carlo")
     for metric in (part.metric for part in settings.scenario.requirement.parts):

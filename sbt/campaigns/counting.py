@@ -14,15 +14,15 @@ from sbt.errors import InputError
 from sbt.estimators import binomial
 from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.requirement import Requirement
 from sbt.store.history import History
 from sbt.store.records import Iteration
 
 __all__ = [
-    "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "counted_batches", "counted_iterations", "held",
-    "random_draws", "with_event",
+    "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "counted_batches", "counted_iterations", "crude_rows",
+    "held", "random_draws", "with_event",
 ]  # fmt: skip
 
 DRAWN = "estimation"
@@ -86,9 +86,20 @@ def _counted(log: Log) -> Iterator[tuple[Iteration, PoolSummary, CountedDraws]]:
             yield batch, proposal.pool or PoolSummary(len(proposal.counted.pi), 0.0, 0.0, 1), proposal.counted
 
 
+def crude_rows(history: History) -> Mask:
+    """Return which draws from the inputs' distribution an estimate by crude Monte Carlo has.
+
+    Those before a metamodel had drawn do not count again after it: whether it is left depends on what they met.
+    """
+    rows = history.stage == NOMINAL
+    guided = history.iteration[np.isin(history.stage, (DRAWN, LEARNED))]
+    later = rows & (history.iteration > guided.max(initial=-1))
+    return later if later.any() else rows
+
+
 def random_draws(history: History) -> int:
     """Return how many runs an estimate by crude Monte Carlo has, where all of its draws count."""
-    crude = int((history.stage == NOMINAL).sum())
+    crude = int(crude_rows(history).sum())
     return crude + int((history.stage == RANDOM).sum()) if crude else 0
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.campaigns.clustering import spread_of_share
-from sbt.campaigns.counting import NOMINAL, RANDOM
+from sbt.campaigns.counting import NOMINAL, RANDOM, crude_rows
 from sbt.campaigns.records import COUNT, EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.estimators.monte_carlo import Proportion
@@ -152,7 +152,7 @@ def nominal_rows(log: Log, stage: str = NOMINAL) -> Mask:
     Beside the first level of subset simulation all do; in crude Monte Carlo those halves of the first draws that do not count
     because of their own results.
     """
-    rows = log.history.stage == stage
+    rows = crude_rows(log.history) if stage == NOMINAL else log.history.stage == stage
     first = np.flatnonzero(log.history.stage == RANDOM)
     if stage == FIRST_LEVEL:
         rows[first] = True

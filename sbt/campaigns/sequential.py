@@ -100,6 +100,8 @@ a process takes for noise what it has not learned yet, and learns it."""
 _TOLD, _TOLD_RUNS, _MET_ANYWAY = 0.3, 60, 0.05
 """Share of the budget, and runs, from which on a metamodel that gains nothing is given up: of 53 testbeds, two seeds each, only
 rastrigin_ak has one that does not gain by then. Where failures are so common any draws meet them, and it is learned later."""
+_RETURN = 0.5
+"""Share of the budget up to which draws that count end where values come that can be followed."""
 _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
 _SURPRISE = 0.01
@@ -164,11 +166,20 @@ class SequentialStage:
             return replace(batch, runs=(*batch.runs, *again))
 
     def _tells_now(self, log: Log) -> bool:
-        """Return whether the draws that count have met the first values to follow, and none that is critical: a slope, a cap."""
-        known = Known.of(log.history, self._coordinates, self.settings)
-        before = log.history.stage != NOMINAL
-        first = Known.of(log.history.where(before), self._coordinates, self.settings)
-        return first.constant and not known.constant and known.one_sided
+        """Return whether the draws that count have met the first values to follow: a slope, a cap.
+
+        Those of critical runs among runs that are not do not tell, and whether there were some decides nothing: draws that are
+        left out because they had met none would leave too many with those that had. Later there is no way back.
+        """
+        history = log.history
+        drawn = history.stage == NOMINAL
+        begun = int(history.iteration[drawn].min()) if drawn.any() else log.iteration
+        if len(log.planned) > _RETURN * self.settings.budget or not drawn[history.iteration > begun].all():
+            return False
+        first, known = (Known.of(history.where(rows), self._coordinates, self.settings) for rows in (~drawn, drawn))
+        side = bool(len(first.y)) and bool(first.critical[0])
+        values = np.concatenate([first.y, known.y[known.critical == side]])
+        return first.constant and bool((values != values[:1]).any())
 
     def _proposed(self, log: Log, size: int) -> Batch:
         s = self.settings
