@@ -36,10 +36,11 @@ CRUDE: dict[str, Any] = {
 
 
 def sharded(configured: Configured, n: int, scenario: str = "SCENARIO", **keys: Any) -> list[Path]:
-    """Run all shards of a configuration, the last first."""
+    """Run all shards of a configuration, the last first, into folders of unlike depth."""
     folders = []
     for k in range(n, 0, -1):
-        loaded = load(configured(f"shard{k}", scenario, **keys))
+        file = configured(f"shard{k}", scenario, **keys)
+        loaded = load(file, [f"store={file.parent.joinpath(*k * ['deep'], f'shard{k}')}"])
         result = run_loaded(loaded, shard=Shard(k, n))
         assert result["conclusion"]["shard"] == f"{k}/{n}"
         folders.append(Path(result["store"]))
@@ -147,6 +148,16 @@ def test_what_is_not_whole_is_not_merged(configured: Configured, campaign: Run, 
         assert not (tmp_path / "merged").exists()
     with pytest.raises(InputError, match="a folder without a campaign, but there is one in"):
         merge_shards([one, two, three], whole)
+
+
+def test_shards_of_other_states_of_the_package_are_not_merged(
+    configured: Configured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    one = run_loaded(load(configured("one", **COVERAGE)), shard=Shard(1, 2))
+    monkeypatch.setattr("sbt.workflows.running.package_print", lambda: "another")
+    other = run_loaded(load(configured("other", **COVERAGE)), shard=Shard(2, 2))
+    with pytest.raises(InputError, match="the same state of this package and of SUMO"):
+        merge_shards([Path(one["store"]), Path(other["store"])], tmp_path / "merged")
 
 
 def test_a_merge_that_fails_leaves_nothing(configured: Configured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

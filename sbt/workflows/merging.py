@@ -20,14 +20,14 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import JsonMapping
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import Record
-from sbt.workflows.changes import CONTENTS, changed_since
+from sbt.workflows.changes import CONTENTS, PACKAGE, changed_since
 from sbt.workflows.rechecking import check_code
 from sbt.workflows.running import Summary, keep_configuration, rebuild_report, summarise
 from sbt.workflows.study import RESOLVED, Study
 
 __all__ = ["merge_shards"]
 
-_OWN = {"folder", "yaml", "shard", "described", CONTENTS}
+_OWN = {"folder", "place", "yaml", "shard", "described", CONTENTS}
 """What may differ in the configurations of shards."""
 _TOLD = 10
 
@@ -104,6 +104,9 @@ def _check_same(parts: Sequence[_Part]) -> None:
     for part in parts[1:]:
         one, other = ({**p.configuration, "number of shards": p.shard.of} for p in (first, part))
         changed = sorted(key for key in {*one, *other} - _OWN if one.get(key) != other.get(key))
+        if PACKAGE in changed:
+            rule = "shards must have been run with the same state of this package and of SUMO"
+            raise InputError(f"{rule}, but {first.folder} and {part.folder} were not")
         if changed:
             differing = "; ".join(f"{key}: {one.get(key)} there, {other.get(key)} here" for key in changed)
             raise InputError(f"shards must have one configuration, but {first.folder} and {part.folder} differ ({differing})")
