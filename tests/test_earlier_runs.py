@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,10 @@ def test_an_input_of_the_earlier_campaign_alone_is_integrated_or_fixed(tmp_path)
         warm = {"store": str(tmp_path / "old"), "transfer": True, "fixed": fixed}
         result = boundary(tmp_path / f"new{len(fixed)}", scenario("after", later), warm_start=warm)
         assert misjudged(result, later) < 0.05
+    for value in (7.0, math.nan, math.inf):
+        warm = {"store": str(tmp_path / "old"), "transfer": True, "fixed": {"d": value}}
+        with pytest.raises(sbt.InputError, match=r"a value that the earlier campaign had: d in .* but got"):
+            boundary(tmp_path / "beyond", scenario("after", later), warm_start=warm)
 
 
 def test_a_new_input_is_learned_beside_the_earlier_runs(old, tmp_path):

@@ -115,6 +115,10 @@ def _check_common(old: ParameterSpace, runs: History, new: LogicalScenario, fixe
         if name not in gone:
             rule = f"warm_start.fixed must name inputs that only the earlier campaign has ({', '.join(gone) or 'none'})"
             raise InputError(f"{rule}, but got '{name}'{did_you_mean(name, gone)}")
+        parameter = old.parameters[old.names.index(name)]
+        if not parameter.contains(np.array(parameter.number(fixed[name]))):
+            rule = f"warm_start.fixed must be a value that the earlier campaign had: {name} in {parameter.range}"
+            raise InputError(f"{rule}, but got {fixed[name]}")
     for part in new.requirement.parts:
         if part.metric not in runs.metrics:
             rule = f"warm_start.store must have measured {part.metric}"
