@@ -18,13 +18,14 @@ from studies import run_loaded, settings_of
 from typer.testing import CliRunner
 
 import sbt
-from sbt.campaigns.counting import counted_batches
+from sbt.campaigns.counting import Seen, counted_batches, denied_by_draws, hardly_known
 from sbt.campaigns.gate import Limits, gate_verdict
 from sbt.campaigns.many_inputs import halves_that_count
 from sbt.campaigns.settings import Gate
 from sbt.cli import app
 from sbt.config.load import ConfigError, load, parse
 from sbt.errors import InputError
+from sbt.estimators import binomial
 from sbt.loop.stages import Log
 from sbt.problem.distribution import Distribution
 from sbt.store.database import Store
@@ -314,6 +315,19 @@ def test_limits_by_few_draws_are_no_wider_than_exact_ones_with_half_the_error():
         held = few.within(exact, value, value)
         assert held.lower(0.9) <= max(value, few.lower(0.9))
         assert held.upper(0.9) >= min(value, few.upper(0.9))
+
+
+def test_limits_of_an_estimate_that_random_draws_deny_end_at_it():
+    """5 hits, one of which moves the estimate of .19 by 98 %, had the interval 0 to 1 beside 85 draws that met one."""
+    seen, anything = Seen(6, 140, 85, 1, 0, 1, 6), Limits(lambda _: 0.0, lambda _: 1.0)
+    for value in (0.01, 0.19):
+        found = anything.within(seen.limits, value, value)
+        assert 0.0 < found.lower(0.975) < 0.001
+        assert found.upper(0.975) == pytest.approx(max(value, binomial.upper(1, 85, 0.9875)))
+        assert hardly_known(value, 0.98 * value)
+        assert bool(denied_by_draws(seen, value, value, 0.975)) == (value == 0.19)
+    assert not hardly_known(0.19, 0.05)
+    assert hardly_known(0.97, 0.02)
 
 
 def test_a_gate_does_not_pass_on_a_metamodel_that_was_refuted():

@@ -10,6 +10,7 @@ import numpy as np
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.records import CountedDraws, EstimationProposal, EventDraws, PoolSummary
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.wording import number, plural
 from sbt.errors import InputError
 from sbt.estimators import binomial
 from sbt.estimators.intervals import CountedBatch
@@ -22,7 +23,7 @@ from sbt.store.records import Iteration
 
 __all__ = [
     "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "counted_batches", "counted_iterations", "crude_rows",
-    "held", "random_draws", "with_event",
+    "denied_by_draws", "hardly_known", "held", "random_draws", "with_event",
 ]  # fmt: skip
 
 DRAWN = "estimation"
@@ -38,6 +39,8 @@ FEW_KNOWN = 10
 beside a plateau had met 3 to 10 times. The exact limit of random draws holds whatever the metamodel makes of them."""
 _DENIED = 0.01
 """P(critical) below which a critical draw is a surprise to the metamodel."""
+_HARDLY = 0.5
+"""Coefficient of variation above which the limits of an estimate are no wider than those of random draws."""
 
 
 def counted_batches(log: Log, settings: Settings, *, failed_critical: bool = False) -> list[CountedBatch]:
@@ -194,3 +197,17 @@ def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool)
     lower = (lambda c: min(limits.lower(c), seen.limits.lower(c))) if low >= 1.0 else limits.lower
     found = Limits(lower, limits.upper)
     return found.reaching(seen.most_critical) if high <= 0.0 or unstated else found
+
+
+def hardly_known(value: float, std_error: float) -> bool:
+    """Return whether an estimate, or what it leaves to 1, is little more than its standard error."""
+    return std_error > _HARDLY * min(value, 1.0 - value)
+
+
+def denied_by_draws(seen: Seen, low: float, high: float, confidence: float) -> tuple[str, ...]:
+    """Return in words that draws from the inputs' distribution deny an estimate, low to high; () where they do not."""
+    draws = f"{plural(seen.draws, 'draw')} from the inputs' distribution alone"
+    least, most = seen.limits.lower(confidence), seen.limits.upper(confidence)
+    if most < low:
+        return (f"{draws} deny the estimate: by them the probability is at most {number(most, 2)}",)
+    return (f"{draws} deny the estimate: by them the probability is at least {number(least, 2)}",) if least > high else ()

@@ -7,7 +7,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sbt.campaigns.clustering import Spread
-from sbt.campaigns.counting import DRAWN, FEW_KNOWN, NOMINAL, RANDOM, Seen, counted_batches, counted_iterations, held
+from sbt.campaigns.counting import (
+    DRAWN,
+    FEW_KNOWN,
+    NOMINAL,
+    RANDOM,
+    Seen,
+    counted_batches,
+    counted_iterations,
+    denied_by_draws,
+    hardly_known,
+    held,
+)
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
@@ -266,8 +277,10 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         said = "a draw after the last one that counts was critical where the metamodel denied it"
         draws = f"the upper end is at least that of {plural(seen.draws, 'draw')} from the inputs' distribution"
         warnings.append(f"{said}: {draws}")
-    if (few_low or few_high) and not late:
-        limits = limits.within(seen.limits, value, max(_clipped(high.value), value))
+    highest = max(_clipped(high.value), value)
+    if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
+        limits = limits.within(seen.limits, value, highest)
+        warnings += denied_by_draws(seen, value, highest, 0.5 * (1.0 + _CONFIDENCE))
     warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
     return _conclusion(
         value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,

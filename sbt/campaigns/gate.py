@@ -27,15 +27,16 @@ class Limits:
         return Limits(self.lower, lambda confidence: max(self.upper(confidence), upper(confidence)))
 
     def within(self, others: Limits, low: float, high: float) -> Limits:
-        """Return the nearer ones of these limits and of others with half of their error, but for those that deny an estimate."""
+        """Return the nearer ones of these limits and of others with half of their error, but none that denies an estimate.
+
+        Where the others deny it they are the estimate itself: what lies beyond it both deny.
+        """
 
         def lower(confidence: float) -> float:
-            mine, other = self.lower(confidence), others.lower(0.5 * (1.0 + confidence))
-            return max(mine, other) if other < low else mine
+            return max(self.lower(confidence), min(others.lower(0.5 * (1.0 + confidence)), low))
 
         def upper(confidence: float) -> float:
-            mine, other = self.upper(confidence), others.upper(0.5 * (1.0 + confidence))
-            return min(mine, other) if other > high else mine
+            return min(self.upper(confidence), max(others.upper(0.5 * (1.0 + confidence)), high))
 
         return Limits(lower, upper)
 
