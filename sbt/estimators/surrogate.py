@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from sbt.estimators.leaps import leaping
 from sbt.estimators.ridge import ridge_trend
 from sbt.estimators.transfer import Trend, trended
 from sbt.metamodels.base import Metamodel, Predictor, named_errors, predicted, sketched, with_target, without_repetitions
@@ -55,7 +57,8 @@ class Coordinates:
     """From points of the standard-normal space to the inputs of the metamodel.
 
     A uniform input is taken on its range, every other one as its normal score with -5 to 5 as the unit
-    interval, whole numbers at the middle of their cell, choices on an axis for each; derived features of the space follow.
+    interval, whole numbers at the middle of their cell, choices on an axis for each; the values of inputs that leap (`leaping`)
+    and derived features of the space follow.
     """
 
     space: ParameterSpace
@@ -78,10 +81,16 @@ class Coordinates:
             if p.choices:
                 own[:, k] = p.to_unit(p.from_normal(scores[:, k]))
         own = Cube(nominal=self.space.cube.nominal).embedded(own)
-        if not self.space.features:
-            return np.ascontiguousarray(own)
-        u = self.space.to_unit(self.space.from_normal(z))
-        return np.column_stack([own, self.space.metamodel_inputs(u)[:, own.shape[1] :]])
+        further = [np.interp(scores[:, k], *values) for k, values in self._leaping]
+        if self.space.features:
+            u = self.space.to_unit(self.space.from_normal(z))
+            further.append(self.space.metamodel_inputs(u)[:, own.shape[1] :])
+        return np.column_stack([own, *further]) if further else np.ascontiguousarray(own)
+
+    @cached_property
+    def _leaping(self) -> tuple[tuple[int, tuple[Vector, Vector]], ...]:
+        found = ((k, leaping(p)) for k, p in enumerate(self.space.parameters))
+        return tuple((k, values) for k, values in found if values is not None)
 
 
 @dataclass(frozen=True)
