@@ -1,7 +1,5 @@
 """What conclusions say where runs give no metric, and where an interval is wider than asked."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -15,7 +13,7 @@ from sbt.campaigns.telling import tell_boundary, tell_estimation, tell_share
 from sbt.cli import app
 from sbt.loop.stages import Facts
 from sbt.problem.requirement import Requirement
-from sbt.store.history import History, Record, Rows
+from sbt.store.history import History, Rows
 
 LOW = Requirement("m", high=0.0)
 NARROW = {"probability": 0.1, "low": 0.09, "high": 0.11, "cov": 0.05, "hits": 40, "counted": 60, "undetected_mass_bound": 0.05}
@@ -148,15 +146,3 @@ def test_that_nearly_all_is_critical_does_not_deny_the_runs_that_were_not(safe):
     assert ("which no run met" in said[1]) == (safe == 0)
     assert ("is 1 (" in said[0]) == (safe == 0)
     assert safe == 0 or ("is at least 0.905" in said[0] and "9 runs were not critical" in said[1])
-
-
-def test_a_boundary_says_whether_runs_fail_somewhere_or_by_chance_and_no_more_of_what_is_critical():
-    found = BoundaryConclusion(0.01, 0.001, 0.01, None, failing_fraction=0.25, critical_range=(1e-90, 0.02))
-    rows = [Record(k, "s", 0, {"a": 0.1 * k}, k, "ok", {"m": 1.0 - k}) for k in range(3)]
-    none, some = (Facts(History.of(("a",), rows[:n]), LOW, "m", "s") for n in (1, 3))
-    said, met = " ".join(found.sentences(none)), " ".join(found.sentences(some))
-    assert "of the parameter space gives no metric: runs there fail." in said
-    assert "up to 2\N{NO-BREAK SPACE}% may be critical, though no run was." in said
-    assert "critical runs lie beside it: of what gives a metric between 0\N{NO-BREAK SPACE}% and 2\N{NO-BREAK SPACE}%" in met
-    chance = " ".join(replace(found, failing_by_chance=True, critical_range=None).sentences(none))
-    assert "About 25\N{NO-BREAK SPACE}% of runs give no metric, wherever they lie." in chance

@@ -16,7 +16,7 @@ from sbt.campaigns.each import each_share, fits_words, independence_words, share
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch, space_filling
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
-from sbt.campaigns.openness import fails_by_chance, open_range
+from sbt.campaigns.openness import open_range
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place, succeeding
 from sbt.campaigns.regions import CriticalRegion, critical_regions
@@ -66,7 +66,6 @@ class BoundaryConclusion:
         earlier: runs of an earlier campaign that the metamodel learned from, too; 0: they do not help; None: there are none.
         critical_range: least and largest critical fraction, as runs fail or not where that is open; None: it hardly matters.
         even_fraction: critical share of all runs that fill the space evenly, the held-out ones among them.
-        failing_by_chance: runs fail wherever they lie; None: they do not, or it is not known.
     """
 
     critical_fraction: float | None
@@ -89,7 +88,6 @@ class BoundaryConclusion:
     earlier: int | None = optional()
     critical_range: tuple[float, float] | None = optional()
     even_fraction: CriticalShare | None = optional()
-    failing_by_chance: bool | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -106,7 +104,14 @@ class BoundaryConclusion:
         told = tell_boundary(self, measured, facts) if every is None else every.sentences(facts.scenario, condition)
         found = [*told, *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
-        found += self._failing(met=bool(facts.requirement.critical_runs(facts.history).any()))
+        if self.failing_fraction is not None:
+            found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
+        if self.critical_range is not None:
+            least, most = map(percent, self.critical_range)
+            found.append(
+                "Where failing begins is not known sharply, and critical runs lie beside it: of what gives a metric between"
+                f" {least} and {most} may be critical."
+            )
         if self.earlier is not None:
             found.append(_earlier_words(self.earlier))
         if self.weights is not None:
@@ -117,23 +122,6 @@ class BoundaryConclusion:
             found.append(self.explained.sentence(facts.requirement.told_as))
         if self.doubt is not None:
             found.append(self.doubt.sentence())
-        return found
-
-
-    def _failing(self, *, met: bool) -> list[str]:
-        """Return what runs that fail leave open; `met`: some run was critical."""
-        found = []
-        if self.failing_fraction is not None:
-            share, chance = percent(self.failing_fraction), self.failing_by_chance
-            found.append(
-                f"About {share} of runs give no metric, wherever they lie."
-                if chance else f"About {share} of the parameter space gives no metric: runs there fail."
-            )  # fmt: skip
-        if self.critical_range is not None:
-            least, most = map(percent, self.critical_range)
-            known = ", and critical runs lie beside it: of what gives a metric between" if met else ": of what gives a metric"
-            range_ = f"{least} and {most} may be critical" if met else f"up to {most} may be critical, though no run was"
-            found.append(f"Where failing begins is not known sharply{known} {range_}.")
         return found
 
 
@@ -175,7 +163,6 @@ def recipe(settings: Settings) -> Campaign:
             place, explained_variance(settings, log.history, unchosen), traffic_doubt(settings, log.history),
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted, log.history),
             critical_share(log.history.where(unchosen), settings.scenario),
-            fails_by_chance(learner, fitted, log.history) or None,
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

@@ -38,7 +38,7 @@ def percent(value: float) -> str:
     >>> percent(0.0123) == "1.23\N{NO-BREAK SPACE}%"
     True
     """
-    return f"{0.0 if abs(value) < _NIL else 100 * value:.3g}\N{NO-BREAK SPACE}%"
+    return f"{100 * value:.3g}\N{NO-BREAK SPACE}%"
 
 
 def plural(n: int, noun: str) -> str:
