@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import sbt
 from sbt import testbeds
-from sbt.campaigns.openness import fails_by_chance, open_range
 from sbt.metamodels.success import failure_probability, log_success
 from sbt.seeds import stream
-from sbt.store.history import History, Record
 
 AWAY = 0.25
 """Largest share of the guided runs that may fail."""
@@ -146,40 +143,6 @@ def test_a_boundary_says_what_failing_leaves_open(tmp_path: Path):
     least, most = result.conclusion.critical_range
     assert least < 0.167 < most
     assert any(told.endswith("may be critical.") for told in result.sentences())
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_few_failed_runs_in_the_middle_of_what_is_critical_are_no_chance(seed: int):
-    """A metamodel of few failed runs smooths them away; 30 of them, or equal inputs that did both, show that it is chance."""
-    rng = stream(seed, "few")
-    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
-    scenario = sbt.Scenario("s", inputs, sbt.Requirement("y", high=0.0), evaluate=lambda values, seed: {"y": 1.0})
-    u = rng.random((4000, 2))
-
-    def disc(points: np.ndarray) -> np.ndarray:
-        return np.hypot(*(points - [0.7, 0.3]).T)
-
-    def smooth(points: np.ndarray) -> np.ndarray:
-        return np.full(len(points), np.log(0.93))
-
-    critical = SimpleNamespace(probability=lambda _: (disc(u) < 0.2).astype(float))
-    learner, fitted = SimpleNamespace(probe=u, scenario=scenario), SimpleNamespace(log_success=smooth, predict=lambda _: critical)
-
-    def history(x: np.ndarray, failed: np.ndarray) -> History:
-        return History.of(("a", "b"), [
-            Record(k, "s", 0, {"a": a, "b": b}, k, "failed" if lost else "ok", {} if lost else {"y": 1.0})
-            for k, ((a, b), lost) in enumerate(zip(x.tolist(), failed.tolist(), strict=True))
-        ])  # fmt: skip
-
-    x = rng.random((120, 2))
-    few = history(x, disc(x) < 0.16)
-    assert not fails_by_chance(learner, fitted, few)
-    least, most = open_range(learner, fitted, few)
-    inside = disc(u)
-    assert least < (inside[inside > 0.16] < 0.2).mean() < most
-    for chance in (history(x, np.arange(120) % 4 == 0), history(np.vstack([x, x[:1]]), np.arange(121) == 120)):
-        assert fails_by_chance(learner, fitted, chance)
-        assert open_range(learner, fitted, chance) is None
 
 
 def test_one_run_is_too_few_and_none_failed(tmp_path: Path):

@@ -161,7 +161,7 @@ def recipe(settings: Settings) -> Campaign:
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history, unchosen), traffic_doubt(settings, log.history),
-            every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted, log.history),
+            every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted),
             critical_share(log.history.where(unchosen), settings.scenario),
         ), fitted  # fmt: skip
 

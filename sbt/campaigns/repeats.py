@@ -18,9 +18,7 @@ from sbt.store.database import PlannedRun
 from sbt.store.history import PLANNED, History
 from sbt.store.records import optional, to_json
 
-__all__ = [
-    "REPEAT", "WANTED", "SimulatorNoise", "equal_inputs", "lost_inputs", "repeats_wanted", "simulator_noise", "stated_noise",
-]  # fmt: skip
+__all__ = ["REPEAT", "WANTED", "SimulatorNoise", "equal_inputs", "repeats_wanted", "simulator_noise", "stated_noise"]
 
 REPEAT = "repeat"
 """Stage of the early runs that repeat inputs with other seeds; metamodels learn from them."""
@@ -146,10 +144,10 @@ def _pooled(y: Vector, group: NDArray[np.intp]) -> float:
 
 def stated_noise(history: History, scenario: LogicalScenario) -> SimulatorNoise | None:
     """Return what a conclusion says of the simulator's noise; None for recorded rows, which nothing simulates."""
-    return replace(simulator_noise(history, scenario.requirement), lost=lost_inputs(history)) if scenario.pool is None else None
+    return replace(simulator_noise(history, scenario.requirement), lost=_lost(history)) if scenario.pool is None else None
 
 
-def lost_inputs(history: History) -> int | None:
+def _lost(history: History) -> int | None:
     """Return at how many inputs some runs gave a metric and others gave none; None: at none."""
     runs = history.where((history.status != PLANNED) & history.drawn & (history.columns["level"] == 0))
     if not len(runs):
