@@ -17,6 +17,7 @@ from sbt.estimators.binomial import interval
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.metamodels.base import simplest
+from sbt.metamodels.success import learned_success
 from sbt.problem.arrays import Mask, Points
 from sbt.samplers.free_region import FreeRegion
 from sbt.samplers.plateaus import plateau
@@ -153,7 +154,7 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
     seen = log.history.where(log.history.stage != VALIDATION)
     search = Search(
         scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
-        lambda u: space.feasible(space.from_unit(u)), cube=space.cube, most_rows=_MOST_ROWS,
+        lambda u: space.feasible(space.from_unit(u)), cube=space.cube, most_rows=_MOST_ROWS, learn_success=learned_success,
     )  # fmt: skip
     y = scenario.requirement.values(seen)
     u = np.clip(space.to_unit(seen.x), 0.0, 1.0)

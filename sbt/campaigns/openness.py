@@ -1,16 +1,17 @@
-"""What critical shares leave open where it is not known whether a run gives a metric."""
+"""What runs that fail leave open: which part of the space gives no metric, and how much of the rest is critical."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sbt.loop.learner import FittedMetamodel, Learner
+from sbt.metamodels.success import Success
+from sbt.problem.arrays import Vector
 
 __all__ = ["open_range"]
 
-_SURE = 0.95  # P(a run gives a metric), from which on it does, and below 1 - which it fails
 _MATTERS = 0.2  # of the share, by which its ends must differ to be told
-_BY_CHANCE = 0.8  # share of the variance of "gives a metric" that inputs leave open, from which on runs fail by chance
+_LIKELY = 0.5  # log evidence that inputs decide which runs fail, below which chance is the better account
 
 
 def open_range(learner: Learner, fitted: FittedMetamodel) -> tuple[float, float] | None:
@@ -19,17 +20,15 @@ def open_range(learner: Learner, fitted: FittedMetamodel) -> tuple[float, float]
     Least: where it is open whether a run gives a metric, what is critical fails and the rest does not; largest: the other way
     round. Where runs fail by chance nothing is open: their mean is what counts.
     """
-    if fitted.log_success is None:
+    success, u = fitted.log_success, learner.probe
+    if not isinstance(success, Success) or success.gain < _LIKELY:
         return None
-    u = learner.probe
-    p, ok = fitted.predict(u).probability(learner.scenario.requirement.critical), np.exp(fitted.log_success(u))
-    mean = float(ok.mean())
-    if float((ok * (1.0 - ok)).mean()) > _BY_CHANCE * mean * (1.0 - mean):
-        return None
-    sure, doubtful = ok >= _SURE, (ok < _SURE) & (ok > 1.0 - _SURE)
-    critical, beside, safe = float(p[sure].sum()), float(p[doubtful].sum()), float((1.0 - p[doubtful]).sum())
-    n = float(sure.sum())
-    if n == 0.0:
-        return None
-    least, most = critical / (n + safe), (critical + beside) / (n + beside)
-    return (least, most) if most - least > _MATTERS * max(float(np.average(p, weights=ok)), 1e-12) and most > 1e-3 else None
+    p = fitted.predict(u).probability(learner.scenario.requirement.critical)
+    (rarely, often), ok = success.ends(u), np.exp(success(u))
+
+    def share(critical: Vector, safe: Vector) -> float:
+        inside = float((p * critical).sum())
+        return inside / max(inside + float(((1.0 - p) * safe).sum()), 1e-300)
+
+    least, most = share(rarely, often), share(often, rarely)
+    return (least, most) if most - least > _MATTERS * max(share(ok, ok), 1e-12) and most > 1e-3 else None

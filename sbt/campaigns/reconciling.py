@@ -51,6 +51,8 @@ def _by_held_out(found: BoundaryConclusion, runs: CriticalShare, learned: int) -
     share, held_out, every = found.critical_fraction or 0.0, _as_told(found, runs), _as_told(found, found.even_fraction)
     where, told = ("the parameter space", "") if found.failing_fraction is None else ("what gives a metric", " that gave one")
     said = f"The metamodel takes {percent(share)} of {where} to be critical"
+    if found.critical_range is not None:
+        said += f" ({' to '.join(map(percent, found.critical_range))}, as runs fail or not)"
     if held_out is None:
         return [f"{said}; no held-out run checks that."]
     alone = f"the {plural(held_out.counted, 'held-out run')}{told} alone say {percent(held_out.critical_fraction or 0.0)}"
@@ -62,7 +64,7 @@ def _by_held_out(found: BoundaryConclusion, runs: CriticalShare, learned: int) -
         return [f"{said}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
     if held_out.counted < _HARDLY:
         return [f"{said}. So few runs hardly test it: it lies within their interval."]
-    sharper = share and held_out.counted < min(_MANY, learned)
+    sharper = share and found.critical_range is None and held_out.counted < min(_MANY, learned)
     more = f"; the metamodel's figure, which rests on {plural(learned, 'other run')}, is the sharper one" if sharper else ""
     return [f"{said}. They agree: it lies within that interval{more}."]
 

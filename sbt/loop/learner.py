@@ -17,7 +17,7 @@ from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import scored
 from sbt.metamodels.scores import scores
-from sbt.metamodels.success import log_success
+from sbt.metamodels.success import Success, learned_success
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN
 from sbt.problem.scenario import LogicalScenario
@@ -104,14 +104,14 @@ class Learner:
         critical = self.scenario.requirement.critical
         return lambda points: log_ambiguity_bound(predictor, self.inputs(points), critical)
 
-    def success(self, history: History) -> Callable[[Points], Vector] | None:
+    def success(self, history: History) -> Success | None:
         """Return log P(a run gives a metric) at the inputs' (n, d) unit-cube points; None where all runs did, or none."""
         space, runs = self.scenario.space, history.where(history.stage != VALIDATION)
         if runs.ok.all():
             return None
         u = space.metamodel_inputs(space.to_unit(runs.x))
-        score = log_success(u, runs.ok, stream(self.seed, "success", len(runs)))
-        return None if score is None else lambda points: score(space.metamodel_inputs(points))
+        score = learned_success(u, runs.ok, stream(self.seed, "success", len(runs)))
+        return None if score is None else score.of(space.metamodel_inputs)
 
     def on_inputs(self, predictor: Predictor, learned: int) -> Predictor:
         """Return a predictor as a function of the inputs' (n, d) unit-cube points; derived features are added here."""

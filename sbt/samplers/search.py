@@ -61,6 +61,7 @@ class Search:
         deflation: see `DEFLATION`.
         cube: which coordinates take single values: distances and steps know that choices have no order.
         most_rows: runs that the metamodel learns from at most: those nearest to M_c are a tenth, the others are drawn.
+        learn_success: learns where runs give a metric.
     """
 
     critical: CriticalInterval
@@ -70,6 +71,7 @@ class Search:
     deflation: float = DEFLATION
     cube: Cube = CONTINUOUS
     most_rows: int = 4000
+    learn_success: Callable[[Points, Mask, np.random.Generator], LogSuccess | None] = log_success
 
     def reached(self, u: Points, y: Vector) -> tuple[Search, Vector]:
         """Return the search without an end of M_c that the metric ends at, and the metric with what stands for none on its side.
@@ -255,7 +257,7 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
     at = search.cube.embedded
     left = ok & ~deflated & free(at(u))
     flank = ~free(at(u[left]), _FLANK)
-    success = log_success(search.columns(u), ok, rng)
+    success = search.learn_success(search.columns(u), ok, rng)
 
     def admissible(points: Points) -> Mask:
         left = search.feasible(points) & free(at(points))

@@ -1,0 +1,62 @@
+"""Where runs fail, and how much of the rest is critical: small places, and chance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sbt
+from sbt.metamodels.classifier import _log_posterior, classifier
+from sbt.samplers.sobol import SobolSequence
+from sbt.seeds import stream
+
+
+def evenly(fails: Callable[[dict[str, float], int], bool], folder: Path, seed: int = 1) -> sbt.Result:
+    """Return a boundary of even runs: critical within .2 of (.7, .3), share .1257."""
+
+    def run(values: dict[str, float], seed: int) -> dict[str, float]:
+        if fails(values, seed):
+            raise sbt.RunError("failed", "as told")
+        return {"y": math.hypot(values["a"] - 0.7, values["b"] - 0.3) - 0.2}
+
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
+    return sbt.run(
+        campaign="boundary", scenario=sbt.Scenario("disc", inputs, sbt.Requirement("y", high=0.0), evaluate=run), budget=90,
+        initial=90, seed=seed, executor="serial", store=folder / "s", report=False, metamodel={"kind": "gp"},
+    )  # fmt: skip
+
+
+def test_a_small_place_where_all_runs_fail_is_no_chance(tmp_path: Path):
+    """Runs fail in .0804 of the space, all of it critical; of what gives a metric .0492 is."""
+    found = evenly(lambda v, _: math.hypot(v["a"] - 0.7, v["b"] - 0.3) < 0.16, tmp_path)
+    assert found.conclusion.failing_fraction == pytest.approx(0.0804, abs=0.03)
+    least, most = found.conclusion.critical_range or (0.0, 0.0)
+    assert least < 0.0492 < most
+    assert any("of the parameter space gives no metric: runs there fail." in told for told in found.sentences())
+
+
+def test_the_slope_of_a_classifier_is_that_of_its_evidence():
+    u = stream(1, "slope").random((40, 2))
+    sign = np.where(np.hypot(u[:, 0] - 0.6, u[:, 1] - 0.3) > 0.3, 1.0, -1.0)
+    theta = np.array([-1.0, -0.5, 0.7, 1.2])
+    slope = _log_posterior(theta, u, sign, None)[1]
+    steps = [1e-3 * row for row in np.eye(4)]
+    told = [(_log_posterior(theta + s, u, sign, None)[0] - _log_posterior(theta - s, u, sign, None)[0]) / 2e-3 for s in steps]
+    assert slope == pytest.approx(told, abs=0.01)
+
+
+@pytest.mark.parametrize("d", [1, 3])
+def test_a_classifier_tells_places_from_chance(d: int):
+    u, rng = SobolSequence(d, 1).points(0, 90), stream(2, "labels")
+    new = rng.random((2000, d))
+    place = classifier(u, u[:, 0] > 0.08, rng)
+    assert 1.0 - place(new).mean() == pytest.approx(0.08, abs=0.02)
+    assert place.gain > 8.0
+    chance = classifier(u, rng.random(90) > 0.3, rng)
+    assert chance.gain < 4.0
+    low, high = chance.ends(new)
+    assert np.mean((low < 0.7) & (high > 0.7)) > 0.9
