@@ -39,6 +39,14 @@ def test_a_small_place_where_all_runs_fail_is_no_chance(tmp_path: Path):
     assert any("of the parameter space gives no metric: runs there fail." in told for told in found.sentences())
 
 
+def test_runs_that_fail_by_chance_fail_nowhere_in_particular(tmp_path: Path):
+    found = evenly(lambda _, seed: stream(seed, "unlucky").random() < 0.3, tmp_path)
+    told = " ".join(found.sentences())
+    assert "of the parameter space gives no metric" not in told
+    assert "of all runs give no metric, and nothing shows that the inputs decide which" in told
+    assert found.conclusion.critical_range is None
+
+
 def test_the_slope_of_a_classifier_is_that_of_its_evidence():
     u = stream(1, "slope").random((40, 2))
     sign = np.where(np.hypot(u[:, 0] - 0.6, u[:, 1] - 0.3) > 0.3, 1.0, -1.0)

@@ -16,7 +16,7 @@ from sbt.campaigns.each import each_share, fits_words, independence_words, share
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch, space_filling
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
-from sbt.campaigns.openness import open_range
+from sbt.campaigns.openness import by_chance, failing_words, open_range
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place, succeeding
 from sbt.campaigns.regions import CriticalRegion, critical_regions
@@ -24,7 +24,7 @@ from sbt.campaigns.repeats import SimulatorNoise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_boundary
 from sbt.campaigns.warmed import conditional_on
-from sbt.campaigns.wording import percent, plural, requirement_words
+from sbt.campaigns.wording import plural, requirement_words
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Campaign, Facts, Log
@@ -66,6 +66,7 @@ class BoundaryConclusion:
         earlier: runs of an earlier campaign that the metamodel learned from, too; 0: they do not help; None: there are none.
         critical_range: least and largest critical fraction, as runs fail or not where that is open; None: it hardly matters.
         even_fraction: critical share of all runs that fill the space evenly, the held-out ones among them.
+        fails_by_chance: nothing shows that inputs decide which runs fail; None: none fails.
     """
 
     critical_fraction: float | None
@@ -88,6 +89,7 @@ class BoundaryConclusion:
     earlier: int | None = optional()
     critical_range: tuple[float, float] | None = optional()
     even_fraction: CriticalShare | None = optional()
+    fails_by_chance: bool | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -104,14 +106,7 @@ class BoundaryConclusion:
         told = tell_boundary(self, measured, facts) if every is None else every.sentences(facts.scenario, condition)
         found = [*told, *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
-        if self.failing_fraction is not None:
-            found.append(f"About {percent(self.failing_fraction)} of the parameter space gives no metric: runs there fail.")
-        if self.critical_range is not None:
-            least, most = map(percent, self.critical_range)
-            found.append(
-                "Where failing begins is not known sharply, and critical runs lie beside it: of what gives a metric between"
-                f" {least} and {most} may be critical."
-            )
+        found += failing_words(self.failing_fraction, self.fails_by_chance, self.critical_range)
         if self.earlier is not None:
             found.append(_earlier_words(self.earlier))
         if self.weights is not None:
@@ -162,7 +157,7 @@ def recipe(settings: Settings) -> Campaign:
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history, unchosen), traffic_doubt(settings, log.history),
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted),
-            critical_share(log.history.where(unchosen), settings.scenario),
+            critical_share(log.history.where(unchosen), settings.scenario), by_chance(fitted),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

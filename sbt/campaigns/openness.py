@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from sbt.campaigns.wording import percent
 from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.metamodels.success import Success
 from sbt.problem.arrays import Vector
 
-__all__ = ["open_range"]
+__all__ = ["by_chance", "failing_words", "open_range"]
 
 _MATTERS = 0.2  # of the share, by which its ends must differ to be told
 _LIKELY = 0.5  # log evidence that inputs decide which runs fail, below which chance is the better account
@@ -32,3 +33,30 @@ def open_range(learner: Learner, fitted: FittedMetamodel) -> tuple[float, float]
 
     least, most = share(rarely, often), share(often, rarely)
     return (least, most) if most - least > _MATTERS * max(share(ok, ok), 1e-12) and most > 1e-3 else None
+
+
+def by_chance(fitted: FittedMetamodel) -> bool | None:
+    """Return whether nothing shows that inputs decide which runs fail; None where it is not asked, or none fails."""
+    return None if not isinstance(fitted.log_success, Success) else not fitted.log_success.shown
+
+
+def failing_words(share: float | None, chance: bool | None, critical: tuple[float, float] | None) -> list[str]:
+    """Return how much of the space, or how many runs, give no metric, and what that leaves open of the critical share.
+
+    Args:
+        share: that gives no metric; None: all do.
+        chance: of `by_chance`.
+        critical: of `open_range`.
+    """
+    found = []
+    if share is not None and chance:
+        found.append(f"About {percent(share)} of all runs give no metric, and nothing shows that the inputs decide which.")
+    elif share is not None:
+        found.append(f"About {percent(share)} of the parameter space gives no metric: runs there fail.")
+    if critical is not None:
+        least, most = map(percent, critical)
+        found.append(
+            "Where failing begins is not known sharply, and critical runs lie beside it: of what gives a metric between"
+            f" {least} and {most} may be critical."
+        )
+    return found
