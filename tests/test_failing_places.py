@@ -1,4 +1,4 @@
-"""Where runs fail, and how much of the rest is critical: small places, and chance."""
+"""Where runs fail, and how much of the rest is critical: small places, chance, and what no run has met."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 
 import sbt
+from sbt.campaigns.boundary import BoundaryConclusion
+from sbt.loop.stages import Facts
 from sbt.metamodels.classifier import _log_posterior, classifier
+from sbt.problem.requirement import Requirement
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
+from tests.sided_runs import sided_runs
 
 
-def evenly(fails: Callable[[dict[str, float], int], bool], folder: Path, seed: int = 1) -> sbt.Result:
-    """Return a boundary of even runs: critical within .2 of (.7, .3), share .1257."""
+def boundary(fails: Callable[[dict[str, float], int], bool], folder: Path, initial: int = 90) -> sbt.Result:
+    """Return a boundary, of even runs alone by default: critical within .2 of (.7, .3), share .1257."""
 
     def run(values: dict[str, float], seed: int) -> dict[str, float]:
         if fails(values, seed):
@@ -26,25 +30,44 @@ def evenly(fails: Callable[[dict[str, float], int], bool], folder: Path, seed: i
     inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
     return sbt.run(
         campaign="boundary", scenario=sbt.Scenario("disc", inputs, sbt.Requirement("y", high=0.0), evaluate=run), budget=90,
-        initial=90, seed=seed, executor="serial", store=folder / "s", report=False, metamodel={"kind": "gp"},
+        initial=initial, seed=1, executor="serial", store=folder / "s", report=False, metamodel={"kind": "gp"},
     )  # fmt: skip
 
 
 def test_a_small_place_where_all_runs_fail_is_no_chance(tmp_path: Path):
     """Runs fail in .0804 of the space, all of it critical; of what gives a metric .0492 is."""
-    found = evenly(lambda v, _: math.hypot(v["a"] - 0.7, v["b"] - 0.3) < 0.16, tmp_path)
+    found = boundary(lambda v, _: math.hypot(v["a"] - 0.7, v["b"] - 0.3) < 0.16, tmp_path)
     assert found.conclusion.failing_fraction == pytest.approx(0.0804, abs=0.03)
     least, most = found.conclusion.critical_range or (0.0, 0.0)
     assert least < 0.0492 < most
+    low, high = found.conclusion.failing_range or (0.0, 0.0)
+    assert low < 0.0804 < high
     assert any("of the parameter space gives no metric: runs there fail." in told for told in found.sentences())
 
 
 def test_runs_that_fail_by_chance_fail_nowhere_in_particular(tmp_path: Path):
-    found = evenly(lambda _, seed: stream(seed, "unlucky").random() < 0.3, tmp_path)
+    found = boundary(lambda _, seed: stream(seed, "unlucky").random() < 0.3, tmp_path)
     told = " ".join(found.sentences())
     assert "of the parameter space gives no metric" not in told
     assert "of all runs give no metric, and nothing shows that the inputs decide which" in told
     assert found.conclusion.critical_range is None
+
+
+def test_runs_are_not_lost_where_all_fails_that_would_be_critical(tmp_path: Path):
+    found = boundary(lambda v, _: math.hypot(v["a"] - 0.7, v["b"] - 0.3) < 0.2, tmp_path, 20)
+    chosen = found.frame[found.frame.stage == "boundary"]
+    assert (chosen.status != "ok").mean() < 0.45
+
+
+def test_where_nothing_critical_was_met_no_least_share_is_told():
+    found = BoundaryConclusion(1e-90, 0.01, 0.1, None, failing_fraction=0.07, critical_range=(9.54e-89, 0.0176))
+    facts = [Facts(sided_runs(critical, 20), Requirement("y", high=0.0), "m", "s") for critical in (0, 3)]
+    none, some = ([told for told in found.sentences(each) if "failing begins" in told] for each in facts)
+    (told,) = none
+    assert "none was met: of what gives a metric at most 1.76" in told
+    assert "between" not in told
+    (told,) = some
+    assert "between 0\N{NO-BREAK SPACE}% and 1.76" in told
 
 
 def test_the_slope_of_a_classifier_is_that_of_its_evidence():

@@ -16,7 +16,7 @@ from sbt.campaigns.each import each_share, fits_words, independence_words, share
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch, space_filling
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
-from sbt.campaigns.openness import by_chance, failing_words, open_range
+from sbt.campaigns.openness import by_chance, failing_range, failing_words, open_range
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
 from sbt.campaigns.place import BoundaryPlace, boundary_place, succeeding
 from sbt.campaigns.regions import CriticalRegion, critical_regions
@@ -67,6 +67,7 @@ class BoundaryConclusion:
         critical_range: least and largest critical fraction, as runs fail or not where that is open; None: it hardly matters.
         even_fraction: critical share of all runs that fill the space evenly, the held-out ones among them.
         fails_by_chance: nothing shows that inputs decide which runs fail; None: none fails.
+        failing_range: ends of the failing fraction; None: it is not known to be a part of the space.
     """
 
     critical_fraction: float | None
@@ -90,6 +91,7 @@ class BoundaryConclusion:
     critical_range: tuple[float, float] | None = optional()
     even_fraction: CriticalShare | None = optional()
     fails_by_chance: bool | None = optional()
+    failing_range: tuple[float, float] | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -106,7 +108,7 @@ class BoundaryConclusion:
         told = tell_boundary(self, measured, facts) if every is None else every.sentences(facts.scenario, condition)
         found = [*told, *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
-        found += failing_words(self.failing_fraction, self.fails_by_chance, self.critical_range)
+        found += failing_words(self.failing_fraction, self.fails_by_chance, self.failing_range, self.critical_range, facts)
         if self.earlier is not None:
             found.append(_earlier_words(self.earlier))
         if self.weights is not None:
@@ -156,8 +158,9 @@ def recipe(settings: Settings) -> Campaign:
             *shares, r.validation, r.weights, r.chosen_because,
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history, unchosen), traffic_doubt(settings, log.history),
-            every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted),
+            every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted, len(met)),
             critical_share(log.history.where(unchosen), settings.scenario), by_chance(fitted),
+            failing_range(learner, fitted),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

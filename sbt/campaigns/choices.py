@@ -38,6 +38,7 @@ _MOST_FILLING = 0.6  # the same where noise alone decides: where P is said to be
 _SETTLED = 0.5  # the same while edges are known far better than what even runs may have missed
 _KNOWN, _SHARP = 0.1, 0.05  # of 1 / the even runs, and of the critical share: expected on the wrong side where they are
 _ALIKE = 1.0, 0.6  # the same while all runs are critical: of one value, which tells of no direction, and of several
+_FILLED_INSTEAD, _MOST_LOST = 0.6, 0.25  # the same where so many of the chosen runs fail
 _PROBED = 512  # points at which the noise is taken
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
 _DRAWN, _MOST_DRAWN = 600, 2000  # points that the representative ones are chosen from
@@ -106,7 +107,7 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     fitted = _within(fitted, about_regions(settings, log) if exploring else None)
     looking = explore(settings, log, min(_rounded(share * n, log), n))
     opened = _MOST_FILLING * _open_share(settings, fitted, log)
-    filled = max(_FILLING, opened, _settled(fitted, log), _all_critical(settings, log))
+    filled = max(_FILLING, opened, _settled(fitted, log), _all_critical(settings, log), _lost(fitted, log))
     filling = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
@@ -132,6 +133,17 @@ def _settled(fitted: FittedMetamodel, log: Log) -> float:
     record, n = fitted.record, int(space_filling(log).sum())
     wrong = record.expected_misclassified
     return _SETTLED if n and wrong < _KNOWN / n and wrong < _SHARP * record.critical_fraction else 0.0
+
+
+def _lost(fitted: FittedMetamodel, log: Log) -> float:
+    """Return the share of runs that fill the space while those that are chosen fail, and most of the space does not; else 0.
+
+    Then all that is unsure lies where runs begin to fail, which the next ones would tell no more of.
+    """
+    chosen, failing = log.history.where(~space_filling(log)), fitted.record.failing_fraction
+    if failing is None or not len(chosen):
+        return 0.0
+    return _FILLED_INSTEAD if float(1.0 - chosen.ok.mean()) > max(_MOST_LOST, 2.0 * failing) else 0.0
 
 
 def _all_critical(settings: Settings, log: Log) -> float:

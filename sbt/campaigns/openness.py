@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import numpy as np
 
+from sbt.campaigns.sides import met
 from sbt.campaigns.wording import percent
 from sbt.loop.learner import FittedMetamodel, Learner
+from sbt.loop.stages import Facts
 from sbt.metamodels.success import Success
 from sbt.problem.arrays import Vector
 
-__all__ = ["by_chance", "failing_words", "open_range"]
+__all__ = ["by_chance", "failing_range", "failing_words", "open_range"]
 
+Ends = tuple[float, float]
+"""The least and the largest share."""
 _MATTERS = 0.2  # of the share, by which its ends must differ to be told
 _LIKELY = 0.5  # log evidence that inputs decide which runs fail, below which chance is the better account
 
 
-def open_range(learner: Learner, fitted: FittedMetamodel) -> tuple[float, float] | None:
+def open_range(learner: Learner, fitted: FittedMetamodel, met: int) -> Ends | None:
     """Return the least and the largest critical share of what gives a metric; None where no run fails, or it hardly matters.
 
     Least: where it is open whether a run gives a metric, what is critical fails and the rest does not; largest: the other way
-    round. Where runs fail by chance nothing is open: their mean is what counts.
+    round. Where runs fail by chance nothing is open: their mean is what counts. Where none of the runs was critical (`met`, how
+    many are), none may be.
     """
     success, u = fitted.log_success, learner.probe
     if not isinstance(success, Success) or success.gain < _LIKELY:
@@ -31,8 +36,17 @@ def open_range(learner: Learner, fitted: FittedMetamodel) -> tuple[float, float]
         inside = float((p * critical).sum())
         return inside / max(inside + float(((1.0 - p) * safe).sum()), 1e-300)
 
-    least, most = share(rarely, often), share(often, rarely)
+    least, most = share(rarely, often) if met else 0.0, share(often, rarely)
     return (least, most) if most - least > _MATTERS * max(share(ok, ok), 1e-12) and most > 1e-3 else None
+
+
+def failing_range(learner: Learner, fitted: FittedMetamodel) -> Ends | None:
+    """Return the least and the largest share of the space that gives no metric; None where none is known to."""
+    success = fitted.log_success
+    if not isinstance(success, Success) or not success.shown:
+        return None
+    rarely, often = success.ends(learner.probe)
+    return float(1.0 - often.mean()), float(1.0 - rarely.mean())
 
 
 def by_chance(fitted: FittedMetamodel) -> bool | None:
@@ -40,23 +54,27 @@ def by_chance(fitted: FittedMetamodel) -> bool | None:
     return None if not isinstance(fitted.log_success, Success) else not fitted.log_success.shown
 
 
-def failing_words(share: float | None, chance: bool | None, critical: tuple[float, float] | None) -> list[str]:
+def failing_words(share: float | None, chance: bool | None, failing: Ends | None, open_: Ends | None, facts: Facts) -> list[str]:
     """Return how much of the space, or how many runs, give no metric, and what that leaves open of the critical share.
 
     Args:
         share: that gives no metric; None: all do.
         chance: of `by_chance`.
-        critical: of `open_range`.
+        failing: of `failing_range`.
+        open_: of `open_range`.
+        facts: of the campaign.
     """
     found = []
     if share is not None and chance:
         found.append(f"About {percent(share)} of all runs give no metric, and nothing shows that the inputs decide which.")
     elif share is not None:
-        found.append(f"About {percent(share)} of the parameter space gives no metric: runs there fail.")
-    if critical is not None:
-        least, most = map(percent, critical)
-        found.append(
-            "Where failing begins is not known sharply, and critical runs lie beside it: of what gives a metric between"
-            f" {least} and {most} may be critical."
-        )
+        ends = "" if failing is None else f" ({' to '.join(map(percent, failing))})"
+        found.append(f"About {percent(share)}{ends} of the parameter space gives no metric: runs there fail.")
+    if open_ is not None:
+        least, most = map(percent, open_)
+        beside, between = "critical runs lie beside it", f"between {least} and {most}"
+        if not met(facts):
+            beside, between = "the metamodel expects critical runs there, though none was met", f"at most {most}"
+        lead = "Where failing begins is not known sharply, and"
+        found.append(f"{lead} {beside}: of what gives a metric {between} may be critical.")
     return found

@@ -13,6 +13,7 @@ from sbt.problem.requirement import Requirement
 __all__ = ["NOTHING", "measured", "mixture_shares", "number", "percent", "plural", "requirement_words", "written_unit"]
 
 _NIL = 1e-30  # a rounding error of what is zero
+_NO_SHARE = 1e-15  # a share that is a tail of a metamodel's, and nothing else
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "\N{EN DASH}"
 """Stands where there is no value."""
@@ -35,9 +36,10 @@ def number(value: Any, digits: int = 4) -> str:
 def percent(value: float) -> str:
     """Return a share as percentage; the space before the sign does not break.
 
-    >>> percent(0.0123) == "1.23\N{NO-BREAK SPACE}%"
-    True
+    >>> percent(0.0123) == "1.23\N{NO-BREAK SPACE}%", percent(9.5e-89) == "0\N{NO-BREAK SPACE}%"
+    (True, True)
     """
+    value = 0.0 if abs(value) < _NO_SHARE else value
     return f"{100 * value:.3g}\N{NO-BREAK SPACE}%"
 
 
