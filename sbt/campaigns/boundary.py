@@ -15,6 +15,7 @@ from sbt.campaigns.doubt import TrafficDoubt, traffic_doubt
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch, space_filling
+from sbt.campaigns.likely import CriticalCombinations, critical_combinations
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.openness import by_chance, failing_range, failing_words, open_range
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
@@ -68,6 +69,7 @@ class BoundaryConclusion:
         even_fraction: critical share of all runs that fill the space evenly, the held-out ones among them.
         fails_by_chance: nothing shows that inputs decide which runs fail; None: none fails.
         failing_range: ends of the failing fraction; None: it is not known to be a part of the space.
+        critical_combinations: where no input is continuous; None: one is, or the metamodel sees none.
     """
 
     critical_fraction: float | None
@@ -92,6 +94,7 @@ class BoundaryConclusion:
     even_fraction: CriticalShare | None = optional()
     fails_by_chance: bool | None = optional()
     failing_range: tuple[float, float] | None = optional()
+    critical_combinations: CriticalCombinations | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -106,6 +109,7 @@ class BoundaryConclusion:
         every = self.every_combination
         condition = requirement_words(facts.requirement, facts.unit, facts.units)
         told = tell_boundary(self, measured, facts) if every is None else every.sentences(facts.scenario, condition)
+        told += [] if self.critical_combinations is None else [self.critical_combinations.sentence(facts.units or {})]
         found = [*told, *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
         found += failing_words(self.failing_fraction, self.fails_by_chance, self.failing_range, self.critical_range, facts)
@@ -161,6 +165,7 @@ def recipe(settings: Settings) -> Campaign:
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted, len(met)),
             critical_share(log.history.where(unchosen), settings.scenario), by_chance(fitted),
             failing_range(learner, fitted),
+            None if every is not None else critical_combinations(log_odds, settings.scenario, fitted.log_success),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

@@ -85,7 +85,7 @@ class LinksTold:
         """Return in words what was asked, and what remains open."""
         asked = f"{plural(self.runs, 'run')} between critical ones tested whether they are of one failure mode"
         found = f"{self.critical} {'was' if self.critical == 1 else 'were'} critical"
-        found += "" if self.lost is None else f", {self.lost} gave no metric"
+        found += "" if self.lost is None else f", {self.lost} gave no metric and {'tells' if self.lost == 1 else 'tell'} nothing"
         still = f"; {plural(self.left, 'way')} between them {'is' if self.left == 1 else 'are'} still in doubt"
         return f"{asked}: {found}{still if self.left else ''}."
 
