@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,9 @@ def test_where_nothing_critical_was_met_no_least_share_is_told():
     assert "none was met: of what gives a metric at most 1.76" in told
     assert "between" not in told
     (told,) = some
+    chance = " ".join(replace(found, fails_by_chance=True).sentences(facts[1]))
+    assert "Should inputs decide it after all: of what gives a metric between" in chance
+    assert "Where failing begins" not in chance
     assert "between 0\N{NO-BREAK SPACE}% and 1.76" in told
 
 

@@ -76,5 +76,6 @@ def failing_words(share: float | None, chance: bool | None, failing: Ends | None
         if not met(facts):
             beside, between = "the metamodel expects critical runs there, though none was met", f"at most {most}"
         lead = "Where failing begins is not known sharply, and"
-        found.append(f"{lead} {beside}: of what gives a metric {between} may be critical.")
+        said = "Should inputs decide it after all" if chance else f"{lead} {beside}"
+        found.append(f"{said}: of what gives a metric {between} may be critical.")
     return found
