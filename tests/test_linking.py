@@ -124,7 +124,7 @@ def test_a_campaign_that_is_to_end_at_so_many_modes_goes_on_where_runs_between_t
 
 
 def test_runs_between_critical_ones_that_gave_no_metric_are_told():
-    assert LinksTold(2, 0, 0, lost=2).sentence().endswith(": 0 were critical, 2 gave no metric.")
+    assert LinksTold(2, 0, 0, lost=2).sentence().endswith(": 0 were critical, 2 gave no metric and tell nothing.")
     assert LinksTold(2, 1, 1).sentence().endswith(": 1 was critical; 1 way between them is still in doubt.")
 
 

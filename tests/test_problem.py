@@ -15,6 +15,7 @@ from scipy import integrate, stats
 from scipy.special import ndtri
 
 import sbt
+from sbt.campaigns.parts import _uniform
 from sbt.errors import InputError, RunError
 from sbt.problem.distribution import KINDS, Distribution
 from sbt.problem.expression import Expression
@@ -518,3 +519,19 @@ def test_an_input_over_decades_is_searched_in_its_logarithm(low, high, distribut
     even = np.diff(np.log(x)) if logarithmic else np.diff(x)
     np.testing.assert_allclose(even, even[0])
     assert parameter.centre == pytest.approx(x[4])
+
+
+def test_densities_of_inputs_over_decades_are_those_of_the_cube_where_draws_are_from_it():
+    """A log-uniform input is uniform in the cube, whose volume the density there fills; held-out runs know theirs."""
+    law = Distribution.of("scipy", name="loguniform", a=1e-4, b=1.0)
+    a, b, k = Parameter("a", 1e-4, 1.0, distribution=law), Parameter("b", 0.0, 4.0), Parameter("k", 1, 3, kind="integer")
+    space = ParameterSpace((a, b, k))
+    x, log_q = _uniform(space, 400, np.random.default_rng(1))
+    u = space.to_unit(x)
+    assert np.ptp(space.log_density_in_cube(u)) < 1e-9
+    np.testing.assert_allclose(np.exp(log_q), 1.0 / (x[:, 0] * np.log(1e4) * 4.0 * 3.0))
+    np.testing.assert_allclose(space.log_density(x), log_q)  # all inputs are drawn as they are distributed
+    lognormal = ParameterSpace((Parameter("a", 1e-3, 100.0, distribution=Distribution.of("lognormal", mean=1.0, std=2.0)),))
+    grid = np.linspace(0.0, 1.0, 20_001)[:, None]
+    density = np.exp(lognormal.log_density_in_cube(grid)) * np.log(1e5)
+    assert np.trapezoid(density, grid[:, 0]) == pytest.approx(1.0, abs=1e-6)

@@ -194,7 +194,7 @@ class _BenchmarkStage:
         def score(u: Points) -> Vector:
             if fitted is None or acquisition is None:
                 return np.zeros(len(u))
-            return acquisition(fitted.predict(u), critical, space.log_density(space.from_unit(u)))
+            return acquisition(fitted.predict(u), critical, space.log_density_in_cube(u))
 
         admissible = (lambda u: space.feasible(space.from_unit(u))) if space.constraints else None
         if self.scenario.pool is not None:

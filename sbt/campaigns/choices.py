@@ -228,7 +228,7 @@ def _score_by(
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
 
     def score(u: Points) -> Vector:
-        found = log_scores(acquisition, predict(u), critical, space.log_density(space.from_unit(u)))
+        found = log_scores(acquisition, predict(u), critical, space.log_density_in_cube(u))
         return found if fitted.log_success is None else found + _WARY * fitted.log_success(u)
 
     return score

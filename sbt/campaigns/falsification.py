@@ -237,7 +237,7 @@ class SearchStage:
         def scored(u: Points) -> Vector:
             if fitted is None:
                 return np.zeros(len(u))
-            log_density = space.log_density(space.from_unit(u))
+            log_density = space.log_density_in_cube(u)
             found = log_scores(score, fitted.predict(u), s.scenario.requirement.critical, log_density)
             return found if fitted.log_success is None else found + fitted.log_success(u)  # a run that fails shows nothing
 

@@ -170,14 +170,14 @@ def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun
     """Return n uniform random runs of the box, with their log density, for the batch of this iteration."""
     space = settings.scenario.space
     rng = stream(settings.seed, VALIDATION, iteration)
-    u, log_q = _uniform(space, n, rng)
-    return [PlannedRun(VALIDATION, named_inputs(settings.scenario, row), log_q) for row in space.from_unit(u)]
+    x, log_q = _uniform(space, n, rng)
+    return [PlannedRun(VALIDATION, named_inputs(settings.scenario, row), q) for row, q in zip(x, log_q, strict=True)]
 
 
-def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[Points, float | None]:
-    """Return (n, d) uniform points of the feasible box and their log density in physical values.
+def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[Points, list[float | None]]:
+    """Return the values (n, d) at uniform points of the unit cube that are feasible, and the log density of each.
 
-    The density is None where constraints cut the box (its volume is not known exactly).
+    The densities are None where constraints cut the box (its volume is not known exactly).
     """
     kept: list[Points] = [np.empty((0, space.dimension))]
     missing = n
@@ -186,11 +186,13 @@ def _uniform(space: ParameterSpace, n: int, rng: np.random.Generator) -> tuple[P
         u = u[space.feasible(space.from_unit(u))][:missing]
         kept.append(u)
         missing -= len(u)
+    x = space.from_unit(np.vstack(kept))
     if space.constraints:
-        return np.vstack(kept), None
-    ends = [p.bounds for p in space.parameters]
-    whole = [p.discrete for p in space.parameters]
-    return np.vstack(kept), -float(sum(math.log(b - a + w) for (a, b), w in zip(ends, whole, strict=True)))
+        return x, [None] * len(x)
+    ends = [(*p.bounds, p) for p in space.parameters]
+    spans = [math.log(math.log(b / a)) if p.logarithmic else math.log(b - a + p.discrete) for a, b, p in ends]
+    log_q = -float(sum(spans))
+    return x, [log_q - stretch for stretch in space.log_stretch(x).tolist()]
 
 
 def named_inputs(scenario: LogicalScenario, row: Vector) -> dict[str, Value]:

@@ -268,6 +268,16 @@ class ParameterSpace:
             log_p = np.where(self.feasible(x), log_p - np.log(self.feasible_mass), -np.inf)
         return log_p
 
+    def log_density_in_cube(self, u: Points) -> Vector:
+        """Return (n,) the log density of the inputs as one of the unit cube, but for a constant, at its points u (n, d)."""
+        x = self.from_unit(u)
+        return self.log_density(x) + self.log_stretch(x)
+
+    def log_stretch(self, x: Points) -> Vector:
+        """Return (n,) log dx/du at values x (n, d), but for what is the same everywhere: of inputs over decades their log."""
+        decades = [k for k, p in enumerate(self.parameters) if p.logarithmic]
+        return np.asarray(np.log(np.maximum(x[:, decades], np.finfo(np.float64).tiny)).sum(axis=1))
+
     def _log_density(self, x: Points) -> Vector:
         log_p = np.sum([p.log_density(x[:, k]) for k, p in enumerate(self.parameters)], axis=0)
         if self._factor is not None:

@@ -12,6 +12,7 @@ from sbt.campaigns.modes import FailureMode
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
 from sbt.campaigns.wording import NOTHING, number, percent, written_unit
 from sbt.problem.arrays import Vector
+from sbt.problem.plain import Value
 from sbt.problem.space import ParameterSpace
 from sbt.report.axes import drawn
 from sbt.report.figures import whole_ticks
@@ -81,9 +82,17 @@ def _change(mode: FailureMode, space: ParameterSpace) -> str:
     safe = mode.nearest_safe
     if safe is None:
         return "no uncritical run"
-    spans = {p.name: p.bounds[1] - p.bounds[0] for p in space.parameters}
+    inputs = {p.name: p for p in space.parameters}
     units = {p.name: written_unit(p.unit) for p in space.parameters}
-    sizes = {k: math.inf if isinstance(v, str) else abs(v) / spans[k] for k, v in safe.change.items()}  # another choice first
+
+    def size(name: str, change: Value) -> float:
+        if isinstance(change, str):  # another choice first
+            return math.inf
+        here = float(mode.inputs[name])
+        first, second = inputs[name].to_unit(np.array([here, here + change]))
+        return abs(float(second - first))
+
+    sizes = {name: size(name, change) for name, change in safe.change.items()}
     ranked = sorted(safe.change.items(), key=lambda item: -sizes[item[0]])[:3]
     changes = ", ".join(
         f"{name} {change}" if isinstance(change, str) else f"{name} {change:+.3g} {units[name]}".strip()
