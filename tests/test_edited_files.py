@@ -146,3 +146,19 @@ def test_a_print_of_code_is_that_of_any_process():
     }  # fmt: skip
     assert prints == {f"{code_print(_scenario(_cell('x')))}\n"}
     assert code_print(_scenario(_cell("x"))) != code_print(_scenario(_cell("x + 0.0")))
+
+
+def test_a_store_that_spread_an_input_evenly_does_not_go_on_in_its_logarithm(tmp_path, monkeypatch):
+    def run(budget: int) -> None:
+        law = sbt.Distribution.of(kind="scipy", name="loguniform", a=1e-3, b=10.0)
+        scenario = sbt.Scenario(
+            "s", [sbt.Parameter("a", 1e-3, 10.0, distribution=law)], sbt.Requirement("y", high=0.0),
+            evaluate=lambda values, seed: {"y": values["a"]},
+        )  # fmt: skip
+        sbt.run(campaign="coverage", scenario=scenario, budget=budget, store=tmp_path / "s", executor="serial", report=False)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sbt.problem.parameter._DECADES", float("inf"))  # as stores of before
+        run(6)
+    with pytest.raises(InputError, match=r"logarithmic: None there, \['a'\] now"):
+        run(8)

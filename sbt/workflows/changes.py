@@ -23,16 +23,20 @@ CONTENTS = "contents"
 
 PACKAGE = "package"
 """Key under which a store remembers `package_print`; stores of before have none."""
+_SIMULATES = ("execution", "metrics", "plugins", "problem", "scenarios", "sumo", "testbeds", "seeds.py")
+"""What of this package decides how a run goes."""
 
 
 @cache
 def package_print() -> str:
-    """Return a digest of what runs depend on beside the user's files: this package, its networks, the version of SUMO."""
+    """Return a digest of what runs depend on beside the user's files: of this package, its networks, the version of SUMO."""
     from sbt.sumo.nets import nets_folder
 
     digest, package = hashlib.blake2b(versions().encode(), digest_size=16), Path(__file__).resolve().parents[1]
-    for folder, pattern in ((package, "*.py"), (nets_folder(), "*.xml")):
-        for path in sorted(folder.rglob(pattern)):
+    nets = nets_folder()
+    code = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] in _SIMULATES]
+    for folder, files in ((package, code), (nets, nets.rglob("*.xml"))):
+        for path in sorted(files):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 

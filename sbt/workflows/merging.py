@@ -129,7 +129,7 @@ def _check_files(parts: Sequence[_Part], study: Study) -> None:
         for part in parts:
             if changed_since(part.folder, part.configuration):
                 with Store.read(part.folder) as store, study.executor() as executor:
-                    check_code(store, study, executor, changed=True)
+                    check_code(store, study, executor, changed=True, package=False)
 
 
 def _check_whole(parts: Sequence[_Part]) -> None:

@@ -130,9 +130,10 @@ def run_study(
         store.begin(snapshot)
         _check_same(store, snapshot)
         before = store.configuration
-        same_code = before.get(CODE, snapshot[CODE]) == snapshot[CODE] and before.get(PACKAGE) == snapshot[PACKAGE]
-        changed = (store.folder / RESOLVED).is_file() and not (same_code and not changed_files(store.folder, before))
-        if not changed:  # else what is written is newer, so that the runs are tried before
+        begun, same_code = (store.folder / RESOLVED).is_file(), before.get(CODE, snapshot[CODE]) == snapshot[CODE]
+        changed = begun and not (same_code and not changed_files(store.folder, before))
+        package = begun and before.get(PACKAGE) != snapshot[PACKAGE]
+        if not (changed or package):  # else what is written is newer, so that the runs are tried before
             keep_configuration(store, study, snapshot)
         common: Json = {
             "seed": study.config.seed, "requirement": study.scenario.requirement, "versions": versions(),
@@ -141,8 +142,8 @@ def run_study(
         executor = study.executor()  # at the isolation level that the store remembers
         warm_up(study.spec, study.config.executor.workers, partial(_tell, store, study, common["listener"]))
         with executor:
-            check_code(store, study, executor, changed=changed)
-            if changed:
+            check_code(store, study, executor, changed=changed, package=package)
+            if changed or package:
                 keep_configuration(store, study, snapshot)
             if shard is None:
                 finished = run_stages(campaign, store, executor, budget=study.budget, workers=study.workers, **common)
@@ -167,8 +168,9 @@ def _tell(store: Store, study: Study, listener: Callable[[Progress], None], acti
 
 
 def _code_of(study: Study) -> Json:
-    """Return what a store remembers of the code that its runs depend on."""
-    return {CODE: code_print(study.scenario), PACKAGE: package_print()}
+    """Return what a store remembers of the code that its runs depend on, and which inputs are spread in their logarithm."""
+    logarithmic = [p.name for p in study.scenario.space.parameters if p.logarithmic]
+    return {CODE: code_print(study.scenario), PACKAGE: package_print(), "logarithmic": logarithmic or None}
 
 
 def keep_configuration(store: Store, study: Study, snapshot: JsonMapping) -> None:
