@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,9 @@ import sbt
 from sbt.errors import InputError
 from sbt.execution.code_print import code_print
 from sbt.store.database import Store
+from sbt.sumo.nets import nets_folder
 from sbt.testbeds.problem import _Pointwise
+from sbt.workflows.changes import package_print
 
 FUNCTION = """import sbt
 SCENARIO = sbt.Scenario('s', [sbt.Parameter('a', 0, 1, 'm')], sbt.Requirement('gap', high=0.0),
@@ -162,3 +165,18 @@ def test_a_store_that_spread_an_input_evenly_does_not_go_on_in_its_logarithm(tmp
         run(6)
     with pytest.raises(InputError, match=r"logarithmic: None there, \['a'\] now"):
         run(8)
+
+
+def test_a_print_of_the_package_is_that_of_what_simulates(tmp_path, monkeypatch):
+    plain = package_print.__wrapped__
+    now = plain()
+    assert now == package_print()
+    monkeypatch.setattr("sbt.workflows.changes.versions", lambda: "another SUMO")
+    other = plain()
+    monkeypatch.undo()
+    shutil.copytree(nets_folder(), tmp_path / "nets")
+    monkeypatch.setattr("sbt.sumo.nets.nets_folder", lambda: tmp_path / "nets")
+    assert plain() == now  # wherever they lie
+    net = next((tmp_path / "nets").rglob("*.net.xml"))
+    net.write_text(net.read_text() + "<!-- edited -->")
+    assert len({now, other, plain()}) == 3

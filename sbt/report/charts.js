@@ -70,7 +70,8 @@ const drawParallel = (place, data, view) => {
     for (const value of values) { low = Math.min(low, value); high = Math.max(high, value); }
     if (!(high > low)) { low -= 0.5; high += 0.5; }
     const decades = column.log ? Array.from({ length: Math.floor(high) - Math.ceil(low) + 1 }, (_, k) => Math.ceil(low) + k) : [];
-    const named = column.log ? { tickvals: decades, ticktext: decades.map(k => `1e${k}`) } : column.choices.length ? { tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(c => shortened(c, 12)) } : {};
+    const named = column.log && decades.length > 1 ? { tickvals: decades, ticktext: decades.map(k => `1e${k}`) }
+      : column.log ? { tickvals: [low, high], ticktext: [low, high].map(at => digits(10 ** at, 2)) } : column.choices.length ? { tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(c => shortened(c, 12)) } : {};
     return { label: shortened(titled(column), 18), values, range: [low, high], constraintrange: brushed(column, view.brushes.get(column.name), Math.log10), ...named };
   });
   const [safeColour, criticalColour] = shades();
