@@ -507,6 +507,7 @@ def _of(inputs=None, requirement=None, evaluate=lambda values, seed: {"m": value
     (0.1, 1000.0, Distribution.of("lognormal", mean=5.0, std=5.0), True),
     (0.1, 1000.0, Distribution.of("uniform"), False), (0.1, 1000.0, None, False),  # every value counts the same
     (0.0, 1000.0, Distribution.of("exponential", mean=5.0), False),  # there is no logarithm
+    (5e-324, 1000.0, Distribution.of("exponential", mean=5.0), False),
     (0.1, 5.0, Distribution.of("lognormal", mean=0.3, std=0.3), False),
     (0.1, 1000.0, Distribution.of("normal", mean=500.0, std=100.0), False),
 ])  # fmt: skip

@@ -20,12 +20,12 @@ from sbt.problem.parameter import Parameter
 
 __all__ = ["MOST_GIVEN", "MOST_JOINED", "JoinedCells", "log_cell_mass"]
 
-MOST_JOINED, MOST_GIVEN = 4, 2
+MOST_JOINED, MOST_GIVEN = 3, 2
 """Whole numbers whose joint probability is computed; fewer where it is another one for each value of continuous inputs."""
-_NODES = {2: 64, 3: 24, 4: 14}
-"""Nodes of each score but the last, by the number of scores: relative errors below 1e-5 at correlations up to .95."""
-_FEW_NODES, _LOOSE = 24, 0.25
-"""Of two scores that leave each other a standard deviation above that: errors below 1e-8."""
+_NODES = {2: 64, 3: 24}
+"""Nodes of each score but the last, by the number of scores: relative errors below 1e-5 (3: 1e-4) at correlations up to .95."""
+_FEW_NODES, _LOOSE = {2: 24, 3: 10}, {2: 0.25, 3: 0.5}
+"""Of scores that leave each other a standard deviation above that: errors below 1e-8 (3: 3e-5)."""
 _AT_ONCE = 2**15
 _DEPENDENT = 1e-12
 _LEAST = 1e-320
@@ -140,7 +140,7 @@ def log_cell_mass(lower: Points, upper: Points, covariance: Points) -> Vector:
     p = _between(lower, upper)[2]
     if m > 1:
         left = 1.0 / np.sqrt(np.diag(np.linalg.inv(correlation)).max())
-        nodes, weights = _nodes(_FEW_NODES if m == 2 and left > _LOOSE else _NODES[m], m)
+        nodes, weights = _nodes((_FEW_NODES if left > _LOOSE[m] else _NODES)[m], m)
         parts = np.array_split(np.arange(len(p)), -(-len(p) * len(weights) // _AT_ONCE) or 1)
         order = np.argsort(p, axis=1)
         p = np.vstack([_each_given_those_before(lower[k], upper[k], order[k], correlation, nodes) @ weights for k in parts])

@@ -230,7 +230,7 @@ class Parameter:
         A range over two decades or more, of whose distribution half lies in the lowest tenth, would hardly be searched there.
         """
         low, high = self.bounds
-        if self.discrete or self.truncated is None or not 0.0 < low * _DECADES <= high:
+        if self.discrete or self.truncated is None or not 0.0 < low * _DECADES <= high or math.isinf(high / low):
             return False
         return float(self.truncated.cdf(np.array(low + 0.1 * (high - low)))) >= 0.5
 
