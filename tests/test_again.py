@@ -103,6 +103,7 @@ def test_the_correlation_of_truncated_inputs_is_raised_and_lowered(tmp_path):
     assert found.estimate(critical=(-np.inf, 1e6)).probability == 1.0
 
 
+@pytest.mark.slow
 def test_one_requirement_of_a_combination_is_asked_for_by_its_name(tmp_path):
     inputs = [sbt.Parameter(name, -6, 6, "", sbt.Normal(0, 1)) for name in "xw"]
     required = sbt.any_of(sbt.Requirement("y", low=2.0, name="late"), sbt.Requirement("z", low=3.5))

@@ -350,6 +350,7 @@ def test_a_gate_that_passes_says_what_it_cannot_exclude(undetected, told):
     assert ("could hold up to 0.12" in verdict.statement) == told
 
 
+@pytest.mark.slow
 def test_a_gate_goes_on_while_its_pass_would_trust_the_search(tmp_path):
     """The estimate is precise long before what no run has met is known to be less than what is allowed."""
     keys = {"campaign": "estimation", "scenario": "testbed:linear_d2", "budget": 240, "seed": 3, "executor": "serial"}

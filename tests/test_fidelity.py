@@ -322,6 +322,7 @@ def test_coarse_runs_begin_with_coarse_warm_ups_and_replay_so(tmp_path: Path) ->
     assert replay_run(tmp_path / "store", int(coarse.index[0])).identical
 
 
+@pytest.mark.slow
 @pytest.mark.sumo
 def test_warm_ups_of_a_coarser_scenario_that_are_not_the_scenarios_are_refused(tmp_path: Path) -> None:
     """They were silently replaced by the scenario's."""

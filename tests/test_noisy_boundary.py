@@ -143,7 +143,9 @@ def test_where_noise_decides_the_space_is_filled(tmp_path: Path):
     assert filled[2][:2] == [0, 0], "likewise until edges are known"
 
 
-@pytest.mark.parametrize("critical", [CriticalInterval(low=1.0), CriticalInterval(high=-1.0)])
+@pytest.mark.parametrize(
+    "critical", [CriticalInterval(low=1.0), pytest.param(CriticalInterval(high=-1.0), marks=pytest.mark.slow)]
+)
 def test_of_a_flag_that_chance_decides_the_rate_is_learned(critical: CriticalInterval):
     """Critical with 5 to 45 % of the seeds by a whole number: without labels the share was stated as .14 for .25."""
     sign = 1.0 if critical.high == np.inf else -1.0

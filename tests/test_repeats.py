@@ -185,6 +185,7 @@ def test_modes_of_one_input_each_may_be_parts_of_one_region(tmp_path: Path):
     assert not said["round_"]
 
 
+@pytest.mark.slow
 def test_failures_by_chance_beside_a_smooth_region_pass_no_gate(tmp_path: Path):
     """All repeats were of the smooth region, "no noise was met", and a gate passed at a fifteenth of P = .0169 (seed 21)."""
 
