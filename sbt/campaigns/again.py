@@ -228,10 +228,11 @@ def _check_joined(old: ParameterSpace, space: ParameterSpace) -> None:
 def _predicted(log: Log, settings: Settings, space: ParameterSpace, draws: list[_Draws]) -> Iterator[tuple[_Said, _Said]]:
     """Yield what a metamodel of earlier runs only says of each batch, failed runs as safe, and as critical."""
     old, history = settings.scenario.space, log.history
+    coordinates = Coordinates(old)
     step = -(-len(draws) // _FITS)
     for k, batch in enumerate(draws):
         if k % step == 0:
-            known = Known.of(history.where(history.iteration < batch.number), Coordinates(old), settings)
+            known = Known.of(history.where(history.iteration < batch.number), coordinates, settings)
             learned = None if settings.learner is None else known.learn(stream(settings.seed, "fit", batch.number))
             if learned is not None:
                 mixture = _mixture(learned, known, old, space, stream(settings.seed, "again", batch.number))

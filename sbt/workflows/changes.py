@@ -13,16 +13,14 @@ from sbt.plugins import contents_read, newer
 from sbt.plugins.source import is_installed
 from sbt.problem.plain import Json, JsonMapping
 from sbt.workflows.portable import place_of
-from sbt.workflows.study import RESOLVED
+from sbt.workflows.study import PACKAGE, RESOLVED
 
-__all__ = ["CONTENTS", "PACKAGE", "changed_files", "changed_since", "contents_in", "package_changed", "package_print",
+__all__ = ["CONTENTS", "changed_files", "changed_since", "contents_in", "package_changed", "package_print",
            "told"]  # fmt: skip
 
 CONTENTS = "contents"
 """Key under which a store remembers a hash of each file, by its path seen from where the names of the configuration start."""
 
-PACKAGE = "package"
-"""Key under which a store remembers `package_print`; stores of before have none."""
 _SIMULATES = ("execution", "metrics", "plugins", "problem", "scenarios", "sumo", "testbeds", "seeds.py")
 """What of this package decides how a run goes."""
 

@@ -20,10 +20,10 @@ from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.plain import JsonMapping
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import Record
-from sbt.workflows.changes import CONTENTS, PACKAGE, changed_since
+from sbt.workflows.changes import CONTENTS, changed_since
 from sbt.workflows.rechecking import check_code
 from sbt.workflows.running import Summary, keep_configuration, rebuild_report, summarise
-from sbt.workflows.study import RESOLVED, Study
+from sbt.workflows.study import PACKAGE, RESOLVED, Study
 
 __all__ = ["merge_shards"]
 

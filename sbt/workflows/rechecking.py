@@ -77,8 +77,8 @@ def not_repeated(scenario: LogicalScenario) -> str:
 def check_earlier(study: Study) -> None:
     """Refuse to learn from an earlier campaign as from this one where code has changed: its first and last run are tried.
 
-    Where this package or SUMO was another one then, as many as `_TRIED` are. With warmed traffic none is, since another number
-    of warm-ups is another beginning.
+    Where this package or SUMO was another one then, as many as `_TRIED` are; of files that SUMO does not repeat most of these are
+    enough. With warmed traffic none is tried, since another number of warm-ups is another beginning.
     """
     choice = study.config.warm_start
     if choice is None or choice.transfer or (study.isolation is not None and study.isolation.warm):
@@ -90,12 +90,13 @@ def check_earlier(study: Study) -> None:
     history = earlier.same_runs(study.scenario)
     ok = np.flatnonzero(history.ok & history.drawn & (history.columns["level"] == 0))
     unsure, differing = "" if same_package else not_repeated(study.runnable), 0
+    tried = _spread(ok, 2 if same_package else _TRIED)
     with study.executor() as executor:
-        for record, outcome in _again(history, _spread(ok, 2 if same_package else _TRIED), executor):
+        for record, outcome in _again(history, tried, executor):
             stored = {name: value for name, value in record.metrics.items() if name in outcome.metrics or not outcome.metrics}
             now = {name: outcome.metrics[name] for name in stored if outcome.metrics} or outcome.reason
             differing += now != stored
-            if now != stored and (not unsure or 2 * differing > _TRIED):
+            if now != stored and (not unsure or 2 * differing > len(tried)):
                 rule = f"warm_start.store must be of what is run now, but its run {record.index} now gives {now}, not {stored}"
                 rule += "" if same_package else " (this package or SUMO was another one then)"
                 raise InputError(f"{rule}: transfer: true takes it as another setup")

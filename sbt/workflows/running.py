@@ -30,13 +30,13 @@ from sbt.store.database import Store
 from sbt.store.history import Record
 from sbt.store.planning import storable
 from sbt.workflows.asking import sensitivities_in
-from sbt.workflows.changes import CONTENTS, PACKAGE, changed_files, changed_since, contents_in, package_changed, package_print
+from sbt.workflows.changes import CONTENTS, changed_files, changed_since, contents_in, package_changed, package_print
 from sbt.workflows.fidelity import COARSE_COST
 from sbt.workflows.filming import film_runs
 from sbt.workflows.judging import judge_campaign
 from sbt.workflows.portable import write_bundle
 from sbt.workflows.rechecking import check_code, check_earlier
-from sbt.workflows.study import RESOLVED, Study
+from sbt.workflows.study import PACKAGE, RESOLVED, Study
 
 __all__ = [
     "Replay", "Summary", "bundle_store", "keep_configuration", "rebuild_report", "replay_run", "run_study", "summarise",

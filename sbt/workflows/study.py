@@ -36,7 +36,7 @@ from sbt.workflows.mistakes import further_mistakes
 from sbt.workflows.own_campaign import checked
 from sbt.workflows.portable import place_of, where_it_is
 
-__all__ = ["RESOLVED", "Study"]
+__all__ = ["PACKAGE", "RESOLVED", "Study"]
 
 STATES = "snapshots"
 """Folder of the warmed states in that of a store."""
@@ -44,6 +44,8 @@ COVARIATES, EARLIER = "covariate_names", "earlier"
 """Keys under which a store remembers that seeds are looked at, and the runs of an earlier campaign that it learns from."""
 RESOLVED = "config.resolved.yaml"
 """The configuration with its defaults, in a store's folder."""
+PACKAGE = "package"
+"""Key under which a store remembers a print of this package (`sbt.workflows.changes`); stores of before have none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +273,7 @@ class Study:
         try:
             with Store.read(folder) as store:
                 before, history, finished = Study.from_store(store), store.history(), store.conclusion is not None
-                package = store.configuration.get("package", "")
+                package = store.configuration.get(PACKAGE, "")
         except StoreError as error:
             raise StoreError(f"warm_start.store: {error}") from None
         if not finished:
