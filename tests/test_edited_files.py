@@ -111,7 +111,7 @@ def test_a_changed_function_of_a_notebook_is_tried_at_more_runs(tmp_path):
     assert len(sbt.open(tmp_path / "s", scenario=_scenario(_cell("x"))).history) == 44
 
 
-@pytest.mark.parametrize("kind", ["resumed", "warm start"])
+@pytest.mark.parametrize("kind", ["resumed", "warm start", "unsure"])
 def test_runs_that_another_state_of_the_package_would_not_give_are_refused(tmp_path, monkeypatch, kind):
     def campaign(budget: int, **options: object) -> sbt.Result:
         name = "second" if "warm_start" in options else "first"
@@ -126,6 +126,8 @@ def test_runs_that_another_state_of_the_package_would_not_give_are_refused(tmp_p
         monkeypatch.setattr(f"sbt.workflows.{place}.package_print", lambda: "earlier")
     campaign(6)
     monkeypatch.undo()
+    if kind == "unsure":  # SUMO does not repeat every run of such files: of six all differ
+        monkeypatch.setattr("sbt.workflows.rechecking.not_repeated", lambda _: "; it may")
     before = _Pointwise.__call__
     with monkeypatch.context() as patch:
         patch.setattr(_Pointwise, "__call__", lambda self, values, seed: {"y": before(self, values, seed)["y"] + 1e-9})
