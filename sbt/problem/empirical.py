@@ -28,6 +28,8 @@ _TERMS = 2_000_000  # distances between points and values that are held at once
 _RARE = 1e-290  # mass below which its log is summed in logs
 _MOST_NODES, _STEPS = 20_000, 60  # tabulated points, and steps from them at most
 _NEAR = 1e-5  # step, in bandwidths, after which the next one would be of rounding
+_DENSE = 32  # tabulated points a bandwidth
+_STEEP, _WIDE = 2.0, 1.5  # change of slope between two of them, and their distance over the usual, up to which a cubic will do
 
 
 def silverman(values: Vector) -> float:
@@ -100,8 +102,8 @@ class KernelDensity:
     def _nodes(self) -> Vector:
         """(m,) x from 40 bandwidths below the least value to 40 above the largest, dense where values are."""
         low, high, h = float(self.values[0]), float(self.values[-1]), self.bandwidth
-        inner = np.linspace(low - 8.0 * h, high + 8.0 * h, min(math.ceil(8.0 * ((high - low) / h + 16.0)) + 1, _MOST_NODES))
-        outer = h * np.arange(8.25, 40.25, 0.25)
+        inner = np.linspace(low - 8.0 * h, high + 8.0 * h, min(math.ceil(_DENSE * ((high - low) / h + 16.0)) + 1, _MOST_NODES))
+        outer = h * np.arange(8 * _DENSE + 1, 40 * _DENSE + 1) / _DENSE
         return np.concatenate([(low - outer)[::-1], inner, high + outer])
 
     @cached_property
@@ -118,7 +120,8 @@ class KernelDensity:
     def _solved(self, log_q: Vector, side: float) -> Vector:
         """Return x with log P(side X <= side x) = log_q; infinite at q = 0 and 1.
 
-        A cubic between tabulated points, then Newton steps within their interval, halves of it where one leaves it.
+        A cubic between tabulated points; where these are far apart, or slopes change between them, Newton steps within their
+        interval follow, halves of it where one leaves it.
         """
         mass, x, slope = self._tables[side]
         k = np.clip(np.searchsorted(mass, log_q) - 1, 0, len(mass) - 2)
@@ -127,8 +130,10 @@ class KernelDensity:
         a, b = np.minimum(x[k], x[k + 1]), np.maximum(x[k], x[k + 1])
         at = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * x[k] + t**2 * (3.0 - 2.0 * t) * x[k + 1]
         at = np.clip(at + width * t * (1.0 - t) * ((1.0 - t) * slope[k] - t * slope[k + 1]), a, b)
+        steep = np.maximum(slope[k] / slope[k + 1], slope[k + 1] / slope[k]) > _STEEP
+        rough = (steep | (b - a > _WIDE / _DENSE * self.bandwidth)).reshape(-1)
         at, a, b, flat = at.reshape(-1), a.reshape(-1).copy(), b.reshape(-1).copy(), log_q.reshape(-1)
-        left = np.flatnonzero(np.isfinite(flat) & (flat < 0.0))
+        left = np.flatnonzero(rough & np.isfinite(flat) & (flat < 0.0))
         for _ in range(_STEPS):
             y = at[left]
             log_mass = self._log_mass(y, side)
