@@ -8,7 +8,8 @@ increasing and the ends of the interval are warped with it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.special import ndtr, stdtr
@@ -40,6 +41,7 @@ class Warp:
         scale: > 0; within it the warp is nearly straight.
         above: > 0, the scale of values above the edge; None: the same.
         gap: distances >= 0 below and above the edge that are left out.
+        reach: warped values <= 0 and >= 0 beyond which the warp is straight, as sinh makes much of little that a process swings.
 
     >>> warp = Warp.around_edge(np.array([1.0, 5.0, 1e6]), CriticalInterval(high=0.0))
     >>> warp.interval(CriticalInterval(high=0.0)).high, bool(warp.values(np.array([1e6]))[0] < 14)
@@ -50,6 +52,12 @@ class Warp:
     scale: float
     above: float | None = None
     gap: tuple[float, float] = (0.0, 0.0)
+    reach: tuple[float, float] = (-math.inf, math.inf)
+
+    def reaching(self, y: Vector) -> Self:
+        """Return the warp that is straight beyond the values y (n,) that runs had; between them it is the same."""
+        warped = self.values(y)
+        return replace(self, reach=(min(float(warped.min()), 0.0), max(float(warped.max()), 0.0)))
 
     @classmethod
     def around_edge(cls, y: Vector, critical: CriticalInterval, quantile: float = 0.25) -> Warp:
@@ -90,12 +98,23 @@ class Warp:
     def values(self, y: Vector) -> Vector:
         """Return the warped y, shape kept."""
         kept = self.kept(y)
-        return np.asarray(np.arcsinh(kept / self.scale_at(kept)))
+        scaled = kept / self.scale_at(kept)
+        near = self._near(scaled)
+        return np.asarray(np.arcsinh(near) + _beyond(scaled, near, 1.0 / np.hypot(1.0, near)))
+
+    def _near(self, scaled: Vector) -> Vector:
+        """Return sinh of warped values, as near as the warp is curved."""
+        return np.clip(scaled, *np.sinh(self.reach))
+
+    def _unwarped(self, warped: Points) -> Points:
+        """Return how far the y of warped values is beyond the edge without the gap, shape kept."""
+        near = np.clip(warped, *self.reach)
+        return np.asarray(self.scale_at(warped) * (np.sinh(near) + _beyond(warped, near, np.cosh(near))))
 
     def back(self, warped: Vector) -> Vector:
         """Return the y of warped values, shape kept; finite ones so far away that they are no numbers any more are nearer."""
         warped = np.where(np.isinf(warped), warped, np.clip(warped, -_FARTHEST, _FARTHEST))
-        kept = self.scale_at(warped) * np.sinh(warped)
+        kept = self._unwarped(warped)
         if self.gap == (0.0, 0.0):
             return np.asarray(self.edge + kept)
         gap, crossing, far = self._gap_at(warped), self._crossing(warped), np.abs(kept)
@@ -110,8 +129,8 @@ class Warp:
         """
         mean, std = np.clip(mean, -_FARTHEST, _FARTHEST), np.clip(std, _LEAST, _FARTHEST)
         low, high = mean - std, mean + std
-        spread = 0.5 * (self.scale_at(high) * np.sinh(high) - self.scale_at(low) * np.sinh(low))
-        middle = self.edge + self.scale_at(mean) * np.sinh(mean)
+        spread = 0.5 * (self._unwarped(high) - self._unwarped(low))
+        middle = self.edge + self._unwarped(mean)
         if self.gap == (0.0, 0.0):
             return middle, spread
         above, beyond = ndtr(mean / std), stdtr(_TAILS, -np.abs(mean) / std)
@@ -122,7 +141,7 @@ class Warp:
         """Return (n,) the logarithm of the warp's derivative at y (n,)."""
         kept = self.kept(y)
         scale = self.scale_at(kept)
-        slope = -0.5 * np.log1p((kept / scale) ** 2) - np.log(scale)
+        slope = -0.5 * np.log1p(self._near(kept / scale) ** 2) - np.log(scale)
         gap, crossing = self._gap_at(kept), self._crossing(kept)
         inside = np.abs(kept) < crossing
         return np.asarray(slope + np.log(np.divide(crossing, gap, out=np.ones_like(scale), where=inside)))
@@ -151,15 +170,23 @@ class LogWarp(Warp):
         """Return the warp around an edge > 0."""
         return cls(edge, edge)
 
+    def reaching(self, y: Vector) -> Self:
+        """Return the warp that is straight beyond the largest y (n,); below the least it stays positive."""
+        return replace(self, reach=(-math.inf, max(float(self.values(y).max()), 0.0)))
+
     def values(self, y: Vector) -> Vector:
         """Return the warped y, shape kept; -inf and what is not positive are very small."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            warped = np.log(np.maximum(np.asarray(y, dtype=np.float64), 0.0) / self.edge)
+            scaled = np.maximum(np.asarray(y, dtype=np.float64), 0.0) / self.edge
+            near = np.minimum(scaled, np.exp(self.reach[1]))
+            warped = np.log(near) + _beyond(scaled, near, 1.0 / near)
         return np.asarray(np.where(np.isneginf(y), -np.inf, np.maximum(warped, -_FARTHEST)))
 
     def back(self, warped: Vector) -> Vector:
         """Return the y of warped values, shape kept."""
-        return np.asarray(self.edge * np.exp(np.where(np.isinf(warped), warped, np.clip(warped, -_FARTHEST, _FARTHEST))))
+        warped = np.where(np.isinf(warped), warped, np.clip(warped, -_FARTHEST, _FARTHEST))
+        near = np.clip(warped, *self.reach)
+        return np.asarray(self.edge * (np.exp(near) + _beyond(warped, near, np.exp(near))))
 
     def moments(self, mean: Points, std: Points) -> tuple[Points, Points]:
         """Return the median of y and half of what lies between a standard deviation on either side, shape kept."""
@@ -169,7 +196,14 @@ class LogWarp(Warp):
 
     def log_slope(self, y: Vector) -> Vector:
         """Return (n,) the logarithm of the warp's derivative at y (n,)."""
-        return -self.values(y) - math.log(self.edge)
+        return -np.minimum(self.values(y), self.reach[1]) - math.log(self.edge)
+
+
+def _beyond(far: Points, near: Points, slope: Points) -> Points:
+    """Return (far - near) slope, shape kept; 0 where both are the same, infinite ones too."""
+    out = np.zeros(np.shape(far))
+    np.subtract(far, near, out=out, where=far != near)
+    return np.multiply(out, slope, out=out, where=out != 0.0)
 
 
 @dataclass(frozen=True)
