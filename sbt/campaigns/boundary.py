@@ -164,7 +164,7 @@ def recipe(settings: Settings) -> Campaign:
             place, explained_variance(settings, log.history, unchosen), traffic_doubt(settings, log.history),
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted, len(met)),
             critical_share(log.history.where(unchosen), settings.scenario), by_chance(fitted),
-            failing_range(learner, fitted),
+            failing_range(learner, fitted, len(log.history.finished)),
             None if every is not None else critical_combinations(log_odds, settings.scenario, fitted.log_success),
         ), fitted  # fmt: skip
 

@@ -37,7 +37,7 @@ _FILLING = 0.1  # share of the mix that fills the space, held-out runs included
 _MOST_FILLING = 0.6  # the same where noise alone decides: where P is said to be small nobody would look again
 _SETTLED = 0.5  # the same while edges are known far better than what even runs may have missed
 _KNOWN, _SHARP = 0.1, 0.05  # of 1 / the even runs, and of the critical share: expected on the wrong side where they are
-_ALIKE = 1.0, 0.6  # the same while all runs are critical: of one value, which tells of no direction, and of several
+_ALIKE = 1.0, 0.6  # the same while all runs have one value, which tells of no direction; while all are critical
 _FILLED_INSTEAD, _MOST_LOST = 0.6, 0.25  # the same where so many of the chosen runs fail
 _PROBED = 512  # points at which the noise is taken
 _TYPICAL = 0.8  # share of what neither explores nor fills the space; the rest is chosen greedily
@@ -102,12 +102,13 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     """
     if fitted is None:
         return evenly(settings, fitted, log, n)
-    exploring = should_explore(settings, fitted, log)
+    alike = _all_alike(settings, log)
+    exploring = should_explore(settings, fitted, log) and alike < 1.0
     share = exploration_share(settings, log) if exploring else 0.0
     fitted = _within(fitted, about_regions(settings, log) if exploring else None)
     looking = explore(settings, log, min(_rounded(share * n, log), n))
     opened = _MOST_FILLING * _open_share(settings, fitted, log)
-    filled = max(_FILLING, opened, _settled(fitted, log), _all_critical(settings, log), _lost(fitted, log))
+    filled = max(_FILLING, opened, _settled(fitted, log), alike, _lost(fitted, log))
     filling = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
     first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
     so_far = np.concatenate([looking, fill])
@@ -146,12 +147,13 @@ def _lost(fitted: FittedMetamodel, log: Log) -> float:
     return _FILLED_INSTEAD if float(1.0 - chosen.ok.mean()) > max(_MOST_LOST, 2.0 * failing) else 0.0
 
 
-def _all_critical(settings: Settings, log: Log) -> float:
-    """Return the share of runs that fill the space while all are critical, and nobody knows where others are; else 0."""
+def _all_alike(settings: Settings, log: Log) -> float:
+    """Return the share of runs that fill the space while all are critical, or have one value: where others are is not known."""
     requirement, training = settings.scenario.requirement, log.history.training
-    if not len(training) or not requirement.critical_runs(training).all():
+    if not len(training):
         return 0.0
-    return _ALIKE[int(np.ptp(requirement.margins(training)) > 0.0)]
+    same = not np.ptp(requirement.margins(training)) > 0.0
+    return _ALIKE[0] if same else _ALIKE[1] if requirement.critical_runs(training).all() else 0.0
 
 
 def _open_share(settings: Settings, fitted: FittedMetamodel, log: Log) -> float:

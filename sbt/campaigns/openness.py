@@ -40,13 +40,16 @@ def open_range(learner: Learner, fitted: FittedMetamodel, met: int) -> Ends | No
     return (least, most) if most - least > _MATTERS * max(share(ok, ok), 1e-12) and most > 1e-3 else None
 
 
-def failing_range(learner: Learner, fitted: FittedMetamodel) -> Ends | None:
-    """Return the least and the largest share of the space that gives no metric; None where none is known to."""
-    success = fitted.log_success
-    if not isinstance(success, Success) or not success.shown:
+def failing_range(learner: Learner, fitted: FittedMetamodel, runs: int) -> Ends | None:
+    """Return the least and the largest share of the space that gives no metric; None where none is known to.
+
+    No end is closer to the share than what one of the runs stands for: a sharp edge lies anywhere between two of them.
+    """
+    success, share = fitted.log_success, fitted.record.failing_fraction
+    if not isinstance(success, Success) or not success.shown or share is None:
         return None
-    rarely, often = success.ends(learner.probe)
-    return float(1.0 - often.mean()), float(1.0 - rarely.mean())
+    (rarely, often), one = success.ends(learner.probe), 1.0 / max(runs, 1)
+    return max(min(float(1.0 - often.mean()), share - one), 0.0), min(max(float(1.0 - rarely.mean()), share + one), 1.0)
 
 
 def by_chance(fitted: FittedMetamodel) -> bool | None:
