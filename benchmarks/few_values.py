@@ -4,10 +4,12 @@
     python benchmarks/few_values.py values [--seeds 20]            # 18 combinations of a value each; few seeds decide
     python benchmarks/few_values.py estimation [--seeds 8]         # normal and uniform inputs, 150 runs, no stop rule
     python benchmarks/few_values.py logarithms [--seeds 12]        # the same problem as y and as log y, 200 runs
+    python benchmarks/few_values.py steps [--seeds 4]              # boundaries of counts, rounded metrics and flags, 100 runs
 
 Campaigns with the product's defaults. Combinations: how many falsifications of 100 runs meet a failure, and how many of as many
 random runs do; how many intervals of an estimation cover, and how many gates pass that should not. Estimation: error and half
-width of the interval over those of crude Monte Carlo of as many runs, intervals that cover.
+width of the interval over those of crude Monte Carlo of as many runs, intervals that cover. Boundaries: what lies on the wrong
+side of P = .5 at 10,000 random points, what is expected to, and the log loss of P there.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -169,12 +172,54 @@ def logarithms(seeds: range) -> Iterator[str]:
         yield f"| {name} | {p:.4f} | {error:.2f} | {math.sqrt((1.0 - p) / p / 200):.2f} | {covered} of {len(runs)} |"
 
 
+STEPPED: dict[str, tuple[Callable[[Points], Vector], int]] = {
+    "ring": (lambda u: 3.0 * np.hypot(u[:, 0] - 0.4, 1.3 * (u[:, 1] - 0.6)) + 0.4 * np.sin(6.0 * u[:, 0]), 2),
+    "slope": (lambda u: 4.0 * u[:, 0] + 2.0 * u[:, 1] ** 2 - 1.5 * u[:, 2], 3),
+    "bowl": (lambda u: 2.0 * np.sqrt(((u - 0.5) ** 2).sum(axis=1)) + 0.5 * u[:, 0], 4),
+}
+STEPS = {"ring": (0.1, 0.5, 1.2), "slope": (0.1, 1.2), "bowl": (0.1, 0.5)}
+
+
+def stepped() -> Iterator[tuple[str, Callable[[Points], Vector], int, float]]:
+    """Yield a metric, at least 0 where it is critical, its name and its inputs."""
+    for name, (shape, d) in STEPPED.items():
+        edge = float(np.quantile(shape(stream(0, "edge").random((100_000, d))), 0.25))
+        for step in STEPS[name]:
+            yield f"{name}, steps of {step:g}", lambda u, f=shape, s=step, e=edge: np.floor((e - f(u)) / s) * s, d, 0.0
+        yield f"{name}, a flag", lambda u, f=shape, e=edge: (f(u) <= e).astype(float), d, 0.5
+
+
+def steps(seeds: range) -> Iterator[str]:
+    yield "| metric | inputs | wrong side, in % | expected | log loss | CPU s |"
+    for name, metric, d, low in stepped():
+        u, told = stream(1, "points").random((10_000, d)), []
+        critical, names = metric(u) >= low, "abcd"[:d]
+        inputs, began = [sbt.Parameter(n, 0, 1) for n in names], time.process_time()
+
+        def evaluate(values: dict, seed: int, metric: Callable[[Points], Vector] = metric) -> dict[str, float]:
+            return {"y": float(metric(np.array([list(values.values())]))[0])}
+
+        for seed in seeds:
+            scenario = sbt.Scenario("steps", inputs, sbt.Requirement("y", low=low), evaluate=evaluate)
+            with tempfile.TemporaryDirectory() as folder:
+                store = Path(folder) / "s"
+                result = sbt.run(
+                    campaign="boundary", scenario=scenario, seed=seed, store=store, executor="serial", report=False, budget=100
+                )  # fmt: skip
+                p = result.predict(dict(zip(names, u.T, strict=True)))["p_critical"].to_numpy()
+            sure = np.clip(np.where(critical, p, 1.0 - p), 1e-6, 1.0)
+            told.append([100.0 * ((p > 0.5) != critical).mean(), 100.0 * np.minimum(p, 1.0 - p).mean(), -np.log(sure).mean()])
+        wrong, expected, loss = np.mean(told, axis=0)
+        took = (time.process_time() - began) / len(seeds)
+        yield f"| {name} | {d} | {wrong:.2f} | {expected:.2f} | {loss:.4f} | {took:.0f} |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms"))
+    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms", "steps"))
     parser.add_argument("--seeds", type=int, default=8)
     given = parser.parse_args()
-    tables = {"combinations": combinations, "values": values, "estimation": estimation, "logarithms": logarithms}
+    tables = {"combinations": combinations, "values": values, "estimation": estimation, "logarithms": logarithms, "steps": steps}
     rows = tables[given.what](range(given.seeds))
     for k, row in enumerate(rows):
         print(row, flush=True)

@@ -13,7 +13,7 @@ import pytest
 import sbt
 from sbt.campaigns.boundary import BoundaryConclusion
 from sbt.loop.stages import Facts
-from sbt.metamodels.classifier import _log_posterior, classifier
+from sbt.metamodels.classifier import classifier
 from sbt.problem.requirement import Requirement
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
@@ -72,16 +72,6 @@ def test_where_nothing_critical_was_met_no_least_share_is_told():
     assert "Should inputs decide it after all: of what gives a metric between" in chance
     assert "Where failing begins" not in chance
     assert "between 0\N{NO-BREAK SPACE}% and 1.76" in told
-
-
-def test_the_slope_of_a_classifier_is_that_of_its_evidence():
-    u = stream(1, "slope").random((40, 2))
-    sign = np.where(np.hypot(u[:, 0] - 0.6, u[:, 1] - 0.3) > 0.3, 1.0, -1.0)
-    theta = np.array([-1.0, -0.5, 0.7, 1.2])
-    slope = _log_posterior(theta, u, sign, None)[1]
-    steps = [1e-3 * row for row in np.eye(4)]
-    told = [(_log_posterior(theta + s, u, sign, None)[0] - _log_posterior(theta - s, u, sign, None)[0]) / 2e-3 for s in steps]
-    assert slope == pytest.approx(told, abs=0.01)
 
 
 @pytest.mark.parametrize("d", [1, 3])

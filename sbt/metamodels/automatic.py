@@ -12,7 +12,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metamodels.base import Metamodel, Predictor, Screened, check_rows, is_rate, sample_paths, sketched, without_repetitions
+from sbt.metamodels.base import (
+    Metamodel,
+    Predictor,
+    Screened,
+    check_rows,
+    is_rate,
+    once,
+    sample_paths,
+    sketched,
+    without_repetitions,
+)
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
@@ -21,6 +31,7 @@ from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.noise_shape import better_uneven, shaped
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.rated import better_rate
+from sbt.metamodels.rounded import Rounding, better_rounded
 from sbt.metamodels.sided import better_sided
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.stepped import better_stepped
@@ -116,12 +127,13 @@ class Auto:
         return _TargetedAuto(self, critical)
 
     def _fit(
-        self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None, warp: Warp | None = None
-    ) -> MixturePredictor:
-        """Fit to y and M_c, both in the unit of the warp where there is one."""
+        self, u: Points, y: Vector, rng: np.random.Generator, critical: CriticalInterval | None, warp: Warp | None = None,
+        told: Rounding | None = None,
+    ) -> MixturePredictor:  # fmt: skip
+        """Fit to y and M_c, both in the unit of the warp where there is one; `told`: by a metric that comes in steps."""
         n = len(y)
         if critical is not None and _FEWEST <= n <= self.gp_rows:
-            return self._fit_at_edge(u, y, rng, Bins.around_edge(y, critical, warp))
+            return self._fit_at_edge(u, y, rng, Bins.around_edge(y, critical, warp), told)
         bins = None if critical is None else Bins.around_edge(y, critical, warp)
         models, compared = self._models(n, n, target_aware=bins is not None), min(n, self.compare_rows)
         if n < _FEWEST:
@@ -134,10 +146,12 @@ class Auto:
         comparison = _explain(list(models), weights, scores, compared, self, bins)
         return self._mixed(models, {}, comparison, u, y, rng)
 
-    def _fit_at_edge(self, u: Points, y: Vector, rng: np.random.Generator, bins: Bins) -> MixturePredictor:
+    def _fit_at_edge(
+        self, u: Points, y: Vector, rng: np.random.Generator, bins: Bins, told: Rounding | None = None
+    ) -> MixturePredictor:
         """Return the process alone, or the mixture where it is better for where the runs fell, at the edge and over the space."""
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
-        bins = replace(bins, near=np.inf) if is_rate(u, y) else bins  # ranges beside the edge tell nothing of two values
+        bins = replace(bins, near=np.inf) if told is not None or is_rate(u, y) else bins  # nor do ranges between two steps
         plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
         stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
         even = plain if stepped is not None else better_uneven(self.simplest, plain, bins.critical, u, y, shares, rng) or plain
@@ -148,6 +162,9 @@ class Auto:
         rated = better_rate(self.simplest, own, bins.critical, u, y, rng)
         process: Predictor = rated[0] if rated is not None else values if sided is None else sided[0]
         own = own if rated is None else own + rated[1]
+        rounded = None if told is None else better_rounded(told, own, bins.critical, u, y, bins.warp, shares, rng)
+        process = process if rounded is None else rounded[0]
+        own = own if rounded is None else own + rounded[1]
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             missed = max(-float(own.mean()), _NOTHING)
             left = f"of {n} rows, each predicted from all others, {missed:.1g}: others could add no more"
@@ -190,19 +207,27 @@ class _TargetedAuto:
 
     settings: Auto
     critical: CriticalInterval
+    told: Rounding | None = None
 
     def with_target(self, critical: CriticalInterval) -> _TargetedAuto:
         """Return the same settings for another interval."""
         return _TargetedAuto(self.settings, critical)
 
+    def with_rounding(self, told: Rounding) -> _TargetedAuto:
+        """Return the same settings for rows of a metric that comes in steps, and what each of them tells."""
+        return replace(self, told=told)
+
     def fit(self, u: Points, y: Vector, rng: np.random.Generator) -> MixturePredictor | WarpedPredictor:
         """Return the mixture fitted to u (n, d) and y (n,), in the unit of `better_warp`; see `Metamodel.fit`."""
-        u, y = without_repetitions(*check_rows(u, y))
+        u, y = check_rows(u, y)
+        kept = once(u, y)
+        u, y, told = u[kept], y[kept], None if self.told is None else self.told.take(kept)
         warp = better_warp(self.settings.simplest, u, y, self.critical)
         warp = better_without_gap(self.settings.simplest, u, y, self.critical, warp) or warp
         if warp is None:
-            return self.settings._fit(u, y, rng, self.critical)
-        return WarpedPredictor(self.settings._fit(u, warp.values(y), rng, warp.interval(self.critical), warp), warp)
+            return self.settings._fit(u, y, rng, self.critical, told=told)
+        warp = warp.reaching(y)
+        return WarpedPredictor(self.settings._fit(u, warp.values(y), rng, warp.interval(self.critical), warp, told), warp)
 
 
 def _paced(n: int, full: Ensemble, pace: float) -> Ensemble:

@@ -30,6 +30,7 @@ from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbt.errors import InputError, SbtError, did_you_mean, naming
 from sbt.metamodels.prediction import Prediction, PredictionError
@@ -38,7 +39,7 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
     "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "gives_different", "is_rate",
-    "log_ambiguity_bound", "named_errors", "predicted", "sample_paths", "simplest", "sketched", "split_validation",
+    "log_ambiguity_bound", "named_errors", "once", "predicted", "sample_paths", "simplest", "sketched", "split_validation",
     "standardise", "with_target", "without_repetitions",
 ]  # fmt: skip
 
@@ -301,12 +302,17 @@ def without_repetitions(u: Points, y: Vector) -> tuple[Points, Vector]:
     >>> without_repetitions(np.array([[0.1], [0.2], [0.1]]), np.array([1.0, 2.0, 3.0]))[1].tolist()
     [1.0, 2.0, 3.0]
     """
+    kept = once(u, y)
+    return u[kept], y[kept]
+
+
+def once(u: Points, y: Vector) -> NDArray[np.intp]:
+    """Return the rows that `without_repetitions` keeps."""
     first = np.unique(u, axis=0, return_index=True)[1]
     pairs = np.unique(np.column_stack([u, y]), axis=0)
     if len(first) == len(u) or len(pairs) > len(first) or len(first) < 2:
-        return u, y
-    kept = np.sort(first)
-    return u[kept], y[kept]
+        return np.arange(len(u))
+    return np.sort(first)
 
 
 def gives_different(u: Points, y: Vector) -> bool:

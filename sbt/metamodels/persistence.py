@@ -23,8 +23,8 @@ from sbt.files import write_atomically
 from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
 from sbt.metamodels import deep_ensemble as ensemble
-from sbt.metamodels import extra_trees as et
 from sbt.metamodels import (
+    expectation_propagation,
     gp_algebra,
     gp_predictor,
     joint,
@@ -32,6 +32,7 @@ from sbt.metamodels import (
     prediction,
     rated,
     recalibrated,
+    rounded,
     saturation,
     sided,
     sparse,
@@ -39,6 +40,7 @@ from sbt.metamodels import (
     warp,
     warped,
 )
+from sbt.metamodels import extra_trees as et
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
 from sbt.problem.combination import CombinedInterval
@@ -64,7 +66,10 @@ _KINDS: dict[str, Any] = {
         gp_predictor.GaussianProcessPredictor,
         gp_predictor.NoiseSpread,
         joint.JointPredictor,
+        expectation_propagation.Belief,
+        expectation_propagation.Hyper,
         rated.RatePredictor,
+        rounded.RoundedPredictor,
         recalibrated.RecalibratedPredictor,
         saturation.Ending,
         prediction.Scale,

@@ -19,6 +19,7 @@ from scipy.special import log_ndtr
 from sbt.metamodels.base import Metamodel, Predictor, Screened, is_rate, sample_paths, sketched, with_target
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction, Scale, reached_beyond
+from sbt.metamodels.rounded import StepAware, rounding
 from sbt.metamodels.warp import Warp, gap_of
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN
@@ -304,6 +305,8 @@ class Opened:
         critical = as_passed(self.critical, y)
         if self.beyond:
             metamodel, (learned, limit) = with_target(self.metamodel, critical), opened_and_limit(u, y, critical, rng)
+            told = rounding(u, y, critical)
+            metamodel = metamodel.with_rounding(told) if told is not None and isinstance(metamodel, StepAware) else metamodel
         else:
             metamodel, learned, limit = self.metamodel, centred(u, y, critical), None
         steps = _steps(y, learned) if limit is None else ()

@@ -1,0 +1,218 @@
+"""A process of what a metric was rounded from: a count, a time in steps of the simulation, a level of severity.
+
+Of such a metric a run tells between which two numbers it lay. Least squares take the steps for noise, so that P(critical) is
+vague next to runs that leave no doubt, or for the shape itself, and are surest where a step goes on. Here each run tells its
+range.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from sbt.metamodels.base import Metamodel
+from sbt.metamodels.expectation_propagation import Belief, Hyper, Priors, believe, fitted, latent, latent_jointly
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.stacking import surely_positive
+from sbt.metamodels.warp import Warp
+from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.requirement import CriticalInterval
+
+__all__ = ["RoundedPredictor", "Rounding", "StepAware", "better_rounded", "rounding"]
+
+_FEWEST, _TIED = 10, 0.5
+"""Rows, and the least share of those between the first and the last value that have the value of a row elsewhere."""
+_WHOLE = 1e-3
+"""Of a step: how far multiples of it may be off."""
+_LEARNED, _MOST = 200, 1000
+"""Rows that hyperparameters are found by, and that are learned from, at most: half of them those nearest to the edge."""
+_LENGTH, _NOISE = 0.3, 0.03
+"""Where the search of hyperparameters starts: length in sqrt(d), noise in standard deviations of y."""
+_BOUNDS = ((-3.5, 4.0), (-4.0, 3.0), (-30.0, 30.0), (math.log(1e-3), 1.0))
+"""Of log lengths, log spread, mean and log noise, in standard deviations of y."""
+_SURE, _SURELY_WORSE = 1.0, 2.0
+"""Standard errors by which left-out runs of a flag must be predicted better, and those of other metrics may not be worse."""
+_SAME = 1e-9
+"""Standard deviations of y, within which the edge is reached."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rounding:
+    """What rows of a rounded metric tell, in the unit of the metric.
+
+    Args:
+        low, high: (n,) ends of the range that each value stands for; infinite ones of the first and the last value.
+        edge: between the ranges of what is critical and what is not.
+        width: > 0, of the step at the edge.
+    """
+
+    low: Vector
+    high: Vector
+    edge: float
+    width: float
+
+    def take(self, rows: NDArray[np.intp]) -> Rounding:
+        """Return what these rows tell."""
+        return replace(self, low=self.low[rows], high=self.high[rows])
+
+
+@runtime_checkable
+class StepAware(Protocol):
+    """A metamodel that learns otherwise where the metric comes in steps."""
+
+    def with_rounding(self, told: Rounding) -> Metamodel:
+        """Return the same settings for rows of which each tells a range."""
+        ...
+
+
+def rounding(u: Points, y: Vector, critical: CriticalInterval) -> Rounding | None:
+    """Return what y (n,) at u (n, d) tells where it comes in steps; None where it does not, or M_c has two ends.
+
+    Steps of one size are known wherever they lie; those of other metrics of few values end midway between these.
+
+    >>> found = rounding(np.arange(12.0)[:, None], np.repeat([0.0, 1.0, 2.0, 4.0], 3), CriticalInterval(high=2.0))
+    >>> found.edge, found.low[3:7].tolist(), found.high[3:7].tolist()
+    (2.5, [0.5, 0.5, 0.5, 1.5], [1.5, 1.5, 1.5, 2.5])
+    """
+    if not critical.one_sided or len(y) < _FEWEST:
+        return None
+    values, which = np.unique(y, return_inverse=True)
+    between = (which > 0) & (which < len(values) - 1)
+    tied = np.bincount(np.unique(np.column_stack([which, u]), axis=0)[:, 0].astype(np.intp)) > 1
+    if len(values) < 2 or (tied[which[between]].mean() < _TIED if between.any() else not tied.all()):
+        return None
+    step, inside = _step(values), critical.contains(values)
+    if step is not None:
+        sign, low, high, width = critical.outward, values - 0.5 * step, values + 0.5 * step, step
+        last = float(values[0]) + sign * step * math.floor(sign * float(critical.edge - values[0]) / step + _WHOLE)  # critical
+        edge = last + 0.5 * sign * step
+    elif inside.all() or not inside.any():
+        return None
+    else:
+        middle = 0.5 * (values[1:] + values[:-1])
+        low, high = np.append(values[0], middle), np.append(middle, values[-1])
+        k = int(np.flatnonzero(inside[1:] != inside[:-1])[0])
+        edge, width = float(middle[k]), float(values[k + 1] - values[k])
+    low[0], high[-1] = -np.inf, np.inf
+    return Rounding(low[which], high[which], edge, width)
+
+
+def _step(values: Vector) -> float | None:
+    """Return the size of which all differences of values (k,), increasing, are multiples; None where there is none."""
+    apart = np.diff(values)
+    step = float(apart.min())
+    times = apart / step
+    return step if bool((np.abs(times - np.round(times)) < _WHOLE * times).all()) else None
+
+
+@dataclass(frozen=True, eq=False)
+class RoundedPredictor:
+    """A process of what a metric was rounded from, as one of the metric, of which P(critical) is that of a range.
+
+    Args:
+        u: (m, d) rows.
+        hyper: of the process, whose unit is `scale`, about `edge`.
+        belief: of the process.
+        scale: standard deviation of y > 0, in its unit.
+        edge, width: of the rounding, in the unit of the metric.
+        critical: M_c, in the unit of y.
+        warp: the unit of y; None: that of the metric.
+    """
+
+    u: Points
+    hyper: Hyper
+    belief: Belief
+    scale: float
+    edge: float
+    width: float
+    critical: CriticalInterval
+    warp: Warp | None
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the prediction of y at u (n, d)."""
+        mean, variance = latent(u, self.u, self.hyper, self.belief)
+        told, ratio = self._told(mean)
+        noise = ratio * self.scale * self.hyper.noise
+        return Prediction.gaussian(told, np.hypot(ratio * self.scale * np.sqrt(variance), noise), noise)
+
+    def mu(self, u: Points) -> Vector:
+        """Return the (n,) mean of y at u (n, d)."""
+        return self._told(latent(u, self.u, self.hyper, self.belief)[0])[0]
+
+    def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, m) draws of y as a function at u (m, d); the cost is cubic in m."""
+        mean, covariance = latent_jointly(u, self.u, self.hyper, self.belief)
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        return self._told(mean + rng.standard_normal((n, len(u))) @ root.T)[0]
+
+    def log_sides(self, u: Points, inside: Mask, rows: NDArray[np.intp]) -> Vector:
+        """Return (n,) log P of the side of the edge on which runs at u (n, d) fell, those that it learned by all others."""
+        mean, variance = latent(u, self.u, self.hyper, self.belief)
+        mean[rows], variance[rows] = self.hyper.mean + self.belief.beside, self.belief.wide
+        return log_ndtr(np.where(inside, -mean, mean) * self.critical.outward / np.sqrt(variance + self.hyper.noise**2))
+
+    def _told(self, off: Points) -> tuple[Points, Points]:
+        """Return the y of what is so far from the edge, in standard deviations, and its distance from M_c over that; shape kept.
+
+        Next to the edge y is as far from M_c; from the next step on it is what was rounded.
+        """
+        edge, w = self.critical.edge, self.width
+        own, end = (edge, edge) if self.warp is None else (float(self.warp.values(np.array(self.edge))), self.warp.edge)
+        at = self.edge + self.scale * off if self.warp is None else self.warp.back(own + self.scale * off)
+        knots = self.edge + w * np.array([-1.5, -0.5, 0.5, 1.5])
+        moved = np.interp(at, knots, [knots[0], end - 0.5 * w, end + 0.5 * w, knots[3]])
+        y = np.where((at < knots[0]) | (at > knots[3]), at, moved)
+        y = y if self.warp is None else self.warp.values(y)
+        near = np.abs(off) < _SAME
+        return y, np.where(near, 1.0, (y - edge) / np.where(near, 1.0, self.scale * off))
+
+
+def better_rounded(
+    told: Rounding, score: Vector, critical: CriticalInterval, u: Points, y: Vector, warp: Warp | None, shares: Vector,
+    rng: np.random.Generator,
+) -> tuple[RoundedPredictor, Vector] | None:  # fmt: skip
+    """Return a process of what y was rounded from, and (n,) what it gains in log P(side) of left-out rows; None where nothing.
+
+    Args:
+        told: what each row tells.
+        score: (n,) log P(side) that each row has by another metamodel of the others.
+        critical: M_c, in the unit of y.
+        u: (n, d) rows.
+        y: (n,) their metric, as it is learned, in the unit of `warp`.
+        warp: that unit; None: that of the metric.
+        shares: (n,) of the space that each row stands for.
+        rng: the only source of randomness.
+    """
+    scale, inside = float(np.std(y)), critical.contains(y)
+    if not scale > 0.0:
+        return None
+    low, high, edge = (
+        ends if warp is None else warp.values(ends) for ends in (told.low, told.high, np.array(told.edge))
+    )  # fmt: skip
+    low, high, d = (low - edge) / scale, (high - edge) / scale, u.shape[1]
+    near = np.argsort(np.abs(y - critical.edge), kind="stable")
+    few, rows = (_some(near, most, rng) for most in (_LEARNED, _MOST))
+    start = Hyper(np.full(d, _LENGTH * math.sqrt(d)), 1.0, float(np.mean(y - critical.edge)) / scale, _NOISE)
+    priors = Priors(
+        (math.sqrt(2.0) + 0.5 * math.log(d), math.sqrt(3.0)), (0.0, 1.0), (0.0, 2.0), (math.log(0.01), 2.0), _BOUNDS
+    )  # fmt: skip
+    hyper, _ = fitted(u[few], low[few], high[few], start, priors)
+    belief = believe(hyper, hyper.covariance(u[rows])[0], low[rows], high[rows])
+    found = RoundedPredictor(u[rows], hyper, belief, scale, told.edge, told.width, critical, warp)
+    gain = found.log_sides(u, inside, rows) - score
+    flag = len(np.unique(told.low)) == 2  # of which the sides alone are learned by others as well
+    better = surely_positive(gain, _SURE) and float(shares @ gain) > 0.0 if flag else not surely_positive(-gain, _SURELY_WORSE)
+    return (found, gain) if better else None
+
+
+def _some(near: NDArray[np.intp], most: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return up to so many rows, in order: half of them the nearest, the others drawn."""
+    if len(near) <= most:
+        return np.sort(near)
+    return np.sort(np.concatenate([near[: most // 2], rng.permutation(near[most // 2 :])[: most - most // 2]]))
